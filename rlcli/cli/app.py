@@ -1,4 +1,4 @@
-"""The command table, and the one place where an error becomes an exit code."""
+"""The commands of `rlcli`, and the conversion of errors into messages and exit codes."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ import traceback
 from typing import TYPE_CHECKING, Any
 
 import typer
-from typer._click.exceptions import ClickException, NoArgsIsHelpError, UsageError
+from typer._click.exceptions import ClickException, NoArgsIsHelpError
+from typer._click.exceptions import UsageError as ClickUsageError
 
 from rlcli.cli.ui.console import console, discard, print_log_records
-from rlcli.cli.ui.options import CHOOSE, with_common_options
+from rlcli.cli.ui.help_text import HelpGroup
+from rlcli.cli.ui.options import CHOOSE, add_command
 from rlcli.config.settings_file import read_settings
-from rlcli.errors import ConfigError, RlcliError
+from rlcli.errors import ConfigError, MachineError, RlcliError, Stopped, UsageError
 from rlcli.machine import delay_garbage_collection
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.settings import settings_file, use_settings
@@ -25,24 +27,33 @@ from rlcli.trainers import TrainerSpec
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-COMMANDS = (
-    "list-tasks", "terms", "show", "validate", "train", "sweep", "bench", "play", "eval", "stress", "export", "replay",
-    "autopsy", "runs", "watch", "plot", "report", "diff", "reproduce", "check", "lint", "new", "doctor",
-)  # fmt: skip
-"""Commands, in the order of `--help`; each has a module of `rlcli.cli.commands` of its name with `command`."""
-
+PANELS = {
+    "Tasks": ("list-tasks", "terms", "show", "new", "validate", "check", "lint"),
+    "Train": ("bench", "train", "watch", "sweep", "import"),
+    "Play": ("play", "replay", "autopsy"),
+    "Evaluate": ("eval", "stress", "plot", "report"),
+    "Deploy": ("export",),
+    "Project": ("runs", "diff", "reproduce", "doctor"),
+}
+"""Panel of `--help` -> its commands, in the order in which they are usually used."""
 GROUPS = {"import": "import_"}
-"""Command that has commands of its own -> module of `rlcli.cli.commands` with their `app`."""
+"""Command with subcommands -> module of `rlcli.cli.commands` with their `app`."""
+COMMANDS = tuple(name for names in PANELS.values() for name in names if name not in GROUPS)
+"""Other commands: each has a module of `rlcli.cli.commands` of its name with a function `command`."""
 
 _INTERRUPTED = 130
 _HELP_FLAGS = frozenset(("-h", "--help", "--version", "--install-completion", "--show-completion"))
 _COMPLETION_VARIABLE = "_RLCLI_COMPLETE"
-"""Environment variable that a shell sets to complete a line."""
-
+"""Environment variable that a shell sets to complete a command line."""
 _SETTINGS = {
     "help_option_names": ["-h", "--help"],
     "token_normalize_func": lambda name: name.replace("_", "-"),
 }
+_EXAMPLES = """\
+rlcli train cartpole
+    Train the built-in task cartpole; the run goes to runs/cartpole/.
+rlcli play cartpole
+    Show the policy of its newest run in a window or the browser."""
 
 
 def _root(
@@ -57,23 +68,26 @@ def _root(
 
 @functools.cache
 def build(only: str | None = None) -> typer.Typer:
-    """The app with every command registered, or with one; command modules import nothing heavy."""
+    """Return the app with all commands, or with one; modules of commands import nothing heavy."""
     app = typer.Typer(
+        cls=HelpGroup,
         context_settings=_SETTINGS,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
         help="Train, play, evaluate and export robot-control policies in MuJoCo.",
+        epilog=_EXAMPLES,
     )
     app.callback(invoke_without_command=True)(_root)
-    for name in COMMANDS:
-        if only in (None, name):
-            command = importlib.import_module(f"rlcli.cli.commands.{name.replace('-', '_')}").command
-            app.command(name, context_settings=_SETTINGS)(with_common_options(command))
-    for name, module in GROUPS.items():
-        if only in (None, name):
-            group = importlib.import_module(f"rlcli.cli.commands.{module}").app
-            app.add_typer(group, name=name, context_settings=_SETTINGS)
+    for panel, names in PANELS.items():
+        for name in names:
+            if only not in (None, name):
+                continue
+            module = importlib.import_module(f"rlcli.cli.commands.{GROUPS.get(name) or name.replace('-', '_')}")
+            if name in GROUPS:
+                app.add_typer(module.app, name=name, rich_help_panel=panel)
+            else:
+                add_command(app, name, module.command, rich_help_panel=panel)
     return app
 
 
@@ -97,7 +111,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _with_values(arguments: list[str]) -> list[str]:
-    """`--video` may stand without its FILE: the parser knows no optional values, so the word for "choose" is put in."""
+    """Insert CHOOSE after a `--video` without FILE, because the parser has no optional values."""
     filled = []
     for position, word in enumerate(arguments):
         filled.append(word)
@@ -108,46 +122,61 @@ def _with_values(arguments: list[str]) -> list[str]:
 
 
 def _command_name(arguments: list[str]) -> str | None:
-    """The command on the command line, if it exists."""
+    """Return the command on the command line, if it exists."""
     word = next((word for word in arguments if not word.startswith("-")), "").replace("_", "-")
     return word if word in COMMANDS or word in GROUPS else None
 
 
 def _run(arguments: list[str]) -> int:
     try:
-        with use_settings(_preferences(arguments)):
+        with use_settings(_user_settings(arguments)):
             result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
-        if result == _INTERRUPTED:  # how typer hands on Ctrl-C
+        if result == _INTERRUPTED:  # typer turns Ctrl-C into this exit code
             raise KeyboardInterrupt
         return result if isinstance(result, int) else 0
-    except RlcliError as error:
-        return _report(error)
-    except UsageError as error:
-        return _usage(error, arguments)
-    except ClickException as error:
-        console.error("usage", error.exit_code, error.format_message(), None, [])
-        return error.exit_code
-    except (KeyboardInterrupt, typer.Abort):
-        console.error("stopped", _INTERRUPTED, "interrupted", None, [])
-        return _INTERRUPTED
-    except OSError as error:
-        return _machine(error)
-    except Exception as error:
-        from rlcli.cli.ui.error_origin import own_failure
-        from rlcli.sim.gl import opengl_import_error
-
-        if (unusable := opengl_import_error(error)) is not None:
-            return _report(unusable)
-        if (failure := own_failure(error)) is not None:
-            return _report(failure)
-        traceback.print_exc()
-        message = f"this is a bug in rlcli: {type(error).__name__}: {error}"
-        console.error("bug", 1, message, "please report it with the lines above", [])
-        return 1
+    except NoArgsIsHelpError as error:
+        if not console.json:
+            console.info(error.message)
+            return 2
+        failure: RlcliError = UsageError("no command", hint="rlcli --help")
+    except (Exception, KeyboardInterrupt) as error:
+        failure = _as_rlcli_error(error, arguments)
+        is_expected = isinstance(error, ClickException | KeyboardInterrupt | typer.Abort)
+        if failure.kind == "bug" or (console.debug and not is_expected):
+            traceback.print_exc()
+    console.error(failure)
+    return failure.exit_code
 
 
-def _preferences(arguments: list[str]) -> dict[str, Any]:
-    """The user's settings; what is asked for help, or to find out what is wrong, works without them too."""
+def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
+    """Return the error to print for any exception."""
+    if isinstance(error, RlcliError):
+        return error
+    if isinstance(error, ClickException):
+        failure = UsageError(error.format_message(), hint=_usage_hint(error, arguments))
+        failure.exit_code = error.exit_code
+        return failure
+    if isinstance(error, KeyboardInterrupt | typer.Abort):
+        return Stopped("interrupted", exit_code=_INTERRUPTED)
+    if isinstance(error, OSError):
+        file = f"{error.filename}: " if error.filename else ""
+        return MachineError(f"{file}{error.strerror or error}")
+
+    from rlcli.cli.ui.error_origin import error_of_task
+    from rlcli.sim.gl import opengl_import_error
+
+    known = opengl_import_error(error) or error_of_task(error)
+    if known is not None:
+        return known
+    bug = RlcliError(
+        f"this is a bug in rlcli: {type(error).__name__}: {error}", hint="please report it with the lines above"
+    )
+    bug.kind = "bug"
+    return bug
+
+
+def _user_settings(arguments: list[str]) -> dict[str, Any]:
+    """Return the user's settings; help, completion and `doctor` also work if the file is broken."""
     try:
         settings = read_settings()
     except ConfigError:
@@ -163,44 +192,32 @@ def _preferences(arguments: list[str]) -> dict[str, Any]:
     return settings
 
 
-def _report(error: RlcliError) -> int:
-    problems: list[dict[str, Any]] = []
-    if isinstance(error, ConfigError):
-        problems = [{"where": p.where, "path": p.path, "message": p.message, "hint": p.hint} for p in error.problems]
-    if console.debug:
-        traceback.print_exc()  # of what is being handled, which may be another one
-    console.error(error.kind, error.exit_code, error.message, error.hint, problems)
-    return error.exit_code
-
-
-def _usage(error: UsageError, arguments: list[str]) -> int:
-    if isinstance(error, NoArgsIsHelpError):
-        console.error("usage", 2, "no command", "rlcli --help", []) if console.json else console.info(error.message)
-        return 2
-    hint = "rlcli --help" if error.ctx is None else f"{error.ctx.command_path} --help"
+def _usage_hint(error: ClickException, arguments: list[str]) -> str | None:
+    """Return the hint for a wrong command line: how to write the option, or where the help is."""
+    if not isinstance(error, ClickUsageError):
+        return None
     match = re.match(r"No such option: --([A-Za-z_][\w.-]*)", error.format_message())
-    if match:
-        hint = _hint_for_option(match[1], arguments) or hint
-    console.error("usage", 2, error.format_message(), hint, [])
-    return 2
+    if match and (hint := _hint_for_option(match[1], arguments)):
+        return hint
+    return "rlcli --help" if error.ctx is None else f"{error.ctx.command_path} --help"
 
 
 def _hint_for_option(name: str, arguments: list[str]) -> str | None:
-    """What to write where an option does not exist: the override of a setting, or an option of rlcli."""
-    keys = _settings_called(name)
+    """Return what to write for an unknown option: the override of a setting, or an option of rlcli."""
+    keys = _matching_settings(name)
     if not keys:
-        return _WRITTEN_OTHERWISE.get(name)
+        return _FOREIGN_OPTIONS.get(name)
     spellings = (f"--{name}", f"--{name.replace('-', '_')}")
-    given = next((word for word in arguments if word.startswith(spellings)), "")
-    value = given.partition("=")[2]
-    if not value and given in arguments[:-1]:
-        value = arguments[arguments.index(given) + 1]
+    word = next((word for word in arguments if word.startswith(spellings)), "")
+    value = word.partition("=")[2]
+    if not value and word in arguments[:-1]:
+        value = arguments[arguments.index(word) + 1]
     value = value or "VALUE"
     return f"overrides have no dashes: {' or '.join(f'{key}={value}' for key in keys)}"
 
 
-def _settings_called(option: str) -> list[str]:
-    """The settings that an option's name without its dashes may mean: an address, or the last part of one to three."""
+def _matching_settings(option: str) -> list[str]:
+    """Return the settings that an option without its dashes may mean: a full key, or the last part of one to three."""
     name = option.replace("-", "_")
     if "." in name.strip("."):
         return [name]
@@ -209,8 +226,8 @@ def _settings_called(option: str) -> list[str]:
 
     key = _SHORT_FOR.get(name, name)
     models: list[dict[str, Any]] = [{"": TaskConfig}, *({"agent": model} for model in _agent_models())]
-    places = list(dict.fromkeys(place for model in models for place in key_locations(model).get(key, [])))
-    return places if len(places) <= 3 and name != "task" else []  # the task is an argument
+    keys = list(dict.fromkeys(found for model in models for found in key_locations(model).get(key, [])))
+    return keys if len(keys) <= 3 and name != "task" else []  # the task is an argument
 
 
 def _agent_models() -> set[type[BaseModel]]:
@@ -219,18 +236,10 @@ def _agent_models() -> set[type[BaseModel]]:
     return {load_object(model) for spec in specs for model in spec.algorithms.values()}
 
 
-_WRITTEN_OTHERWISE = {
+_FOREIGN_OPTIONS = {
     "task": "the task is named without an option, as in: rlcli train cartpole",
     "load-run": "a run or one of its checkpoints is named by --checkpoint RUN; rlcli train --resume RUN goes on",
     "enable-cameras": "cameras of a task need no option",
 }
-"""Options of other programs -> what is written here."""
+"""Option of another program -> what to write for rlcli."""
 _SHORT_FOR = {"lr": "learning_rate"}
-
-
-def _machine(error: OSError) -> int:
-    if console.debug:
-        traceback.print_exc()
-    place = f"{error.filename}: " if error.filename else ""
-    console.error("machine", 10, f"{place}{error.strerror or error}", None, [])
-    return 10

@@ -1,12 +1,14 @@
-"""How fast a task steps and trains on this machine, and which sizes and threads get an iteration done soonest.
+"""Speed of a task on this machine, and the sizes and threads with the shortest training iterations.
 
-What is compared learns alike: as many samples an iteration, as many gradient steps of as many samples. Then the time of
-an iteration is what the time to a solution hangs on; more steps a second that are learned from less are no gain.
+Only settings that learn alike are compared: they have the same number of samples in an iteration, and the same number
+and size of gradient steps. Then the time of an iteration decides the time to a solution. More steps per second with
+fewer gradient steps per sample would be no gain.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import os
 import statistics
@@ -25,33 +27,34 @@ from rlcli.training.setup import make_trainer
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
-    from rlcli.envs.vec_env import VecEnv
     from rlcli.rl.trainer import Trainer
 
 SIZES = (16, 64, 256, 1_024, 4_096, 16_384)
-"""Numbers of environments that are stepped."""
+"""Numbers of environments that are measured."""
 HORIZONS = ("num_steps", "n_steps", "num_steps_per_env", "train_freq")
-"""What trainers call the steps of an environment in an iteration."""
+"""Names that trainers use for the steps of one environment in an iteration."""
 UNSTEADY = 0.15
-"""Spread of a measurement that is repeated; of one that stays so, other work on the machine is a part."""
+"""Relative spread above which a measurement is repeated, and the machine is reported as busy."""
 WORTH = 0.97
-"""Share of the present time below which another setting is recommended."""
+"""Share of the present iteration time below which another setting is recommended."""
 _ACTIONS = 8
+"""Different random actions that are applied in turn."""
 _ENV_BYTES = 256 * 2**10
-"""Memory that an environment is taken to need until one has been built."""
+"""Assumed memory of one environment before the first measurement [bytes]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How long is measured."""
+    """Duration of the measurements."""
 
     block_s: float = 0.4
-    """A block of calls takes at least so long."""
+    """Shortest duration of a block of calls [s]."""
     blocks: int = 5
+    """Blocks in one round."""
     rounds: int = 3
-    """Times that blocks are measured while they differ."""
+    """Largest number of rounds, if the blocks differ by more than UNSTEADY."""
     longest_s: float = 4.0
-    """A step that would take longer is left out."""
+    """A size whose step would take longer [s] is left out."""
 
 
 QUICK = Pace(block_s=0.05, blocks=3, rounds=1, longest_s=1.0)
@@ -59,19 +62,19 @@ QUICK = Pace(block_s=0.05, blocks=3, rounds=1, longest_s=1.0)
 
 @dataclass(frozen=True, slots=True)
 class Stepped:
-    """Environments under random actions."""
+    """Measurement of environments with random actions."""
 
     num_envs: int
     engine_threads: int
     steps_per_s: float | None = None
     physics: float | None = None
-    """Share of the time."""
+    """Share of the physics in the time of a step."""
     spread: float | None = None
-    """Difference of the quartiles of its blocks, as a share of their median."""
+    """Interquartile range of the blocks, divided by their median."""
     resident: int | None = None
-    """Of the process [bytes]."""
+    """Resident memory of the process [bytes]."""
     left_out: str | None = None
-    """Why it was not measured."""
+    """Reason for not measuring."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,24 +90,24 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """Iterations of a training."""
+    """Measurement of training iterations."""
 
     setting: Setting
     alike: bool
-    """Whether it learns as the present setting does."""
+    """Whether a training learns as with the present setting."""
     samples: int = 0
-    """An iteration."""
+    """Samples in an iteration."""
     seconds: float | None = None
-    """An iteration, the median."""
+    """Median duration of an iteration [s]."""
     shares: Mapping[str, float] = field(default_factory=dict)
-    """Of physics, task, policy and update."""
+    """Part (physics, task, policy, update) -> its share of the time."""
     spread: float | None = None
     resident: int | None = None
     left_out: str | None = None
 
     @property
     def steps_per_s(self) -> float | None:
-        """Environment steps, rollout and update taken together."""
+        """Environment steps per second of rollout and update together."""
         return None if self.seconds is None else self.samples / self.seconds
 
     @property
@@ -115,23 +118,23 @@ class Trained:
 
 @dataclass(slots=True)
 class Findings:
-    """What has been measured so far."""
+    """Measurements so far."""
 
     stepped: list[Stepped] = field(default_factory=list)
     trained: list[Trained] = field(default_factory=list)
     present: Trained | None = None
-    """The setting as it is, measured in turn with the recommended one."""
+    """The task's own setting, measured in alternation with the recommended one."""
     recommended: Trained | None = None
 
     @property
     def unsteady(self) -> bool:
-        """Whether other work on the machine shows in what was measured."""
+        """Whether the measurements vary so much that other programs must run on the machine."""
         rows: list[Stepped | Trained] = [*self.stepped, *self.trained]
-        known = [row.spread for row in rows if row.spread is not None]
-        return bool(known) and statistics.median(known) > UNSTEADY
+        spreads = [row.spread for row in rows if row.spread is not None]
+        return bool(spreads) and statistics.median(spreads) > UNSTEADY
 
     def record(self) -> dict[str, Any]:
-        """As plain data."""
+        """Return the measurements as plain data."""
         rows = []
         for one in self.trained:
             entries = asdict(one)
@@ -140,12 +143,12 @@ class Findings:
 
 
 class Bench:
-    """Measures one task and agent.
+    """Benchmark of one task and agent.
 
     Args:
-        resolve: the configuration with some keys changed: dotted key -> value.
-        pace: how long is measured.
-        announce: called with what is measured next.
+        resolve: returns the configuration with changed keys: dotted key -> value.
+        pace: duration of the measurements.
+        announce: called before each measurement with its description.
         show: called after each measurement.
     """
 
@@ -158,25 +161,24 @@ class Bench:
     ) -> None:
         self.findings = Findings()
         self._resolve, self._pace, self._announce, self._show = resolve, pace, announce, show
-        self._present = resolve({})
-        agent = self._present.agent
+        present = resolve({})
+        agent = present.agent
         assert agent is not None
         self.horizon_key = next((key for key in HORIZONS if isinstance(getattr(agent, key, None), int)), None)
-        engine, update = threads(self._present)
+        engine, update = threads(present)
         horizon = None if self.horizon_key is None else int(getattr(agent, self.horizon_key))
-        minibatches = getattr(agent, "num_minibatches", None)
-        if getattr(agent, "minibatch_size", None) is not None:
-            minibatches = None
-        self.present = Setting(self._present.task.scene.num_envs, horizon, minibatches, engine, update)
+        fixed_size = getattr(agent, "minibatch_size", None) is not None
+        minibatches = None if fixed_size else getattr(agent, "num_minibatches", None)
+        self.present = Setting(present.task.scene.num_envs, horizon, minibatches, engine, update)
 
     def run(self) -> Findings:
-        """Measure everything; what is found stands in `findings` all the while."""
+        """Run all measurements; `findings` holds those that are finished."""
         self._step_all()
         self._train_all()
         return self.findings
 
     def changes(self, setting: Setting) -> dict[str, Any]:
-        """A setting as keys of the configuration."""
+        """Return a setting as keys of the configuration."""
         changed: dict[str, Any] = {
             "scene.num_envs": setting.num_envs,
             "sim.engine_threads": setting.engine_threads,
@@ -191,9 +193,10 @@ class Bench:
     # --- the environment alone ---
 
     def _step_all(self) -> None:
-        most = self.present.engine_threads
-        sizes = [(num_envs, most) for num_envs in SIZES]
-        sizes += [(self.present.num_envs, count) for count in _powers(available_cores()) if count != most]
+        present = self.present
+        sizes = [(num_envs, present.engine_threads) for num_envs in SIZES]
+        other_threads = [count for count in _powers(available_cores()) if count != present.engine_threads]
+        sizes += [(present.num_envs, count) for count in other_threads]
         for num_envs, engine_threads in sizes:
             self.findings.stepped.append(self._step(num_envs, engine_threads))
             self._show(self.findings)
@@ -204,43 +207,32 @@ class Bench:
         if reason is not None:
             return Stepped(num_envs, engine_threads, left_out=reason)
         torch.set_num_threads(1)  # as in a rollout
-        env = make_env(
-            self._resolve({"scene.num_envs": num_envs, "sim.engine_threads": engine_threads}), seed=42, device="cpu"
-        )
-        try:
+        resolved = self._resolve({"scene.num_envs": num_envs, "sim.engine_threads": engine_threads})
+        with contextlib.closing(make_env(resolved, seed=42, device="cpu")) as env, torch.inference_mode():
             generator = torch.Generator().manual_seed(42)
             shape = (_ACTIONS, num_envs, env.layout.action_size)
-            actions = torch.rand(shape, generator=generator) * 2.0 - 1.0
+            actions = itertools.cycle(torch.rand(shape, generator=generator) * 2.0 - 1.0)
             env.reset(seed=42)
-            taken = 0
-
-            def step() -> None:
-                nonlocal taken
-                env.step(actions[taken % _ACTIONS])
-                taken += 1
-
-            with torch.inference_mode():
-                for _ in range(3):
-                    step()
-                before = dict(env.seconds)
-                blocks = list(_blocks(step, self._pace))
+            for _ in range(3):  # warm-up
+                env.step(next(actions))
+            before = dict(env.seconds)
+            blocks = _blocks(lambda: env.step(next(actions)), self._pace)
             physics = (env.seconds["physics"] - before["physics"]) / (env.seconds["step"] - before["step"])
-            middle = statistics.median(blocks)
-            return Stepped(num_envs, engine_threads, num_envs / middle, physics, _spread(blocks), resident_memory())
-        finally:
-            env.close()
+            rate = num_envs / statistics.median(blocks)
+            return Stepped(num_envs, engine_threads, rate, physics, _spread(blocks), resident_memory())
 
     def _too_large(self, num_envs: int) -> str | None:
-        """Why so many environments are not built."""
+        """Return the reason for not building so many environments; None if they can be built."""
         smaller = [row for row in self.findings.stepped if row.left_out is None and row.num_envs < num_envs]
-        known = sorted(smaller, key=lambda row: row.num_envs)
-        last = known[-1] if known else None
-        each = _ENV_BYTES
-        if last is not None and last.resident is not None and known[0].resident is not None and last is not known[0]:
-            each = max(4096, (last.resident - known[0].resident) // (last.num_envs - known[0].num_envs))
-        if each * num_envs > available_memory() // 2:
-            return f"it would take about {each * num_envs / 2**30:.1f} GiB"
-        if last is not None and last.steps_per_s and num_envs / last.steps_per_s > self._pace.longest_s:
+        measured = sorted(smaller, key=lambda row: row.num_envs)
+        first, last = (measured[0], measured[-1]) if measured else (None, None)
+        env_bytes = _ENV_BYTES
+        if first and last and first is not last and first.resident is not None and last.resident is not None:
+            # memory grows linearly with the number of environments
+            env_bytes = max(4096, (last.resident - first.resident) // (last.num_envs - first.num_envs))
+        if env_bytes * num_envs > available_memory() // 2:
+            return f"it would take about {env_bytes * num_envs / 2**30:.1f} GiB"
+        if last and last.steps_per_s and num_envs / last.steps_per_s > self._pace.longest_s:
             return f"a step would take about {num_envs / last.steps_per_s:.0f} s"
         return None
 
@@ -250,8 +242,8 @@ class Bench:
         best = self._add_trained(self.present)
         for key, most in (("torch_threads", min(16, available_cores())), ("engine_threads", available_cores())):
             others = [count for count in _powers(most) if count != getattr(best.setting, key)]
-            best = _soonest([best, *(self._add_trained(replace(best.setting, **{key: count})) for count in others)])
-        best = _soonest([best, *(self._add_trained(setting) for setting in self._sizes(best.setting))])
+            best = _fastest([best, *(self._add_trained(replace(best.setting, **{key: count})) for count in others)])
+        best = _fastest([best, *(self._add_trained(setting) for setting in self._sizes(best.setting))])
         if best.setting.minibatches is not None:
             for count in (best.setting.minibatches // 2, best.setting.minibatches * 2):
                 if count:
@@ -259,7 +251,7 @@ class Bench:
         self._compare(best)
 
     def _sizes(self, setting: Setting) -> Iterator[Setting]:
-        """As many samples an iteration from half and from twice the environments."""
+        """Yield settings with the same samples per iteration from half and from twice the environments."""
         if setting.horizon is None:
             return
         samples = setting.num_envs * setting.horizon
@@ -280,58 +272,40 @@ class Bench:
         if reason is not None:
             return Trained(setting, alike, left_out=reason)
         try:
-            env, trainer = self._build(setting)
+            with self._open_training(setting) as training:
+                training.iterate()  # warm-up
+                training.seconds.clear()
+                training.blocks = _blocks(training.iterate, self._pace)
+                return training.row(setting, alike=alike)
         except ConfigError as error:
             if setting == self.present:
                 raise
             return Trained(setting, alike, left_out=error.problems[0].message)
-        try:
-            parts: list[Mapping[str, float]] = []
-            iterate = _iteration(trainer, parts)
-            iterate()
-            parts.clear()
-            blocks = list(_blocks(iterate, self._pace))
-            return self._trained(setting, alike, trainer, blocks, parts)
-        finally:
-            env.close()
 
-    def _trained(
-        self, setting: Setting, alike: bool, trainer: Trainer, blocks: list[float], parts: list[Mapping[str, float]]
-    ) -> Trained:
-        total = sum(sum(each.values()) for each in parts)
-        names = dict.fromkeys(name for each in parts for name in each)
-        shares = {name: sum(each.get(name, 0.0) for each in parts) / total for name in names}
-        middle, spread = statistics.median(blocks), _spread(blocks)
-        return Trained(setting, alike, trainer.steps_per_iteration, middle, shares, spread, resident_memory())
-
-    def _build(self, setting: Setting) -> tuple[VecEnv, Trainer]:
-        resolved = self._resolve(self.changes(setting))
-        trainer, env = make_trainer(resolved, 42, "cpu", setting.torch_threads)
-        try:
+    @contextlib.contextmanager
+    def _open_training(self, setting: Setting) -> Iterator[_Training]:
+        """Context with a training that has started."""
+        trainer, env = make_trainer(self._resolve(self.changes(setting)), 42, "cpu", setting.torch_threads)
+        with contextlib.closing(env):
             trainer.start()
-        except BaseException:
-            env.close()
-            raise
-        return env, trainer
+            yield _Training(trainer)
 
     def _compare(self, best: Trained) -> None:
-        """Measure the best and the present setting once more, in turn, so that both meet the same machine."""
+        """Measure the best and the present setting again, in alternation, so that other load affects both alike."""
         present = self.findings.trained[0]
         if best.setting == present.setting:
             self.findings.present = self.findings.recommended = present
             return
-        self._announce(f"in turn: {_describe(present.setting)} and {_describe(best.setting)}")
+        settings = (present.setting, best.setting)
+        self._announce(f"in alternation: {' and '.join(map(_describe, settings))}")
         with contextlib.ExitStack() as stack:
-            built: list[tuple[Trained, Trainer, list[float], list[Mapping[str, float]]]] = []
-            for row in (present, best):
-                env, trainer = self._build(row.setting)
-                stack.callback(env.close)
-                built.append((row, trainer, [], []))
+            trainings = [stack.enter_context(self._open_training(setting)) for setting in settings]
             for _ in range(1 + max(3, self._pace.blocks)):
-                for _, trainer, blocks, parts in built:
-                    blocks.append(_block(_iteration(trainer, parts), self._pace.block_s))
-            now = [self._trained(row.setting, True, t, blocks[1:], parts) for row, t, blocks, parts in built]
-        present, best = now
+                for training in trainings:
+                    training.blocks.append(_block(training.iterate, self._pace.block_s))
+            for training in trainings:
+                del training.blocks[0]  # warm-up
+            present, best = (training.row(each, alike=True) for training, each in zip(trainings, settings, strict=True))
         assert present.seconds is not None
         assert best.seconds is not None
         noise = max(present.spread or 0.0, best.spread or 0.0)
@@ -339,36 +313,55 @@ class Bench:
         self.findings.present, self.findings.recommended = present, best if better else present
 
 
+@dataclass(slots=True)
+class _Training:
+    """Trainer with the durations of its iterations."""
+
+    trainer: Trainer
+    blocks: list[float] = field(default_factory=list)
+    """Mean duration of an iteration in each block [s]."""
+    seconds: list[Mapping[str, float]] = field(default_factory=list)
+    """Part -> duration [s], for each iteration."""
+
+    def iterate(self) -> None:
+        """Run one iteration."""
+        self.seconds.append(self.trainer.iterate().seconds)
+
+    def row(self, setting: Setting, *, alike: bool) -> Trained:
+        """Return the measurement."""
+        total = sum(sum(parts.values()) for parts in self.seconds)
+        names = dict.fromkeys(name for parts in self.seconds for name in parts)
+        shares = {name: sum(parts.get(name, 0.0) for parts in self.seconds) / total for name in names}
+        samples, median = self.trainer.steps_per_iteration, statistics.median(self.blocks)
+        return Trained(setting, alike, samples, median, shares, _spread(self.blocks), resident_memory())
+
+
 def load() -> float | None:
-    """Processes that want to run, the mean of the last minute; None where the system does not say."""
+    """Return the load [processes], the mean over the last minute; None where the system has no such number."""
     try:
         return os.getloadavg()[0]
     except (AttributeError, OSError):
         return None
 
 
-def _iteration(trainer: Trainer, parts: list[Mapping[str, float]]) -> Callable[[], None]:
-    """An iteration that notes the seconds of its parts."""
-    return lambda: parts.append(trainer.iterate().seconds)
-
-
-def _blocks(call: Callable[[], None], pace: Pace) -> Iterator[float]:
-    """Seconds of a call, a number for each block; blocks that differ are measured again."""
+def _blocks(call: Callable[[], object], pace: Pace) -> list[float]:
+    """Return the mean seconds of a call in each block; measure more blocks if they differ."""
     blocks: list[float] = []
     for _ in range(pace.rounds):
         blocks += [_block(call, pace.block_s) for _ in range(pace.blocks)]
         if _spread(blocks) <= UNSTEADY:
             break
-    yield from blocks
+    return blocks
 
 
-def _block(call: Callable[[], None], least_s: float) -> float:
+def _block(call: Callable[[], object], min_s: float) -> float:
+    """Repeat a call for at least `min_s`; return the mean duration of a call [s]."""
     begin, calls = time.perf_counter(), 0
     while True:
         call()
         calls += 1
         took = time.perf_counter() - begin
-        if took >= least_s:
+        if took >= min_s:
             return took / calls
 
 
@@ -378,12 +371,12 @@ def _spread(blocks: list[float]) -> float:
 
 
 def _powers(most: int) -> list[int]:
-    """1, 2, 4, ... and the number itself."""
+    """Return 1, 2, 4, ... up to a number, and the number itself."""
     return sorted({*(2**n for n in range(int(math.log2(most)) + 1)), most})
 
 
-def _soonest(rows: list[Trained]) -> Trained:
-    """Of those that learn alike."""
+def _fastest(rows: list[Trained]) -> Trained:
+    """Return the fastest measurement among settings that learn alike."""
     measured = [row for row in rows if row.alike and row.seconds is not None]
     return min(measured, key=lambda row: row.seconds or math.inf)
 

@@ -15,14 +15,14 @@ from rlcli.tuning.extract_preset import preset_of, put
 def bench_preset(
     resolved: Resolved, changes: Mapping[str, Any], findings: Findings, machine: Mapping[str, Any], agent_named: bool
 ) -> str:
-    """Return YAML: the user's changes, the recommended settings, and comments with the measurements.
+    """Return YAML with the user's changes, the recommended settings, and comments with the measurements.
 
     Args:
         resolved: the configuration of the command line.
         changes: the recommended settings: dotted key -> value.
         findings: the measurements.
         machine: the machine that was measured.
-        agent_named: whether the command line names the agent, which becomes the default.
+        agent_named: whether the command line names the agent; the preset then makes it the default.
     """
     data = preset_of(resolved, agent_named)
     for key, value in changes.items():
@@ -43,13 +43,13 @@ def explanation(findings: Findings) -> list[str]:
     if present is None or best is None:
         return []
     if best is present:
-        reason = "nothing that learns alike is faster than the present sizes and threads:"
+        reason = "no setting that learns alike is faster than the present sizes and threads:"
         lines = [f"{reason} {_describe(present)}"]
     else:
-        lines = [f"{_describe(best)},", f"instead of {_describe(present)}, measured in turn"]
-    lines.append("compared at as many samples and gradient steps an iteration, so that it learns alike")
+        lines = [f"{_describe(best)},", f"instead of {_describe(present)}, measured in alternation"]
+    lines.append("compared at the same samples and gradient steps per iteration, so that training learns alike")
     if findings.unsteady:
-        lines.append("the machine was busy: the figures are not steady")
+        lines.append("the machine was busy: the measurements vary")
     return lines
 
 
@@ -58,6 +58,6 @@ def _describe(row: Trained) -> str:
     assert row.steps_per_s is not None
     shares = ", ".join(f"{name} {share:.0%}" for name, share in row.shares.items())
     return (
-        f"{1e3 * row.seconds:.3g} ms an iteration of {row.samples:,} samples ({row.steps_per_s:,.0f} steps/s;"
+        f"{1e3 * row.seconds:.3g} ms per iteration of {row.samples:,} samples ({row.steps_per_s:,.0f} steps/s;"
         f" {shares}; spread {row.spread or 0.0:.0%})"
     )

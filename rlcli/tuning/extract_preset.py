@@ -1,4 +1,4 @@
-"""Preset: all settings of a training that differ from its task's own, as a `--config` file holds them."""
+"""Presets: the settings of a training that differ from its task's own, in the form of a `--config` file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def preset_of(resolved: Resolved, names_agent: bool) -> dict[str, Any]:
             continue
         inner, value = _until_list(resolved.layers.data, path)
         if isinstance(value, dict) and value:
-            continue  # its content has paths of its own
+            continue  # its entries have their own paths
         put(preset, ("agent", *inner[2:]) if inner[:2] == agent else inner, value)
     if names_agent:
         put(preset, ("agents", "default"), resolved.agent_name)
@@ -31,7 +31,7 @@ def preset_of(resolved: Resolved, names_agent: bool) -> dict[str, Any]:
 
 
 def put(data: dict[str, Any], path: tuple[Any, ...], value: object) -> None:
-    """Set a value in nested mappings, which are made if they are missing."""
+    """Set a value in nested mappings; create missing mappings."""
     for key in path[:-1]:
         inner = data.get(key)
         if not isinstance(inner, dict):
@@ -41,7 +41,7 @@ def put(data: dict[str, Any], path: tuple[Any, ...], value: object) -> None:
 
 
 def _until_list(data: object, path: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
-    """Return the part of a path that leads through mappings, and the value there: a file replaces lists as a whole."""
+    """Return the path up to the first list, and the value there, because a file can only replace a whole list."""
     for depth, step in enumerate(path):
         if not isinstance(data, dict):
             return path[:depth], data

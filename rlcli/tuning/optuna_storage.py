@@ -1,4 +1,4 @@
-"""Optuna's storage of a sweep: a journal in its folder, or a database that several machines share."""
+"""Storage of a sweep's trials in Optuna: a journal in the sweep's folder, or a database for several machines."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     import optuna
 
 JOURNAL = "journal.log"
-_TRIES = 5
+_ATTEMPTS = 5
+"""Attempts to create the tables of a database."""
 
 
 def check_optuna() -> None:
@@ -37,15 +38,15 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
     """Open Optuna's study of a sweep.
 
     Args:
-        folder: of the sweep, in which a journal is kept.
-        settings: of the sweep: `task`, `name`, `direction` and `pruner` (median or none).
-        storage: URL of a database; None is the journal.
-        create: make it if it is not there.
+        folder: the folder of the sweep, which holds the journal.
+        settings: settings of the sweep: `task`, `name`, `direction` and `pruner` (median or none).
+        storage: URL of a database; None uses the journal.
+        create: whether to create the study if it does not exist.
 
     Raises:
-        CheckpointError: if it is not there, or its journal is damaged.
-        MachineError: if the storage cannot be reached, or the folder not written.
-        UsageError: if `storage` is no address.
+        CheckpointError: if the study does not exist, or its journal is damaged.
+        MachineError: if the database cannot be reached, or the folder cannot be written.
+        UsageError: if `storage` is not the URL of a database.
     """
     import optuna
 
@@ -57,16 +58,11 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            place = _journal(folder, create) if storage is None else _database(storage)
+            trials = _journal(folder, create) if storage is None else _database(storage)
+        study: dict[str, Any] = {"study_name": name, "storage": trials, "pruner": pruner}
         if not create:
-            return optuna.load_study(study_name=name, storage=place, pruner=pruner)
-        return optuna.create_study(
-            storage=place,
-            study_name=name,
-            load_if_exists=True,
-            direction=settings["direction"],
-            pruner=pruner,
-        )
+            return optuna.load_study(**study)
+        return optuna.create_study(**study, direction=settings["direction"], load_if_exists=True)
     except KeyError:
         raise CheckpointError(
             f"there is no sweep '{name}' in {without_password(storage) if storage else folder}"
@@ -77,24 +73,24 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
 
 @contextlib.contextmanager
 def storage_errors(storage: str | None) -> Iterator[None]:
-    """Context that turns the errors of a lost database into a MachineError.
+    """Context that converts errors of a database into a MachineError.
 
     Raises:
-        MachineError: if it cannot be reached any more.
+        MachineError: if the database cannot be reached.
     """
     try:
         yield
     except Exception as error:
-        if storage is None or not _is_of_a_database(error):
+        if storage is None or not _is_database_error(error):
             raise
         raise MachineError(
             f"--storage {without_password(storage)} cannot be reached: {_first_line(error)}",
-            hint="the same command again goes on, once it is there",
+            hint="when it is available, run the same command again to continue",
         ) from None
 
 
 def without_password(url: str) -> str:
-    """Return an address without its password."""
+    """Return a URL without its password."""
     before, at, after = url.rpartition("@")
     if not at:
         return url
@@ -108,34 +104,35 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
 
     file = folder / JOURNAL
     if file.is_symlink():
-        raise CheckpointError(f"{file} is a link; it was not made by rlcli")
+        raise CheckpointError(f"{file} is a link; rlcli does not create links")
     if not create and not file.is_file():
-        raise CheckpointError(f"{folder} has lost its trials: there is no {JOURNAL} in it")
+        raise CheckpointError(f"{folder} has lost its trials: it has no {JOURNAL}")
 
-    lock: Any = FileLock(folder / f".{JOURNAL}")  # released by the system when its process is killed
+    lock: Any = FileLock(folder / f".{JOURNAL}")  # the system releases it when the process is killed
 
     class Backend(JournalFileBackend):
-        """Optuna's backend, with checks for lines cut short by a full disk and for damage."""
+        """Optuna's journal, with repair of lines that a full disk cut short and checks for damage."""
 
         def append_logs(self, logs: list[dict[str, Any]]) -> None:
             with lock:
                 try:
-                    _cut(file)
+                    _remove_partial_line(file)
                     super().append_logs(logs)
                 except OSError as error:
                     with contextlib.suppress(OSError):
-                        _cut(file)
+                        _remove_partial_line(file)
                     raise disk_error(file, error) from error
 
         def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:  # type: ignore[override]
             try:
                 for entry in super().read_logs(log_number_from):
                     if not isinstance(entry, dict) or not {"op_code", "worker_id"} <= entry.keys():
-                        raise ValueError("a line is no entry")
+                        raise ValueError("a line is not a log entry")
                     yield entry
             except ValueError as error:
                 raise CheckpointError(
-                    f"{file} is corrupt: {error}", hint="another --name begins anew; the runs of its trials are whole"
+                    f"{file} is corrupt: {error}",
+                    hint="choose another --name for a new sweep; the runs of the trials are not damaged",
                 ) from None
             except OSError as error:
                 raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
@@ -143,7 +140,7 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
     return JournalStorage(Backend(str(file), lock_obj=lock))
 
 
-def _cut(file: Path) -> None:
+def _remove_partial_line(file: Path) -> None:
     """Remove the incomplete last line of a killed writer; the caller holds the lock."""
     with file.open("r+b") as journal:
         size = begin = journal.seek(0, 2)
@@ -164,24 +161,24 @@ def _database(url: str) -> optuna.storages.BaseStorage:
     except ImportError:
         raise DependencyError("a shared storage needs SQLAlchemy", hint='pip install "rlcli[sweep]"') from None
     try:
-        closed_after_use = {"poolclass": sqlalchemy.pool.NullPool}  # a trial lasts longer than a connection
-        for _ in range(_TRIES):
+        no_pool = {"poolclass": sqlalchemy.pool.NullPool}  # connections time out during a trial
+        for _ in range(_ATTEMPTS):
             with contextlib.suppress(sqlalchemy.exc.IntegrityError, sqlalchemy.exc.ProgrammingError):
-                return RDBStorage(url, engine_kwargs=closed_after_use)
-            time.sleep(1.0)  # another machine makes the same tables at this moment
-        return RDBStorage(url, engine_kwargs=closed_after_use)
+                return RDBStorage(url, engine_kwargs=no_pool)
+            time.sleep(1.0)  # another machine creates the same tables at the same time
+        return RDBStorage(url, engine_kwargs=no_pool)
     except ModuleNotFoundError as error:
         raise DependencyError(f"--storage needs the driver {error.name}", hint=f"pip install {error.name}") from None
     except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError) as error:
         raise UsageError(
-            f"--storage '{without_password(url)}' is no address of a database: {_first_line(error)}",
+            f"--storage '{without_password(url)}' is not the URL of a database: {_first_line(error)}",
             hint="as in postgresql+psycopg://user@host/name",
         ) from None
     except (sqlalchemy.exc.SQLAlchemyError, OSError) as error:
         raise MachineError(f"--storage {without_password(url)} cannot be reached: {_first_line(error)}") from None
 
 
-def _is_of_a_database(error: BaseException) -> bool:
+def _is_database_error(error: BaseException) -> bool:
     from optuna.exceptions import StorageInternalError
 
     sqlalchemy: Any = sys.modules.get("sqlalchemy")

@@ -1,4 +1,4 @@
-"""Search space and objective of a sweep, as the command line writes them."""
+"""Search space and objective of a sweep, parsed from the command line."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ if TYPE_CHECKING:
 
 _RANGE = re.compile(r"(log:)?([^:,\[\]]+):([^:,\[\]]+)")
 _OBJECTIVE = re.compile(
-    r"((?:success|return|length)|(?:reward_terms|terminations)\.[^@\s]+)(?:@([0-9.e+]+)(s|steps)?)?"
+    r"((?:success|return|length)|(?:reward_terms|terminations)\.[^@\s]+)"
+    r"(?:@((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e\+?[0-9]+)?)(s|steps)?)?"
 )
-_LARGEST = {int: 2**53, float: 1e300}
-"""Bounds of a range: floats hold every integer up to there, and the width of the range is finite."""
+_MAX_BOUND = {int: 2**53, float: 1e300}
+"""Largest bounds of a range: a float represents each such integer exactly, and the width of a range is finite."""
 HINT = "KEY=LOW:HIGH, KEY=log:LOW:HIGH or KEY=A,B,C"
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """Key of the configuration with the range or the choices of its values."""
+    """Key of the configuration, with a range or choices of values."""
 
     key: str
     low: float | int | None = None
@@ -38,30 +39,30 @@ class Parameter:
 
     @property
     def bounds(self) -> tuple[Any, ...]:
-        """Values that the configuration is checked with: the ends of the range, or each choice."""
+        """Values for the check of the configuration: the ends of the range, or all choices."""
         return self.choices or (self.low, self.high)
 
     def override(self, value: object) -> str:
         """Return a value as an override on the command line."""
-        return f"{self.key}={_written(value)}"
+        return f"{self.key}={_to_line(value)}"
 
     def suggest(self, trial: optuna.Trial) -> Any:
         """Return a value that Optuna suggests."""
-        if self.choices:  # Optuna stores scalars; other values are stored as text
-            return self.value(trial.suggest_categorical(self.key, [_written(choice) for choice in self.choices]))
+        if self.choices:  # Optuna stores only scalars, so choices are stored as YAML text
+            return self.value(trial.suggest_categorical(self.key, [_to_line(choice) for choice in self.choices]))
         suggest = trial.suggest_int if isinstance(self.low, int) else trial.suggest_float
         return suggest(self.key, *self.bounds, log=self.log)
 
     def value(self, stored: Any) -> Any:
-        """Return the value that Optuna stores for a trial."""
+        """Return the value of a trial from what Optuna stores."""
         if not self.choices:
             return stored
-        return self.choices[[_written(choice) for choice in self.choices].index(stored)]
+        return self.choices[[_to_line(choice) for choice in self.choices].index(stored)]
 
 
 @dataclass(frozen=True, slots=True)
 class Objective:
-    """Number by which trials are compared, and how long a trial trains."""
+    """Metric that ranks trials, and the length of a training."""
 
     key: str
     """Entry in the document of `rlcli eval`: success, return, length, reward_terms.NAME or terminations.NAME."""
@@ -74,7 +75,7 @@ class Objective:
         """Return the value in the document of an evaluation; NaN if it was not finite.
 
         Raises:
-            UsageError: if it is not in there.
+            UsageError: if the document does not have it.
         """
         first, _, name = self.key.partition(".")
         found = document.get(first)
@@ -82,7 +83,7 @@ class Objective:
         if not isinstance(entry, dict):
             known = listing(f"{first}.{key}" for key in found) if name and isinstance(found, dict) else ""
             raise UsageError(
-                f"--objective {self.key}: the evaluation does not tell it",
+                f"--objective {self.key}: not in the results of the evaluation",
                 hint=f"there are: {known}" if known else "return, success or length",
             )
         value = entry["rate"] if "rate" in entry else entry["mean"]
@@ -90,7 +91,7 @@ class Objective:
 
     @property
     def training_metric(self) -> str | None:
-        """The metric of training that is compared by the pruner meanwhile."""
+        """The metric of training that the pruner compares; None: trials are not pruned."""
         return self.key if self.key in ("return", "success") else None
 
 
@@ -98,13 +99,13 @@ def read_parameters(texts: Sequence[str]) -> list[Parameter]:
     """Parse the repeated option `--param`.
 
     Raises:
-        UsageError: for what is none, an empty range, or a key twice.
+        UsageError: for a wrong form, an empty range, or a repeated key.
     """
     found = [_read(text) for text in texts]
     keys = [parse_address(parameter.key) for parameter in found]
     twice = next((key for key in keys if keys.count(key) > 1), None)
     if twice is not None:
-        raise UsageError(f"--param names {'.'.join(twice)} twice")
+        raise UsageError(f"--param varies {'.'.join(twice)} twice")
     return found
 
 
@@ -115,28 +116,23 @@ def read_objective(text: str) -> Objective:
         UsageError: for anything else.
     """
     found = _OBJECTIVE.fullmatch(text)
-    try:
-        if found is None:
-            raise ValueError
-        if found[2] is None:
-            return Objective(found[1])
-        number = float(found[2])
-        if not 0.0 < number < 1e12:
-            raise ValueError
-        return Objective(found[1], seconds=number) if found[3] == "s" else Objective(found[1], steps=int(number))
-    except ValueError:
+    number = float(found[2] or 1.0) if found else 0.0
+    if found is None or not 0.0 < number < 1e12:
         raise UsageError(
-            f"--objective '{text}' is not one",
+            f"--objective '{text}' is not valid",
             hint="return, success, length, reward_terms.NAME or terminations.NAME; @30s after 30 s of training, @2e6"
-            " after so many steps",
-        ) from None
+            " after 2,000,000 steps",
+        )
+    if found[2] is None:
+        return Objective(found[1])
+    return Objective(found[1], seconds=number) if found[3] == "s" else Objective(found[1], steps=int(number))
 
 
 def _read(text: str) -> Parameter:
     key, equals, ranges = text.partition("=")
     key = key.strip()
     if not equals or not key or not ranges.strip():
-        raise UsageError(f"--param '{text}' says no range", hint=HINT)
+        raise UsageError(f"--param '{text}' has no range", hint=HINT)
     try:
         parse_override(f"{key}=0")
     except ConfigError as error:
@@ -146,12 +142,15 @@ def _read(text: str) -> Parameter:
         return _choices(text, key, ranges)
     low, high = (_load(text, part.strip()) for part in span.groups()[1:])
     log = span[1] is not None
-    if any(type(end) not in (int, float) or not abs(end) < _LARGEST[type(end)] for end in (low, high)):
-        raise UsageError(f"--param '{text}': the ends of a range are numbers, not beyond all bounds", hint=HINT)
+    if any(type(end) not in (int, float) or not abs(end) < _MAX_BOUND[type(end)] for end in (low, high)):
+        raise UsageError(
+            f"--param '{text}': the ends of a range must be numbers below 1e300, or whole numbers below 2**53",
+            hint=HINT,
+        )
     if not low < high:
         raise UsageError(f"--param '{text}' is empty: {low} is not below {high}", hint=HINT)
     if log and low <= 0:
-        raise UsageError(f"--param '{text}': a logarithmic range begins above 0", hint=HINT)
+        raise UsageError(f"--param '{text}': a logarithmic range must start above 0", hint=HINT)
     if float in (type(low), type(high)):
         low, high = float(low), float(high)
     return Parameter(key, low, high, log)
@@ -160,10 +159,10 @@ def _read(text: str) -> Parameter:
 def _choices(text: str, key: str, words: str) -> Parameter:
     choices = _load(text, f"[{words}]")
     if not isinstance(choices, list) or len(choices) < 2:
-        raise UsageError(f"--param '{text}' leaves nothing to choose", hint=HINT)
-    written = [_written(choice) for choice in choices]
+        raise UsageError(f"--param '{text}' has fewer than two choices", hint=HINT)
+    written = [_to_line(choice) for choice in choices]
     if len(set(written)) < len(written):
-        raise UsageError(f"--param '{text}' names a choice twice")
+        raise UsageError(f"--param '{text}' has a choice twice")
     return Parameter(key, choices=tuple(choices))
 
 
@@ -175,8 +174,8 @@ def _load(text: str, value: str) -> Any:
         raise UsageError(f"--param '{text}': {error.message}", hint=HINT) from None
 
 
-def _written(value: object) -> str:
-    """Return a value in YAML, on one line."""
+def _to_line(value: object) -> str:
+    """Return a value as YAML on one line."""
     text = to_yaml({"v": value})
     if isinstance(value, list | dict) or "\n" in text.strip():
         import json

@@ -1,4 +1,4 @@
-"""Sweep: trials in Optuna's storage, shared by any number of processes; each trial is a run in the sweep's folder."""
+"""Sweeps: trials in a storage of Optuna, shared by any number of processes; each trial is a run in the folder."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ PRESET = "best.yaml"
 PICTURE = "sweep.svg"
 _SWEEP_LOCK, _TRIAL_LOCK = ".sweep", ".worker"
 _SETTINGS = "rlcli"
-"""Attribute of an Optuna study with the settings that are the same in all of its processes."""
-_PLACE = "place"
-"""Attribute of a trial with the machine and the folder of its run: only there it can be resumed."""
+"""Attribute of an Optuna study with the settings of the sweep, which are equal in all processes."""
+_LOCATION = "place"
+"""Attribute of a trial with the machine and the folder of its run; the trial can only be resumed there."""
 _SURPLUS = "surplus"
-"""Attribute of a trial that was begun at the same moment as the last one; it does not count."""
+"""Attribute of a trial that another machine started in excess of the wanted number; it does not count."""
 _KINDS: dict[str, type] = {
     **dict.fromkeys(("task", "name", "agent", "objective", "direction", "pruner"), str),
     **dict.fromkeys(("trials", "episodes", "seed"), int),
@@ -47,14 +47,14 @@ _ENDED = ("COMPLETE", "PRUNED", "FAIL")
 
 @dataclass(slots=True)
 class Trial:
-    """Trial that this process runs."""
+    """Trial that is claimed by this process."""
 
     number: int
     folder: Path
     trial: optuna.Trial
     """Optuna's trial."""
     values: dict[str, Any]
-    """Key -> value of its parameters."""
+    """Key of a parameter -> value."""
     _lock: FileLock | None = None
 
     def release(self) -> None:
@@ -75,7 +75,7 @@ class Sweep:
     _claimed: dict[int, Trial] = field(default_factory=dict)
 
     def trials(self) -> list[FrozenTrial]:
-        """Return Optuna's trials in order, without those that were begun beyond the wanted number."""
+        """Return Optuna's trials in order, without surplus trials."""
         return [trial for trial in self.study.get_trials(deepcopy=False) if _SURPLUS not in trial.user_attrs]
 
     def ended(self) -> list[FrozenTrial]:
@@ -117,36 +117,38 @@ class Sweep:
         }
 
     def claim(self) -> Trial | None:
-        """Return a trial whose process is gone, or a new one; None if none is left.
+        """Return a trial whose process has died, or a new one; None if none is left.
 
-        One process claims at a time, so no trial is begun twice and none too many.
+        A lock lets one process claim at a time, so that no trial starts twice and none in excess.
         """
         with _locked(self.folder / _SWEEP_LOCK):
             for trial in self.trials():
                 if trial.state.name != "RUNNING" or trial.number in self._claimed or not self._is_here(trial):
                     continue
-                taken = self._lock_trial(trial.number)
-                if taken is None:
+                lock = self._lock_trial(trial.number)
+                if lock is None:
                     continue
-                if any(other.number == trial.number for other in self.ended()):  # another process has just ended it
-                    taken.release()
+                if any(
+                    other.number == trial.number for other in self.ended()
+                ):  # another process ended it before the lock was taken
+                    lock.release()
                     continue
-                return self._claim(taken, self._with_own_sampler(trial))
+                return self._claim(lock, self._with_own_sampler(trial))
             if len(self.trials()) >= self.settings["trials"]:
                 return None
-            asked = self.study.ask()
-            asked.set_user_attr(_PLACE, self._here)
-            if sum(trial.number < asked.number for trial in self.trials()) >= self.settings["trials"]:
-                asked.set_user_attr(_SURPLUS, True)  # another machine has begun the last trial
-                self.study.tell(asked, state=_state("FAIL"))
+            new = self.study.ask()
+            new.set_user_attr(_LOCATION, self._here)
+            if sum(trial.number < new.number for trial in self.trials()) >= self.settings["trials"]:
+                new.set_user_attr(_SURPLUS, True)  # another machine has started the last trial
+                self.study.tell(new, state=_state("FAIL"))
                 return None
-            held = self._lock_trial(asked.number)
-            if held is None:
-                raise MachineError(f"{self.trial_folder(asked.number)} is being written to by another process")
-            return self._claim(held, self._with_own_sampler(asked))
+            lock = self._lock_trial(new.number)
+            if lock is None:
+                raise MachineError(f"{self.trial_folder(new.number)} is being written to by another process")
+            return self._claim(lock, self._with_own_sampler(new))
 
     def tell(self, trial: Trial, value: float | None = None, *, state: str | None = None, **notes: Any) -> None:
-        """Tell Optuna the value or the state of a trial that has ended; `notes` are stored with it."""
+        """Store the value or the state of an ended trial, and further notes."""
         for key, note in notes.items():
             trial.trial.set_user_attr(key, note)
         self.study.tell(trial.trial, value, state=_state(state))
@@ -154,15 +156,15 @@ class Sweep:
         trial.release()
 
     def write_preset(self, data: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> Path | None:
-        """Write the best trial as a `--config` file, with a comment that says where it is from.
+        """Write the best trial as a `--config` file, with a comment that names the trial.
 
         Args:
             data: returns the content of the file for the values of a trial.
 
         Raises:
-            MachineError: if it cannot be written.
+            MachineError: if the file cannot be written.
         """
-        with _locked(self.folder / _SWEEP_LOCK):  # another process may have told a better trial since
+        with _locked(self.folder / _SWEEP_LOCK):  # another process may have stored a better trial
             best = self.best()
             if best is None:
                 return None
@@ -182,16 +184,16 @@ class Sweep:
         return f"{platform.node()}:{self.folder.resolve()}"
 
     def _is_here(self, trial: FrozenTrial) -> bool:
-        """Return whether a trial was begun in this folder, on this machine or one that shares the folder."""
-        return self.settings["storage"] is None or trial.user_attrs.get(_PLACE) == self._here
+        """Return whether a trial was started in this folder on this machine; a journal is always in its folder."""
+        return self.settings["storage"] is None or trial.user_attrs.get(_LOCATION) == self._here
 
     def _lock_trial(self, number: int) -> FileLock | None:
-        place = self.trial_folder(number)
+        folder = self.trial_folder(number)
         try:
-            place.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise disk_error(place, error) from error
-        lock = FileLock(place / _TRIAL_LOCK)
+            raise disk_error(folder, error) from error
+        lock = FileLock(folder / _TRIAL_LOCK)
         try:
             lock.acquire(timeout=0)
         except Timeout:
@@ -199,7 +201,7 @@ class Sweep:
         return lock
 
     def _with_own_sampler(self, trial: FrozenTrial | optuna.Trial) -> optuna.Trial:
-        """Return a trial whose sampler depends on its number, not on the process; values drawn before stay."""
+        """Return a trial whose sampler depends only on the trial's number; values that it already has are kept."""
         import optuna
 
         self.study.sampler = _sampler(derive(self.settings["seed"], f"trial {trial.number}"))
@@ -220,63 +222,63 @@ def open_sweep(
     parameters: list[Parameter],
     storage: str | None,
 ) -> Sweep:
-    """Begin a sweep in a folder, or join the one that is there.
+    """Create a sweep in a folder, or join the existing one.
 
     Args:
-        folder: of the sweep; made if it is not there.
-        settings: equal in all processes of the sweep, but for `trials`, which may grow.
-        source: where the task is from; equal in all processes that share the folder.
+        folder: the folder of the sweep; created if it does not exist.
+        settings: settings of the sweep; equal in all processes, except for `trials`.
+        source: origin of the task; equal in all processes that share the folder.
         parameters: the parameters of a trial.
-        storage: URL of a database; None keeps a journal in the folder.
+        storage: URL of a database; None uses a journal in the folder.
 
     Raises:
         UsageError: if the folder or the storage holds another sweep.
-        CheckpointError: if what the folder holds is damaged.
-        MachineError: if the storage cannot be reached, or the folder not written.
+        CheckpointError: if the files of the sweep are damaged.
+        MachineError: if the storage cannot be reached, or the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise disk_error(folder, error) from error
-    about = {"kind": "sweep", **settings, "source": dict(source)}
+    record = {"kind": "sweep", **settings, "source": dict(source)}
     with _locked(folder / _SWEEP_LOCK):
         exists = (folder / STUDY).is_file()
         if exists:
-            _require_same(folder, read_study(folder, "sweep"), about)
+            _require_same(folder, read_study(folder, "sweep"), record)
         study = open_study(folder, settings, storage, create=storage is not None or not exists)
         known = study.user_attrs.get(_SETTINGS)
         if known is not None:
             _require_same(storage or folder, known, settings)
         study.set_user_attr(_SETTINGS, settings)
-        write_atomic(folder / STUDY, to_json(about))
+        write_atomic(folder / STUDY, to_json(record))
     return Sweep(folder, settings, parameters, study)
 
 
 def read_sweep(folder: Path, storage: str | None = None) -> Sweep:
-    """Open a sweep to read it.
+    """Open an existing sweep for reading.
 
     Raises:
-        CheckpointError: if there is none, or it is damaged.
+        CheckpointError: if it does not exist or is damaged.
         MachineError: if its storage cannot be reached.
     """
     settings = read_study(folder, "sweep")
     if any(not isinstance(settings.get(key), kind) for key, kind in _KINDS.items()):
-        raise CheckpointError(f"{folder / STUDY} is corrupt: it lacks what a sweep is told")
+        raise CheckpointError(f"{folder / STUDY} is corrupt: settings of the sweep are missing")
     if settings.get("storage") and storage is None:
-        raise UsageError(f"{folder} keeps its trials in a database", hint="--storage URL, as it was begun")
+        raise UsageError(f"{folder} has its trials in a database", hint="add the --storage URL of the sweep")
     study = open_study(folder, settings, storage, create=False)
     return Sweep(folder, settings, read_parameters(settings["params"]), study)
 
 
 def find_sweep(words: Sequence[str], runs: Path, storage: str | None) -> Sweep:
-    """Find a sweep by its folder or its name; without one return the newest.
+    """Return a sweep by its folder or its name; without a name the newest.
 
     Raises:
-        CheckpointError: if there is none.
-        UsageError: if several are named, or several have that name.
+        CheckpointError: if there is no such sweep.
+        UsageError: for several names, or a name that several sweeps have.
     """
     if len(words) > 1:
-        raise UsageError("one sweep at a time", hint="its folder or its name")
+        raise UsageError("more than one sweep given", hint="name one sweep by its folder or its name")
     known = sorted(file.parent for file in runs.glob(f"*/sweep-*/{STUDY}"))
     if not words:
         found = sorted(known, key=lambda folder: (folder / STUDY).stat().st_mtime)[-1:]
@@ -287,22 +289,22 @@ def find_sweep(words: Sequence[str], runs: Path, storage: str | None) -> Sweep:
     if len(found) > 1:
         raise UsageError(f"several tasks have a sweep '{words[0]}'", hint=f"name one: {listing(map(str, found))}")
     if not found:
-        have = f"sweeps: {listing(map(str, known))}" if known else "rlcli sweep TASK --param ... makes one"
-        raise CheckpointError(f"no sweep{f' {words[0]!r}' if words else ''} in {runs}", hint=have)
+        hint = f"sweeps: {listing(map(str, known))}" if known else "rlcli sweep TASK --param ... starts one"
+        raise CheckpointError(f"no sweep{f' {words[0]!r}' if words else ''} in {runs}", hint=hint)
     return read_sweep(found[0], storage)
 
 
 def draw_sweep(sweep: Sweep) -> Path:
-    """Draw the values of the trials over each parameter into the sweep's folder.
+    """Draw the values of the trials over each parameter to a file in the sweep's folder.
 
     Raises:
-        UsageError: if no trial has ended yet.
+        UsageError: if no trial is complete yet.
         DependencyError: without matplotlib.
     """
     check_drawing()
     done = [trial for trial in sweep.trials() if trial.state.name == "COMPLETE"]
     if not done:
-        raise UsageError("there is nothing to draw: no trial has ended yet")
+        raise UsageError("nothing to draw: no trial is complete yet")
     panels = [("trial", [trial.number for trial in done], False)]
     panels += [(p.key, [sweep.values(trial)[p.key] for trial in done], p.log) for p in sweep.parameters]
     values = [trial.value for trial in done if trial.value is not None]  # a finished trial has a value
@@ -310,17 +312,19 @@ def draw_sweep(sweep: Sweep) -> Path:
     return write_atomic(sweep.folder / PICTURE, picture)
 
 
-def _require_same(place: object, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-    """Check that a sweep has the same settings as this process.
+def _require_same(location: object, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """Check that the settings of a sweep and of this process are equal, except for `trials`.
 
     Raises:
-        UsageError: naming what differs.
+        UsageError: with the settings that differ.
     """
     differing = [key for key in settings if key != "trials" and known.get(key) != settings[key]]
     if differing:
-        said = "; ".join(f"{key}: {known.get(key)!r} there, {settings[key]!r} here" for key in differing[:3])
-        where = without_password(str(place))
-        raise UsageError(f"{where} is another sweep ({said})", hint="another --name, or the same command again")
+        differences = "; ".join(f"{key}: {known.get(key)!r} there, {settings[key]!r} here" for key in differing[:3])
+        where = without_password(str(location))
+        raise UsageError(
+            f"{where} is another sweep ({differences})", hint="choose another --name, or the same settings"
+        )
 
 
 def _sampler(seed: int) -> optuna.samplers.BaseSampler:
@@ -342,7 +346,7 @@ def _locked(file: Path) -> Iterator[None]:
     try:
         lock = FileLock(file).acquire(timeout=120)
     except Timeout:
-        raise MachineError(f"{file} is held by another process") from None
+        raise MachineError(f"another process holds {file}") from None
     except OSError as error:
         raise disk_error(file, error) from error
     with lock:

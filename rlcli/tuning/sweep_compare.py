@@ -1,4 +1,4 @@
-"""Comparison of the best trial's settings with the task's own: which learn faster, with several seeds."""
+"""Comparison of the best trial of a sweep with the task's own settings: time to a threshold with several seeds."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 ARMS = ("default", "best")
-"""The task's own settings, and those of the best trial."""
+"""The task's own settings, and the settings of the best trial."""
 
 
 @dataclass(slots=True)
 class Training:
-    """One of the trainings that are compared."""
+    """One training of a comparison."""
 
     arm: str
     seed: int
@@ -43,7 +43,7 @@ class Training:
 
     @property
     def state(self) -> str:
-        """reached, not reached, or failed."""
+        """One of reached, not reached and failed."""
         return "failed" if self.error else "reached" if self.reached else "not reached"
 
     def time(self) -> dict[str, float | None]:
@@ -55,7 +55,7 @@ class Training:
 
 @dataclass(slots=True)
 class Comparison:
-    """Trainings with both settings, and how long they took to reach the threshold."""
+    """Trainings with both settings, and their times to the threshold."""
 
     sweep: Path
     task: str
@@ -73,11 +73,11 @@ class Comparison:
         return next((one.error.exit_code for one in self.trainings if one.error is not None), 0)
 
     def training(self, seed: int, arm: str) -> Training | None:
-        """Return a training, if it was made."""
+        """Return the training with a seed and an arm; None if it has not run."""
         return next((one for one in self.trainings if (one.seed, one.arm) == (seed, arm)), None)
 
     def medians(self) -> dict[str, dict[str, float | None]]:
-        """Return arm -> the medians of seconds and steps, for arms that were trained with every seed."""
+        """Return arm -> medians of seconds and steps, for arms that were trained with all seeds."""
         medians = {}
         for arm in ARMS:
             times = [one.time() for one in self.trainings if one.arm == arm]
@@ -129,7 +129,7 @@ def compare(
 
     Raises:
         CheckpointError: if no trial has finished.
-        UsageError: if the task has no success to be measured by.
+        UsageError: if the task defines no success and `until` is None.
     """
     best = sweep.best()
     if best is None:
@@ -139,7 +139,7 @@ def compare(
     with _request_of_sweep(sweep, request) as base:
         resolved, _ = base.resolve()
         if resolved.task.success is None and until is None:
-            raise UsageError("this task defines no success: until what?", hint="--until return=X")
+            raise UsageError("the task defines no success; a threshold is needed", hint="--until return=X")
         require_success(resolved, [threshold.key])
         if resolved.agent is not None and not resolved.agent.eval_interval:
             base.overrides.append("agent.eval_interval=1")
@@ -147,11 +147,13 @@ def compare(
         changes: dict[str, list[str]] = {"default": [], "best": sweep.overrides(sweep.values(best))}
         with stop:
             for turn, seed in enumerate(seeds):
-                for arm in ARMS if turn % 2 == 0 else ARMS[::-1]:  # a machine that slows down slows both arms
+                for arm in (
+                    ARMS if turn % 2 == 0 else ARMS[::-1]
+                ):  # alternate, so that a slow period of the machine affects both arms
                     if stop.signal is not None:
                         break
                     training = _train(comparison, replace(base, seed=seed), arm, changes[arm], stop)
-                    if training.reached or training.error or stop.signal is None:  # else a signal stopped it
+                    if training.reached or training.error or stop.signal is None:  # else a signal stopped this training
                         comparison.trainings.append(training)
     if stop.signal is not None and len(comparison.trainings) < len(ARMS) * len(seeds):
         comparison.stop_code = stop.exit_code
@@ -160,7 +162,7 @@ def compare(
 
 @contextmanager
 def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[TrainingRequest]:
-    """Complete a request by what the trials of a sweep have in common, except for their budget."""
+    """Context with a request that has the settings shared by all trials of a sweep, except for their budget."""
     from rlcli.runs.restore import recorded_task
 
     settings = sweep.settings
@@ -183,7 +185,7 @@ def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[Traini
 def _train(
     comparison: Comparison, request: TrainingRequest, arm: str, changes: Sequence[str], stop: StopRequest
 ) -> Training:
-    """Train with one of the settings until the threshold is reached, the budget is spent, or a signal arrives."""
+    """Train one arm until the threshold is reached, the budget is spent, or a signal arrives."""
     seed, threshold = request.seed, comparison.threshold
     name = "compare-default" if arm == "default" else f"compare-trial-{comparison.trial:04d}"
     training = Training(arm, seed, _run_folder(comparison.sweep, f"{name}-seed-{seed}", request, changes))
@@ -218,7 +220,7 @@ def _train(
 
 
 def _run_folder(sweep: Path, name: str, request: TrainingRequest, changes: Sequence[str]) -> Path:
-    """Return the folder of a training; if the name is that of a run with other settings, append a number."""
+    """Return the folder of a training; append a number if a run with other settings has the name."""
     config = to_yaml(to_data(request.resolve(changes)[0]))
     number = 1
     while True:

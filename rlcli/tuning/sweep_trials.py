@@ -1,4 +1,4 @@
-"""Trials of a sweep: each is trained and then evaluated in a subprocess, and pruned if it learns worse than most."""
+"""Runner of a sweep's trials: trains, evaluates and prunes them in subprocesses."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _REPORT_EVERY_S = 1.0
-"""Time between two reports of a trial's progress to the pruner."""
+"""Time between two reports of a trial's progress to the pruner [s]."""
 _PRUNER_STEPS = 100
-"""Trials are compared by the pruner at each percent of their budget."""
+"""Steps of the pruner: it compares trials at each percent of their budget."""
 _MAX_FAILURES = 3
-"""Number of failed trials before the first success after which the sweep itself is wrong."""
-_NOT_OF_THE_TRIAL = (7, 8, 10, STOPPED, 130)
-"""Exit codes that another setting would not change: a missing package or device, the machine, a signal."""
+"""Failed trials, without a successful one, after which the sweep ends with an error."""
+_NOT_CAUSED_BY_TRIAL = (7, 8, 10, STOPPED, 130)
+"""Exit codes that do not depend on the settings of a trial: a missing package or device, the machine, a signal."""
 
 
 def check_parameters(request: TrainingRequest, parameters: Sequence[Parameter], objective: Objective) -> Resolved:
-    """Check before anything is written that trials can be trained and evaluated; return a configuration.
+    """Check, before anything is written, that trials can be trained and evaluated; return a configuration.
 
     Raises:
-        ConfigError: for an unknown key, or a bound of a range that its key cannot have.
+        ConfigError: for an unknown key, or a bound that is not valid for its key.
         UsageError: for an objective that evaluations of this task do not have.
     """
     for index in range(max(len(parameter.bounds) for parameter in parameters)):
@@ -53,7 +53,7 @@ def check_parameters(request: TrainingRequest, parameters: Sequence[Parameter], 
     names = [key for key, term in groups.get(group, {}).items() if term is not None]
     if names and name not in names:
         hint = did_you_mean(name, names) or f"there are: {listing(names)}"
-        raise UsageError(f"--objective {objective.key}: the task has none of that name", hint=hint)
+        raise UsageError(f"--objective {objective.key}: the task has no such term", hint=hint)
     return resolved
 
 
@@ -68,7 +68,7 @@ def write_preset(sweep: Sweep, request: TrainingRequest) -> None:
 
 
 class TrialRunner:
-    """Runner of trials: it claims trials, trains and evaluates each in subprocesses, and tells the storage."""
+    """Runner that claims trials, trains and evaluates them in subprocesses, and stores their results."""
 
     def __init__(
         self, sweep: Sweep, request: TrainingRequest, objective: Objective, jobs: int, stop: StopRequest
@@ -78,10 +78,10 @@ class TrialRunner:
         self._failures: list[RlcliError] = []
 
     def run(self) -> None:
-        """Run trials until there is none left, or a signal arrives.
+        """Run trials until none is left or a signal arrives.
 
         Raises:
-            RlcliError: if the first trials all fail, or for an error that every trial would have.
+            RlcliError: if the first trials all fail, or for an error that all trials would have.
         """
         try:
             while True:
@@ -90,7 +90,7 @@ class TrialRunner:
                     trial = self._sweep.claim()
                     if trial is None:
                         break
-                    self._active.append(self._begin(trial))
+                    self._active.append(self._start(trial))
                 if not self._active:
                     break
                 for stage in list(self._active):
@@ -108,8 +108,8 @@ class TrialRunner:
         if self._failures and not stopping and self._sweep.best() is None:
             raise self._all_failed()
 
-    def _begin(self, trial: Trial) -> _Stage:
-        """Start or resume the training of a trial, or evaluate a trial that is trained already."""
+    def _start(self, trial: Trial) -> _Stage:
+        """Start or resume the training of a trial, or start the evaluation of a trained one."""
         changes = self._sweep.overrides(trial.values)
         _log.info("trial %s: %s", trial.number, ", ".join(changes))
         device = prepare_run(trial.folder, self._request, changes)
@@ -125,7 +125,7 @@ class TrialRunner:
         return _Stage(trial, start_command(trial.folder, words), evaluates=True)
 
     def _watch(self, stage: _Stage) -> None:
-        """Stop a training whose time is over, or that learns worse than most."""
+        """Stop a training that has reached its time limit or is pruned."""
         if stage.evaluates or stage.process.stop_requested:
             return
         now, limit_s, metric = time.monotonic(), self._objective.seconds, self._objective.training_metric
@@ -154,10 +154,10 @@ class TrialRunner:
             stage.process.stop()
 
     def _end(self, stage: _Stage, stopping: bool) -> None:
-        """Evaluate a trial that is trained, tell the storage of one that is evaluated, pruned or failed."""
+        """Evaluate a trained trial; store the result of an evaluated, pruned or failed one."""
         trial, process = stage.trial, stage.process
         if stage.evaluates and process.exit_code == 0:
-            self._tell_value(trial, self._objective.read(process.document))
+            self._store_value(trial, self._objective.read(process.document))
         elif stage.pruned:
             self._sweep.tell(trial, state="PRUNED")
             _log.info("trial %s: pruned", trial.number)
@@ -165,17 +165,17 @@ class TrialRunner:
             return  # the trial stays in the storage, to be resumed
         elif not stage.evaluates and not process.has_failed:
             self._active.append(self._evaluate(trial))
-        elif process.exit_code in _NOT_OF_THE_TRIAL:
+        elif process.exit_code in _NOT_CAUSED_BY_TRIAL:
             error = process.error()
             error.message = f"trial {trial.number}: {error.message}"
-            error.hint = "the same command again goes on with this trial"
+            error.hint = "run the same command again to continue with this trial"
             raise error
         else:
             self._fail(trial, process.error())
 
-    def _tell_value(self, trial: Trial, value: float) -> None:
+    def _store_value(self, trial: Trial, value: float) -> None:
         if not math.isfinite(value):
-            self._fail(trial, DivergedError(f"{self._objective.key} of its evaluation is not finite"))
+            self._fail(trial, DivergedError(f"{self._objective.key} is not finite in its evaluation"))
             return
         run = overview(trial.folder)
         self._sweep.tell(trial, value, seconds=run.duration_s, step=run.step)
@@ -205,18 +205,20 @@ class _Stage:
     evaluates: bool = False
     pruned: bool = False
     reported: int = 0
-    """Newest step of the pruner that was reported."""
+    """Last step of the pruner that was reported."""
     next_report: float = 0.0
+    """Time of the next report to the pruner [s], by `time.monotonic`."""
     trained_s: float = 0.0
+    """Time of the rollouts and updates so far [s]."""
     counted: int = 0
-    """Iterations that `trained_s` includes."""
+    """Iterations that are included in `trained_s`."""
 
     def add_trained_time(self, rows: Sequence[Mapping[str, Any]]) -> float:
-        """Add the rollouts and updates of new rows of the metrics; return the time of all [s]."""
-        fresh = [row for row in rows if row["iteration"] > self.counted]
-        if fresh and fresh[0]["iteration"] > self.counted + 1:  # rows were missed, or the run was resumed
+        """Add the rollouts and updates of new rows of metrics; return the total time [s]."""
+        new_rows = [row for row in rows if row["iteration"] > self.counted]
+        if new_rows and new_rows[0]["iteration"] > self.counted + 1:  # rows were missed, or the run was resumed
             self.trained_s = max(self.trained_s, overview(self.trial.folder).duration_s or 0.0)
-        self.trained_s += sum(map(training_s, fresh))
-        if fresh:
-            self.counted = fresh[-1]["iteration"]
+        self.trained_s += sum(map(training_s, new_rows))
+        if new_rows:
+            self.counted = new_rows[-1]["iteration"]
         return self.trained_s

@@ -22,7 +22,7 @@ class Threshold:
     value: float
 
     def reached_by(self, row: Mapping[str, Any]) -> bool:
-        """Return whether the evaluation in a row of the metrics reached the threshold."""
+        """Return whether the evaluation in a row of metrics reached the threshold."""
         return bool(row.get(_METRICS[self.key], -math.inf) >= self.value)
 
 
@@ -49,9 +49,11 @@ def read_threshold(text: str) -> Threshold:
     except ValueError:
         value = math.nan
     if key not in _METRICS or not math.isfinite(value):
-        raise UsageError(f"--until '{text}' is no bar", hint="as in --until success=0.99, return=200 or length=250")
+        raise UsageError(
+            f"--until '{text}' is not a threshold", hint="as in --until success=0.99, return=200 or length=250"
+        )
     if key == "success" and not 0.0 < value <= 1.0:
-        raise UsageError(f"--until '{text}': a success rate is above 0 and at most 1")
+        raise UsageError(f"--until '{text}': a success rate must be above 0 and at most 1")
     return Threshold(key, value)
 
 
@@ -61,7 +63,7 @@ def training_s(row: Mapping[str, Any]) -> float:
 
 
 def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -> Reached | None:
-    """Return when a training first reached a threshold, by all rows of its metrics; None if it has not."""
+    """Return the time at which a training first reached a threshold, from all rows of metrics; None if it did not."""
     seconds = 0.0
     for row in rows:
         seconds += training_s(row)
@@ -71,6 +73,6 @@ def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -
 
 
 def median(values: Sequence[float | None]) -> float | None:
-    """Return the median over seeds; None stands for a seed that never reached the threshold, also as the result."""
+    """Return the median over seeds; None means that the threshold was not reached."""
     found = statistics.median([math.inf if value is None else value for value in values])
     return found if math.isfinite(found) else None

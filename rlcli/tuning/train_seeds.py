@@ -1,4 +1,4 @@
-"""Training of one configuration with several seeds, and the curves of all seeds together."""
+"""Training of one configuration with several seeds, and their aggregated learning curves."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class StudyView(Protocol):
     """Context that shows the progress of the runs of a study."""
 
     def poll(self) -> None:
-        """Update the view if it is time to."""
+        """Update the view if the last update is old enough."""
         ...
 
     def __enter__(self) -> Any: ...
@@ -53,7 +53,7 @@ class StudyResult:
     runs: list[dict[str, Any]]
     """The seed, the state and the last metrics of each run."""
     together: dict[str, Any] | None = None
-    """Name -> interquartile mean over the seeds and its interval; None if no run has metrics."""
+    """Name -> interquartile mean over the seeds with its interval; None if no run has metrics."""
     curves: Path | None = None
     picture: Path | None = None
     exit_code: int = 0
@@ -63,7 +63,7 @@ class StudyResult:
 
 
 def new_study(request: TrainingRequest, resolved: Resolved, device: str, seeds: Sequence[int]) -> Path:
-    """Create the folder of a study, with a run for each seed that waits for its training."""
+    """Create the folder of a study, with a waiting run for each seed."""
     record, config = run_record(request, resolved, device), to_yaml(to_data(resolved))
     folder = create_study(request.runs, resolved.source.name, request.name, config, record, seeds)
     _log.info("study %s: seeds %s", folder, ", ".join(map(str, seeds)))
@@ -71,7 +71,7 @@ def new_study(request: TrainingRequest, resolved: Resolved, device: str, seeds: 
 
 
 def resume_options(request: TrainingRequest) -> list[str]:
-    """Return the options of a request that each run of a resumed study is resumed with."""
+    """Return the options of a request that apply to each run of a resumed study."""
     values = {
         "--max-iterations": request.budget.get("agent.max_iterations"),
         "--max-steps": request.budget.get("agent.max_steps"),
@@ -90,23 +90,23 @@ def train_seeds(
     finished_too: bool = False,
     options: Sequence[str] = (),
 ) -> StudyResult:
-    """Train the runs of a study that are not finished, and write the curves of all seeds together.
+    """Train the unfinished runs of a study, and write the aggregated curves.
 
     Args:
         folder: the study.
-        device: where to train; None is the device that the study began on.
+        device: device of the trainings; None: the device of the study.
         jobs: number of trainings at a time.
         stop: the request to stop by a signal.
-        make_view: makes the view from a title and the folders of the runs.
-        finished_too: whether runs that are finished have a new budget.
+        make_view: returns the view for a title and the folders of the runs.
+        finished_too: whether finished runs have a new budget and continue.
         options: further options of each `rlcli train --resume`.
     """
     study = read_study(folder)
     runs = runs_of(folder, study)
     with stop:
-        left = [run for run in runs if finished_too or overview(run).state != "finished"]
+        unfinished = [run for run in runs if finished_too or overview(run).state != "finished"]
         with make_view(f"rlcli train {study['task']}", runs) as view:
-            ended = train_all(left, device or str(study.get("device", "cpu")), jobs, options, stop, view.poll)
+            ended = train_all(unfinished, device or str(study.get("device", "cpu")), jobs, options, stop, view.poll)
     result = _summary(folder, study["task"], runs)
     result.exit_code = next((one.exit_code for one in ended if one.exit_code and not one.stop_requested), 0)
     if stop.signal is not None and any(overview(run).state != "finished" for run in runs):
@@ -115,7 +115,7 @@ def train_seeds(
 
 
 def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
-    """Write the curves of all seeds together, and return them with the last metrics of each seed."""
+    """Write the aggregated curves; return them with the last metrics of each seed."""
     rows: list[dict[str, Any]] = []
     for run in map(overview, runs):
         row = {"seed": run.seed, "run": str(run.folder), "state": run.state, "step": run.step}
@@ -141,9 +141,9 @@ def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
 
 
 def _csv(lines: dict[str, Line]) -> str:
-    """Return a table of steps and, of each metric, the interquartile mean with its interval.
+    """Return CSV with the steps and, for each metric, the interquartile mean and its interval.
 
-    The first metric gives the steps; the others are interpolated.
+    The steps are those of the first metric; other metrics are interpolated.
     """
     import numpy as np
 
@@ -160,7 +160,7 @@ def _csv(lines: dict[str, Line]) -> str:
 
 
 def _picture(folder: Path, curves: list[Curve]) -> Path | None:
-    """Draw the curves, if matplotlib is installed."""
+    """Draw the aggregated curves; return None without matplotlib."""
     try:
         check_drawing()
     except DependencyError:

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: a process in an empty folder."""
+"""Fixtures that run the command line in an empty folder, in a subprocess or in this process."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ def here(tmp_path):
 
 @pytest.fixture
 def rlcli(here, tmp_path):
-    """rlcli(arguments...) -> the finished process."""
+    """Return a function that runs `rlcli ARGUMENTS` in a subprocess and returns the finished process."""
 
     def run(*arguments, stdout=subprocess.PIPE, **environment):
         env = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache"), **environment}
@@ -28,7 +28,7 @@ def rlcli(here, tmp_path):
 
 @pytest.fixture
 def in_process(monkeypatch, here, capfd):
-    """in_process(arguments...) -> (exit code, stdout, stderr), without the cost of a process."""
+    """Return a function that runs `rlcli ARGUMENTS` in this process and returns (exit code, stdout, stderr)."""
     from rlcli.cli.app import main
 
     monkeypatch.chdir(here)
@@ -79,7 +79,7 @@ agents:
 
 @pytest.fixture
 def small(here):
-    """small(old=..., new=...) -> the name of a task folder, its YAML edited."""
+    """Return a function that writes a small task, with edits of its YAML, and returns its folder."""
 
     def make(*edits, model=MODEL, **files):
         folder = here / "small"

@@ -1,4 +1,4 @@
-"""Garbage in cycles: looked for seldom while a command starts, as usual once it runs."""
+"""Garbage collection: rare while a command starts, with the usual thresholds once it runs."""
 
 import gc
 import subprocess
@@ -11,11 +11,11 @@ import gc, sys
 from rlcli import machine
 usual = gc.get_threshold()
 as_usual, seen = machine.restore_garbage_collection, []
-def told():
+def record_thresholds():
     seen.append(gc.get_threshold())
     as_usual()
     seen.append(gc.get_threshold())
-machine.restore_garbage_collection = told
+machine.restore_garbage_collection = record_thresholds
 from rlcli.cli.app import main
 code = main()
 assert code == 0, code
@@ -26,21 +26,21 @@ print("as usual again")
 """
 
 
-def started(*words, folder):
+def run_probe(*words, folder):
     done = subprocess.run([sys.executable, "-c", PROBE, *words], capture_output=True, text=True, cwd=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def test_training_and_evaluating_collect_as_usual_once_they_run(tmp_path):
+def test_train_and_eval_restore_gc_thresholds(tmp_path):
     small = ["--num-envs", "8", "--quiet"]
-    assert "as usual again" in started(
+    assert "as usual again" in run_probe(
         "train", "cartpole", "--max-iterations", "1", *small, "--runs-dir", "runs", folder=tmp_path
     )
-    assert "as usual again" in started("eval", "cartpole", "--episodes", "8", *small, folder=tmp_path)
+    assert "as usual again" in run_probe("eval", "cartpole", "--episodes", "8", *small, folder=tmp_path)
 
 
-def test_a_program_that_calls_the_command_line_keeps_its_own_settings():
+def test_main_called_from_python_keeps_gc_thresholds():
     before = gc.get_threshold()
     assert main(["show", "cartpole"]) == 0
     assert gc.get_threshold() == before

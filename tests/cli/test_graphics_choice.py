@@ -1,4 +1,4 @@
-"""What MUJOCO_GL and DISPLAY may say wrongly: told as what it is, not as a bug."""
+"""Wrong values of MUJOCO_GL and DISPLAY, and of names on the command line, have clear messages."""
 
 import os
 import subprocess
@@ -18,7 +18,7 @@ def rlcli(folder, *words, **environment):
     )
 
 
-def test_a_misspelt_mujoco_gl_is_said_with_what_is_allowed(tmp_path):
+def test_invalid_mujoco_gl_lists_valid_values(tmp_path):
     done = rlcli(tmp_path, "eval", "cartpole", "--policy", "zero", "--episodes", "1", MUJOCO_GL="elg")
     assert done.returncode == 10
     assert "MUJOCO_GL=elg" in done.stderr
@@ -27,8 +27,8 @@ def test_a_misspelt_mujoco_gl_is_said_with_what_is_allowed(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_display_that_does_not_answer_is_passed_over(tmp_path):
-    """Something else draws, or what was tried is told."""
+def test_unreachable_display_falls_back_to_other_backend(tmp_path):
+    """Another backend draws, or the message lists the backends that were tried."""
     words = ("play", "cartpole", "--policy", "zero", "--num-envs", "1", "--video", "x.mp4")
     done = rlcli(tmp_path, *words, DISPLAY=":77", MUJOCO_GL="")
     assert done.returncode in (0, 10), done.stderr
@@ -38,7 +38,7 @@ def test_a_display_that_does_not_answer_is_passed_over(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["eval", "play", "export"])
-def test_a_run_named_as_a_task_is_told_how_to_be_named(tmp_path, command):
+def test_run_given_as_task_has_checkpoint_hint(tmp_path, command):
     assert rlcli(tmp_path, "train", "cartpole", "--num-envs", "4", "--max-iterations", "1").returncode == 0
     done = rlcli(tmp_path, command, "latest")
     assert done.returncode == 4
@@ -46,7 +46,7 @@ def test_a_run_named_as_a_task_is_told_how_to_be_named(tmp_path, command):
     assert "hint: --checkpoint latest" in done.stderr
 
 
-def test_a_name_is_suggested_once():
+def test_did_you_mean_has_no_duplicates():
     from rlcli.errors import did_you_mean
 
     assert did_you_mean("body_mas", ["body_mass", "body_mass"]) == "did you mean 'body_mass'?"

@@ -1,4 +1,4 @@
-"""The user's settings: what they change, what comes before them, and what a broken file is answered with."""
+"""User settings: their effects, their precedence, and the messages of a broken file."""
 
 import json
 import os
@@ -19,7 +19,7 @@ from rlcli.training.loggers import LOGGERS
 
 @pytest.fixture
 def settings(tmp_path, monkeypatch):
-    """settings(text) writes them; the file."""
+    """Return a function that writes the settings file and returns its path."""
     file = tmp_path / "my settings.yaml"
     monkeypatch.setenv("RLCLI_SETTINGS", str(file))
 
@@ -30,25 +30,23 @@ def settings(tmp_path, monkeypatch):
     return write
 
 
-def test_a_flag_comes_before_the_variable_and_that_before_the_settings_and_they_before_the_default(
-    settings, in_process, monkeypatch, tmp_path
-):
+def test_precedence_of_flag_variable_settings_and_default(settings, in_process, monkeypatch, tmp_path):
     settings(f"runs_dir: '{tmp_path}/of-settings'\n")
 
-    def said(*flags):
+    def error_output(*flags):
         return in_process("runs", *flags)[2]
 
     monkeypatch.delenv("RLCLI_RUNS_DIR", raising=False)
-    assert f"no run in {tmp_path}/of-settings" in said()
+    assert f"no run in {tmp_path}/of-settings" in error_output()
     monkeypatch.setenv("RLCLI_RUNS_DIR", "of-variable")
-    assert "no run in of-variable" in said()
-    assert "no run in of-flag" in said("--runs-dir", "of-flag")
+    assert "no run in of-variable" in error_output()
+    assert "no run in of-flag" in error_output("--runs-dir", "of-flag")
     monkeypatch.delenv("RLCLI_RUNS_DIR")
     monkeypatch.setenv("RLCLI_SETTINGS", "none")
-    assert "no run in runs" in said()
+    assert "no run in runs" in error_output()
 
 
-def test_home_is_understood_and_the_library_has_no_preferences(settings, in_process, monkeypatch, tmp_path):
+def test_home_folder_is_expanded_and_library_ignores_settings(settings, in_process, monkeypatch, tmp_path):
     settings("runs_dir: ~/experiments\n")
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.delenv("RLCLI_RUNS_DIR", raising=False)
@@ -69,9 +67,7 @@ def test_home_is_understood_and_the_library_has_no_preferences(settings, in_proc
         ("normal", ("--quiet", "--verbose"), True),
     ],
 )
-def test_quiet_and_verbose_are_settings_that_a_flag_turns_round(
-    settings, in_process, monkeypatch, verbosity, flags, loud
-):
+def test_verbosity_flag_overrides_settings(settings, in_process, monkeypatch, verbosity, flags, loud):
     settings(f"verbosity: {verbosity}\n")
     monkeypatch.setattr("rlcli.cli.commands.validate.log_notes", lambda _: viewer_choice.console.detail("a detail"))
     code, _, err = in_process("validate", "cartpole", *flags)
@@ -79,7 +75,7 @@ def test_quiet_and_verbose_are_settings_that_a_flag_turns_round(
     assert ("a detail" in err) == loud
 
 
-def test_a_preferred_viewer_is_opened_only_where_play_may_choose(monkeypatch):
+def test_preferred_viewer_applies_only_without_explicit_choice(monkeypatch):
     monkeypatch.setattr("rlcli.sim.gl.has_display", lambda: False)
 
     def first(viewer, port=None, headless=False):
@@ -87,7 +83,7 @@ def test_a_preferred_viewer_is_opened_only_where_play_may_choose(monkeypatch):
 
     with use_settings({"viewer": "web"}):
         assert first(None) == "web"
-        assert first("auto") == "none", "no terminal asks"
+        assert first("auto") == "none", "not started from a terminal"
         assert first("none") == "none"
         assert first(None, headless=True) == "none", "a file is written"
     with use_settings({"viewer": "native"}):
@@ -96,7 +92,7 @@ def test_a_preferred_viewer_is_opened_only_where_play_may_choose(monkeypatch):
         assert first(None, port=8080) == "web", "a port is a viewer in the browser"
 
 
-def test_preferred_plugins_leave_the_others_out(settings, in_process, monkeypatch):
+def test_plugins_setting_hides_other_plugins(settings, in_process, monkeypatch):
     monkeypatch.delenv("RLCLI_PLUGINS", raising=False)
     file = settings("plugins: [no-such-plugin]\n")
     code, out, err = in_process("list-tasks", "--json")
@@ -108,7 +104,7 @@ def test_preferred_plugins_leave_the_others_out(settings, in_process, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("verbosity: loud\n", ":1:1: verbosity: expected 'quiet', 'normal' or 'verbose', found 'loud'"),
         ("# mine\nveiwer: none\n", ":2:1: veiwer: unknown key 'veiwer'; did you mean 'viewer'?"),
@@ -124,25 +120,25 @@ def test_preferred_plugins_leave_the_others_out(settings, in_process, monkeypatc
         ("runs_dir: \x00\n", ":1:11: "),
     ],
 )
-def test_a_broken_file_is_one_message_with_its_place_and_exit_code_3(settings, in_process, text, said):
+def test_broken_settings_are_one_message_with_exit_code_3(settings, in_process, text, message):
     file = settings(text)
     for command in (["runs"], ["list-tasks"], ["train", "cartpole"], ["show", "cartpole"]):
         code, out, err = in_process(*command)
         assert (code, out) == (3, "")
-        assert err.startswith(f"error: {file}{said}")
+        assert err.startswith(f"error: {file}{message}")
         assert len(err.splitlines()) == 1
     assert json.loads(in_process("runs", "--json")[1])["error"]["exit_code"] == 3
 
 
 @pytest.mark.parametrize("command", [["--help"], ["train", "--help"], ["--version"], ["sweep", "-h"]])
-def test_help_is_there_with_a_broken_file_too(settings, in_process, command):
+def test_help_works_with_broken_settings(settings, in_process, command):
     settings("[")
     code, out, err = in_process(*command)
     assert (code, err) == (0, "")
     assert "rlcli" in out
 
 
-def test_what_is_no_file_is_said_where_it_was_named(monkeypatch, in_process, tmp_path):
+def test_missing_settings_file_names_variable(monkeypatch, in_process, tmp_path):
     for named in (tmp_path / "gone.yaml", tmp_path):
         monkeypatch.setenv("RLCLI_SETTINGS", str(named))
         code, _, err = in_process("runs")
@@ -152,7 +148,7 @@ def test_what_is_no_file_is_said_where_it_was_named(monkeypatch, in_process, tmp
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the folder of other platforms is not moved by XDG")
-def test_the_file_lies_in_the_platforms_folder_and_need_not_be_there(monkeypatch, tmp_path):
+def test_settings_file_is_in_platform_folder_and_optional(monkeypatch, tmp_path):
     monkeypatch.delenv("RLCLI_SETTINGS")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     assert settings_file() == tmp_path / "rlcli" / "settings.yaml"
@@ -164,7 +160,7 @@ def test_the_file_lies_in_the_platforms_folder_and_need_not_be_there(monkeypatch
     assert read_settings() == {"color": "never"}
 
 
-def test_what_can_be_set_is_what_the_flags_take():
+def test_settings_have_same_choices_as_flags():
     def choices(field):
         return set(typing.get_args(UserSettings.model_fields[field].annotation))
 
@@ -174,36 +170,36 @@ def test_what_can_be_set_is_what_the_flags_take():
     assert not {"tasks", "agent", "device", "seed"} & set(UserSettings.model_fields)
 
 
-def colored(arguments, tmp_path, **variables):
-    """What a command writes on a terminal of 120 columns."""
+def terminal_output(arguments, tmp_path, **variables):
+    """Return the output of a command on a terminal of 120 columns."""
     leader, follower = pty.openpty()
     env = {**os.environ, "TERM": "xterm", "COLUMNS": "120", **variables}
     process = subprocess.Popen([sys.executable, "-m", "rlcli", *arguments], stdout=follower, env=env, cwd=tmp_path)
     os.close(follower)
-    said = b""
+    output = b""
     try:
         while chunk := os.read(leader, 65536):
-            said += chunk
-    except OSError:  # Linux's way to say that the other end is closed
+            output += chunk
+    except OSError:  # Linux raises this when the other end is closed
         pass
     os.close(leader)
     assert process.wait() == 0
-    return said
+    return output
 
 
-def test_colours_are_for_terminals_unless_a_variable_or_the_settings_say_otherwise(settings, tmp_path):
+def test_colors_on_terminal_follow_variables_and_settings(settings, tmp_path):
     settings("{}")
     command = ["list-tasks", "cartpole"]
-    assert b"\x1b[" in colored(command, tmp_path)
-    assert b"\x1b[" not in colored(command, tmp_path, NO_COLOR="1")
-    assert b"\x1b[" not in colored(command, tmp_path, TERM="dumb")
-    assert b"\x1b[" in colored(command, tmp_path, NO_COLOR="")
+    assert b"\x1b[" in terminal_output(command, tmp_path)
+    assert b"\x1b[" not in terminal_output(command, tmp_path, NO_COLOR="1")
+    assert b"\x1b[" not in terminal_output(command, tmp_path, TERM="dumb")
+    assert b"\x1b[" in terminal_output(command, tmp_path, NO_COLOR="")
     settings("color: never\n")
-    assert b"\x1b[" not in colored(command, tmp_path)
-    assert b"\x1b[" in colored(command, tmp_path, FORCE_COLOR="1")
+    assert b"\x1b[" not in terminal_output(command, tmp_path)
+    assert b"\x1b[" in terminal_output(command, tmp_path, FORCE_COLOR="1")
 
 
-def test_a_pipe_has_colours_only_where_they_are_forced(settings, rlcli):
+def test_colors_in_pipe_only_if_forced(settings, rlcli):
     settings("{}")
     assert "\x1b" not in rlcli("list-tasks", "cartpole").stdout
     assert "\x1b[" in rlcli("list-tasks", "cartpole", FORCE_COLOR="1").stdout

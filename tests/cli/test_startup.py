@@ -1,4 +1,4 @@
-"""What a command does not import: most of the time to its first line is imports."""
+"""Imports of commands: they take most of the time until the first line of output."""
 
 import subprocess
 import sys
@@ -8,11 +8,11 @@ import pytest
 COMPUTING = {"torch", "mujoco", "numpy", "stable_baselines3", "gymnasium", "pandas", "matplotlib", "optuna", "rich"}
 READING = {"pydantic", "yaml", "rlcli.config.load"}
 REST = {"torch._dynamo", "torch._inductor", "sympy", "pandas", "matplotlib", "scipy", "optuna", "sqlalchemy", "imageio"}
-"""Of training: torch's compiler alone takes as long to import as torch."""
+"""Modules that training does not need; torch's compiler alone takes as long to import as torch."""
 
 
 def imported(words, wanted):
-    """The exit code of a command, and which of these modules it has imported."""
+    """Run a command; return its exit code, the `wanted` modules that it imported, and its stderr."""
     program = (
         "import sys\nfrom rlcli.cli.app import main\n"
         f"code = main({words!r})\nprint(code, *sorted(set({sorted(wanted)!r}) & set(sys.modules)))"
@@ -33,11 +33,11 @@ def imported(words, wanted):
     ],
     ids=lambda value: "-".join(value) if isinstance(value, list) else "",
 )
-def test_a_command_that_computes_nothing_imports_nothing_that_does(words, unwanted):
+def test_light_command_imports_nothing_heavy(words, unwanted):
     assert imported(words, unwanted)[:2] == (0, [])
 
 
-def test_a_command_imports_no_other_command(tmp_path):
+def test_command_imports_no_other_command(tmp_path):
     assert imported(["runs", "--runs-dir", str(tmp_path)], {"rlcli.cli.commands.train", "rlcli.cli.commands.sweep"})[
         :2
     ] == (0, [])
@@ -45,8 +45,8 @@ def test_a_command_imports_no_other_command(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "agent"), [("cartpole", "sb3-ppo"), ("cartpole-direct", "ppo"), ("cartpole", "sac")])
-def test_training_imports_no_compiler_and_nothing_that_draws(task, agent, tmp_path):
+def test_train_imports_no_compiler_or_plotting_library(task, agent, tmp_path):
     words = ["train", task, "--agent", agent, "--num-envs", "4", "--max-iterations", "1", "-q"]
     words += ["--device", "cpu", "--runs-dir", str(tmp_path)]
-    code, found, said = imported(words, REST)
-    assert (code, found) == (0, []), said
+    code, found, error_output = imported(words, REST)
+    assert (code, found) == (0, []), error_output

@@ -1,4 +1,4 @@
-"""The command line itself: help, flags, usage errors, the one JSON document, streams that go away."""
+"""Command line: help, flags, usage errors, JSON documents of errors, and closed streams."""
 
 import json
 import os
@@ -13,7 +13,7 @@ HEAVY = ["torch", "mujoco", "numpy", "stable_baselines3"]
 
 
 def document(text):
-    """The one JSON document on stdout."""
+    """Parse the single JSON document on stdout."""
     content = json.loads(text)
     assert content["schema"] == 1
     return content
@@ -21,13 +21,13 @@ def document(text):
 
 @pytest.mark.parametrize("flag", ["-h", "--help"])
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
-def test_help_is_data_and_exits_with_0(in_process, command, flag):
+def test_help_goes_to_stdout_with_exit_code_0(in_process, command, flag):
     code, out, err = in_process(*command, flag)
     assert (code, err) == (0, "")
     assert " ".join(["Usage: rlcli", *command]) in out
 
 
-def test_help_loads_nothing_heavy():
+def test_help_imports_nothing_heavy():
     program = (
         "import sys; from rlcli.cli.app import main; main(['--help']);"
         f"print(sorted(set(sys.modules) & {set(HEAVY)!r}), [m for m in sys.modules if m.startswith('rlcli_tasks')])"
@@ -36,41 +36,41 @@ def test_help_loads_nothing_heavy():
     assert done.stdout.splitlines()[-1] == "[] []"
 
 
-def test_the_version_is_printed(in_process):
+def test_version_is_printed(in_process):
     import rlcli
 
     assert in_process("--version") == (0, f"rlcli {rlcli.__version__}\n", "")
 
 
-def test_no_command_shows_the_help_on_stderr(in_process):
+def test_missing_command_prints_help_on_stderr(in_process):
     code, out, err = in_process()
     assert (code, out) == (2, "")
     assert err.startswith("Usage: rlcli")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["tran", "cartpole"], "Did you mean 'train'?"),
-        (["show"], "Missing argument 'task'"),
+        (["show"], "Missing argument 'TASK'"),
         (["list-tasks", "--jso"], "--json"),
         (["list-tasks", "a", "b"], "unexpected extra argument"),
         (["train", "cartpole", "--seed", "x"], "'--seed': Input should be a valid integer"),
         (["train", "cartpole", "--num-envs"], "requires an argument"),
-        (["train"], "which task?"),
+        (["train"], "no task given"),
         (["train", "cartpole", "--device", "gpu"], "no device 'gpu'"),
         (["train", "cartpole", "--device", "cuda:"], "no device 'cuda:'"),
         (["train", "cartpole", "--device", "cuda:one"], "no device 'cuda:one'"),
         (["play", "cartpole", "--policy", "traned"], "did you mean 'trained'"),
     ],
 )
-def test_usage_errors_exit_with_2(in_process, arguments, said):
+def test_usage_errors_exit_with_2(in_process, arguments, message):
     code, out, err = in_process(*arguments)
     assert (code, out) == (2, "")
-    assert said in err
+    assert message in err
     assert "Traceback" not in err
     code, out, _ = in_process(*arguments, "--json")
-    if arguments[-1] != "--num-envs":  # it takes what follows as its value
+    if arguments[-1] != "--num-envs":  # it takes the next word as its value
         error = document(out)["error"]
         assert (code, error["kind"], error["exit_code"]) == (2, "usage", 2)
 
@@ -84,7 +84,7 @@ def test_usage_errors_exit_with_2(in_process, arguments, said):
         ["--scene.num_envs", "2"],
     ],
 )
-def test_an_override_with_dashes_is_answered_with_the_right_form(in_process, arguments):
+def test_override_with_dashes_has_hint(in_process, arguments):
     code, _, err = in_process("train", "cartpole", *arguments)
     assert code == 2
     key = arguments[0].removeprefix("--").partition("=")[0]
@@ -95,7 +95,7 @@ def test_an_override_with_dashes_is_answered_with_the_right_form(in_process, arg
     ("option", "setting"),
     [("--lr", "agent.learning_rate"), ("--learning-rate", "agent.learning_rate"), ("--decimation", "decimation")],
 )
-def test_a_setting_given_as_an_option_is_answered_with_its_address(in_process, option, setting):
+def test_setting_as_option_has_hint_with_full_key(in_process, option, setting):
     code, _, err = in_process("train", "cartpole", option, "2")
     assert code == 2
     assert f"overrides have no dashes: {setting}=2" in err
@@ -128,8 +128,8 @@ def test_underscores_are_accepted_for_hyphens(in_process):
         (["train", "cartpole", "agent.trainer=rsl-rl"], 7, "dependency"),
     ],
 )
-def test_errors_are_one_document_and_their_exit_code(in_process, here, monkeypatch, arguments, code, kind):
-    monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")  # the trainers of others are not there
+def test_error_prints_one_document_with_exit_code(in_process, here, monkeypatch, arguments, code, kind):
+    monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")  # hides trainers of other distributions
     found, out, err = in_process(*arguments, "--json")
     error = document(out)["error"]
     assert (found, error["exit_code"], error["kind"]) == (code, code, kind)
@@ -140,16 +140,16 @@ def test_errors_are_one_document_and_their_exit_code(in_process, here, monkeypat
     found, out, err = in_process(*arguments)
     assert (found, out) == (code, "")
     assert "Traceback" not in err
-    assert list(here.iterdir()) == []  # nothing half-written
+    assert list(here.iterdir()) == []  # no partial files
 
 
-def test_debug_shows_the_traceback_of_an_error(in_process):
+def test_debug_prints_traceback(in_process):
     code, _, err = in_process("show", "nope", "--debug")
     assert code == 4
     assert "Traceback" in err
 
 
-def test_a_missing_trainer_is_answered_with_the_pip_line(in_process, monkeypatch):
+def test_missing_trainer_names_pip_command(in_process, monkeypatch):
     monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")
     code, _, err = in_process("train", "cartpole", "agent.trainer=rl-games")
     assert code == 7
@@ -161,7 +161,7 @@ def test_a_missing_trainer_is_answered_with_the_pip_line(in_process, monkeypatch
     "arguments",
     [["list-tasks"], ["show", "cartpole"], ["list-tasks", "--json"], ["show", "nope", "--json"], ["--help"]],
 )
-def test_a_reader_that_goes_away_is_no_error_to_report(rlcli, arguments):
+def test_closed_pipe_is_not_an_error(rlcli, arguments):
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as stdout:
@@ -174,14 +174,14 @@ def test_a_reader_that_goes_away_is_no_error_to_report(rlcli, arguments):
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is always full")
 @pytest.mark.parametrize("arguments", [["list-tasks"], ["show", "cartpole", "--json"]])
-def test_a_full_disk_is_said_in_one_line(rlcli, arguments):
+def test_full_disk_is_one_message(rlcli, arguments):
     with open("/dev/full", "w") as stdout:
         done = rlcli(*arguments, stdout=stdout)
     assert done.returncode == 10
     assert done.stderr == "error: No space left on device\n"
 
 
-def test_a_closed_stdout_is_no_crash(here):
+def test_closed_stdout_is_not_an_error(here):
     done = subprocess.run(
         [sys.executable, "-m", "rlcli", "list-tasks"], cwd=here, stderr=subprocess.PIPE, text=True,
         preexec_fn=lambda: os.close(1),
@@ -189,7 +189,7 @@ def test_a_closed_stdout_is_no_crash(here):
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_text_that_the_terminal_cannot_show_is_escaped(rlcli, small):
+def test_unencodable_text_is_escaped(rlcli, small):
     done = rlcli("show", small(("a small task", "größer →")), PYTHONIOENCODING="ascii")
     assert done.returncode == 0
     assert r"gr\xf6\xdfer \u2192" in done.stdout
@@ -217,7 +217,7 @@ TASK = TaskConfig(
 
 
 @pytest.mark.parametrize("flags", [[], ["--debug"]])
-def test_a_term_that_raises_is_named_with_its_line_and_is_no_bug_of_rlcli(in_process, tmp_path, flags):
+def test_exception_in_task_code_names_file_and_line(in_process, tmp_path, flags):
     (tmp_path / "task.py").write_text(FAILING, encoding="utf-8")
     code, _, err = in_process("validate", "--deep", str(tmp_path), *flags)
     line = FAILING.split("\n").index("    return entity.data.joint_poss[:, 0]") + 1
@@ -227,7 +227,7 @@ def test_a_term_that_raises_is_named_with_its_line_and_is_no_bug_of_rlcli(in_pro
     assert ("Traceback" in err) is bool(flags)
 
 
-def test_what_rlcli_itself_raises_is_a_bug_with_its_traceback(in_process, monkeypatch):
+def test_exception_in_rlcli_is_reported_as_bug(in_process, monkeypatch):
     monkeypatch.setattr("rlcli.cli.commands.validate.task_source", None)
     code, _, err = in_process("validate", "--deep", "cartpole")
     assert code == 1
@@ -236,7 +236,7 @@ def test_what_rlcli_itself_raises_is_a_bug_with_its_traceback(in_process, monkey
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["train", "--task", "cartpole"], "rlcli train cartpole"),
         (["play", "--load_run", "x"], "--checkpoint RUN"),
@@ -248,7 +248,7 @@ def test_what_rlcli_itself_raises_is_a_bug_with_its_traceback(in_process, monkey
         ),
     ],
 )
-def test_habits_of_other_programs_are_answered_with_what_is_written_here(in_process, arguments, said):
+def test_options_of_other_programs_have_hints(in_process, arguments, message):
     code, _, err = in_process(*arguments)
     assert code in (2, 3)
-    assert said in err
+    assert message in err

@@ -82,7 +82,7 @@ def test_compare_prints_a_table(cli, trained):
     first, *_ = done.out.splitlines()
     assert (
         first
-        == "cartpole: 4 episodes each, seed 42, the same ones; 30 steps of 0.0166667 s at most, episode_length_s=0.5"
+        == "cartpole: the same 4 episodes for each, seed 42; at most 30 steps of 0.0166667 s, episode_length_s=0.5"
     )
     assert "P(IMPROVEMENT)" in done.out
     assert f"return: {run.name} - zero" in done.out
@@ -130,9 +130,9 @@ def test_limits_apply_to_the_first_policy(cli, trained):
         (("nowhere",), 2, "--compare needs at least two policies, found: nowhere"),
         (("lqr", "zero"), 2, "--compare needs at least one run"),
         (("nowhere", "zero"), 5, "no run 'nowhere'"),
-        (("a", "b", "--checkpoint", "c"), 2, "as words"),
-        (("a", "b", "--policy", "zero"), 2, "as words"),
-        (("a", "b", "--record", "x.safetensors"), 2, "as words"),
+        (("a", "b", "--checkpoint", "c"), 2, "as arguments"),
+        (("a", "b", "--policy", "zero"), 2, "as arguments"),
+        (("a", "b", "--record", "x.safetensors"), 2, "as arguments"),
     ],
 )
 def test_compare_usage_errors(cli, words, code, message):

@@ -47,7 +47,7 @@ def test_list_tasks_imports_no_plugin_and_no_heavy_module(plugins, cli):
     lines = done.stdout.splitlines()
     assert lines[-1] == "0 [] []"
     assert sum("plug" in line for line in lines[:-1]) == 20
-    assert "--probe tells more" in done.stdout
+    assert "--probe shows more" in done.stdout
 
 
 @pytest.mark.parametrize(("arguments", "bound_s"), [(["list-tasks"], 0.35), (["--help"], 0.25)])

@@ -86,7 +86,7 @@ def test_first_divergence_is_dumped_and_replayed(diverging_task, cli, only_run):
     assert shown.code == 0
     assert "in physics step 0 of call 3, t = 0.03 s: joint 'robot/slide'" in shown.out
     assert "qvel nan" in shown.out
-    assert "4 engine calls stepped again, 3 states compared: equal bit by bit" in shown.out
+    assert "4 engine calls simulated again, 3 states compared: equal bit by bit" in shown.out
     document = cli("replay", file, "--json").json
     assert document["equal"] is True
     (found,) = document["environments"]
@@ -109,7 +109,7 @@ def test_replay_of_a_changed_state_exits_9(dump, cli):
     assert shown.code == 9
     assert (shown.json["equal"], shown.json["same_model"]) == (False, False)
     assert (shown.json["difference"]["env"], shown.json["difference"]["call"]) == (5, 0)
-    assert "the task's model is not what it was dumped with" in shown.err
+    assert "the task's model has changed since the file was written" in shown.err
 
 
 def test_replay_refuses_a_dump_of_another_model(dump, cli):

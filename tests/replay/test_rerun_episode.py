@@ -136,14 +136,14 @@ def coin_file(coin):
 
 def test_draws_from_torch_depend_on_num_envs_with_a_warning(sampled_coin, cli):
     arguments = ("--policy", "zero", "--env", "3", "--episode", "6", "--num-envs", "5")
-    message = cli("play", sampled_coin, *arguments, "--json")
-    assert message.code == 0
-    assert message.json["shared_draws"] is True
-    assert "with another --num-envs than 5 the episode is another" in message.err
+    said = cli("play", sampled_coin, *arguments, "--json")
+    assert said.code == 0
+    assert said.json["shared_draws"] is True
+    assert "the episode is only the same with --num-envs 5" in said.err
     whole = cli("eval", sampled_coin, "--policy", "zero", "--num-envs", "5", "--episodes", "35", "--record", "all.st")
     assert whole.code == 0
     mine = [e for e in read_trajectory(coin_file("").parent / "all.st").header.episodes if e.env == 3][6]
-    assert (message.json["length"], message.json["ended_by"]) == (mine.length, mine.causes)
+    assert (said.json["length"], said.json["ended_by"]) == (mine.length, mine.causes)
 
 
 def test_reward_that_draws_from_torch_runs_earlier_episodes(tmp_path):

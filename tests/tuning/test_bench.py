@@ -1,4 +1,4 @@
-"""`rlcli bench`: what it measures, what it recommends, and the preset that a training takes."""
+"""`rlcli bench`: measurements, recommendation, and the preset for a training."""
 
 import json
 import signal
@@ -14,19 +14,19 @@ from rlcli.tuning.bench import Bench, Pace
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
-HASTE = Pace(block_s=0.0, blocks=3, rounds=1, longest_s=100.0)
+SHORT_PACE = Pace(block_s=0.0, blocks=3, rounds=1, longest_s=100.0)
 
 
 @pytest.fixture
-def hasty(monkeypatch):
-    """Few sizes on one core, a call each: what is measured matters here, not how well."""
-    monkeypatch.setattr(bench, "QUICK", HASTE)
+def short_measurements(monkeypatch):
+    """Measure few sizes on one core with one call each: the tests need rows, not exact times."""
+    monkeypatch.setattr(bench, "QUICK", SHORT_PACE)
     monkeypatch.setattr(bench, "SIZES", (4, 8))
     for module in (bench, job):
         monkeypatch.setattr(module, "available_cores", lambda: 1)
 
 
-def test_every_row_that_learns_alike_has_as_many_samples_and_minibatches(coin, cli, hasty):
+def test_comparable_rows_have_equal_samples_and_minibatches(coin, cli, short_measurements):
     done = cli("bench", coin, "--quick", "--json")
     found = done.json
     assert (done.code, found["schema"], found["command"], found["state"]) == (0, 1, "bench", "finished")
@@ -45,7 +45,7 @@ def test_every_row_that_learns_alike_has_as_many_samples_and_minibatches(coin, c
     assert found["machine"]["cores"] >= 1
 
 
-def test_threads_are_tried_up_to_the_cores(coin, cli, hasty, monkeypatch):
+def test_threads_are_measured_up_to_number_of_cores(coin, cli, short_measurements, monkeypatch):
     monkeypatch.setattr(bench, "available_cores", lambda: 3)
     found = cli("bench", coin, "--quick", "--json").json
     tried = {(row["engine_threads"], row["torch_threads"]) for row in found["training"]}
@@ -53,7 +53,7 @@ def test_threads_are_tried_up_to_the_cores(coin, cli, hasty, monkeypatch):
     assert {row["engine_threads"] for row in found["environment"] if row["num_envs"] == 32} == {2, 3}
 
 
-def test_a_preset_trains(coin, cli, hasty, only_run):
+def test_preset_can_be_trained(coin, cli, short_measurements, only_run):
     done = cli("bench", coin, "--quick", "--save-preset", "fast", "--json")
     assert (done.code, done.json["preset"]) == (0, "fast.yaml")
     assert "samples" in Path("fast.yaml").read_text().splitlines()[2]
@@ -63,7 +63,7 @@ def test_a_preset_trains(coin, cli, hasty, only_run):
     assert record["engine_threads"] == best["sim.engine_threads"]
 
 
-def test_a_preset_holds_what_was_asked_for_and_what_was_found(coin, cli, hasty):
+def test_preset_has_user_changes_and_recommendation(coin, cli, short_measurements):
     Path("mine.yaml").write_text("agent: {gamma: 0.9, policy: {hidden: [8, 8]}}\nparams: {chance: 0.1}\n")
     words = ["bench", coin, "params.chance=0.25", "--config", "mine.yaml", "--num-envs", 16, "--agent", "ppo"]
     assert cli(*words, "--quick", "--save-preset", "p.yaml", "-q").code == 0
@@ -74,14 +74,14 @@ def test_a_preset_holds_what_was_asked_for_and_what_was_found(coin, cli, hasty):
     assert resolved.task.scene.num_envs * resolved.agent.n_steps == 16 * 8
 
 
-def test_a_preset_of_another_agent_names_it(cli, hasty):
+def test_preset_names_chosen_agent(cli, short_measurements):
     words = ["--agent", "ppo", "--num-envs", 8, "agent.num_steps=4", "--quick", "--save-preset", "p.yml", "-q"]
     assert cli("bench", "cartpole", *words).code == 0
     resolved = resolve(find_task("cartpole"), config_file=Path("p.yml"))
     assert (resolved.agent_name, resolved.agent.num_steps * resolved.task.scene.num_envs) == ("ppo", 32)
 
 
-def test_a_file_is_replaced_only_if_told_so(coin, cli, hasty):
+def test_preset_replaces_file_only_with_overwrite(coin, cli, short_measurements):
     Path("p.yaml").write_text("# mine\n")
     done = cli("bench", coin, "--quick", "--save-preset", "p")
     assert (done.code, done.out, Path("p.yaml").read_text()) == (2, "", "# mine\n")
@@ -91,7 +91,7 @@ def test_a_file_is_replaced_only_if_told_so(coin, cli, hasty):
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
         (["./coin", "--agent", "pppo"], 3, "no agent 'pppo'"),
         (["./coin", "agent.gama=0.9"], 3, "gama"),
@@ -103,16 +103,16 @@ def test_a_file_is_replaced_only_if_told_so(coin, cli, hasty):
         ([], 2, "TASK"),
     ],
 )
-def test_what_cannot_be_measured_is_said_at_once(coin, cli, words, code, said, monkeypatch):
+def test_invalid_arguments_fail_before_measuring(coin, cli, words, code, message, monkeypatch):
     monkeypatch.setattr(Bench, "run", lambda self: pytest.fail("measured"))
     Path("coin.yaml").write_text("")
     done = cli("bench", *words)
     assert (done.code, done.out) == (code, "")
-    assert said.lower() in done.err.lower()
+    assert message.lower() in done.err.lower()
     assert done.err.count("error:") == 1
 
 
-def test_sizes_that_memory_cannot_hold_are_left_out(coin, cli, hasty, monkeypatch):
+def test_sizes_beyond_memory_are_left_out(coin, cli, short_measurements, monkeypatch):
     monkeypatch.setattr(bench, "SIZES", (4, 8, 1 << 20))
     monkeypatch.setattr(bench, "memory", lambda: 64 << 20)
     rows = cli("bench", coin, "--quick", "--json").json["environment"]
@@ -121,12 +121,12 @@ def test_sizes_that_memory_cannot_hold_are_left_out(coin, cli, hasty, monkeypatc
     assert rows[2]["steps_per_s"] is None
 
 
-def test_sizes_whose_rollout_does_not_divide_are_left_out(coin, cli, hasty):
+def test_sizes_with_indivisible_rollout_are_left_out(coin, cli, short_measurements):
     rows = cli("bench", coin, "agent.n_steps=1", "--num-envs", 2, "--quick", "--json").json["training"]
     assert {(row["num_envs"], row["horizon"]) for row in rows} == {(2, 1), (1, 2)}
 
 
-def test_a_training_without_a_known_horizon_keeps_its_sizes(coin, cli, hasty, monkeypatch):
+def test_unknown_horizon_keeps_sizes(coin, cli, short_measurements, monkeypatch):
     monkeypatch.setattr(bench, "HORIZONS", ())
     found = cli("bench", coin, "--quick", "--json").json
     assert {row["num_envs"] for row in found["training"]} == {32}
@@ -135,7 +135,7 @@ def test_a_training_without_a_known_horizon_keeps_its_sizes(coin, cli, hasty, mo
     }  # fmt: skip
 
 
-def test_off_policy_agents_keep_their_updates(cli, hasty):
+def test_off_policy_agents_keep_updates_per_sample(cli, short_measurements):
     words = ["--agent", "sac", "--num-envs", 8, "agent.learning_starts=1", "--quick", "--json"]
     found = cli("bench", "cartpole", *words).json
     assert {row["samples"] for row in found["training"]} == {64}
@@ -145,7 +145,7 @@ def test_off_policy_agents_keep_their_updates(cli, hasty):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [(), ("--json",)])
-def test_ctrl_c_shows_what_was_measured(coin, start, words):
+def test_ctrl_c_prints_measurements_so_far(coin, start, words):
     process = start("bench", coin, "--save-preset", "p.yaml", *words)
     first = process.stderr.readline()
     while "envs" not in first:

@@ -1,4 +1,4 @@
-"""Sweeps: what is drawn, what a mistake says, and that processes which come and go end with every trial once."""
+"""Sweeps: parsing, error messages, and several processes that run each trial exactly once."""
 
 import getpass
 import json
@@ -38,7 +38,7 @@ RATE = ("--param", "agent.learning_rate=log:1e-4:1e-2")
         ("a.b=1,2.5,null", (1, 2.5, None), False),
     ],
 )
-def test_a_parameter_is_a_range_or_a_choice(text, bounds, log):
+def test_read_parameters_of_ranges_and_choices(text, bounds, log):
     (parameter,) = read_parameters([text])
     assert (parameter.key, parameter.bounds, parameter.log) == ("a.b", bounds, log)
     for bound in bounds:
@@ -49,12 +49,12 @@ def test_a_parameter_is_a_range_or_a_choice(text, bounds, log):
     "text",
     ["a.b", "a.b=", "=1:2", "a.b=2:1", "a.b=1:1", "a.b=log:0:1", "a.b=x:y", "a.b=3", "a.b=1,1", "a.b=[1", "a b=1:2"],
 )
-def test_what_is_no_range_is_refused_with_the_parameter(text):
+def test_malformed_parameter_is_usage_error(text):
     with pytest.raises(UsageError, match="--param"):
         read_parameters([text])
 
 
-def test_a_key_is_varied_once():
+def test_repeated_key_is_usage_error():
     with pytest.raises(UsageError, match="twice"):
         read_parameters(["a.b=1:2", "a.b=3:4"])
 
@@ -69,48 +69,48 @@ def test_a_key_is_varied_once():
         ("reward_terms.alive", Objective("reward_terms.alive")),
     ],
 )
-def test_an_objective_says_what_and_when(text, objective):
-    said = read_objective(text)
-    assert (said.key, said.seconds, said.steps) == (objective.key, objective.seconds, objective.steps)
+def test_read_objective(text, objective):
+    found = read_objective(text)
+    assert (found.key, found.seconds, found.steps) == (objective.key, objective.seconds, objective.steps)
 
 
 @pytest.mark.parametrize("text", ["", "speed@@3s", "succes", "success@s", "success@-3s", "return@0s", "reward_terms."])
-def test_what_is_no_objective_is_refused(text):
+def test_malformed_objective_is_usage_error(text):
     with pytest.raises(UsageError, match="--objective"):
         read_objective(text)
 
 
-def test_an_objective_is_read_from_the_document_of_an_evaluation():
+def test_objective_reads_evaluation_document():
     document = {"success": {"rate": 0.5}, "return": {"mean": 3.0}, "reward_terms": {"alive": {"mean": 2.0}}}
     assert Objective("success").read(document) == 0.5
     assert Objective("return").read(document) == 3.0
     assert Objective("reward_terms.alive").read(document) == 2.0
-    with pytest.raises(UsageError, match="does not tell"):
+    with pytest.raises(UsageError, match="not in the results"):
         Objective("length").read(document)
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
-        ((), 2, "nothing is to be varied"),
+        ((), 2, "no --param given"),
         (("--param", "agent.learning_rat=1e-4:1e-3"), 3, "learning_rate"),
         (("--param", "agent.learning_rate=-1.0:1e-3"), 3, "learning_rate"),
         ((*RATE, "--objective", "sucess"), 2, "--objective"),
         ((*RATE, "--name", "../x"), 2, "--name"),
         ((*RATE, "--pruner", "medan"), 2, "median"),
-        ((*RATE, "--storage", "nonsense"), 2, "no address of a database"),
-        ((*RATE, "--storage", "nodialect://host/x"), 2, "no address of a database"),
-        ((*RATE, "--objective", "return@1000", "--max-steps", "10"), 2, "how long"),
+        ((*RATE, "--storage", "nonsense"), 2, "is not the URL of a database"),
+        ((*RATE, "--storage", "nodialect://host/x"), 2, "is not the URL of a database"),
+        ((*RATE, "--objective", "return@1000", "--max-steps", "10"), 2, "already limits the length"),
     ],
 )
-def test_a_mistake_is_one_message_and_nothing_is_begun(cli, words, code, said):
+def test_invalid_arguments_start_nothing(cli, words, code, message):
     result = cli("sweep", "cartpole", *words)
     assert result.code == code, result.err
-    assert said in result.err
+    assert message in result.err
     assert not list(Path().glob("runs/*/*/trial-*"))
 
 
-def test_a_storage_that_cannot_be_reached_is_the_machines_fault_and_its_password_is_not_said(cli):
+def test_unreachable_storage_is_machine_error_without_password(cli):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
@@ -122,24 +122,24 @@ def test_a_storage_that_cannot_be_reached_is_the_machines_fault_and_its_password
 
 
 @pytest.mark.slow
-def test_another_sweep_of_the_same_name_is_refused_and_the_same_one_is_joined(cli):
-    begun = cli("sweep", "cartpole", *SMALL, *RATE, "--trials", 1, "--max-iterations", 1, "--episodes", 4, "--json")
-    assert begun.code == 0, begun.err
+def test_same_sweep_is_joined_and_other_settings_are_refused(cli):
+    first = cli("sweep", "cartpole", *SMALL, *RATE, "--trials", 1, "--max-iterations", 1, "--episodes", 4, "--json")
+    assert first.code == 0, first.err
     for change in (["--param", "agent.gamma=0.9:0.99"], ["--objective", "success"], ["--seed", "3"], ["--minimize"]):
         other = cli("sweep", "cartpole", *SMALL, *RATE, *change, "--trials", 1, "--max-iterations", 1, "--episodes", 4)
         assert other.code == 2, other.err
         assert "is another sweep" in other.err
     again = cli("sweep", "cartpole", *SMALL, *RATE, "--trials", 1, "--max-iterations", 1, "--episodes", 4, "--json")
-    assert again.json["trials"] == begun.json["trials"]
+    assert again.json["trials"] == first.json["trials"]
     shown = cli("sweep", "show", "sweep", "--json")
-    assert shown.json["trials"] == begun.json["trials"]
+    assert shown.json["trials"] == first.json["trials"]
     assert shown.json["best"]["trial"] == 0
     drawn = cli("sweep", "show", "--plot")
     assert drawn.code == 0, drawn.err
     assert Path("runs/cartpole/sweep-sweep/sweep.svg").stat().st_size > 1000
-    preset = yaml.safe_load(Path(begun.json["preset"]).read_text())
-    assert preset["agent"]["learning_rate"] == pytest.approx(begun.json["best"]["params"]["agent.learning_rate"])
-    used = cli("show", "cartpole", "--config", begun.json["preset"], "--json")
+    preset = yaml.safe_load(Path(first.json["preset"]).read_text())
+    assert preset["agent"]["learning_rate"] == pytest.approx(first.json["best"]["params"]["agent.learning_rate"])
+    used = cli("show", "cartpole", "--config", first.json["preset"], "--json")
     assert used.code == 0, used.err
     missing = cli("sweep", "show", "other")
     assert missing.code == 5
@@ -153,7 +153,7 @@ def sweep(start, *words):
     )
 
 
-def worked_on(folder):
+def started_trials(folder):
     return [run for run in folder.glob("trial-*") if (run / "metrics.jsonl").exists()]
 
 
@@ -161,7 +161,7 @@ def assert_whole(document, trials):
     assert [trial["trial"] for trial in document["trials"]] == list(range(trials))
     assert {trial["state"] for trial in document["trials"]} == {"complete"}
     rates = [trial["params"]["agent.learning_rate"] for trial in document["trials"]]
-    assert len(set(rates)) == trials, "no trial is there twice"
+    assert len(set(rates)) == trials, "no trial is repeated"
     for trial in document["trials"]:
         record = json.loads((Path(trial["run"]) / "run.json").read_text())
         assert record["state"] == "finished"
@@ -174,13 +174,13 @@ def assert_whole(document, trials):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)  # many processes, on whatever else the machine does
-def test_two_processes_one_of_them_killed_and_begun_again_end_with_every_trial_once(start):
+@pytest.mark.timeout(1200)  # many processes on a possibly busy machine
+def test_killed_and_restarted_process_completes_every_trial_once(start):
     trials = 12
     one, other = (sweep(start, "--trials", trials) for _ in range(2))
     folder = Path("runs/cartpole/sweep-sweep")
     deadline = time.monotonic() + 200
-    while len(worked_on(folder)) < 3 and time.monotonic() < deadline:
+    while len(started_trials(folder)) < 3 and time.monotonic() < deadline:
         time.sleep(0.05)
     one.send_signal(signal.SIGKILL)
     one.wait()
@@ -195,24 +195,25 @@ def test_two_processes_one_of_them_killed_and_begun_again_end_with_every_trial_o
 
 
 @pytest.mark.slow
-def test_a_sweep_that_is_stopped_goes_on_with_the_trial_it_was_at(start, cli):
+def test_stopped_sweep_resumes_its_trial(start, cli):
     process = sweep(start, "--trials", 2)
     folder = Path("runs/cartpole/sweep-sweep")
     deadline = time.monotonic() + 100
-    while not worked_on(folder) and time.monotonic() < deadline:
+    while not started_trials(folder) and time.monotonic() < deadline:
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=100)
     assert process.returncode == 75, err
     assert (
-        "goes on" in json.loads(out.rpartition("\n{")[2].join(["{", ""]) if out.count("\n{") else out)["error"]["hint"]
+        "to continue"
+        in json.loads(out.rpartition("\n{")[2].join(["{", ""]) if out.count("\n{") else out)["error"]["hint"]
     )
     out, err = sweep(start, "--trials", 2).communicate(timeout=200)
     assert_whole(json.loads(out), 2)
 
 
 @pytest.mark.slow
-def test_a_time_limit_ends_training_and_the_policy_of_that_moment_is_judged(cli):
+def test_time_limit_ends_training_and_policy_is_evaluated(cli):
     result = cli(
         *("sweep", "cartpole", *SMALL, *RATE, "--trials", 1, "--objective", "success@2s"),
         *("--max-iterations", 100_000, "--episodes", 8, "--json"),
@@ -226,7 +227,7 @@ def test_a_time_limit_ends_training_and_the_policy_of_that_moment_is_judged(cli)
 
 
 @pytest.mark.slow
-def test_settings_that_no_trial_survives_end_the_sweep_with_what_is_wrong(cli):
+def test_sweep_ends_after_three_failed_trials(cli):
     words = ("--param", "agent.learning_rate=1e30,1e31,1e32", "--trials", 8, "--max-iterations", 3)
     result = cli("sweep", "cartpole", *SMALL, *words)
     assert result.code == 6, result.err
@@ -235,7 +236,7 @@ def test_settings_that_no_trial_survives_end_the_sweep_with_what_is_wrong(cli):
 
 
 @pytest.mark.slow
-def test_a_sweep_whose_only_trial_fails_says_so(cli):
+def test_sweep_with_single_failed_trial_is_an_error(cli):
     words = ("--param", "agent.learning_rate=1e30,1e31", "--trials", 1, "--max-iterations", 3)
     result = cli("sweep", "cartpole", *SMALL, *words, "--json")
     assert result.code == 6, result.err
@@ -247,13 +248,13 @@ def test_a_sweep_whose_only_trial_fails_says_so(cli):
 
 
 @pytest.mark.slow
-def test_a_trial_whose_process_was_killed_before_its_result_was_told_is_judged_and_not_trained_again(cli):
+def test_trained_trial_without_result_is_only_evaluated(cli):
     words = ("sweep", "cartpole", *SMALL, *RATE, "--max-iterations", 2, "--episodes", 4)
     first = cli(*words, "--trials", 1, "--json").json
     folder = Path(first["sweep"])
     journal = (folder / "journal.log").read_text().splitlines(keepends=True)
-    told = next(place for place, line in enumerate(journal) if '"op_code":6' in line and '"state":1' in line)
-    (folder / "journal.log").write_text("".join(journal[:told]))
+    result_line = next(number for number, line in enumerate(journal) if '"op_code":6' in line and '"state":1' in line)
+    (folder / "journal.log").write_text("".join(journal[:result_line]))
     (folder / "best.yaml").unlink()
     trained = (folder / "trial-0000" / "metrics.jsonl").read_bytes()
     again = cli(*words, "--trials", 2, "--json").json
@@ -264,7 +265,7 @@ def test_a_trial_whose_process_was_killed_before_its_result_was_told_is_judged_a
 
 
 @pytest.mark.slow
-def test_a_full_disk_costs_no_trial(cli):
+def test_full_disk_loses_no_trial(cli):
     small = Path("small")
     small.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=120k", "none", small], capture_output=True).returncode:
@@ -283,7 +284,7 @@ def test_a_full_disk_costs_no_trial(cli):
 
 
 @pytest.mark.slow
-def test_the_preset_is_the_trial_without_its_budget(cli):
+def test_preset_equals_trial_without_budget(cli):
     Path("more.yaml").write_text("rewards: {alive: {weight: 2.0}}\nagent: {gamma: 0.9}\n")
     words = ("--param", "agent.actor.hidden.0=8:12", "--trials", 1, "--max-iterations", 1, "--episodes", 4)
     done = cli("sweep", "cartpole", "--num-envs", 16, "--agent", "ppo", "--config", "more.yaml", *words, "--json")
@@ -301,15 +302,15 @@ def test_the_preset_is_the_trial_without_its_budget(cli):
     assert own["agents"]["ppo"]["actor"]["hidden"][0] == done.json["best"]["params"]["agent.actor.hidden.0"]
 
 
-def test_an_objective_that_is_not_finite_is_no_number():
+def test_non_finite_objective_is_nan():
     assert math.isnan(Objective("values.x").read({"values": {"x": {"mean": None}}}))
 
 
-def test_an_objective_that_the_task_does_not_tell_is_said_before_anything_is_trained(cli):
-    for objective, said in (("reward_terms.aliv", "did you mean 'alive'"), ("terminations.nope", "time_out")):
+def test_unknown_objective_term_fails_before_training(cli):
+    for objective, message in (("reward_terms.aliv", "did you mean 'alive'"), ("terminations.nope", "time_out")):
         result = cli("sweep", "cartpole", *SMALL, *RATE, "--objective", objective)
         assert result.code == 2
-        assert said in result.err
+        assert message in result.err
     assert not Path("runs").exists()
 
 
@@ -321,17 +322,17 @@ def postgres_programs():
 
 @pytest.fixture
 def database():
-    """The address of an empty PostgreSQL database on loopback, which ends with the test."""
+    """URL of an empty PostgreSQL database on the loopback interface, which stops after the test."""
     programs = postgres_programs()
     if programs is None:
         pytest.skip("PostgreSQL's server is not on this machine (apt-get install postgresql)")
     pytest.importorskip("psycopg", reason="pip install 'psycopg[binary]'")
-    place = Path(tempfile.mkdtemp(prefix="rlcli-postgres-"))  # pytest's own folders are closed to other users
+    place = Path(tempfile.mkdtemp(prefix="rlcli-postgres-"))  # other users cannot read the folders of pytest
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     settings, user = {}, getpass.getuser()
-    if os.geteuid() == 0:  # its server refuses to be root's
+    if os.geteuid() == 0:  # the server refuses to run as root
         user = "nobody"
         shutil.chown(place, "nobody")
         settings = {"user": "nobody"}
@@ -348,8 +349,8 @@ def database():
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)  # many processes, on whatever else the machine does
-def test_machines_that_share_a_database_share_a_sweep(start, cli, database):
+@pytest.mark.timeout(1200)  # many processes on a possibly busy machine
+def test_machines_share_sweep_through_database(start, cli, database):
     trials = 4
     processes = [
         sweep(start, "--trials", trials, "--storage", database, "--runs-dir", folder) for folder in ("here", "there")
@@ -363,7 +364,7 @@ def test_machines_that_share_a_database_share_a_sweep(start, cli, database):
     assert [trial["trial"] for trial in last["trials"]] == list(range(trials))
     assert {trial["state"] for trial in last["trials"]} == {"complete"}
     runs = [run.name for folder in ("here", "there") for run in Path(folder).glob("cartpole/sweep-sweep/trial-*")]
-    assert sorted(runs) == [f"trial-{number:04d}" for number in range(trials)], "each was trained on one of them"
+    assert sorted(runs) == [f"trial-{number:04d}" for number in range(trials)], "each was trained on one machine"
     shown = cli("sweep", "show", "here/cartpole/sweep-sweep", "--storage", database, "--json")
     assert shown.json["ended"] == trials
     assert "--storage" in cli("sweep", "show", "here/cartpole/sweep-sweep").err

@@ -1,4 +1,4 @@
-"""`sweep compare`: how long the best trial's settings and the task's own take until the policy is good enough."""
+"""`sweep compare`: time to a threshold with the best trial's settings and the task's own."""
 
 import json
 import shutil
@@ -24,34 +24,34 @@ def row(iteration, seconds, **evaluation):
     return {"iteration": iteration, "step": iteration * 100, **rates, **evaluation}
 
 
-def test_a_bar_is_a_number_of_the_evaluation():
+def test_read_threshold():
     assert read_threshold("success=0.99") == Threshold("success", 0.99)
     assert read_threshold("return=-3e2") == Threshold("return", -300.0)
 
 
 @pytest.mark.parametrize("text", ["", "success", "success=", "success=1.5", "success=0", "return=nan", "speed=1", "=1"])
-def test_what_is_no_bar_is_refused(text):
+def test_malformed_threshold_is_usage_error(text):
     with pytest.raises(UsageError, match="--until"):
         read_threshold(text)
 
 
-def test_the_time_to_a_bar_is_that_of_rollouts_and_updates_up_to_the_first_evaluation_that_reaches_it():
+def test_time_to_threshold_sums_rollouts_and_updates():
     rates = [None, 0.5, None, 0.99, 0.2]
     rows = [row(i, 2.0, **({} if rate is None else {"Eval/success_rate": rate})) for i, rate in enumerate(rates, 1)]
     assert time_to_threshold(rows, Threshold("success", 0.99)) == Reached(8.0, 400, 4)
     assert time_to_threshold(rows, Threshold("success", 0.5)) == Reached(4.0, 200, 2)
     assert time_to_threshold(rows, Threshold("success", 1.0)) is None
-    assert time_to_threshold(rows, Threshold("return", 0.0)) is None, "nothing was said of it"
+    assert time_to_threshold(rows, Threshold("return", 0.0)) is None, "the rows have no return"
 
 
-def test_a_seed_that_never_arrives_is_later_than_the_others():
+def test_median_counts_unreached_seeds_as_infinite():
     assert median([3.0, None, 1.0]) == 3.0
     assert median([None, None, 1.0]) is None
 
 
 @pytest.fixture(scope="module")
 def runs_with_a_sweep(tmp_path_factory):
-    """The runs folder of a sweep of one trial that is over."""
+    """The runs folder of a finished sweep with one trial."""
     folder = tmp_path_factory.mktemp("swept")
     words = [
         "--param",
@@ -78,13 +78,13 @@ def rows_of(run):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("swept")
-def test_both_settings_are_trained_with_every_seed_until_the_bar_and_the_table_is_printed(cli):
+def test_compare_trains_both_arms_until_threshold(cli):
     words = ("sweep", "compare", "sweep", "--seeds", "0..1", "--until", "length=1", "--episodes", 4)
     done = cli(*words, "--json")
     assert done.code == 0, done.err
     compared = done.json["compared"]
     order = [(one["policy"], one["seed"]) for one in compared]
-    assert order == [("default", 0), ("best", 0), ("best", 1), ("default", 1)], "a slower hour slows both"
+    assert order == [("default", 0), ("best", 0), ("best", 1), ("default", 1)], "a slow period affects both arms"
     for one in compared:
         assert one["state"] == "reached"
         first = rows_of(one["run"])[0]
@@ -101,19 +101,19 @@ def test_both_settings_are_trained_with_every_seed_until_the_bar_and_the_table_i
     assert done.json["ratios"]["seconds"] == pytest.approx(medians["best"]["seconds"] / medians["default"]["seconds"])
     again = cli(*words)
     assert again.code == 0
-    assert len(list(FOLDER.glob("compare-*"))) == 4, "what was trained is not trained again"
+    assert len(list(FOLDER.glob("compare-*"))) == 4, "finished trainings are not repeated"
     lines = again.out.splitlines()
     assert lines[0].split() == ["SEED", "DEFAULT", "S", "STEPS", "TRIAL", "0", "S", "STEPS"]
     assert [line.split()[0] for line in lines[1:]] == ["0", "1", "median", "ratio"]
     assert f"{compared[0]['seconds']:.2f}" in lines[1]
     json_again = cli(*words, "--json").json
     assert json_again["medians"] == medians
-    assert cli("sweep", "show", "--json").json["trials"][0]["trial"] == 0, "the sweep is what it was"
+    assert cli("sweep", "show", "--json").json["trials"][0]["trial"] == 0, "the sweep is unchanged"
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("swept")
-def test_a_bar_that_is_not_reached_within_the_budget_is_no_time(cli):
+def test_unreached_threshold_has_no_time(cli):
     words = ("--seeds", "3", "--until", "success=1", "--max-iterations", 2, "--episodes", 4)
     done = cli("sweep", "compare", *words, "--json")
     assert done.code == 0, done.err
@@ -122,12 +122,12 @@ def test_a_bar_that_is_not_reached_within_the_budget_is_no_time(cli):
     assert done.json["medians"]["best"] == {"seconds": None, "steps": None}
     assert done.json["ratios"] == {"seconds": None, "steps": None}
     longer = cli("sweep", "compare", *words, "--max-iterations", 3, "--json")
-    assert [len(rows_of(one["run"])) for one in longer.json["compared"]] == [3, 3], "another budget, other runs"
+    assert [len(rows_of(one["run"])) for one in longer.json["compared"]] == [3, 3], "another budget has other runs"
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("swept")
-def test_a_comparison_that_is_stopped_goes_on_where_it_was(cli, start):
+def test_stopped_comparison_resumes(cli, start):
     words = ("sweep", "compare", "--seeds", "0", "--until", "success=1", "--max-iterations", 30, "--episodes", 4)
     process = start(*words, "--json")
     deadline = time.monotonic() + 100
@@ -136,7 +136,7 @@ def test_a_comparison_that_is_stopped_goes_on_where_it_was(cli, start):
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=100)
     assert process.returncode == 130, err
-    assert "goes on" in json.loads(out)["error"]["hint"]
+    assert "to continue" in json.loads(out)["error"]["hint"]
     done = cli(*words, "--json")
     assert done.code == 0, done.err
     assert len(list(FOLDER.glob("compare-*"))) == 2
@@ -149,32 +149,32 @@ def test_a_comparison_that_is_stopped_goes_on_where_it_was(cli, start):
 @pytest.mark.slow
 @pytest.mark.usefixtures("swept")
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
         (("--until", "sucess=1"), 2, "--until"),
         (("--seeds", "3..1"), 2, "is empty"),
         (("other",), 5, "no sweep 'other'"),
-        (("sweep", "second"), 2, "one sweep at a time"),
+        (("sweep", "second"), 2, "more than one sweep given"),
         (("agent.learning_rat=1",), 3, "learning_rate"),
-        (("--trials", "3"), 2, "--trials is not of sweep compare"),
+        (("--trials", "3"), 2, "--trials is not an option of sweep compare"),
     ],
 )
-def test_a_mistake_is_one_message_and_nothing_is_trained(cli, words, code, said):
+def test_invalid_arguments_train_nothing(cli, words, code, message):
     result = cli("sweep", "compare", *words)
     assert result.code == code, result.err
-    assert said in result.err
+    assert message in result.err
     assert not list(FOLDER.glob("compare-*"))
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
-        (("show", "--trials", "3"), "--trials is not of sweep show"),
+        (("show", "--trials", "3"), "--trials is not an option of sweep show"),
         (("cartpole", "--plot"), "rlcli sweep show"),
         (("cartpole", "--until", "success=1"), "rlcli sweep compare"),
     ],
 )
-def test_an_option_of_another_of_its_commands_is_refused(cli, words, said):
+def test_option_of_other_form_is_usage_error(cli, words, message):
     result = cli("sweep", *words)
     assert result.code == 2
-    assert said in result.err
+    assert message in result.err

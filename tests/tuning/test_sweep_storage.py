@@ -1,4 +1,4 @@
-"""The trials of a sweep without their trainings: who begins which, what is drawn, and a storage that is damaged."""
+"""Trials of a sweep without training: claims of several processes, sampled values, and damaged storage."""
 
 import json
 import threading
@@ -24,13 +24,13 @@ SETTINGS = {
 SOURCE = {"name": "cartpole", "distribution": "rlcli", "folder": None}
 
 
-def begin(folder, storage=None, source=SOURCE, **changes):
+def open_or_join(folder, storage=None, source=SOURCE, **changes):
     settings = {**SETTINGS, "storage": storage and without_password(storage), **changes}
     return open_sweep(folder, settings, source, read_parameters(PARAMS), storage)
 
 
 def finish(search, count):
-    """Trials that are told a value as soon as they are begun; what was drawn for each."""
+    """Claim trials and complete them at once; return the values of each."""
     drawn = []
     for _ in range(count):
         trial = search.claim()
@@ -39,34 +39,34 @@ def finish(search, count):
     return drawn
 
 
-def test_the_same_seed_draws_the_same_trials_and_another_seed_others(tmp_path):
+def test_seed_determines_trials(tmp_path):
     first, again, other = (
-        finish(begin(tmp_path / name, seed=seed), 12) for name, seed in (("a", 3), ("b", 3), ("c", 4))
+        finish(open_or_join(tmp_path / name, seed=seed), 12) for name, seed in (("a", 3), ("b", 3), ("c", 4))
     )
     assert first == again
     assert not [values for values in first if values in other]
     assert len({values["agent.learning_rate"] for values in first}) == 12
 
 
-def test_a_trial_draws_by_its_number_whichever_process_begins_it(tmp_path):
-    alone = finish(begin(tmp_path / "alone"), 6)
-    one, other = begin(tmp_path / "both"), begin(tmp_path / "both")
+def test_trial_values_depend_on_number_not_process(tmp_path):
+    alone = finish(open_or_join(tmp_path / "alone"), 6)
+    one, other = open_or_join(tmp_path / "both"), open_or_join(tmp_path / "both")
     trials = [search.claim() for search in (one, other, other, one, other, one)]
     assert [trial.number for trial in trials] == [0, 1, 2, 3, 4, 5]
     assert [trial.values for trial in trials] == alone
 
 
-def test_a_trial_whose_process_is_gone_goes_on_with_what_it_had_drawn(tmp_path):
-    gone, other = begin(tmp_path), begin(tmp_path)
+def test_abandoned_trial_keeps_its_values(tmp_path):
+    gone, other = open_or_join(tmp_path), open_or_join(tmp_path)
     left = gone.claim()
-    assert other.claim().number == 1, "while it is worked on it is nobody else's"
+    assert other.claim().number == 1, "a claimed trial belongs to one process"
     gone.release()
     taken = other.claim()
     assert (taken.number, taken.values, taken.folder) == (0, left.values, left.folder)
 
 
-def test_a_trial_that_ends_while_another_process_looks_is_not_begun_again(tmp_path):
-    one, other = begin(tmp_path), begin(tmp_path)
+def test_trial_ending_during_claim_is_not_restarted(tmp_path):
+    one, other = open_or_join(tmp_path), open_or_join(tmp_path)
     trial = one.claim()
     seen = other.trials()
     one.tell(trial, 1.0)
@@ -82,41 +82,41 @@ def test_a_trial_that_ends_while_another_process_looks_is_not_begun_again(tmp_pa
         type(other).trials = fresh
 
 
-def test_three_processes_begin_every_trial_once(tmp_path):
-    begun, wrong = [], []
+def test_concurrent_claims_start_each_trial_once(tmp_path):
+    started, errors = [], []
 
     def work():
         try:
-            search = begin(tmp_path)
+            search = open_or_join(tmp_path)
             while (trial := search.claim()) is not None:
-                begun.append(trial.number)
+                started.append(trial.number)
                 search.tell(trial, 1.0)
         except BaseException as error:
-            wrong.append(error)
+            errors.append(error)
 
     threads = [threading.Thread(target=work) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert not wrong
-    assert sorted(begun) == list(range(12))
+    assert not errors
+    assert sorted(started) == list(range(12))
 
 
-def test_more_trials_may_be_wanted_later(tmp_path):
-    finish(begin(tmp_path, trials=2), 2)
-    more = begin(tmp_path, trials=3)
+def test_number_of_trials_can_grow(tmp_path):
+    finish(open_or_join(tmp_path, trials=2), 2)
+    more = open_or_join(tmp_path, trials=3)
     assert len(finish(more, 1)) == 1
     assert more.claim() is None
-    assert begin(tmp_path, trials=2).claim() is None
+    assert open_or_join(tmp_path, trials=2).claim() is None
 
 
-def test_machines_that_begin_the_last_trial_at_once_leave_no_trial_too_many(tmp_path):
+def test_surplus_trial_of_other_machine_does_not_count(tmp_path):
     storage = f"sqlite:///{tmp_path / 'trials.db'}"
-    here, there = (begin(tmp_path / name, storage, trials=1) for name in ("here", "there"))
+    here, there = (open_or_join(tmp_path / name, storage, trials=1) for name in ("here", "there"))
     held = here.claim()
     fresh = type(there).trials
-    answers = [[], []]  # to the other machine there is none yet
+    answers = [[], []]  # the other machine sees no trial yet
     type(there).trials = lambda search: answers.pop() if answers else fresh(search)
     try:
         assert there.claim() is None
@@ -124,15 +124,15 @@ def test_machines_that_begin_the_last_trial_at_once_leave_no_trial_too_many(tmp_
         type(there).trials = fresh
     here.tell(held, 1.0)
     assert [trial.number for trial in here.trials()] == [0]
-    assert len(finish(begin(tmp_path / "here", storage, trials=2), 1)) == 1, "the surplus one is not counted"
+    assert len(finish(open_or_join(tmp_path / "here", storage, trials=2), 1)) == 1, "the surplus trial does not count"
 
 
-def test_a_line_that_a_full_disk_has_cut_short_is_dropped_and_the_sweep_goes_on(tmp_path):
-    drawn = finish(begin(tmp_path), 3)
+def test_partial_journal_line_is_dropped(tmp_path):
+    drawn = finish(open_or_join(tmp_path), 3)
     journal = tmp_path / JOURNAL
     whole = journal.read_bytes()
     journal.write_bytes(whole + b'{"op_code":4,"wor' + b"x" * 10_000)
-    search = begin(tmp_path)
+    search = open_or_join(tmp_path)
     assert [search.values(trial) for trial in search.trials()] == drawn
     finish(search, 2)
     assert [json.loads(line)["op_code"] for line in journal.read_bytes().splitlines()]
@@ -140,19 +140,19 @@ def test_a_line_that_a_full_disk_has_cut_short_is_dropped_and_the_sweep_goes_on(
 
 
 @pytest.mark.parametrize("damage", [b"nonsense\n", b"{}\n", b"5\n", b"\xff\xfe\n", b"\n"])
-def test_a_journal_that_is_damaged_is_named(tmp_path, damage):
-    finish(begin(tmp_path), 2)
+def test_corrupt_journal_is_checkpoint_error(tmp_path, damage):
+    finish(open_or_join(tmp_path), 2)
     with (tmp_path / JOURNAL).open("ab") as journal:
         journal.write(damage)
-    for look in (lambda: begin(tmp_path).trials(), lambda: read_sweep(tmp_path).trials()):
+    for look in (lambda: open_or_join(tmp_path).trials(), lambda: read_sweep(tmp_path).trials()):
         with pytest.raises(CheckpointError, match=f"{JOURNAL} is corrupt"):
             look()
 
 
-def test_a_sweep_that_has_lost_its_journal_does_not_begin_anew_among_its_old_runs(tmp_path):
-    finish(begin(tmp_path), 2)
+def test_missing_journal_is_checkpoint_error(tmp_path):
+    finish(open_or_join(tmp_path), 2)
     (tmp_path / JOURNAL).unlink()
-    for look in (begin, read_sweep):
+    for look in (open_or_join, read_sweep):
         with pytest.raises(CheckpointError, match="lost its trials"):
             look(tmp_path)
 
@@ -160,39 +160,39 @@ def test_a_sweep_that_has_lost_its_journal_does_not_begin_anew_among_its_old_run
 @pytest.mark.parametrize(
     "change", [{"params": ["agent.gamma=0.9:0.99"]}, {"pruner": "median"}, {"seed": 4}, {"overrides": ["a=1"]}]
 )
-def test_another_sweep_in_the_same_folder_is_refused(tmp_path, change):
-    begin(tmp_path)
+def test_different_settings_in_same_folder_are_refused(tmp_path, change):
+    open_or_join(tmp_path)
     with pytest.raises(UsageError, match="is another sweep"):
-        begin(tmp_path, **change)
+        open_or_join(tmp_path, **change)
 
 
-def test_a_task_of_the_same_name_in_another_place_is_another_sweep(tmp_path):
-    begin(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/one"})
+def test_task_from_other_folder_is_other_sweep(tmp_path):
+    open_or_join(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/one"})
     with pytest.raises(UsageError, match="is another sweep"):
-        begin(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/two"})
+        open_or_join(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/two"})
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"kind": "sweep", "task": "cartpole"}', '{"kind": "seeds", "task": "a"}'])
-def test_a_folder_that_is_not_a_whole_sweep_is_named(tmp_path, text):
-    begin(tmp_path)
+def test_malformed_study_file_is_checkpoint_error(tmp_path, text):
+    open_or_join(tmp_path)
     (tmp_path / "study.json").write_text(text)
     with pytest.raises(CheckpointError, match=r"study\.json|study of seeds"):
         read_sweep(tmp_path)
 
 
-def test_a_database_that_goes_away_is_the_machines_fault_and_its_password_is_not_said(tmp_path):
+def test_lost_database_is_machine_error_without_password(tmp_path):
     file = tmp_path / "trials.db"
-    search = begin(tmp_path / "sweep", f"sqlite:///{file}")
+    search = open_or_join(tmp_path / "sweep", f"sqlite:///{file}")
     trial = search.claim()
     file.write_bytes(b"")
     for use in (search.trials, search.claim, lambda: search.tell(trial, 1.0)):
         with pytest.raises(MachineError, match="cannot be reached") as caught, storage_errors("x://me:secret@host/y"):
             use()
         assert "secret" not in caught.value.message
-        assert "goes on" in caught.value.hint
+        assert "to continue" in caught.value.hint
 
 
-def test_a_change_within_a_list_is_written_as_the_whole_list():
+def test_preset_writes_whole_list_for_changed_element():
     resolved = resolve(find_task("cartpole"), agent="ppo", overrides=["agent.actor.hidden.0=8", "sim.dt=0.01"])
     hidden = list(resolved.agent.actor.hidden)
     assert hidden[0] == 8

@@ -1,4 +1,4 @@
-"""Several seeds in one study: each is the run that it would be alone, and a study that was stopped goes on."""
+"""Studies of several seeds: each run equals a single training, and a stopped study resumes."""
 
 import json
 import os
@@ -28,35 +28,35 @@ def study_folder():
 @pytest.mark.parametrize(
     ("text", "seeds"), [("0..4", [0, 1, 2, 3, 4]), ("7", [7]), ("1,5,9", [1, 5, 9]), ("0..1, 8..9", [0, 1, 8, 9])]
 )
-def test_seeds_are_numbers_and_ranges_with_both_ends(text, seeds):
+def test_read_seeds(text, seeds):
     assert read_seeds(text) == seeds
 
 
 @pytest.mark.parametrize("text", ["", "0..", "4..1", "1,1", "0..3,2", "a", "-1", "0..99999", "1.5", "0...3"])
-def test_what_is_no_list_of_seeds_is_refused(text):
+def test_malformed_seeds_are_usage_error(text):
     with pytest.raises(UsageError, match="--seeds"):
         read_seeds(text)
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--seeds", "0..1", "--seed", "3"), "contradict"),
         (("--seeds", "0..1", "--gpus", "1"), "contradict"),
-        (("--jobs", "2"), "--jobs is of several"),
+        (("--jobs", "2"), "--jobs needs several"),
         (("--seeds", "3..1"), "empty"),
         (("--seeds", "0..1", "agent.learning_rat=1"), "learning_rate"),
     ],
 )
-def test_a_mistake_is_said_before_anything_is_made(cli, words, said):
+def test_invalid_arguments_create_nothing(cli, words, message):
     result = cli("train", "cartpole", *words)
     assert result.code in (2, 3)
-    assert said in result.err
+    assert message in result.err
     assert not Path("runs").exists()
 
 
 @pytest.mark.slow
-def test_each_seed_is_the_run_that_it_would_be_alone(cli):
+def test_seed_of_study_equals_single_run(cli):
     several = cli("train", "cartpole", *SMALL, "--max-iterations", 4, "--seeds", "0..2", "--jobs", 2, "--json")
     assert several.code == 0, several.err
     study = study_folder()
@@ -80,18 +80,18 @@ def test_each_seed_is_the_run_that_it_would_be_alone(cli):
     assert named.code == 5
     assert "study of several runs" in named.err
     again = cli("train", "--resume", study, "--json")
-    assert again.code == 0, "a finished study is finished"
+    assert again.code == 0, "resuming a finished study does nothing"
     assert again.json["together"] == several.json["together"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_study_that_is_stopped_goes_on_where_it_was(start, cli, number):
+def test_stopped_study_resumes(start, cli, number):
     process = start("train", "cartpole", *SMALL, "--max-iterations", 60, "--seeds", "0..2", "--jobs", 2, "--json")
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline:
-        told = [file for file in Path("runs").glob("*/*/seed-*/metrics.jsonl") if file.stat().st_size]
-        if len(told) >= 2:
+        with_metrics = [file for file in Path("runs").glob("*/*/seed-*/metrics.jsonl") if file.stat().st_size]
+        if len(with_metrics) >= 2:
             break
         time.sleep(0.05)
     process.send_signal(number)
@@ -110,7 +110,7 @@ def test_a_study_that_is_stopped_goes_on_where_it_was(start, cli, number):
 
 
 @pytest.mark.slow
-def test_what_a_killed_study_has_started_stops_and_can_be_resumed(start):
+def test_killed_study_stops_its_trainings(start):
     process = start("train", "cartpole", *SMALL, "--max-iterations", 100_000, "--seeds", "0..1", "--jobs", 1)
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline and not any(
@@ -126,7 +126,7 @@ def test_what_a_killed_study_has_started_stops_and_can_be_resumed(start):
 
 
 @pytest.mark.slow
-def test_a_seed_that_goes_wrong_is_named_and_the_others_are_trained(cli):
+def test_failed_seed_is_named(cli):
     done = cli("train", "cartpole", *SMALL, "--max-iterations", 3, "--seeds", "0..1", "--name", "s", "--json")
     assert done.code == 0
     study = study_folder()
@@ -139,8 +139,8 @@ def test_a_seed_that_goes_wrong_is_named_and_the_others_are_trained(cli):
 
 
 @pytest.mark.slow
-def test_a_finished_study_is_trained_longer_when_a_new_budget_is_given(cli):
-    steady = (*SMALL, "agent.schedule=constant")  # another schedule knows where its budget ends
+def test_finished_study_continues_with_new_budget(cli):
+    steady = (*SMALL, "agent.schedule=constant")  # other schedules depend on the budget
     done = cli("train", "cartpole", *steady, "--max-iterations", 2, "--seeds", "4..5", "--jobs", 5, "--json")
     assert done.code == 0, done.err
     longer = cli("train", "--resume", study_folder(), "--max-iterations", 3, "--logger", "tensorboard", "--json")
@@ -148,23 +148,23 @@ def test_a_finished_study_is_trained_longer_when_a_new_budget_is_given(cli):
     alone = cli("train", "cartpole", *steady, "--max-iterations", 3, "--seed", 5, "--runs-dir", "alone", "--json")
     assert [row["step"] for row in longer.json["runs"]] == [3 * 32 * 16] * 2
     assert rows_of(study_folder() / "seed-5") == rows_of(Path(alone.json["run"]))
-    assert list((study_folder() / "seed-5").rglob("events.out.tfevents*")), "further options hold for each"
+    assert list((study_folder() / "seed-5").rglob("events.out.tfevents*")), "options apply to each run"
 
 
 @pytest.mark.slow
-def test_a_single_seed_is_a_study_without_an_interval(cli):
+def test_study_with_single_seed_has_no_interval(cli):
     done = cli("train", "cartpole", *SMALL, "--max-iterations", 2, "--seeds", "7..7", "--json")
     assert done.code == 0, done.err
     assert [(row["seed"], row["state"]) for row in done.json["runs"]] == [(7, "finished")]
     (run,) = list_runs(Path("runs"), "cartpole")
     assert run.folder == study_folder() / "seed-7"
-    told = cli("train", "--resume", study_folder())
-    assert told.code == 0
-    assert "nan" not in told.out
+    resumed = cli("train", "--resume", study_folder())
+    assert resumed.code == 0
+    assert "nan" not in resumed.out
 
 
 @pytest.mark.slow
-def test_a_full_disk_leaves_no_half_study(cli):
+def test_full_disk_leaves_no_partial_study(cli):
     small = Path("small")
     small.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "none", small], capture_output=True).returncode:
@@ -179,7 +179,7 @@ def test_a_full_disk_leaves_no_half_study(cli):
 
 
 @pytest.mark.slow
-def test_a_second_ctrl_c_ends_a_study_at_once_and_it_can_be_resumed(start, cli):
+def test_second_ctrl_c_ends_study_at_once(start, cli):
     process = start("train", "cartpole", *SMALL, "--max-iterations", 100_000, "--seeds", "0..1", "--jobs", 2)
     deadline = time.monotonic() + 120
     while (

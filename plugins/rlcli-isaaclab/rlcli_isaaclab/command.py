@@ -12,16 +12,24 @@ from rlcli.formats import Imported
 
 def import_run(
     env: Annotated[Path, typer.Argument(metavar="ENV.yaml", help="params/env.yaml of a run.")],
-    agent: Annotated[Path | None, typer.Argument(metavar="[AGENT.yaml]", help="params/agent.yaml of RSL-RL.")] = None,
+    agent: Annotated[Path | None, typer.Argument(metavar="AGENT.yaml", help="params/agent.yaml of RSL-RL.")] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Folder to write; a new one named after the task if left out."),
+        typer.Option("--output", "-o", metavar="FOLDER", help="Folder to write. [default: imported]"),
     ] = None,
     model: Annotated[
-        list[str] | None, typer.Option("--model", help="ENTITY=FILE.xml: the MJCF of a robot or object; repeatable.")
+        list[str] | None,
+        typer.Option("--model", metavar="ENTITY=FILE", help="MJCF model of a robot or object; repeatable."),
     ] = None,
 ) -> Imported:
-    """Import the settings of an Isaac Lab run. These are its env.yaml and agent.yaml."""
+    """Import the settings of an Isaac Lab run. These are its env.yaml and agent.yaml.
+
+    Examples:
+        rlcli import isaaclab env.yaml agent.yaml --model robot=robot.xml
+            Import a task and its agent, with the MJCF model of the robot.
+        rlcli import isaaclab env.yaml -o my_task --model robot=robot.xml
+            Import only the task, into another folder.
+    """
     from rlcli.errors import UsageError
     from rlcli_isaaclab.importer import convert
 

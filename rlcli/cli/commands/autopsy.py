@@ -1,10 +1,10 @@
-"""`rlcli autopsy`: how the episodes of a training ended that ended badly, or unlike the others."""
+"""`rlcli autopsy`: the recorded failed and outlier episodes of a training."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rlcli.cli.ui.console import console
-from rlcli.cli.ui.options import RunRef, RunsDir, TaskFolder, video_file
+from rlcli.cli.ui.options import RunRef, RunsDir, TaskFolder, choice, video_file
 from rlcli.errors import RlcliError, UsageError, require_known
 
 if TYPE_CHECKING:
@@ -22,21 +22,41 @@ if TYPE_CHECKING:
 
 _BARS = "▁▂▃▄▅▆▇█"
 _WIDTH = 48
-_SORTS = ("when", "return", "length", "kind")
-_MANY = 12
+"""Bars of one sparkline."""
+_SORT_KEYS: dict[str, Callable[[FailureCase], Any]] = {
+    "when": lambda case: 0,  # the cases are in the order of training; sorting is stable
+    "return": lambda case: case.episode.total_reward,
+    "length": lambda case: case.episode.length,
+    "kind": lambda case: (case.failure.kind, case.ended_by),
+}
+_MAX_COLUMNS = 12
+"""Columns of observations, actions or reward terms that are printed."""
 
 
 def command(
     run: RunRef,
-    case: Annotated[int | None, typer.Argument(help="Show this case, by its number in the list.", min=0)] = None,
-    sort: Annotated[str, typer.Option(help="Order of the list: when, return, length or kind.")] = "when",
-    steps: Annotated[int, typer.Option(min=1, help="How many last steps of a case to show.")] = 8,
-    video: Annotated[Path | None, typer.Option(help="Draw the case's last seconds to FILE.mp4 or FILE.gif.")] = None,
+    case: Annotated[int | None, typer.Argument(min=0)] = None,
+    sort: Annotated[str, choice("ORDER", *_SORT_KEYS)] = "when",
+    steps: Annotated[int, typer.Option(min=1)] = 8,
+    video: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
     task: TaskFolder = None,
     runs_dir: RunsDir = None,
 ) -> None:
-    """List or show how kept episodes ended."""
-    require_known(sort, _SORTS, "--sort", "orders")
+    """List or show the recorded failed and outlier episodes of a training.
+
+    Options:
+        case: Show this case, by its number in the list. [default: list all]
+        sort: Order of the list: when, return, length or kind.
+        steps: Number of last steps of a case to show.
+        video: Draw the last seconds of the case to FILE.mp4 or FILE.gif. Without FILE: autopsy.mp4.
+
+    Examples:
+        rlcli autopsy latest --sort return
+            List the recorded episodes of the newest run, worst return first.
+        rlcli autopsy latest 0 --video case.mp4
+            Show the first case and draw its last seconds.
+    """
+    require_known(sort, list(_SORT_KEYS), "--sort", "orders")
     if video is not None and case is None:
         raise UsageError("--video draws one case", hint="rlcli autopsy RUN N --video FILE.mp4")
     video = video_file(video, "autopsy.mp4")
@@ -57,22 +77,26 @@ def command(
     elif case < len(cases):
         _print_case(found, cases[case], case, steps, video, named)
     else:
-        hint = f"it has {len(cases)}, counted from 0" if cases else why_no_cases(found)
+        hint = f"it has {len(cases)} cases, counted from 0" if cases else why_no_cases(found)
         raise UsageError(f"no case {case} in {found.folder}", hint=hint)
 
 
 def _refuse_bundle(folder: str, case: int | None) -> None:
-    """A policy without its training has no episodes of it."""
+    """Explain that a bundle has no recorded episodes, because it has no training."""
     from rlcli.runs.bundle import open_bundle
 
     open_bundle(Path(folder))
     why = (
         f"it is a policy without its training; rlcli eval --checkpoint {folder} --record FILE --record-mode failed"
-        " keeps episodes of it"
+        " records its failed episodes"
     )
     if case is not None:
         raise UsageError(f"no case {case} in {folder}", hint=why)
-    console.info(f"no episode was kept: {why}")
+    _print_no_cases(folder, why)
+
+
+def _print_no_cases(folder: str, why: str) -> None:
+    console.info(f"no episode was recorded: {why}")
     console.document("autopsy", run=folder, cases=[], why_none=why)
 
 
@@ -80,21 +104,14 @@ def _print_list(run: Run, cases: list[FailureCase], sort: str) -> None:
     """Print a table of the cases."""
     from rlcli.replay.failure_cases import why_no_cases
 
-    keys: dict[str, Any] = {
-        "when": lambda case: 0,
-        "return": lambda case: case.episode.total_reward,
-        "length": lambda case: case.episode.length,
-        "kind": lambda case: (case.failure.kind, case.ended_by),
-    }
-    rows = sorted(enumerate(cases), key=lambda row: keys[sort](row[1]))
-    why_none = None if cases else why_no_cases(run)
-    if why_none is not None:
-        console.info(f"no episode was kept: {why_none}")
-    else:
-        columns = ["CASE", "ITERATION", "STEP", "ENV", "EPISODE", "LENGTH", "RETURN", "KEPT FOR", "ENDED BY", "HELD"]
-        console.table(columns, [[str(number), *_row(case)] for number, case in rows])
+    if not cases:
+        _print_no_cases(str(run.folder), why_no_cases(run))
+        return
+    rows = sorted(enumerate(cases), key=lambda row: _SORT_KEYS[sort](row[1]))
+    columns = ["CASE", "ITERATION", "STEP", "ENV", "EPISODE", "LENGTH", "RETURN", "KEPT FOR", "ENDED BY", "HELD"]
+    console.table(columns, [[str(number), *_row(case)] for number, case in rows])
     listed = [{"case": number, **case.record()} for number, case in rows]
-    console.document("autopsy", run=str(run.folder), cases=listed, why_none=why_none)
+    console.document("autopsy", run=str(run.folder), cases=listed, why_none=None)
 
 
 def _row(case: FailureCase) -> list[str]:
@@ -106,7 +123,7 @@ def _row(case: FailureCase) -> list[str]:
 def _print_case(
     run: Run, case: FailureCase, number: int, steps: int, video: Path | None, named: TaskSource | None
 ) -> None:
-    """Print one case; without the task's code, all but its contacts and pictures."""
+    """Print one case; contacts and pictures need the task's code."""
     from rlcli.replay.failure_cases import stage_case
 
     staged, error = None, None
@@ -127,7 +144,7 @@ def _print_case(
         from rlcli.viewer.replay_video import film_case
 
         frames, fps, backend = film_case(staged, video)
-        console.info(f"{frames} frames at {fps:g} a second, drawn with {backend}")
+        console.info(f"{frames} frames at {fps:g} per second, drawn with {backend}")
         console.data(str(video))
     if error is not None:
         console.info(f"no contacts: {error.message}{f'; {error.hint}' if error.hint else ''}")
@@ -152,24 +169,23 @@ def _print_facts(case: FailureCase, number: int) -> None:
         f"case {number}: environment {episode.env}, episode {episode.index}, ended in iteration {failure.iteration}"
         f" (step {failure.step}) after {episode.length} steps, {episode.length * step_dt:.3g} s"
     )
-    others = "" if usual is None else f"; half of the others: {usual[0]:.6g} .. {usual[1]:.6g}"
+    others = "" if usual is None else f"; middle half of other episodes: {usual[0]:.6g} .. {usual[1]:.6g}"
     console.data(f"return {episode.total_reward:.6g}{others}")
     console.data(f"kept for: {failure.kind}; ended by: {case.ended_by}")
     if case.world.diverged_at is not None:
         console.data(f"  {case.world.diverged_at}")
-    held = f"its last {episode.kept} steps, {case.seconds:.3g} s"
-    console.data(f"held: {held}; rlcli replay {case.trajectory.file} steps them again")
+    console.data(f"recorded: its last {episode.kept} steps, {case.seconds:.3g} s; rlcli replay {case.trajectory.file}")
 
 
 def _print_rewards(case: FailureCase) -> None:
-    """Print each reward term over the kept steps."""
+    """Print each reward term over the recorded steps."""
     console.data("")
     rows = []
     for name, values in [*case.columns("reward_terms").items(), ("reward", case.values("rewards"))]:
         numbers = (values.sum(), values.min(), values.max(), values[-1])
         rows.append([name, sparkline(values.tolist()), *(f"{x:.4g}" for x in numbers)])
     times = case.times
-    console.table(["REWARD A STEP", f"{times[0]:.3g} .. {times[-1]:.3g} s", "SUM", "MIN", "MAX", "LAST"], rows)
+    console.table(["REWARD PER STEP", f"{times[0]:.3g} .. {times[-1]:.3g} s", "SUM", "MIN", "MAX", "LAST"], rows)
 
 
 def _print_steps(case: FailureCase, steps: int) -> None:
@@ -177,16 +193,16 @@ def _print_steps(case: FailureCase, steps: int) -> None:
     kept, times = case.episode.kept, case.times
     last = range(max(0, kept - steps), kept)
     rows = [["", "end of step [s]", *(f"{times[i]:.4g}" for i in last)]]
-    left = 0
-    for word, part in (("saw", "observations"), ("did", "actions"), ("paid", "reward_terms")):
+    hidden = 0
+    for word, part in (("obs", "observations"), ("action", "actions"), ("reward", "reward_terms")):
         columns = list(case.columns(part).items())
-        rows += [[word, name, *(f"{values[i]:.4g}" for i in last)] for name, values in columns[:_MANY]]
-        left += len(columns[_MANY:])
-    rows.append(["paid", "reward", *(f"{case.values('rewards')[i]:.4g}" for i in last)])
+        rows += [[word, name, *(f"{values[i]:.4g}" for i in last)] for name, values in columns[:_MAX_COLUMNS]]
+        hidden += len(columns[_MAX_COLUMNS:])
+    rows.append(["reward", "total", *(f"{case.values('rewards')[i]:.4g}" for i in last)])
     console.data("")
     console.table(["", "", *(f"{i - kept + 1}" for i in last)], rows)
-    if left:
-        console.info(f"{left} further columns are in --json")
+    if hidden:
+        console.info(f"--json has {hidden} more columns")
 
 
 def _print_contacts(contacts: Sequence[Contact]) -> None:
@@ -194,14 +210,14 @@ def _print_contacts(contacts: Sequence[Contact]) -> None:
     if not contacts:
         console.data("contacts at the end: none")
         return
-    rows = [[*c.geoms, f"{1e3 * c.distance:.3f}", f"{c.force:.4g}"] for c in contacts[: 2 * _MANY]]
+    rows = [[*c.geoms, f"{1e3 * c.distance:.3f}", f"{c.force:.4g}"] for c in contacts[: 2 * _MAX_COLUMNS]]
     console.table(["CONTACT AT THE END", "", "DISTANCE [mm]", "FORCE [N]"], rows)
-    if len(contacts) > 2 * _MANY:
-        console.info(f"{len(contacts) - 2 * _MANY} further contacts are in --json")
+    if len(contacts) > 2 * _MAX_COLUMNS:
+        console.info(f"--json has {len(contacts) - 2 * _MAX_COLUMNS} more contacts")
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
-    """Values as bars of eight heights, neighbours averaged where there are more than columns; `?` is not finite."""
+    """Draw values as bars of eight heights; average neighbours if there are more than `width`; `?` is not finite."""
     if len(values) > width:
         edges = [round(i * len(values) / width) for i in range(width + 1)]
         values = [sum(values[a:b]) / (b - a) for a, b in itertools.pairwise(edges)]

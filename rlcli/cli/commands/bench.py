@@ -1,4 +1,4 @@
-"""`rlcli bench TASK`: how fast it steps and trains here, and with which sizes and threads it trains soonest."""
+"""`rlcli bench`: speed of a task on this machine, and the sizes and threads with the fastest iterations."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from rlcli.config.load import Resolved
     from rlcli.tuning.bench import Bench, Findings, Stepped, Trained
 
-_BUSY = 0.5
-"""Processes a core that want to run before anything is measured: more is said."""
+_MAX_LOAD = 0.5
+"""Load per core before the measurements [processes] above which a warning is printed."""
 
 
 def command(
@@ -30,13 +30,23 @@ def command(
     agent: Agent = None,
     num_envs: NumEnvs = None,
     config: ConfigFile = None,
-    save_preset: Annotated[
-        str | None, typer.Option(metavar="FILE|NAME", help="Write what is recommended, for train --config.")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="The preset may replace a file.")] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="A first impression: short, and once.")] = False,
+    save_preset: Annotated[str | None, typer.Option(metavar="FILE|NAME")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
+    quick: Annotated[bool, typer.Option("--quick")] = False,
 ) -> None:
-    """Measure a task here, and recommend sizes and threads."""
+    """Measure the speed of a task on this machine, and recommend sizes and threads for its training.
+
+    Options:
+        save_preset: Write the recommended settings to FILE.yaml, or to NAME.yaml here, for train --config.
+        overwrite: Allow --save-preset to replace a file.
+        quick: Measure shortly and once, for a first impression.
+
+    Examples:
+        rlcli bench cartpole --quick
+            Get a first impression of the speed.
+        rlcli bench cartpole --save-preset fast.yaml
+            Write the recommended settings, for: rlcli train --config fast.yaml
+    """
     from rlcli.config.layers import flags
     from rlcli.config.load import resolve
     from rlcli.machine import limit_openmp_spinning
@@ -47,16 +57,16 @@ def command(
     source = named_task(task)
 
     def resolved(changes: Mapping[str, Any]) -> Resolved:
-        given = {**flags(scene__num_envs=num_envs), **changes}
-        return resolve(source, agent=agent, config_file=config, overrides=overrides or [], flags=given)
+        settings = {**flags(scene__num_envs=num_envs), **changes}
+        return resolve(source, agent=agent, config_file=config, overrides=overrides or [], flags=settings)
 
-    wanted = resolved({})
-    wanted.require_agent()
-    log_notes(wanted.notes)
+    present = resolved({})
+    present.require_agent()
+    log_notes(present.notes)
 
     from rlcli.tuning.bench import QUICK, Bench, Pace
 
-    machine = _machine(wanted)
+    machine = _machine(present)
     stopped = False
     with _View(f"rlcli bench {source.name}") as view:
         bench = Bench(resolved, QUICK if quick else Pace(), view.announce, view.show)
@@ -64,9 +74,9 @@ def command(
             bench.run()
         except KeyboardInterrupt:
             stopped = True
-    _report(bench, wanted, machine, file, f"rlcli train {task}", names_agent=agent is not None, stopped=stopped)
+    _report(bench, present, machine, file, f"rlcli train {task}", names_agent=agent is not None, stopped=stopped)
     if stopped:
-        raise Stopped("stopped; what had been measured is shown, and no preset was written", exit_code=130)
+        raise Stopped("stopped; the measurements so far are shown, and no preset was written", exit_code=130)
 
 
 def _report(
@@ -88,7 +98,7 @@ def _report(
     for line in explanation(findings):
         console.data(line)
     if findings.unsteady:
-        console.warn("measurements differ from one repeat to the next: something else runs on this machine")
+        console.warn("repeated measurements differ: other programs run on this machine")
     changes = None if findings.recommended is None else bench.changes(findings.recommended.setting)
     if changes is not None and file is not None:
         write_atomic(file, bench_preset(resolved, changes, findings, machine, names_agent))
@@ -108,15 +118,15 @@ def _report(
     )
 
 
-def _preset_file(word: str, overwrite: bool) -> Path:
-    """Where the preset goes: FILE, or NAME.yaml here.
+def _preset_file(name: str, overwrite: bool) -> Path:
+    """Return the file of the preset: FILE, or NAME.yaml in the current folder.
 
     Raises:
-        UsageError: if something is there that may not be replaced.
-        MachineError: if there is no such folder, or it cannot be written.
+        UsageError: if the file exists and may not be replaced.
+        MachineError: if the folder does not exist or cannot be written.
     """
-    file = Path(word)
-    if not word or file.name in ("", ".."):
+    file = Path(name)
+    if not name or file.name in ("", ".."):
         raise UsageError("--save-preset needs the name of a file", hint="--save-preset cartpole.yaml")
     if file.suffix not in (".yaml", ".yml"):
         file = file.with_name(f"{file.name}.yaml")
@@ -124,7 +134,7 @@ def _preset_file(word: str, overwrite: bool) -> Path:
     if file.is_dir():
         raise UsageError(f"--save-preset {file} is a folder", hint=f"give a file: {file / 'preset.yaml'}")
     if os.path.lexists(file) and not overwrite:
-        raise UsageError(f"--save-preset: {file} exists", hint="another name, or --overwrite")
+        raise UsageError(f"--save-preset: {file} exists", hint="choose another name, or add --overwrite")
     if not folder.is_dir():
         raise MachineError(f"--save-preset: there is no folder {folder}")
     if not os.access(folder, os.W_OK):
@@ -140,8 +150,8 @@ def _machine(resolved: Resolved) -> dict[str, Any]:
     from rlcli.tuning.bench import load
 
     cores, busy = available_cores(), load()
-    if busy is not None and busy > _BUSY * cores:
-        console.warn(f"the machine is busy (load {busy:.1f} on {cores} cores): figures will vary")
+    if busy is not None and busy > _MAX_LOAD * cores:
+        console.warn(f"the machine is busy (load {busy:.1f} on {cores} cores): measurements will vary")
     return {
         "cpu": processor()["model"],
         "cores": cores,
@@ -155,89 +165,75 @@ def _machine(resolved: Resolved) -> dict[str, Any]:
 def _show(findings: Findings, horizon: str) -> None:
     if findings.stepped:
         columns = ["ENVS", "THREADS", "STEPS/S", "PHYSICS", "SPREAD", "MEMORY", ""]
-        console.table(columns, [_stepped(row) for row in findings.stepped], "environment, random actions")
+        console.table(columns, [_step_cells(row) for row in findings.stepped], "environment, random actions")
     if findings.trained:
         shares = list(dict.fromkeys(name for row in findings.trained for name in row.shares))
         columns = ["ENVS", horizon, "MINIBATCHES", "ENGINE", "TORCH", "MS", "STEPS/S", *map(str.upper, shares)]
-        rows = [_trained(row, shares) for row in findings.trained]
+        rows = [_training_cells(row, shares) for row in findings.trained]
         console.data("")
-        console.table([*columns, "SPREAD", "MEMORY", ""], rows, "training, an iteration")
+        console.table([*columns, "SPREAD", "MEMORY", ""], rows, "training, one iteration")
         console.data("")
 
 
-def _stepped(row: Stepped) -> list[str]:
+def _step_cells(row: Stepped) -> list[str]:
     return [
         f"{row.num_envs:,}",
         str(row.engine_threads),
         cell(row.steps_per_s, ",.0f"),
         cell(row.physics, ".0%"),
-        cell(row.spread, ".0%"),
-        _memory(row.resident),
-        f"left out: {row.left_out}" if row.left_out else "",
+        *_last_cells(row, ""),
     ]
 
 
-def _trained(row: Trained, shares: Sequence[str]) -> list[str]:
+def _training_cells(row: Trained, shares: Sequence[str]) -> list[str]:
     setting = row.setting
-    remark = f"left out: {row.left_out}" if row.left_out else "" if row.alike else "learns otherwise"
-    return [
-        f"{setting.num_envs:,}",
-        cell(setting.horizon),
-        cell(setting.minibatches),
-        str(setting.engine_threads),
-        str(setting.torch_threads),
-        cell(row.milliseconds, ".4g"),
-        cell(row.steps_per_s, ",.0f"),
-        *(cell(row.shares.get(name), ".0%") for name in shares),
-        cell(row.spread, ".0%"),
-        _memory(row.resident),
-        remark,
-    ]
+    sizes = [cell(setting.num_envs, ","), cell(setting.horizon), cell(setting.minibatches)]
+    threads = [str(setting.engine_threads), str(setting.torch_threads)]
+    times = [cell(row.milliseconds, ".4g"), cell(row.steps_per_s, ",.0f")]
+    times += [cell(row.shares.get(name), ".0%") for name in shares]
+    return [*sizes, *threads, *times, *_last_cells(row, "" if row.alike else "learns differently")]
 
 
-def _memory(count: int | None) -> str:
-    return "-" if count is None else f"{count / 2**20:,.0f} MB"
+def _last_cells(row: Stepped | Trained, remark: str) -> list[str]:
+    memory = "-" if row.resident is None else f"{row.resident / 2**20:,.0f} MB"
+    return [cell(row.spread, ".0%"), memory, f"left out: {row.left_out}" if row.left_out else remark]
 
 
 class _View(LiveView):
-    """View of the measurements so far: a block that grows on a terminal, else lines."""
+    """View of the measurements so far: a growing block on a terminal, else lines."""
 
     def __init__(self, title: str) -> None:
         super().__init__(refresh_per_second=4, transient=True)
-        self._title, self._doing = title, ""
-        self._lines: list[list[str]] = []
+        self._title, self._current = title, ""
+        self._rows: list[list[str]] = []
 
-    def announce(self, doing: str) -> None:
+    def announce(self, current: str) -> None:
         """Show what is measured next."""
-        self._doing = doing
+        self._current = current
         self._draw()
 
     def show(self, findings: Findings) -> None:
         """Show the rows so far."""
-        rows = [_progress(*_stepped(row)[:6]) for row in findings.stepped]
-        for one in findings.trained:
-            setting, ms = one.setting, cell(one.milliseconds, ".4g", " ms")
+        rows = [_step_parts(row) for row in findings.stepped]
+        for row in findings.trained:
+            setting, ms = row.setting, cell(row.milliseconds, ".4g", " ms")
             steps = [] if setting.horizon is None else [f"{setting.horizon} steps"]
             threads = f"threads {setting.engine_threads}, {setting.torch_threads}"
             rows.append([f"{setting.num_envs:,} envs", *steps, threads, ms])
-        if self._live is None and len(rows) > len(self._lines):
+        if self._live is None and len(rows) > len(self._rows):
             console.info("  ".join(rows[-1]))
-        self._lines = rows
+        self._rows = rows
         self._draw()
 
     def _draw(self) -> None:
-        if self._live is None:
-            return
-        from rich.text import Text
-
-        width = self._live.console.width
-        lines = [line for row in self._lines for line in flow(row, width)]
-        room = max(4, self._live.console.height - 4)
-        text = "\n".join([plain(self._title), *lines[-room:], *flow([f"... {self._doing}"], width)])
-        self._live.update(Text(text))
+        if self._live is not None:
+            width, max_lines = self._live.console.width, max(4, self._live.console.height - 4)
+            lines = [line for row in self._rows for line in flow(row, width)]
+            self.update([plain(self._title), *lines[-max_lines:], *flow([f"... {self._current}"], width)])
 
 
-def _progress(envs: str, threads: str, rate: str, physics: str, spread: str, memory: str) -> list[str]:
-    if rate == "-":
+def _step_parts(row: Stepped) -> list[str]:
+    envs, threads, rate, physics, spread, memory, _ = _step_cells(row)
+    if row.steps_per_s is None:
         return [f"{envs} envs", "left out"]
     return [f"{envs} envs", f"threads {threads}", f"{rate} steps/s", f"physics {physics}", f"spread {spread}", memory]

@@ -1,4 +1,4 @@
-"""`rlcli check TASK`: the contract kit, as a table of checks and a list of findings."""
+"""`rlcli check`: the contract tests of a task."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rlcli.cli.ui.console import console
-from rlcli.cli.ui.findings import count_errors, result_of, show_findings
+from rlcli.cli.ui.findings import report_findings
 from rlcli.cli.ui.options import Agent, Overrides, TaskName
 
 if TYPE_CHECKING:
@@ -18,13 +18,22 @@ if TYPE_CHECKING:
 def command(
     task: TaskName,
     overrides: Overrides = None,
-    only: Annotated[list[str] | None, typer.Option(help="Run only this check; repeatable.")] = None,
-    record: Annotated[
-        bool, typer.Option("--record-layout", help="Write down the columns of observations and actions, for `layout`.")
-    ] = False,
+    only: Annotated[list[str] | None, typer.Option(metavar="CHECK")] = None,
+    record: Annotated[bool, typer.Option("--record-layout")] = False,
     agent: Agent = None,
 ) -> None:
-    """Check that a task keeps its contract."""
+    """Check that a task keeps the contract of rlcli: shapes, seeds, resets, rewards, devices.
+
+    Options:
+        only: Run only this check; repeatable.
+        record: Write the columns of observations and actions to a file in the task, for the check `layout`.
+
+    Examples:
+        rlcli check cartpole
+            Run all checks on an installed task.
+        rlcli check ./my_task --only partial-reset
+            Run one check on a task in a folder.
+    """
     from rlcli.runs.trusted_tasks import named_task
 
     named_task(task)  # a missing task is reported before anything heavy is imported
@@ -45,10 +54,4 @@ def command(
         on_check=lambda name, found: checks.append((name, found)),
         on_note=notes.__setitem__,
     )
-    show_findings(task, "CHECK", checks, findings, notes)
-    passed = count_errors(findings) == 0
-    results = [{"name": name, "result": result_of(found), "note": notes.get(name)} for name, found in checks]
-    entries = [asdict(finding) for finding in findings]
-    console.document("check", task=task, passed=passed, checks=results, findings=entries)
-    if not passed:
-        raise typer.Exit(9)
+    report_findings("check", task, "check", checks, [asdict(finding) for finding in findings], notes=notes)

@@ -1,4 +1,4 @@
-"""`rlcli diff`: where two runs first part, read from their files; or in what two configurations differ."""
+"""`rlcli diff`: the first difference of two runs, or all differences of two configurations."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rlcli.cli.ui.completion import runs_and_tasks, words
+from rlcli.cli.ui.completion import runs_and_tasks
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.difference_table import report_differences
-from rlcli.cli.ui.options import Agent, RunsDir
+from rlcli.cli.ui.options import Agent, RunsDir, choice
 from rlcli.errors import CheckpointError, TaskError, UsageError, did_you_mean, listing, require_known
 from rlcli.registry import TASKS, catalog, task_source
 
@@ -19,30 +19,34 @@ if TYPE_CHECKING:
     from rlcli.runs.run import Run
 
 Side = tuple[str, list[str]]
-"""What is compared, and the overrides that stand after it."""
+"""A run or a task, and its overrides."""
 
 
 def command(
     words: Annotated[
         list[str],
-        typer.Argument(
-            autocompletion=runs_and_tasks,
-            metavar="A [KEY.PATH=VALUE]... [B [KEY.PATH=VALUE]...]",
-            help="Each a run (RUN, RUN@step:N, RUN@best, a checkpoint, latest), or a task (a name, a folder, a YAML"
-            " file) with the overrides after it. One task with overrides is compared with itself without them.",
-        ),
+        typer.Argument(autocompletion=runs_and_tasks, metavar="A [KEY.PATH=VALUE]... [B [KEY.PATH=VALUE]...]"),
     ],
     only: Annotated[
-        list[str] | None,
-        typer.Option(
-            autocompletion=words("configuration", "environment", "metrics", "weights", "policy"),
-            help="Of runs: configuration, environment, metrics, weights or policy; repeatable.",
-        ),
+        list[str] | None, choice("PART", "configuration", "environment", "metrics", "weights", "policy")
     ] = None,
     agent: Agent = None,
     runs_dir: RunsDir = None,
 ) -> None:
-    """Tell where two runs or configurations differ. Of each key: physics, MDP, agent or cosmetic."""
+    """Show the differences of two runs or configurations. Each key belongs to physics, MDP, agent or cosmetic.
+
+    Options:
+        words: Each side is a run (RUN, RUN@step:N, RUN@best, a checkpoint folder, latest), or a task (a name, a
+            folder, a YAML file) with its overrides. One task with overrides is compared with the task itself.
+        only: Compare only this part of two runs: configuration, environment, metrics, weights or policy;
+            repeatable.
+
+    Examples:
+        rlcli diff cartpole sim.dt=0.005
+            Show what an override changes.
+        rlcli diff latest 2026-01-31_12-00-00 --only metrics
+            Find the first iteration in which the metrics of two runs differ.
+    """
     from rlcli.runs.run_diff import SECTIONS
     from rlcli.runs.run_ref import default_runs_dir
 
@@ -54,11 +58,11 @@ def command(
     try:
         if one is None and other is None:
             if agent is not None:
-                raise UsageError("--agent is of tasks; a run has the agent that it was trained with")
+                raise UsageError("--agent applies to tasks; a run keeps the agent of its training")
             equal = _compare_runs(left[0], right[0], runs, only)
         else:
             if only:
-                raise UsageError("--only is of two runs; of a task there is the configuration alone")
+                raise UsageError("--only applies to two runs; a task has only a configuration")
             both = (one or _find(left[0], runs)[0], other or _find(right[0], runs)[0])
             equal = _compare_configurations(*both, left, right)
     except RecursionError:
@@ -68,7 +72,7 @@ def command(
 
 
 def _sides(words: list[str]) -> tuple[Side, Side]:
-    """What stands on the command line, with each one's overrides."""
+    """Split the command line into two sides, each with its overrides."""
     sides: list[Side] = []
     for word in words:
         if "=" not in word or Path(word).exists():
@@ -76,40 +80,38 @@ def _sides(words: list[str]) -> tuple[Side, Side]:
         elif sides:
             sides[-1][1].append(word)
         else:
-            raise UsageError(f"what is '{word}' an override of?", hint="rlcli diff TASK key.path=value")
+            raise UsageError(f"the override '{word}' comes before any task", hint="rlcli diff TASK key.path=value")
     if len(sides) == 1 and sides[0][1]:
         sides.insert(0, (sides[0][0], []))
     if len(sides) != 2:
-        found = ", ".join(name for name, _ in sides)
-        raise UsageError(
-            f"two are compared, found {len(sides)}: {found}", hint="rlcli diff A B, or TASK key.path=value"
-        )
+        found = f"found {len(sides)}: {', '.join(name for name, _ in sides)}"
+        raise UsageError(f"two runs or tasks are compared, {found}", hint="rlcli diff A B, or TASK key.path=value")
     return sides[0], sides[1]
 
 
 def _task(side: Side, agent: str | None) -> Resolved | None:
-    """The task that is meant; None if it is a run."""
+    """Return the configuration of a task; None if the side is a run."""
     from rlcli.config.load import resolve
     from rlcli.runs.run import RECORD
 
     name, overrides = side
-    place = Path(name)
-    offered = any(name in (entry.name, entry.qualified) for entry in catalog(TASKS)[0])
-    is_run = not offered and ("@" in name or (place / RECORD).is_file() or (place / "manifest.json").is_file())
+    path = Path(name)
+    installed = any(name in (entry.name, entry.qualified) for entry in catalog(TASKS)[0])
+    is_run = not installed and ("@" in name or (path / RECORD).is_file() or (path / "manifest.json").is_file())
     if not is_run:
         try:
             return resolve(task_source(name), agent=agent, overrides=overrides)
         except TaskError:
-            looks_like_task = offered or place.suffix in (".yaml", ".yml", ".py") or (place / "task.yaml").exists()
+            looks_like_task = installed or path.suffix in (".yaml", ".yml", ".py") or (path / "task.yaml").exists()
             if looks_like_task or (overrides and name != "latest"):
                 raise
     if overrides:
-        raise UsageError(f"{name} is a run, which has no overrides: {' '.join(overrides)}")
+        raise UsageError(f"{name} is a run; overrides apply only to tasks: {' '.join(overrides)}")
     return None
 
 
 def _compare_configurations(one: Resolved | Run, other: Resolved | Run, left: Side, right: Side) -> bool:
-    """Compare what two tasks, or a task and a run, resolve to, and their models and code."""
+    """Compare the resolved configurations, the models and the code of two tasks, or of a task and a run."""
     from rlcli.runs.config_diff import Values, compare_files, compare_values
     from rlcli.runs.provenance import sources
     from rlcli.runs.run import Run
@@ -142,13 +144,13 @@ def _compare_runs(left: str, right: str, runs: Path, only: list[str] | None) -> 
 
 
 def _find(reference: str, runs: Path) -> tuple[Run, int | None]:
-    """A run, and the step of the checkpoint if one is named."""
+    """Return a run, and the step of its checkpoint if the reference names one."""
     from rlcli.runs.run_ref import find_checkpoint, find_run, is_checkpoint_ref
 
     if is_checkpoint_ref(reference):
         run, folder, _ = find_checkpoint(reference, runs)
         if not folder.resolve().name.isdecimal():
-            raise CheckpointError(f"{folder} is not named by its step, as a run's checkpoints are")
+            raise CheckpointError(f"{folder} is not the checkpoint of a run: its name is not a step")
         return run, int(folder.resolve().name)
     try:
         run, why = find_run(reference, runs)

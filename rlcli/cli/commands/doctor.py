@@ -1,4 +1,4 @@
-"""`rlcli doctor`: what works here and what does not, of the machine, the installation and every plugin."""
+"""`rlcli doctor`: checks of the machine, the installation and the plugins."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ def command(
     timeout: ProbeTimeout = TIMEOUT_S,
     runs_dir: RunsDir = None,
 ) -> None:
-    """Tell what works here and how to mend the rest. Every part and plugin is looked at; for bug reports."""
+    """Check the installation, the machine and all plugins, and show how to repair what does not work.
+
+    Examples:
+        rlcli doctor
+            Print a table of all checks, with hints.
+        rlcli doctor --json
+            Print the same as JSON, for a bug report.
+    """
     from rlcli.doctor import run_checks
     from rlcli.runs.run_ref import default_runs_dir
 

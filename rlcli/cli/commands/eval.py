@@ -1,4 +1,4 @@
-"""`rlcli eval`: how good a policy is, with intervals, and whether it is good enough."""
+"""`rlcli eval`: evaluation of a policy with confidence intervals and limits, or comparison of several."""
 
 from __future__ import annotations
 
@@ -20,30 +20,12 @@ if TYPE_CHECKING:
 def command(
     task: options.TaskOfPolicy = None,
     overrides: options.Overrides = None,
-    compare: Annotated[
-        bool,
-        typer.Option(
-            "--compare",
-            help="RUN1 RUN2 [...] in the same episodes: eval --compare A B; beside a run also shipped, lqr, zero or"
-            " random. --fail-under and --fail-over are of the first.",
-        ),
-    ] = False,
+    compare: Annotated[bool, typer.Option("--compare")] = False,
     checkpoint: options.CheckpointRef = None,
     policy: options.Policy = "trained",
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes to run, each environment's first ones.")] = 200,
-    fail_under: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="success=0.99, return=4, length=250, reward_terms.NAME=X, terminations.NAME=X, or a value of the task"
-            " (speed=5): exit 9 below; success.low=0.99 and the like: of the interval's lower end; repeatable."
-        ),
-    ] = None,
-    fail_over: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="The same names, error_vel_xy=0.25: exit 9 above; KEY.high=X: of the interval's upper end; repeatable."
-        ),
-    ] = None,
+    episodes: Annotated[int, typer.Option(min=1)] = 200,
+    fail_under: Annotated[list[str] | None, typer.Option(metavar="KEY=X")] = None,
+    fail_over: Annotated[list[str] | None, typer.Option(metavar="KEY=X")] = None,
     stochastic: options.Stochastic = False,
     record: options.Record = None,
     record_mode: options.RecordMode = "all",
@@ -53,7 +35,22 @@ def command(
     runs_dir: options.RunsDir = None,
     headless: options.Headless = True,
 ) -> None:
-    """Evaluate a policy."""
+    """Evaluate a policy over many episodes, with confidence intervals.
+
+    Options:
+        compare: Compare several runs in the same episodes: eval --compare RUN1 RUN2. Further policies: shipped,
+            lqr, zero, random. Limits apply to the first.
+        episodes: Number of episodes; the first ones of each environment count.
+        fail_under: Exit with code 9 if a mean is below X. Keys: success, return, length, reward_terms.NAME,
+            terminations.NAME, a value of the task (speed); KEY.low is the lower end of the interval; repeatable.
+        fail_over: Exit with code 9 if a mean is above X. The same keys; KEY.high is the upper end; repeatable.
+
+    Examples:
+        rlcli eval cartpole --fail-under success.low=0.95
+            Evaluate the newest run; fail if its success rate may be below 95 %.
+        rlcli eval --compare latest shipped --episodes 500
+            Compare the newest run with the policy that its task ships.
+    """
     from rlcli.cli.ui.evaluation_tables import show_summary
     from rlcli.evaluation import session as sessions
     from rlcli.evaluation.limits import failures, read_limits, require_success
@@ -64,7 +61,7 @@ def command(
     )
     if compare:
         if checkpoint is not None or policy != "trained" or record is not None:
-            raise UsageError("--compare takes its policies as words: eval --compare RUN1 RUN2")
+            raise UsageError("--compare takes policies as arguments only", hint="rlcli eval --compare RUN1 RUN2")
         _compare(request, episodes, limits)
         return
     sessions.check_record(record, record_mode)
@@ -79,7 +76,7 @@ def command(
 
 
 def _compare(request: PolicyRequest, episodes: int, limits: Sequence[Limit]) -> None:
-    """Compare the policies that stand where a task and its overrides would."""
+    """Compare the policies that are given as arguments, in the place of a task and its overrides."""
     from rlcli.cli.ui.evaluation_tables import show_comparison
     from rlcli.evaluation.comparison import compare, find_policies
     from rlcli.evaluation.limits import failures, require_success
@@ -94,8 +91,8 @@ def _compare(request: PolicyRequest, episodes: int, limits: Sequence[Limit]) -> 
     failed = failures(comparison.summaries[0], limits)
     task = resolved.task
     console.data(
-        f"{resolved.source.name}: {episodes} episodes each, seed {request.seed}, the same ones;"
-        f" {task.max_episode_length} steps of {task.step_dt:.6g} s at most{''.join(f', {word}' for word in overrides)}"
+        f"{resolved.source.name}: the same {episodes} episodes for each, seed {request.seed};"
+        f" at most {task.max_episode_length} steps of {task.step_dt:.6g} s{''.join(f', {word}' for word in overrides)}"
     )
     show_comparison(comparison)
     console.document("eval", overrides=overrides, **comparison.record(), passed=not failed, failures=failed)

@@ -1,4 +1,4 @@
-"""`rlcli export`: a trained policy as one file for a robot, checked against the policy and, if asked, in MuJoCo."""
+"""`rlcli export`: write a trained policy as one file for a robot, and verify the file in plain MuJoCo."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from rlcli.runs.policy_ref import Choice
     from rlcli.runs.run import Run
 
-_MOST_PLACES = 10
-"""Differences of the metadata that are printed."""
+_MAX_KEYS = 10
+"""Differing keys of the metadata that are printed."""
 
 
 def command(
@@ -27,33 +27,37 @@ def command(
     checkpoint: CheckpointRef = None,
     format_: Annotated[
         str,
-        typer.Option(
-            "--format",
-            autocompletion=words("onnx", "torch", "numpy", "bundle"),
-            help="onnx, torch (a torch.export program), numpy, or bundle (a folder for rlcli itself).",
-        ),
+        typer.Option("--format", autocompletion=words("onnx", "torch", "numpy", "bundle"), metavar="FORMAT"),
     ] = "onnx",
-    output: Annotated[
-        Path | None,
-        typer.Option(help="File (or folder of a bundle) to write; else RUN/exports/policy.onnx, .pt2, .py or policy."),
-    ] = None,
-    verify: Annotated[
-        bool,
-        typer.Option("--verify", help="Let the file drive plain MuJoCo; writes the model and run_policy.py beside it."),
-    ] = False,
-    episodes: Annotated[int, typer.Option(min=1, help="With --verify: how many to live through.")] = 64,
+    output: Annotated[Path | None, typer.Option()] = None,
+    verify: Annotated[bool, typer.Option("--verify")] = False,
+    episodes: Annotated[int, typer.Option(min=1)] = 64,
     runs_dir: RunsDir = None,
 ) -> None:
-    """Export a trained policy."""
+    """Export a trained policy to a file for a robot, or to a bundle for rlcli.
+
+    Options:
+        format_: onnx, torch (a torch.export program), numpy, or bundle (a folder for rlcli).
+        output: File to write, or folder of a bundle. [default: exports/policy.onnx, .pt2, .py or policy in the run]
+        verify: Run the exported file in plain MuJoCo and compare it with the run's evaluation; also write the model
+            and run_policy.py beside the file.
+        episodes: Number of episodes of --verify.
+
+    Examples:
+        rlcli export cartpole --verify
+            Export the newest policy of cartpole to ONNX and verify it.
+        rlcli export --checkpoint latest@best --format numpy --output policy.py
+            Export the best checkpoint of the newest run to one Python file.
+    """
     from rlcli.deploy.export import BUNDLE, check_target, export
     from rlcli.runs.checkpoint import open_checkpoint
     from rlcli.runs.run_ref import default_runs_dir
 
     if task is None and checkpoint is None:
-        raise UsageError("export what?", hint="a TASK, or --checkpoint RUN|latest")
+        raise UsageError("no task or checkpoint given", hint="rlcli export TASK, or --checkpoint RUN|latest")
     check_target(format_, output)
     if format_ == BUNDLE and verify:
-        raise UsageError("--verify is of the formats that do without rlcli", hint="--format onnx, torch or numpy")
+        raise UsageError("--verify needs a format that runs without rlcli", hint="--format onnx, torch or numpy")
     choice = _find(checkpoint, runs_dir or default_runs_dir(), task)
     file = output or _default_file(choice, format_)
     console.info(f"checkpoint {choice.folder} ({choice.why})")
@@ -63,9 +67,7 @@ def command(
         return
     reference = _open_reference(choice, saved, file, task) if verify else None
     done = export(saved, file, format_, None if reference is None else reference.deployment)
-    console.info(
-        f"equal to the policy on {done.observations} observations: difference {done.max_difference:.1e} at most"
-    )
+    console.info(f"equal to the policy on {done.observations} observations: difference <= {done.max_difference:.1e}")
     verdict = None if reference is None else _verify(reference, saved, done.file, format_, episodes)
     entries = {"observations": done.observations, "max_difference": done.max_difference, "metadata": done.metadata}
     verified = None if verdict is None else verdict.record()
@@ -79,7 +81,7 @@ def _default_file(choice: Choice, format_: str) -> Path:
     from rlcli.runs.run import require_own
 
     if choice.run is None:
-        raise UsageError(f"{choice.folder} lies outside a run", hint="say where to write with --output FILE")
+        raise UsageError(f"{choice.folder} is not in a run", hint="name the file with --output FILE")
     require_own(choice.run, "exports")
     return choice.run.folder / "exports" / f"policy{FORMATS.get(format_, '')}"
 
@@ -90,27 +92,26 @@ def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | N
     from rlcli.runs.trusted_tasks import named_task
 
     if choice.run is None and choice.bundle is None:
-        raise UsageError(f"{choice.folder} lies outside a run", hint="--verify needs the run's configuration")
+        raise UsageError(f"{choice.folder} is not in a run", hint="--verify needs the run's configuration")
     check_overwrites(file)
     return open_reference(choice, saved, None if task is None else named_task(task))
 
 
 def _verify(reference: ReferenceEnv, saved: Checkpoint, file: Path, format_: str, episodes: int) -> ClosedLoopResult:
-    """Run the file in plain MuJoCo, and print what was found."""
+    """Run the file in plain MuJoCo, and print the comparison with the evaluation."""
     from rlcli.deploy.closed_loop import verify
 
     verdict = verify(reference, saved, file, format_, episodes)
-    for what, terms in (("the metadata", verdict.by_metadata), ("the task's own code", verdict.by_task)):
+    for source, terms in (("the metadata", verdict.by_metadata), ("the task's own code", verdict.by_task)):
         if terms:
-            console.info(f"closed by {what}: {', '.join(terms)}")
+            console.info(f"computed by {source}: {', '.join(terms)}")
     rows = [
-        [what, f"{found:.2e}", f"{allowed:g}", "holds" if held else "FAILS"]
-        for what, found, allowed, held in verdict.rows()
+        [name, f"{found:.2e}", f"{allowed:g}", "holds" if held else "FAILS"]
+        for name, found, allowed, held in verdict.rows()
     ]
     console.table(["", "FOUND", "ALLOWED", ""], rows)
     if verdict.differing:
-        places = listing(verdict.differing[:_MOST_PLACES])
-        console.info(f"the metadata says something else than the task of {places}")
+        console.info(f"metadata and task differ in {listing(verdict.differing[:_MAX_KEYS])}")
     console.info(
         f"{verdict.episodes} episodes, mean return {verdict.plain_return:.6g} in plain MuJoCo,"
         f" {verdict.evaluation_return:.6g} in the run's evaluation"
@@ -130,23 +131,23 @@ def _report(checkpoint: Path, format_: str, file: Path, size: int, **entries: An
 
 
 def _export_bundle(saved: Checkpoint, run: Run | None, output: Path) -> None:
-    """Write a folder for rlcli itself, with the evaluation of the checkpoint that the run holds."""
+    """Write a bundle for rlcli, with the saved evaluation of the checkpoint if the run has one."""
     from rlcli.runs.bundle import check_bundle_target, write_bundle
     from rlcli.runs.eval_store import read_evaluation
 
     check_bundle_target(output)
     evaluation = None if run is None else read_evaluation(run, saved.folder.name)
     if run is not None and evaluation is None:
-        console.info(f"the bundle will not say how good it is: rlcli eval --checkpoint {saved.folder} was not run")
-    made = write_bundle(saved, output, run, evaluation)
-    size = sum(file.stat().st_size for file in made.folder.iterdir())
-    _report(saved.folder, "bundle", made.folder, size, metadata=made.manifest)
+        console.info(f"the bundle has no evaluation; make one with rlcli eval --checkpoint {saved.folder}")
+    bundle = write_bundle(saved, output, run, evaluation)
+    size = sum(file.stat().st_size for file in bundle.folder.iterdir())
+    _report(saved.folder, "bundle", bundle.folder, size, metadata=bundle.manifest)
 
 
 def _find(reference: str | None, runs_dir: Path, task: str | None) -> Choice:
-    """A checkpoint and why it was chosen; a checkpoint folder needs no run around it.
+    """Return a checkpoint and the reason for choosing it; a checkpoint folder may be outside a run.
 
-    A task is only looked up where no run of it is found: what was trained can be exported without its code.
+    The task is only imported if it has no run: a trained policy is exported without the task's code.
     """
     from rlcli.evaluation.session import named_task_or_run
     from rlcli.runs.bundle import is_bundle
@@ -158,7 +159,7 @@ def _find(reference: str | None, runs_dir: Path, task: str | None) -> Choice:
     if (folder / "manifest.json").is_file() and not is_bundle(folder):
         run = folder.resolve().parent.parent
         return Choice(folder, "as named", open_run(run) if (run / RECORD).is_file() else None, None)
-    name = task
+    name = None
     if task is not None:
         name = Path(task).resolve().name if Path(task).is_dir() else task.rpartition(":")[2]
     without_run = task is not None and reference in (None, "latest") and not list_runs(runs_dir, name)

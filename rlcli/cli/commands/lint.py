@@ -1,4 +1,4 @@
-"""`rlcli lint TASK`: what a task does under agents that know nothing, as a table of rules and a list of remarks."""
+"""`rlcli lint`: rules for a task that a policy can learn, applied to episodes of scripted agents."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rlcli.cli.ui.console import console
-from rlcli.cli.ui.findings import result_of, show_findings
+from rlcli.cli.ui.findings import report_findings
 from rlcli.cli.ui.options import Agent, Overrides, TaskName
 
 if TYPE_CHECKING:
@@ -17,14 +16,24 @@ if TYPE_CHECKING:
 def command(
     task: TaskName,
     overrides: Overrides = None,
-    seconds: Annotated[
-        float | None, typer.Option(help="Simulated seconds that each agent acts for; else an episode or 1000 steps.")
-    ] = None,
-    only: Annotated[list[str] | None, typer.Option(help="Run only this rule; repeatable.")] = None,
-    ignore: Annotated[list[str] | None, typer.Option(help="Leave this rule out; repeatable.")] = None,
+    seconds: Annotated[float | None, typer.Option()] = None,
+    only: Annotated[list[str] | None, typer.Option(metavar="RULE")] = None,
+    ignore: Annotated[list[str] | None, typer.Option(metavar="RULE")] = None,
     agent: Agent = None,
 ) -> None:
-    """Look for what will get in the way of learning. Rewards, resets, observations, actions, time step, discount."""
+    """Find what makes a task hard to learn. Rewards, resets, observations, actions, time step, discount.
+
+    Options:
+        seconds: Simulated time for which each scripted agent acts [s]. [default: an episode, at most 1000 steps]
+        only: Run only this rule; repeatable.
+        ignore: Leave this rule out; repeatable.
+
+    Examples:
+        rlcli lint cartpole
+            Run all rules on an installed task.
+        rlcli lint ./my_task --only dominant-reward --seconds 5
+            Run one rule on five simulated seconds of each agent.
+    """
     from rlcli.runs.trusted_tasks import named_task
 
     named_task(task)  # a missing task is reported before anything heavy is imported
@@ -43,13 +52,4 @@ def command(
         ignore=ignore or (),
         on_rule=lambda name, found: rules.append((name, found)),
     )
-    show_findings(task, "RULE", rules, remarks)
-    console.document(
-        "lint",
-        task=task,
-        passed=not remarks,
-        rules=[{"name": name, "result": result_of(found)} for name, found in rules],
-        findings=[remark.record() for remark in remarks],
-    )
-    if remarks:
-        raise typer.Exit(9)
+    report_findings("lint", task, "rule", rules, [remark.record() for remark in remarks], fail_on_warnings=True)

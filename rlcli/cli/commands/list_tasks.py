@@ -1,4 +1,4 @@
-"""`rlcli list-tasks`: what is installed, from metadata and a cache; nothing of a plugin is imported."""
+"""`rlcli list-tasks`: the installed tasks, from package metadata and a cache; imports no plugin."""
 
 from __future__ import annotations
 
@@ -16,14 +16,22 @@ from rlcli.registry.probe import TIMEOUT_S, Details, cached_details, probe
 
 
 def command(
-    pattern: Annotated[str | None, typer.Argument(help="Show only names or summaries that contain this.")] = None,
-    probe_all: Annotated[
-        bool,
-        typer.Option("--probe", help="Load every task shown in a process of its own and refresh what is known of it."),
-    ] = False,
+    pattern: Annotated[str | None, typer.Argument()] = None,
+    probe_all: Annotated[bool, typer.Option("--probe")] = False,
     timeout: ProbeTimeout = TIMEOUT_S,
 ) -> None:
-    """List installed tasks."""
+    """List installed tasks.
+
+    Options:
+        pattern: Show only tasks whose name or summary contains this text.
+        probe_all: Load each listed task in a subprocess and update its cached details.
+
+    Examples:
+        rlcli list-tasks
+            List all tasks.
+        rlcli list-tasks cartpole --probe
+            Load the matching tasks and show their sizes.
+    """
     entries, broken = catalog()
     by_name = Counter(entry.name for entry in entries)
     shared = {name for name, count in by_name.items() if count > 1}
@@ -42,7 +50,9 @@ def command(
     for bad in broken:
         console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed")
     for name in unknown_wanted():
-        console.warn(f"{plugins_chosen_by()} names '{name}', which is no installed distribution with tasks or trainers")
+        console.warn(
+            f"{plugins_chosen_by()} names '{name}', but no installed distribution of that name has tasks or trainers"
+        )
     console.document(
         "list-tasks",
         tasks=[_record(entry, known, ambiguous=entry.name in shared - built_in) for entry, known in rows],
@@ -79,7 +89,7 @@ def _show(rows: list[tuple[Entry, Details]], shared: set[str]) -> None:
                 _number(known.num_envs),
                 known.agent or "",
                 known.status,
-                known.summary or ("" if known.broken else "(rlcli list-tasks --probe tells more)"),
+                known.summary or ("" if known.broken else "(rlcli list-tasks --probe shows more)"),
             ]
             for entry, known in rows
         ],

@@ -1,4 +1,4 @@
-"""`rlcli new NAME`: a task of one's own as a package that can be installed."""
+"""`rlcli new`: an installable package with a new task."""
 
 from __future__ import annotations
 
@@ -8,18 +8,27 @@ from typing import Annotated
 import typer
 
 from rlcli.cli.ui.console import console
+from rlcli.cli.ui.options import choice
 
 
 def command(
-    name: Annotated[str, typer.Argument(help="The task's name, small letters and hyphens: my-arm.")],
-    flavour: Annotated[
-        str, typer.Option(help="yaml: lists of terms; direct: one class with the hooks of the direct workflow.")
-    ] = "yaml",
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder to write; a new one named after the task if left out.")
-    ] = None,
+    name: Annotated[str, typer.Argument()],
+    flavour: Annotated[str, choice("FLAVOUR", "yaml", "direct")] = "yaml",
+    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FOLDER")] = None,
 ) -> None:
-    """Write the package of a new task. It has: model, configuration, code, tests."""
+    """Write the package of a new task with model, configuration, code and tests.
+
+    Options:
+        name: Name of the task in lowercase letters, digits and hyphens, such as my-arm.
+        flavour: yaml (lists of terms), or direct (one class with the hooks of the direct workflow).
+        output: Folder to write. [default: a new folder named after the task]
+
+    Examples:
+        rlcli new my-arm
+            Write a package with a YAML task into the folder my-arm.
+        rlcli new my-arm --flavour direct -o packages/my-arm
+            Write a package with a task class into another folder.
+    """
     from rlcli.scaffold import create
 
     folder, files = create(name, flavour, output)

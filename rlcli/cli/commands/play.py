@@ -1,4 +1,4 @@
-"""`rlcli play`: watch a policy, in a window, in the browser, as a video, or as numbers."""
+"""`rlcli play`: a policy in a window, in the browser, as a video, or as numbers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rlcli.cli.ui import options
-from rlcli.cli.ui.completion import words
 from rlcli.cli.ui.console import console
 from rlcli.errors import UsageError
 from rlcli.viewer.protocol import VIEWERS
@@ -18,8 +17,8 @@ if TYPE_CHECKING:
     from rlcli.evaluation.session import Session
 
 _FALLBACK_VIDEO = "play.mp4"
-_SHORTEST_S = 5.0
-"""A video that begins with a terminated episode goes on until it is this long [s]."""
+_MIN_VIDEO_S = 5.0
+"""Shortest video [s] that may end with a terminated episode; a shorter one continues with the next episode."""
 
 
 def command(
@@ -27,36 +26,14 @@ def command(
     overrides: options.Overrides = None,
     checkpoint: options.CheckpointRef = None,
     policy: options.Policy = "trained",
-    video: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write one episode to FILE.mp4 or FILE.gif, offscreen; without FILE into the run. If it is terminated"
-            " within 5 s, the next ones too."
-        ),
-    ] = None,
-    viewer: Annotated[
-        str | None,
-        typer.Option(
-            autocompletion=words("auto", *VIEWERS, "none"),
-            help="auto, native (a window), web (the browser) or none (numbers). auto: a window if there is a display,"
-            " else the browser if a terminal asks, else numbers.",
-        ),
-    ] = None,
-    port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Of --viewer web, on this machine alone; 0: any. Else 8080.")
-    ] = None,
-    drawn: Annotated[
-        int, typer.Option("--show", min=1, help="How many environments to draw, side by side on the grid.")
-    ] = 1,
-    commands: Annotated[
-        list[str] | None,
-        typer.Option("--command", help="Hold commands of the task: vx=0.5,wz=0. A wrong name lists the right ones."),
-    ] = None,
+    video: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
+    viewer: Annotated[str | None, options.choice("VIEWER", "auto", *VIEWERS, "none")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
+    drawn: Annotated[int, typer.Option("--show", min=1)] = 1,
+    commands: Annotated[list[str] | None, typer.Option("--command", metavar="NAME=X")] = None,
     stochastic: options.Stochastic = False,
-    env: Annotated[
-        int | None, typer.Option(min=0, help="With --episode: one episode of this environment, as eval lives it.")
-    ] = None,
-    episode: Annotated[int | None, typer.Option(min=0, help="Which of its episodes, counted from 0.")] = None,
+    env: Annotated[int | None, typer.Option(min=0)] = None,
+    episode: Annotated[int | None, typer.Option(min=0)] = None,
     record: options.Record = None,
     record_mode: options.RecordMode = "all",
     num_envs: options.NumEnvs = None,
@@ -65,7 +42,26 @@ def command(
     runs_dir: options.RunsDir = None,
     headless: options.Headless = False,
 ) -> None:
-    """Play a policy."""
+    """Play a policy in a window or the browser, or write a video.
+
+    Options:
+        video: Write one episode to FILE.mp4 or FILE.gif, without a window; without FILE into the run. After an
+            episode that is terminated within 5 s the next episodes follow.
+        viewer: auto, native (a window), web (the browser) or none (numbers). auto is a window if there is a
+            display, else the browser if started from a terminal, else numbers. [default: the settings' viewer, or
+            auto]
+        port: Port of --viewer web, on this machine only; 0 takes any free port. [default: 8080]
+        drawn: Number of environments to draw, side by side on the grid.
+        commands: Hold commands of the task, such as vx=0.5,wz=0; repeatable. A wrong name lists the valid ones.
+        env: With --episode: environment whose episode of an evaluation is repeated.
+        episode: With --env: number of the episode in that environment, counted from 0.
+
+    Examples:
+        rlcli play cartpole --viewer web
+            Show the policy of the newest run of cartpole in the browser.
+        rlcli play --checkpoint latest@best --video best.mp4
+            Film one episode of the best checkpoint.
+    """
     from rlcli.cli.ui.play_episode import check_choice, play_episode
     from rlcli.cli.ui.viewer_choice import choose_viewers, read_commands, require_viewer, show
     from rlcli.evaluation.session import PolicyRequest, open_session
@@ -102,17 +98,17 @@ def _check_record(record: Path | None, mode: str, video: Path | None, commands: 
     from rlcli.evaluation.session import check_record
 
     if record is not None and video is not None:
-        raise UsageError("--record writes episodes, not pictures", hint="rlcli replay FILE --video draws what it holds")
+        raise UsageError("--record and --video cannot be combined", hint="rlcli replay FILE --video draws a recording")
     if record is not None and commands:
-        raise UsageError("--record with --command would write episodes that the task alone does not give again")
+        raise UsageError("--record with --command would write episodes that replay cannot repeat")
     check_record(record, mode)
 
 
 def _prepare(session: Session, drawn: int, commands: dict[str, float]) -> None:
-    """Check that there are environments enough to draw, and hold the commands."""
+    """Check that there are enough environments to draw, and hold the commands."""
     available = session.env.num_envs
     if drawn > available:
-        raise UsageError(f"--show {drawn}, and there are {available} environments", hint=f"--num-envs {drawn}")
+        raise UsageError(f"--show {drawn}, but there are {available} environments", hint=f"--num-envs {drawn}")
     if commands:
         from rlcli.viewer.playback import hold_command
 
@@ -121,7 +117,7 @@ def _prepare(session: Session, drawn: int, commands: dict[str, float]) -> None:
 
 
 def _default_video(session: Session) -> Path:
-    """`videos/STEP.mp4` in the run; for a policy without a run, a file in the current folder."""
+    """Return `videos/STEP.mp4` in the run; for a policy without a run, a file in the current folder."""
     run, checkpoint = session.policy.run, session.policy.checkpoint
     if run is None or checkpoint is None:
         return Path(_FALLBACK_VIDEO)
@@ -137,14 +133,14 @@ def _video(session: Session, file: Path, drawn: int) -> None:
 
     with film(session, file, drawn=drawn) as filming:
 
-        def note_end(step: StepResult) -> None:
-            long_enough = filming.length_s >= _SHORTEST_S
+        def end_video(step: StepResult) -> None:
+            long_enough = filming.length_s >= _MIN_VIDEO_S
             filming.ended |= bool(step.truncated[0] | (step.terminated[0] & long_enough))
 
-        summary = evaluate(session.env, filming.act, session.env.num_envs, note_end).summary()
+        summary = evaluate(session.env, filming.act, session.env.num_envs, end_video).summary()
     frames, fps, backend = filming.writer.frames, filming.writer.fps, filming.renderer.backend
     which = "environment 0" if drawn == 1 else f"environments 0 to {drawn - 1}"
-    console.info(f"{frames} frames of {which} at {fps:g} a second, drawn with {backend}")
+    console.info(f"{frames} frames of {which} at {fps:g} per second, drawn with {backend}")
     console.data(str(file))
     video = {"video": str(file), "frames": frames, "fps": fps, "gl": backend}
     console.document("play", **session.policy.record(), **video, **summary)
@@ -154,7 +150,7 @@ def _statistics(session: Session, record: Path | None, record_mode: str) -> None
     from rlcli.cli.ui.evaluation_tables import show_summary
     from rlcli.evaluation.session import run_episodes
 
-    console.info("one episode an environment, as numbers (--video FILE.mp4 draws)")
+    console.info("one episode per environment, as numbers (--video FILE.mp4 writes a video)")
     summary, recorded = run_episodes(session, session.env.num_envs, record, record_mode)
     show_summary(summary)
     console.document("play", **session.policy.record(), video=None, recorded=recorded, **summary)

@@ -1,4 +1,4 @@
-"""`rlcli plot`: learning curves of runs, those that differ in their seed only taken together."""
+"""`rlcli plot`: learning curves of runs; runs that differ only in their seed share a curve."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from rlcli.cli.ui.completion import runs_and_tasks
 from rlcli.cli.ui.console import console
-from rlcli.cli.ui.options import RunsDir, check_output
+from rlcli.cli.ui.options import RunsDir, check_output, choice
 from rlcli.errors import MachineError, UsageError, require_known
 
 if TYPE_CHECKING:
@@ -17,46 +17,40 @@ if TYPE_CHECKING:
     from rlcli.reporting.panels import Panel
     from rlcli.runs.run import Run
 
-_MANY = Path("curves.png")
-_MOST_PANELS = 60
-"""Of one picture."""
+_CURVES = Path("curves.png")
+_MAX_PANELS = 60
+"""Number of panels in one figure."""
 
 
 def command(
-    runs: Annotated[
-        list[str],
-        typer.Argument(
-            autocompletion=runs_and_tasks,
-            metavar="RUN",
-            help="Runs by folder or name, latest, or a task: all of its runs.",
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            help="FILE.png, .svg or .pdf; by default RUN/plots/curves.png of one run, curves.png of several.",
-        ),
-    ] = None,
-    metrics: Annotated[
-        str | None,
-        typer.Option(
-            help="return, success, length, rewards, terminations, any metric of the runs (Loss/value), or what stands "
-            "before its slash (Loss); separated by commas."
-        ),
-    ] = None,
-    x: Annotated[str, typer.Option(help="steps, iterations or time (of training, in seconds).")] = "steps",
+    runs: Annotated[list[str], typer.Argument(autocompletion=runs_and_tasks, metavar="RUN")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE")] = None,
+    metrics: Annotated[str | None, typer.Option(metavar="NAMES")] = None,
+    x: Annotated[str, choice("AXIS", "steps", "iterations", "time")] = "steps",
     runs_dir: RunsDir = None,
 ) -> None:
-    """Draw learning curves. Of several seeds their interquartile mean and its 95 % interval."""
+    """Draw learning curves of runs. Several seeds become their interquartile mean with a 95 % interval.
+
+    Options:
+        runs: Runs by folder or name, latest, or a task: all of its runs.
+        output: File to write, FILE.png, .svg or .pdf. [default: plots/curves.png in a single run, else curves.png]
+        metrics: Names separated by commas: return, success, length, rewards, terminations, a metric of the runs
+            (Loss/value), or a group of metrics (Loss). [default: return, success, length, rewards, terminations]
+        x: steps, iterations or time (of training [s]).
+
+    Examples:
+        rlcli plot latest
+            Draw the curves of the newest run into its folder.
+        rlcli plot cartpole --metrics return,Loss -o curves.svg
+            Draw the return and the losses of all runs of cartpole.
+    """
     from rlcli.reporting.figures import FORMATS, check_drawing
     from rlcli.runs.run_ref import default_runs_dir, find_runs
 
     require_known(x, ("steps", "iterations", "time"), "--x", "axes")
     names = None if metrics is None else [name.strip() for name in metrics.split(",") if name.strip()]
     if names == []:
-        raise UsageError("--metrics names none", hint="--metrics return,success")
+        raise UsageError("--metrics names no metric", hint="--metrics return,success")
     check_output(output, "picture", FORMATS)
     check_drawing()
     found = find_runs(runs, runs_dir or default_runs_dir())
@@ -84,14 +78,14 @@ def _choose_panels(curves: list[Curve], names: list[str] | None, x: str) -> list
 
     panels = choose(curves, names, x)
     if not panels:
-        raise UsageError("there is nothing to draw: no episode has ended yet", hint="--metrics Loss draws the losses")
-    if len(panels) > _MOST_PANELS:
-        console.warn(f"the first {_MOST_PANELS} of {len(panels)} panels are drawn; --metrics chooses")
-    return panels[:_MOST_PANELS]
+        raise UsageError("nothing to draw: no episode has ended yet", hint="--metrics Loss draws the losses")
+    if len(panels) > _MAX_PANELS:
+        console.warn(f"drawing the first {_MAX_PANELS} of {len(panels)} panels; choose others with --metrics")
+    return panels[:_MAX_PANELS]
 
 
 def _draw(file: Path, curves: list[Curve], panels: list[Panel], x: str) -> None:
-    """Write the picture, and print which seeds each curve has."""
+    """Write the figure, and print the seeds of each curve."""
     from rlcli.reporting.curves import AXES
     from rlcli.reporting.figures import picture
     from rlcli.runs.atomic_io import write_atomic
@@ -102,15 +96,15 @@ def _draw(file: Path, curves: list[Curve], panels: list[Panel], x: str) -> None:
         seeds = ", ".join(map(str, curve.seeds))
         console.info(f"{curve.label}: seed{'s' * (len(curve.seeds) > 1)} {seeds}")
     if note:
-        console.info("of several seeds: interquartile mean and 95 % bootstrap interval (Agarwal et al. 2021)")
+        console.info("several seeds: interquartile mean and 95 % bootstrap interval (Agarwal et al. 2021)")
 
 
 def _default_file(runs: list[Run]) -> Path:
     from rlcli.runs.run import require_own
 
     if len(runs) > 1:
-        return _MANY
-    file = runs[0].folder / "plots" / _MANY
+        return _CURVES
+    file = runs[0].folder / "plots" / _CURVES
     require_own(runs[0], "plots")
     try:
         file.parent.mkdir(exist_ok=True)
@@ -128,7 +122,7 @@ def _title(curves: list[Curve]) -> str:
 def _note(curves: list[Curve]) -> str:
     if all(len(curve.histories) == 1 for curve in curves):
         return ""
-    few = "of fewer than 4 their mean; " if any(1 < len(curve.histories) < 4 for curve in curves) else ""
+    few = "fewer than 4 seeds: mean; " if any(1 < len(curve.histories) < 4 for curve in curves) else ""
     return (
         f"Lines: interquartile mean of the seeds ({few}terminations: mean). Bands: 95 % stratified bootstrap "
         "interval (Agarwal et al. 2021)."
@@ -136,7 +130,7 @@ def _note(curves: list[Curve]) -> str:
 
 
 def _record(curve: Curve, axis: str) -> dict[str, Any]:
-    """A curve as JSON: the last value of each metric."""
+    """Return a curve as JSON: its runs and the last value of each metric."""
     ends = {}
     for name in curve.names():
         line = curve.line(name, axis)

@@ -1,4 +1,4 @@
-"""`rlcli replay`: simulate a trajectory file again, and report whether it is the same bit by bit."""
+"""`rlcli replay`: simulate a trajectory file again and compare it bit by bit."""
 
 from __future__ import annotations
 
@@ -11,24 +11,30 @@ from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import TaskFolder, video_file
 
 if TYPE_CHECKING:
-    from rlcli.replay.resimulate import Replay
+    from rlcli.replay.resimulate import Difference, Replay
     from rlcli.replay.trajectory import Trajectory
 
 
 def command(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            help="A recording, written by eval or play with --record, the dump of a divergence, or a case of autopsy."
-        ),
-    ],
-    episode: Annotated[int | None, typer.Option(min=0, help="Only this episode, counted from 0; else all.")] = None,
-    video: Annotated[
-        Path | None, typer.Option(help="Draw one episode (--episode, else the first) to FILE.mp4 or .gif.")
-    ] = None,
+    file: Annotated[Path, typer.Argument(metavar="FILE")],
+    episode: Annotated[int | None, typer.Option(min=0)] = None,
+    video: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
     task: TaskFolder = None,
 ) -> None:
-    """Replay a recording or a dump."""
+    """Simulate a recording, crash dump or failure case again. Every state is compared bit by bit.
+
+    Options:
+        file: Recording of eval or play (--record), crash dump of a diverged simulation, or failure case of a run.
+        episode: Number of the episode to replay, counted from 0. [default: all]
+        video: Draw one episode (that of --episode, else the first) to FILE.mp4 or FILE.gif. Without FILE:
+            replay.mp4.
+
+    Examples:
+        rlcli replay episodes.safetensors
+            Replay all episodes of a recording and compare them.
+        rlcli replay episodes.safetensors --episode 3 --video episode.mp4
+            Replay one episode and draw it.
+    """
     video = video_file(video, "replay.mp4")
     import torch
 
@@ -56,18 +62,15 @@ def command(
 
 def _print_episodes(trajectory: Trajectory, result: Replay, episodes: int, video: Path | None, frames: int) -> None:
     """Print the replay of a recording."""
-    content = {"episodes": episodes, "steps": result.steps, "video": video, "frames": frames}
-    difference = result.difference
-    if difference is None:
-        _print_result(trajectory, f"{episodes} episodes, {result.steps} steps: equal bit by bit", None, content)
-        return
-    text = (
-        f"episode {difference.episode} differs first at step {difference.step} in {difference.field}:"
-        f" recorded {_shortened(difference.recorded)}, now {_shortened(difference.replayed)}"
-    )
-    console.info("the task's model or code, MuJoCo or the machine is not what it was recorded with")
-    values = {name: getattr(difference, name) for name in ("episode", "step", "field", "recorded", "replayed")}
-    _print_result(trajectory, text, values, content)
+    difference, values = result.difference, None
+    text = f"{episodes} episodes, {result.steps} steps: equal bit by bit"
+    if difference is not None:
+        text = (
+            f"episode {difference.episode} differs first at step {difference.step} in {_values(difference, 'recorded')}"
+        )
+        console.info("the task's model or code, MuJoCo or the machine has changed since the recording")
+        values = {name: getattr(difference, name) for name in ("episode", "step", "field", "recorded", "replayed")}
+    _print_result(trajectory, text, values, episodes=episodes, steps=result.steps, video=video, frames=frames)
 
 
 def _print_calls(trajectory: Trajectory, result: Replay) -> None:
@@ -81,44 +84,38 @@ def _print_calls(trajectory: Trajectory, result: Replay) -> None:
         console.data(f"environment {world.env}: {world.ended_by}")
         if header.failure is not None and header.failure.kind != "diverged":
             episode = header.episodes[0]
-            console.data(f"  the end of its episode {episode.index}, by {', '.join(episode.causes) or 'nothing named'}")
+            console.data(
+                f"  the end of its episode {episode.index}, by {', '.join(episode.causes) or 'no named cause'}"
+            )
         else:
-            console.data(f"  {point or 'a single world shows nothing: the cause lies outside of what is kept'}")
+            console.data(f"  {point or 'the replay of this environment does not diverge: the file lacks the cause'}")
         where = None if point is None else finite_json(point.model_dump())
         environments.append({"env": world.env, "cause": world.cause, "detail": world.detail, "where": where})
-    content = {
-        "kind": "dump",
-        "calls": result.steps,
-        "compared": result.compared,
-        "same_model": result.same_model,
-        "episode": header.episodes[0].index if header.episodes else None,
-        "environments": environments,
-    }
-    difference = result.difference
-    if difference is None:
-        counts = f"{result.steps} engine calls stepped again, {result.compared} states compared"
-        _print_result(trajectory, f"{counts}: equal bit by bit", None, content)
-        return
-    text = (
-        f"environment {difference.env} differs first after engine call {difference.step} in {difference.field}:"
-        f" dumped {_shortened(difference.recorded)}, now {_shortened(difference.replayed)}"
+    difference, values = result.difference, None
+    text = f"{result.steps} engine calls simulated again, {result.compared} states compared: equal bit by bit"
+    if difference is not None:
+        place = f"environment {difference.env} differs first after engine call {difference.step}"
+        text = f"{place} in {_values(difference, 'dumped')}"
+        changed = "MuJoCo or the machine" if result.same_model else "the task's model"
+        console.info(f"{changed} has changed since the file was written (MuJoCo {header.mujoco})")
+        values = {"env": difference.env, "call": difference.step, "field": difference.field}
+        for name in ("recorded", "replayed"):
+            values[name] = [repr(value) for value in getattr(difference, name)]
+    _print_result(
+        trajectory,
+        text,
+        values,
+        kind="dump",
+        calls=result.steps,
+        compared=result.compared,
+        same_model=result.same_model,
+        episode=header.episodes[0].index if header.episodes else None,
+        environments=environments,
     )
-    what = "MuJoCo or the machine" if result.same_model else "the task's model"
-    console.info(f"{what} is not what it was dumped with (MuJoCo {header.mujoco})")
-    values = {
-        "env": difference.env,
-        "call": difference.step,
-        "field": difference.field,
-        "recorded": [repr(value) for value in difference.recorded],
-        "replayed": [repr(value) for value in difference.replayed],
-    }
-    _print_result(trajectory, text, values, content)
 
 
-def _print_result(
-    trajectory: Trajectory, text: str, difference: dict[str, Any] | None, content: dict[str, Any]
-) -> None:
-    """Print the result and the JSON document; exit with 9 if there is a difference."""
+def _print_result(trajectory: Trajectory, text: str, difference: dict[str, Any] | None, **content: Any) -> None:
+    """Print the result and the JSON document; exit with code 9 if there is a difference."""
     console.data(f"{trajectory.file}: {text}")
     equal = difference is None
     console.document("replay", file=str(trajectory.file), equal=equal, difference=difference, **content)
@@ -126,7 +123,10 @@ def _print_result(
         raise typer.Exit(9)
 
 
-def _shortened(values: list[float]) -> str:
-    """Return the first values as text."""
-    text = ", ".join(repr(value) for value in values[:6])
-    return f"[{text}{', ...' if len(values) > 6 else ''}]"
+def _values(difference: Difference, word: str) -> str:
+    """Return the field that differs, with the first values of both sides."""
+    sides = []
+    for values in (difference.recorded, difference.replayed):
+        text = ", ".join(repr(value) for value in values[:6])
+        sides.append(f"[{text}{', ...' if len(values) > 6 else ''}]")
+    return f"{difference.field}: {word} {sides[0]}, now {sides[1]}"

@@ -1,4 +1,4 @@
-"""`rlcli report`: a run as one page of HTML that needs nothing else."""
+"""`rlcli report`: one self-contained HTML page about a run."""
 
 from __future__ import annotations
 
@@ -20,22 +20,26 @@ _FILE = "report.html"
 
 
 def command(
-    run: Annotated[
-        str,
-        typer.Argument(
-            autocompletion=checkpoints, metavar="RUN", help="RUN, RUN@best, RUN@step:N, a checkpoint, or latest."
-        ),
-    ],
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="FILE.html; by default report.html in the run.")
-    ] = None,
-    no_eval: Annotated[
-        bool, typer.Option("--no-eval", help="Evaluate nothing; an evaluation that the run holds is shown.")
-    ] = False,
-    no_video: Annotated[bool, typer.Option("--no-video", help="No video in the page.")] = False,
+    run: Annotated[str, typer.Argument(autocompletion=checkpoints, metavar="RUN")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE")] = None,
+    no_eval: Annotated[bool, typer.Option("--no-eval")] = False,
+    no_video: Annotated[bool, typer.Option("--no-video")] = False,
     runs_dir: RunsDir = None,
 ) -> None:
-    """Write a run's page. On it: task, curves, evaluation, video, configuration, machine."""
+    """Write a page about a run, with task, curves, evaluation, video, configuration and machine.
+
+    Options:
+        run: RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest.
+        output: File to write, FILE.html. [default: report.html in the run]
+        no_eval: Do not evaluate the policy; show a saved evaluation of the run if there is one.
+        no_video: Do not put a video on the page.
+
+    Examples:
+        rlcli report latest
+            Evaluate and film the newest run; write report.html into it.
+        rlcli report latest@best -o page.html --no-video
+            Write a page about its best checkpoint, without a video.
+    """
     from rlcli.runs.run import require_own
     from rlcli.runs.run_ref import default_runs_dir
 
@@ -68,7 +72,7 @@ def command(
 
 
 def _add_media(page: Page, run: Run, checkpoint: Path | None, *, no_eval: bool, no_video: bool) -> tuple[str, str]:
-    """Put evaluation and video on the page; return where each is from."""
+    """Add the evaluation and the video to the page; return the source of each."""
     from rlcli.reporting.page_media import PageMedia
 
     if checkpoint is None:
@@ -81,7 +85,7 @@ def _add_media(page: Page, run: Run, checkpoint: Path | None, *, no_eval: bool, 
 
 
 def _find(reference: str, runs_dir: Path) -> tuple[Run, Path | None]:
-    """The run, and the checkpoint that the page is about; a run may have none yet."""
+    """Return the run and the checkpoint for the page; None if the run has no checkpoint yet."""
     from rlcli.runs.run_ref import find_checkpoint, find_run, is_checkpoint_ref
 
     one_checkpoint = is_checkpoint_ref(reference)

@@ -1,4 +1,4 @@
-"""`rlcli reproduce RUN`: is the environment what it was, and do the same bits come out of it again?"""
+"""`rlcli reproduce`: compare versions and machine with those of a run, train it again, compare the results."""
 
 from __future__ import annotations
 
@@ -16,21 +16,29 @@ if TYPE_CHECKING:
     from rlcli.runs.run import Run
 
 Row = tuple[str, Any, Any]
-"""A fact of the environment, what it was, and what it is now."""
+"""A fact about software or machine, its value at the time of the run, and its value now."""
 
 
 def command(
     reference: RunRef,
-    iterations: Annotated[
-        int | None, typer.Option(min=1, help="Train and compare only the first N iterations.")
-    ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Go on where the environment is not what run.json records.")
-    ] = False,
-    name: Annotated[str, typer.Option(help="Part of the new run folder's name.")] = "reproduced",
+    iterations: Annotated[int | None, typer.Option(min=1)] = None,
+    force: Annotated[bool, typer.Option("--force")] = False,
+    name: Annotated[str, typer.Option()] = "reproduced",
     runs_dir: RunsDir = None,
 ) -> None:
-    """Train a run again, and compare."""
+    """Train a run again and compare metrics and weights bit by bit.
+
+    Options:
+        iterations: Train and compare only the first iterations. [default: all]
+        force: Also train if versions, code or machine differ from those recorded in run.json.
+        name: Text at the end of the new run folder's name.
+
+    Examples:
+        rlcli reproduce latest
+            Train the newest run again and compare.
+        rlcli reproduce latest --iterations 5 --force
+            Compare five iterations, also in a changed environment.
+    """
     from rlcli.cli.ui.difference_table import report_differences
     from rlcli.machine import limit_openmp_spinning
     from rlcli.runs.run_ref import default_runs_dir, find_run
@@ -58,7 +66,7 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
     """Train the first iterations of a run again.
 
     Returns:
-        The new run, its environment steps, and what differs of the environment.
+        The new run, its environment steps, and the changes of software and machine.
     """
     from rlcli.cli.ui.progress_view import TrainingView
     from rlcli.machine import available_cores
@@ -81,7 +89,7 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
 
     _require(rows, force)
     if original.record.get("resumed"):
-        console.warn("the run was resumed in another environment than it began in; its later bits may not come again")
+        console.warn("the run was resumed with other software or on another machine; later iterations may differ")
 
     run, initial = create_reproduction(original, runs, name, now)
     job = Job(run, resolved, [], init_from=initial, stages=milestones(original, until))
@@ -94,16 +102,16 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
 
 
 def _require(rows: list[Row], force: bool) -> None:
-    """Show what differs of the environment, and stop unless told to go on."""
+    """Print the changes of software and machine, and exit with code 9 unless `force` is set."""
     from rlcli.cli.ui.difference_table import cell
 
     if not rows:
         return
     console.table(["ENVIRONMENT", "THEN", "NOW"], [[cell(name), cell(was), cell(now)] for name, was, now in rows])
     if force:
-        console.warn("the environment is not what it was: other bits are to be expected")
+        console.warn("software or machine have changed: expect different bits")
         return
-    console.info("the environment is not what run.json records; --force trains nevertheless")
+    console.info("software or machine differ from those recorded in run.json; --force trains anyway")
     console.document("reproduce", equal=False, first=None, trained=False, environment=[_entry(row) for row in rows])
     raise typer.Exit(9)
 

@@ -1,4 +1,4 @@
-"""`rlcli runs`: what became of the runs of a folder, newest first."""
+"""`rlcli runs`: the runs of a folder with their state and score."""
 
 from __future__ import annotations
 
@@ -21,48 +21,58 @@ _COLUMNS = [
     "RUN", "STATE", "PROGRESS", "RETURN", "SUCCESS", "BEST", "EVAL", "AGE", "TRAINED", "SIZE", "AGENT", "SEED",
     "REMARK",
 ]  # fmt: skip
-_LONGEST = 60
+_MAX_REMARK = 60
+"""Longest remark [characters]."""
 
 
 def command(
-    task: Annotated[
-        str | None, typer.Argument(autocompletion=tasks, help="Only runs of this task: its name, or its folder.")
-    ] = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="Only the N newest.")] = None,
+    task: Annotated[str | None, typer.Argument(autocompletion=tasks, metavar="TASK")] = None,
+    limit: Annotated[int | None, typer.Option(min=1)] = None,
     runs_dir: RunsDir = None,
 ) -> None:
-    """List runs: their state, progress and score."""
+    """List runs with their state, progress and score, newest first.
+
+    Options:
+        task: List only runs of this task: its name or its folder. [default: all tasks]
+        limit: List only the newest runs. [default: all]
+
+    Examples:
+        rlcli runs
+            List all runs.
+        rlcli runs cartpole --limit 5
+            List the five newest runs of cartpole.
+    """
     from rlcli.runs.index import overviews
     from rlcli.runs.run_ref import default_runs_dir
 
-    place = runs_dir or default_runs_dir()
-    found = overviews(place)
+    folder = runs_dir or default_runs_dir()
+    found = overviews(folder)
     wanted = None if task is None else Path(task).resolve().name if "/" in task else task.rpartition(":")[2]
     chosen = [run for run in found if wanted in (None, run.task)]
     listed = chosen[:limit]
-    console.document("runs", runs_dir=str(place), count=len(chosen), runs=[run.document() for run in listed])
+    console.document("runs", runs_dir=str(folder), count=len(chosen), runs=[run.document() for run in listed])
     if not chosen:
         tasks = sorted({run.task for run in found})
         near = (wanted and did_you_mean(wanted, tasks)) or (f"there are runs of {listing(tasks)}" if tasks else "")
-        console.info(f"no run{f' of {wanted}' if wanted else ''} in {place}" + (f"; {near}" if near else ""))
+        console.info(f"no run{f' of {wanted}' if wanted else ''} in {folder}" + (f"; {near}" if near else ""))
         return
-    console.table(_COLUMNS, [_row(run, place) for run in listed])
+    console.table(_COLUMNS, [_row(run, folder) for run in listed])
     if len(listed) < len(chosen):
         console.info(f"{len(chosen) - len(listed)} older runs are not shown")
 
 
-def _row(run: Overview, place: Path) -> list[str]:
+def _row(run: Overview, runs_dir: Path) -> list[str]:
     from rlcli.cli.ui.progress_view import clock
 
-    folder = run.folder.relative_to(place) if run.folder.is_relative_to(place) else run.folder
+    folder = run.folder.relative_to(runs_dir) if run.folder.is_relative_to(runs_dir) else run.folder
     resumable = run.resumable and run.state in ("interrupted", "stopped", "diverged", "failed")
     if run.state == "broken":
         return [str(folder), run.state, *["-"] * 7, size(run.size_bytes), "-", "-", _one_line(run.reason or "")]
-    of = "?" if run.iterations is None else run.iterations
+    total = "?" if run.iterations is None else run.iterations
     return [
         str(folder),
         run.state + (": resumable" if resumable else ""),
-        f"{run.iteration or 0}/{of}",
+        f"{run.iteration or 0}/{total}",
         cell(run.last.get("return"), ".4g"),
         cell(run.last.get("success"), ".1%"),
         _best(run.best),
@@ -77,7 +87,7 @@ def _row(run: Overview, place: Path) -> list[str]:
 
 
 def _tags(run: Overview) -> str:
-    """Settings that differ from those of most runs."""
+    """Return remarks about a device other than the CPU, several processes, or initial weights."""
     tags = []
     if (device := str(run.tags.get("device", "cpu"))) != "cpu":
         tags.append(device)
@@ -93,11 +103,11 @@ def _best(best: dict[str, float]) -> str:
 
 
 def _one_line(text: str) -> str:
-    return shorten(" ".join(text.split()), _LONGEST, "…")
+    return shorten(" ".join(text.split()), _MAX_REMARK, "…")
 
 
 def age(seconds: float) -> str:
-    """A time in its largest unit."""
+    """Return a time in its largest unit, as `3 d` or `5 min`."""
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
         if seconds >= length:
             return f"{seconds / length:.0f} {unit}"
@@ -105,10 +115,10 @@ def age(seconds: float) -> str:
 
 
 def size(count: int) -> str:
-    """Bytes in a fitting unit."""
+    """Return a number of bytes with a unit, as `1.5 MB`."""
     value = float(count)
     for unit in ("B", "kB", "MB", "GB"):
         if value < 1000 or unit == "GB":
             return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
         value /= 1000
-    raise AssertionError("the last unit takes all")
+    raise AssertionError("GB takes all sizes")

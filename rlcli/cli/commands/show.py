@@ -1,4 +1,4 @@
-"""`rlcli show TASK`: the resolved configuration, where each value comes from, or the schema for editors."""
+"""`rlcli show`: the resolved configuration of a task, the origin of its values, or its JSON Schema."""
 
 from __future__ import annotations
 
@@ -14,14 +14,26 @@ from rlcli.cli.ui.options import Agent, ConfigFile, NumEnvs, Overrides, TaskName
 def command(
     task: TaskName,
     overrides: Overrides = None,
-    origin: Annotated[bool, typer.Option("--origin", help="Say where each value comes from.")] = False,
-    schema: Annotated[bool, typer.Option("--schema", help="The JSON Schema of this task's YAML instead.")] = False,
-    play: Annotated[bool, typer.Option("--play", help="With the task's play: patch, as play and eval see it.")] = False,
+    origin: Annotated[bool, typer.Option("--origin")] = False,
+    schema: Annotated[bool, typer.Option("--schema")] = False,
+    play: Annotated[bool, typer.Option("--play")] = False,
     agent: Agent = None,
     num_envs: NumEnvs = None,
     config: ConfigFile = None,
 ) -> None:
-    """Print a task's resolved configuration."""
+    """Print a task's resolved configuration.
+
+    Options:
+        origin: Show the origin of each value: file and line, override, flag or default.
+        schema: Print the JSON Schema of the task's YAML instead, for editors.
+        play: Apply the task's `play:` patch, as play and eval do.
+
+    Examples:
+        rlcli show cartpole --origin
+            Print all settings with their origin.
+        rlcli show cartpole sim.dt=0.005 --agent ppo
+            Print the settings with an override and another agent.
+    """
     from rlcli.config.dump import json_schema, origins, to_data, to_yaml, to_yaml_with_origins
     from rlcli.config.layers import flags
     from rlcli.config.load import extensions, resolve

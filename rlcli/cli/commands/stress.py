@@ -1,4 +1,4 @@
-"""`rlcli stress`: how far a policy carries when masses, frictions, delays, ... are not what they were."""
+"""`rlcli stress`: evaluation of a policy with changed masses, frictions, delays and other parameters."""
 
 from __future__ import annotations
 
@@ -19,53 +19,56 @@ if TYPE_CHECKING:
     from rlcli.evaluation.stress_params import Sweep
     from rlcli.reporting.heat_map import HeatMap
 
-_MOST_VARIANTS = 10_000
+_MAX_VARIANTS = 10_000
 
 
 def command(
-    subject: Annotated[
-        str | None,
-        typer.Argument(
-            autocompletion=runs_and_tasks,
-            metavar="RUN|TASK",
-            help="A run, RUN@best, RUN@step:N or latest; or a task: its newest run.",
-        ),
-    ] = None,
+    subject: Annotated[str | None, typer.Argument(autocompletion=runs_and_tasks, metavar="RUN|TASK")] = None,
     overrides: options.Overrides = None,
-    sweep: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="NAME[.ELEMENT]=LOW:HIGH[:POINTS] or =A,B,C; repeatable, every combination is tried. Factors on"
-            " body_mass, joint_damping, joint_friction, joint_armature, joint_stiffness, geom_friction, actuator_gain,"
-            " effort_limit, gravity or a field of the model (abs:LOW:HIGH sets it); action_delay and observation_delay"
-            " [control steps], action_noise and observation_noise [std], push [m/s or rad/s]."
-        ),
-    ] = None,
-    points: Annotated[int, typer.Option(min=2, max=1000, help="Values of a range.")] = 5,
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes in each variant.")] = 100,
-    worst: Annotated[int, typer.Option(min=0, max=10_000, help="Look for a worse case at so many further points.")] = 0,
-    against: Annotated[str | None, typer.Option(help="A known answer beside it: lqr, zero or random.")] = None,
+    sweep: Annotated[list[str] | None, typer.Option(metavar="NAME=RANGE")] = None,
+    points: Annotated[int, typer.Option(min=2, max=1000)] = 5,
+    episodes: Annotated[int, typer.Option(min=1)] = 100,
+    worst: Annotated[int, typer.Option(min=0, max=10_000)] = 0,
+    against: Annotated[str | None, typer.Option(metavar="POLICY")] = None,
     policy: options.Policy = "trained",
     checkpoint: options.CheckpointRef = None,
     stochastic: options.Stochastic = False,
-    fail_under: Annotated[
-        list[str] | None,
-        typer.Option(help="success=0.9 and the like, as in eval: exit 9 if it is below in any variant."),
-    ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Draw the map to FILE.png or FILE.svg.")] = None,
+    fail_under: Annotated[list[str] | None, typer.Option(metavar="KEY=X")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE")] = None,
     num_envs: options.NumEnvs = None,
     seed: options.Seed = 42,
     config: options.ConfigFile = None,
     runs_dir: options.RunsDir = None,
 ) -> None:
-    """Evaluate a policy in variants of its task."""
+    """Evaluate a policy in variants of its task: other masses, frictions, delays, noise, pushes.
+
+    Options:
+        subject: A run, RUN@best, RUN@step:N or latest; or a task, for its newest run.
+        sweep: NAME[.ELEMENT]=LOW:HIGH[:POINTS] or =A,B,C; repeatable: all combinations are evaluated. Factors on
+            body_mass, joint_damping, joint_friction, joint_armature, joint_stiffness, geom_friction,
+            actuator_gain, effort_limit, gravity or a field of the model (abs:LOW:HIGH sets the value);
+            action_delay and observation_delay [control steps], action_noise and observation_noise [std],
+            push [m/s or rad/s].
+        points: Number of values in a range.
+        episodes: Number of episodes in each variant.
+        worst: Number of further points at which to search for a worse variant.
+        against: Baseline that is evaluated too: lqr, zero or random.
+        fail_under: Exit with code 9 if the mean is below X in any variant, such as success=0.9; repeatable.
+        output: Draw the heat map to FILE.png or FILE.svg.
+
+    Examples:
+        rlcli stress latest --sweep body_mass=0.5:2
+            Evaluate the newest run with half to twice the mass, in five steps.
+        rlcli stress cartpole --sweep action_delay=0:3 --against lqr -o map.png
+            Compare it with an LQR controller under delays, and draw the map.
+    """
     from rlcli.evaluation.limits import read_limits, require_success
     from rlcli.evaluation.session import PolicyRequest, baseline, find_policy, split_overrides
     from rlcli.reporting.heat_map import check_picture, draw
 
     task, words = split_overrides(subject, overrides or [])
     if task is None and checkpoint is None:
-        raise UsageError("stress what?", hint="a RUN, a TASK, or latest")
+        raise UsageError("no run, task or checkpoint given", hint="rlcli stress latest --sweep body_mass=0.5:2")
     sweeps, limits = _read_sweeps(sweep, points), read_limits(fail_under)
     if output is not None:
         check_picture(output)
@@ -82,7 +85,7 @@ def command(
     maps = _show(result, policy, against)
     if output is not None:
         draw(output, maps)
-        console.info(f"drawn to {output}")
+        console.info(f"wrote {output}")
     document = {**_record(tested), **result.record(against), "picture": str(output) if output else None}
     console.document("stress", **document, passed=not failed, failures=failed)
     options.exit_on_failures(failed)
@@ -102,28 +105,30 @@ def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
     from rlcli.evaluation.stress_params import grid, read_sweeps
 
     if not texts:
-        raise UsageError("sweep what?", hint="--sweep body_mass=0.5:2, --sweep action_delay=0:3")
+        raise UsageError("no --sweep given", hint="--sweep body_mass=0.5:2, --sweep action_delay=0:3")
     sweeps = read_sweeps(texts, points)
     count = len(grid(sweeps))
-    if count > _MOST_VARIANTS:
-        raise UsageError(f"{count:,} variants; {_MOST_VARIANTS:,} are run", hint="fewer sweeps or --points")
+    if count > _MAX_VARIANTS:
+        raise UsageError(
+            f"{count:,} variants, but at most {_MAX_VARIANTS:,} are allowed", hint="fewer sweeps or --points"
+        )
     return sweeps
 
 
 def _resolve_run(request: PolicyRequest) -> PolicyRequest:
-    """Take a run that stands where a task would as the checkpoint."""
+    """Return the request; a run that is given as the argument becomes the checkpoint."""
     from rlcli.evaluation.session import is_run_name
 
     task = request.task
     if task is None or not is_run_name(task, request.runs_dir):
         return request
     if request.checkpoint is not None:
-        raise UsageError(f"{task} is a run, and --checkpoint names another", hint="leave one of them out")
+        raise UsageError(f"{task} is a run, but --checkpoint names another one", hint="leave one of them out")
     return replace(request, task=None, checkpoint=task)
 
 
 def _show(result: StressResult, policy: str, against: str | None) -> list[HeatMap]:
-    """Print the table, the maps and the worst variant; return the maps."""
+    """Print the table, the heat maps and the worst variant; return the heat maps."""
     from rlcli.cli.ui.evaluation_tables import interval, show_stress
     from rlcli.evaluation.limits import mean_or_rate
     from rlcli.evaluation.stress_params import describe_point

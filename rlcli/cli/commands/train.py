@@ -1,4 +1,4 @@
-"""`rlcli train TASK`: options -> configuration -> run folder -> environment and trainer -> training loop."""
+"""`rlcli train`: options -> configuration -> run folder -> environment and trainer -> training loop."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rlcli.cli.ui import options
-from rlcli.cli.ui.completion import checkpoints, runs, tasks, words
+from rlcli.cli.ui.completion import checkpoints, runs
 from rlcli.cli.ui.console import console
+from rlcli.cli.ui.options import choice
 from rlcli.errors import Stopped, UsageError
 from rlcli.formats import log_notes
 
@@ -23,53 +24,47 @@ if TYPE_CHECKING:
 
 
 def command(
-    task: Annotated[
-        str | None,
-        typer.Argument(autocompletion=tasks, help="A task's name, distribution:name, or a folder with a task.yaml."),
-    ] = None,
+    task: options.OptionalTask = None,
     overrides: options.Overrides = None,
     agent: options.Agent = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(min=-1, max=options.MAX_SEED, help="Seed of everything random; -1 draws one; default 42."),
-    ] = None,
-    seeds: Annotated[
-        str | None, typer.Option(help="Several seeds, a run each, in one study folder: 0..4 or 1,5,9.")
-    ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="With --seeds: trainings at a time; default 1.")] = None,
+    seed: Annotated[int | None, typer.Option(min=-1, max=options.MAX_SEED)] = None,
+    seeds: Annotated[str | None, typer.Option(metavar="SEEDS")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1)] = None,
     num_envs: options.NumEnvs = None,
     max_iterations: options.MaxIterations = None,
     max_steps: options.MaxSteps = None,
     device: options.Device = "auto",
-    gpus: Annotated[
-        int | None, typer.Option(min=1, help="Processes on this machine, a GPU each; num_envs is of each.")
-    ] = None,
-    logger: Annotated[
-        list[str] | None,
-        typer.Option(
-            autocompletion=words("tensorboard", "wandb", "mlflow", "trackio", "none"),
-            help="tensorboard, wandb, mlflow, trackio or none; repeatable.",
-        ),
-    ] = None,
-    video_every: Annotated[
-        int | None,
-        typer.Option(
-            min=0, help="Film an episode every N iterations, in an environment of its own, into RUN/videos; 0: never."
-        ),
-    ] = None,
+    gpus: Annotated[int | None, typer.Option(min=1)] = None,
+    logger: Annotated[list[str] | None, choice("LOGGER", "tensorboard", "wandb", "mlflow", "trackio", "none")] = None,
+    video_every: Annotated[int | None, typer.Option(min=0)] = None,
     config: options.ConfigFile = None,
-    resume: Annotated[
-        str | None,
-        typer.Option(autocompletion=runs, help="Go on with a run: RUN, RUN@step:N or latest. Needs no TASK."),
-    ] = None,
-    init_from: Annotated[
-        str | None, typer.Option(autocompletion=checkpoints, help="Start a new run from a checkpoint's weights.")
-    ] = None,
+    resume: Annotated[str | None, typer.Option(autocompletion=runs, metavar="RUN")] = None,
+    init_from: Annotated[str | None, typer.Option(autocompletion=checkpoints, metavar="CHECKPOINT")] = None,
     runs_dir: options.RunsDir = None,
     name: options.RunName = None,
     headless: options.Headless = True,
 ) -> None:
-    """Train a policy."""
+    """Train a policy.
+
+    Options:
+        seed: Seed of all random numbers; -1 draws one and records it. [default: 42]
+        seeds: Train one run for each of several seeds, in one study folder: 0..4 or 1,5,9.
+        jobs: With --seeds: number of trainings at a time. [default: 1]
+        gpus: Number of processes on this machine, one GPU each; each has its own num_envs environments. [default: 1
+            process]
+        logger: tensorboard, wandb, mlflow, trackio or none; repeatable. [default: the settings' loggers, or
+            tensorboard]
+        video_every: Film an episode every N iterations, in a separate environment, into RUN/videos; 0: never.
+            [default: 0, or the value of the resumed run]
+        resume: Resume a run: RUN, RUN@step:N or latest. Needs no TASK.
+        init_from: Start a new run with the weights of a checkpoint.
+
+    Examples:
+        rlcli train cartpole --num-envs 64 agent.gamma=0.95
+            Train cartpole in 64 environments, with a changed setting of the agent.
+        rlcli train --resume latest --max-iterations 500
+            Resume the newest run until iteration 500.
+    """
     from rlcli.config.layers import flags
     from rlcli.machine import limit_openmp_spinning
     from rlcli.rl import distributed
@@ -80,7 +75,7 @@ def command(
 
     stop_with_parent()
     limit_openmp_spinning()
-    console.follows = not distributed.is_rank_zero()
+    console.muted = not distributed.is_rank_zero()
     request = TrainingRequest(runs_dir or default_runs_dir(), None, resume, agent, device, gpus, config)
     request.overrides, request.flags = overrides or [], flags(scene__num_envs=num_envs)
     request.budget = options.budget(max_iterations, max_steps)
@@ -110,11 +105,11 @@ def _study(request: TrainingRequest, seeds: str | None, jobs: int | None, seed: 
 
     study = None
     if request.resume is not None:
-        places = (Path(request.resume), request.runs / request.resume)
-        study = next((place for place in places if (place / STUDY).is_file()), None)
+        folders = (Path(request.resume), request.runs / request.resume)
+        study = next((folder for folder in folders if (folder / STUDY).is_file()), None)
     if seeds is None and study is None:
         if jobs is not None:
-            raise UsageError("--jobs is of several trainings", hint="--seeds 0..4 --jobs 2")
+            raise UsageError("--jobs needs several trainings", hint="--seeds 0..4 --jobs 2")
         return None
     if seed is not None or request.gpus is not None or distributed.launched():
         other = "--seed" if seed is not None else "--gpus"
@@ -123,16 +118,16 @@ def _study(request: TrainingRequest, seeds: str | None, jobs: int | None, seed: 
 
 
 def _source(task: str | None, request: TrainingRequest, seed: int | None, seeds: str | None) -> TaskSource | None:
-    """Return the task; of a resumed run it may be left out.
+    """Return the task; None for a resumed run without one.
 
     Raises:
-        UsageError: without a task, or if a resumed run is given another configuration.
+        UsageError: without a task, or if --resume is combined with changes of the configuration.
     """
     from rlcli.runs.trusted_tasks import named_task
 
     if request.resume is None:
         if task is None:
-            raise UsageError("which task?", hint="rlcli train TASK (rlcli list-tasks shows them), or --resume RUN")
+            raise UsageError("no task given", hint="rlcli train TASK (rlcli list-tasks shows tasks), or --resume RUN")
         return named_task(task)
     source = None if task is None or "=" in task else named_task(task)
     changes = [word for word in [task, *request.overrides] if word and "=" in word]
@@ -144,7 +139,7 @@ def _source(task: str | None, request: TrainingRequest, seed: int | None, seeds:
         raise UsageError(
             f"a resumed run keeps its configuration: {', '.join(changes)} cannot be given with --resume"
             " (--max-iterations and --max-steps can)",
-            hint="--init-from starts a new run from its weights",
+            hint="--init-from starts a new run with its weights",
         )
     return source
 
@@ -168,7 +163,7 @@ def _train(request: TrainingRequest, resolved: Resolved | None, device: str, sto
                 result = run_training(job, trainer, env, stop, view)
             if result is not None:
                 _print(result)
-        except KeyboardInterrupt:  # the second signal, wherever it came
+        except KeyboardInterrupt:  # a second signal, at any point of the training
             raise Stopped("stopped at once", exit_code=stop.exit_code) from None
         finally:
             distributed.leave()
@@ -199,13 +194,13 @@ def _train_seeds(
     jobs: int,
     stop: StopRequest,
 ) -> None:
-    """Train a new study of several seeds, or what is left of one that is resumed."""
+    """Train the runs of a new study, or the unfinished runs of a resumed one."""
     from rlcli.cli.ui.seeds_view import SeedsView, print_study
     from rlcli.tuning.train_seeds import new_study, resume_options, train_seeds
 
     if isinstance(study, Path):
-        place = None if request.device == "auto" else device
-        result = train_seeds(study, place, jobs, stop, SeedsView, bool(request.budget), resume_options(request))
+        chosen = None if request.device == "auto" else device
+        result = train_seeds(study, chosen, jobs, stop, SeedsView, bool(request.budget), resume_options(request))
     else:
         assert resolved is not None
         result = train_seeds(new_study(request, resolved, device, study), device, jobs, stop, SeedsView)

@@ -1,4 +1,4 @@
-"""`rlcli validate FILE|TASK`: every mistake of the files at once; `--deep` the compiled model too."""
+"""`rlcli validate`: check the configuration of a task, and with `--deep` its model."""
 
 from __future__ import annotations
 
@@ -14,34 +14,42 @@ from rlcli.registry import task_source
 
 
 def command(
-    target: Annotated[
-        str,
-        typer.Argument(autocompletion=tasks, metavar="FILE|TASK", help="A task.yaml, its folder, or a task's name."),
-    ],
+    target: Annotated[str, typer.Argument(autocompletion=tasks, metavar="FILE|TASK")],
     overrides: Overrides = None,
-    deep: Annotated[bool, typer.Option("--deep", help="Also compile the model and resolve every name in it.")] = False,
+    deep: Annotated[bool, typer.Option("--deep")] = False,
     agent: Agent = None,
     config: ConfigFile = None,
 ) -> None:
-    """Check a task's configuration."""
+    """Check a task's configuration and print all mistakes at once.
+
+    Options:
+        target: A task.yaml, its folder, or the name of a task.
+        deep: Also compile the model and resolve all names of joints, bodies and sensors in it.
+
+    Examples:
+        rlcli validate ./my_task --deep
+            Check the files and the model of a task in a folder.
+        rlcli validate cartpole rewards.alive.weight=2
+            Check overrides without training.
+    """
     from rlcli.config.load import check_all, resolve
 
     source = task_source(target)
-    given = overrides or []
-    unchecked = [] if agent else check_all(source, config_file=config, overrides=given)
-    resolved = resolve(source, agent=agent, config_file=config, overrides=given)
-    resolve(source, agent=agent, play=True, config_file=config, overrides=given)
+    words = overrides or []
+    unchecked = [] if agent else check_all(source, config_file=config, overrides=words)
+    resolved = resolve(source, agent=agent, config_file=config, overrides=words)
+    resolve(source, agent=agent, play=True, config_file=config, overrides=words)
     checked = "files"
     if deep:
         from rlcli.envs.make import make_env
 
-        small = resolve(source, agent=agent, config_file=config, overrides=given, flags={"scene.num_envs": 2})
+        small = resolve(source, agent=agent, config_file=config, overrides=words, flags={"scene.num_envs": 2})
         make_env(small).reset(seed=0)
         checked = "files and model"
     log_notes(resolved.notes)
     console.data(f"{source.label}: valid ({checked})")
     if unchecked:
-        console.warn(f"not checked, their trainer is not installed: agents {', '.join(unchecked)}")
+        console.warn(f"agents not checked, because their trainer is not installed: {', '.join(unchecked)}")
     console.document(
         "validate",
         file=str(source.config),

@@ -1,4 +1,4 @@
-"""`rlcli watch RUN`: the live table of a training in another terminal, read from the run's files."""
+"""`rlcli watch`: the live table of a training of another process, read from the files of its run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,14 @@ def command(
     reference: RunRef = "latest",
     runs_dir: RunsDir = None,
 ) -> None:
-    """Follow a training from another terminal. Ctrl-C leaves it alone. --json says how it stands and ends."""
+    """Follow a training from another terminal. Ctrl-C stops only the view; --json prints the state once.
+
+    Examples:
+        rlcli watch
+            Follow the newest run.
+        rlcli watch 2026-01-31_12-00-00 --json
+            Print the state of a run as JSON.
+    """
     from rlcli.errors import Stopped
     from rlcli.runs.run_ref import default_runs_dir, find_run
 
@@ -32,7 +39,7 @@ def command(
     try:
         final = _follow(run)
     except KeyboardInterrupt:
-        raise Stopped("no longer watching; the run is left alone", exit_code=130) from None
+        raise Stopped("stopped watching; the training continues", exit_code=130) from None
     _report(final)
 
 
@@ -47,7 +54,7 @@ def _follow(run: Run) -> Overview:
     with TrainingView(f"rlcli train {run.record['task']['name']}") as view:
         while True:
             state, _ = state_of(run)
-            progress = _progress(run)  # read after the state: rows written before it are not missed
+            progress = _progress(run)  # after the state, so that the last rows of an ended run are read
             if progress is not None and (progress.iteration, progress.env_steps) != printed:
                 printed = progress.iteration, progress.env_steps
                 view.show(progress)
@@ -57,7 +64,7 @@ def _follow(run: Run) -> Overview:
             try:
                 run = open_run(run.folder)
             except CheckpointError:
-                if not run.folder.exists():  # a run that never began is removed
+                if not run.folder.exists():  # a run that fails before its first iteration is removed
                     raise
         return overview_of(open_run(run.folder))
 
@@ -73,12 +80,12 @@ def _progress(run: Run) -> Progress | None:
 
 
 def _report(final: Overview) -> None:
-    of = "" if final.iterations is None else f" of {final.iterations}"
-    console.data(f"{final.folder}: {final.state}, iteration {final.iteration}{of}")
+    total = "" if final.iterations is None else f" of {final.iterations}"
+    console.data(f"{final.folder}: {final.state}, iteration {final.iteration}{total}")
     if final.reason:
         console.info(final.reason)
     if final.state != "finished" and final.resumable:
-        console.info(f"rlcli train --resume {final.folder} goes on")
+        console.info(f"rlcli train --resume {final.folder} continues it")
 
 
 def _document(run: Run) -> None:

@@ -1,4 +1,4 @@
-"""How a line may go on, for a shell that asks. Nothing heavy is imported, and no plugin."""
+"""Completion of command lines in a shell; imports nothing heavy and no plugins."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 import typer
 
 Offer = tuple[str, str]
-"""A word, and what it is."""
+"""A word to complete with, and its description."""
 
-_MOST_RUNS = 50
+_MAX_RUNS = 50
 
 
 def words(*choices: str) -> Callable[[str], list[str]]:
-    """Offers one of a few words."""
+    """Return a completion function for a few words."""
 
     def offer(incomplete: str) -> list[str]:
         return [choice for choice in choices if choice.startswith(incomplete)]
@@ -23,7 +23,7 @@ def words(*choices: str) -> Callable[[str], list[str]]:
 
 
 def tasks(incomplete: str) -> list[Offer]:
-    """The installed tasks; a folder is for the shell to complete."""
+    """Return the installed tasks; the shell itself completes folders."""
     from rlcli.registry import OWN, catalog
     from rlcli.registry.probe import Details, cached_details
 
@@ -38,32 +38,32 @@ def tasks(incomplete: str) -> list[Offer]:
 
 
 def runs(ctx: typer.Context, incomplete: str) -> list[Offer]:
-    """The newest runs by name, and `latest`; a path is for the shell to complete."""
+    """Return the names of the newest runs, and `latest`; the shell itself completes paths."""
     if "/" in incomplete:
         return []
     return _starting([("latest", "the newest run"), *_runs(ctx)], incomplete)
 
 
 def checkpoints(ctx: typer.Context, incomplete: str) -> list[Offer]:
-    """Runs, `shipped`, and after a run's name its best checkpoint and its steps."""
+    """Return runs and `shipped`; after `RUN@` return the best checkpoint and the steps of that run."""
     run, at, _ = incomplete.partition("@")
     if at:
-        return _starting([(f"{run}@{what}", "") for what in _saved(ctx, run)], incomplete)
+        return _starting([(f"{run}@{name}", "") for name in _checkpoint_names(ctx, run)], incomplete)
     return _starting([("shipped", "the task's own policy")], incomplete) + runs(ctx, incomplete)
 
 
 def runs_and_tasks(ctx: typer.Context, incomplete: str) -> list[Offer]:
-    """What a run or a task is called."""
+    """Return the names of tasks and runs."""
     return tasks(incomplete) + runs(ctx, incomplete)
 
 
 def agents(ctx: typer.Context, incomplete: str) -> list[Offer]:
-    """The agents of the task that stands on the line."""
-    named = [ctx.params[key] for key in ("task", "subject", "target") if ctx.params.get(key)]
-    named += ctx.args  # a line that ends with --agent could not be read to its end
+    """Return the agents of the task that is named on the command line."""
+    words = [ctx.params[key] for key in ("task", "subject", "target") if ctx.params.get(key)]
+    words += ctx.args  # arguments after an incomplete --agent are not parsed into ctx.params
     try:
-        found = _agents(str(named[0])) if named else []
-    except Exception:  # whatever is wrong with a task is said when it is used
+        found = _agents(str(words[0])) if words else []
+    except Exception:  # a broken task is reported when a command uses it
         found = []
     return _starting([(name, "") for name in found], incomplete)
 
@@ -79,20 +79,20 @@ def _runs_dir(ctx: typer.Context) -> Path:
 
 
 def _runs(ctx: typer.Context) -> Iterator[Offer]:
-    """Names of the newest runs, by when their folders were last changed."""
+    """Yield the names of the newest runs, by the time at which their folders last changed."""
     from rlcli.runs.run import RECORD
 
-    place = _runs_dir(ctx)
+    runs_dir = _runs_dir(ctx)
     try:
-        folders = [file.parent for pattern in ("*/*", "*/*/*") for file in place.glob(f"{pattern}/{RECORD}")]
+        folders = [file.parent for pattern in ("*/*", "*/*/*") for file in runs_dir.glob(f"{pattern}/{RECORD}")]
         folders.sort(key=lambda folder: folder.stat().st_mtime, reverse=True)
     except OSError:
         return
-    for folder in folders[:_MOST_RUNS]:
-        yield folder.name, folder.relative_to(place).parts[0]
+    for folder in folders[:_MAX_RUNS]:
+        yield folder.name, folder.relative_to(runs_dir).parts[0]
 
 
-def _saved(ctx: typer.Context, run: str) -> list[str]:
+def _checkpoint_names(ctx: typer.Context, run: str) -> list[str]:
     from rlcli.runs.checkpoint import steps
     from rlcli.runs.run_ref import find_run
 
@@ -108,9 +108,9 @@ def _agents(task: str) -> list[str]:
     from rlcli.registry import OWN, TASKS, find_entry, find_task
     from rlcli.registry.probe import cached_details
 
-    if not any(mark in task for mark in ("/", "\\")) and not (Path(task) / "task.yaml").is_file():
+    if not any(separator in task for separator in ("/", "\\")) and not (Path(task) / "task.yaml").is_file():
         entry = find_entry(TASKS, task, what="task")
-        if entry.distribution != OWN:  # its file is found by importing it, which is not done for a key press
+        if entry.distribution != OWN:  # reading its file imports the plugin, which is too slow for a key press
             known = cached_details([entry]).get(entry.qualified)
             return [known.agent] if known and known.agent else []
     source = find_task(task)

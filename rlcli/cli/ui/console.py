@@ -1,4 +1,4 @@
-"""Everything that is printed: data on stdout, messages on stderr, one JSON document with `--json`."""
+"""Output of commands: data on stdout, messages on stderr, one JSON document with `--json`."""
 
 from __future__ import annotations
 
@@ -9,45 +9,43 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from rlcli.cli.ui.terminal import supports_styles
+from rlcli.errors import ConfigError, RlcliError
 from rlcli.safe_text import UNSAFE
 
 if TYPE_CHECKING:
     from rlcli.reporting.heat_map import HeatMap
 
 SCHEMA_VERSION = 1
-_OWN = ("bug", "device", "diverged")
-"""Kinds of errors that one process of several may have alone."""
-_GONE = (errno.EPIPE, errno.EIO)
+_ERRORS_OF_ONE_RANK = ("bug", "device", "diverged")
+"""Kinds of errors that may happen on one rank only, so that every rank prints them."""
+_NO_READER = (errno.EPIPE, errno.EIO)
 """Errors of writing to a pipe without a reader, and to a terminal that was closed."""
 
 
 @dataclass(slots=True)
 class Console:
-    """Output of one command: data, messages and the JSON document, as its flags ask for them."""
+    """Output of one command: data, messages and the JSON document, according to its flags."""
 
     json: bool = False
     quiet: bool = False
     verbose: bool = False
     debug: bool = False
-    follows: bool = False
-    """Another process of the run prints; this one prints nothing but its own errors."""
-
+    muted: bool = False
+    """Whether rank 0 prints for this process, which prints only its own errors."""
     owns_process: bool = False
     """Whether the process was started for this command and ends with it."""
-
     has_document: bool = False
-    """Whether the JSON document is printed: what ends the command after that, such as Ctrl-C, prints no second one."""
-
+    """Whether the JSON document is printed; an error after that, such as Ctrl-C, prints no second one."""
     out: Any = None
-    """Where the JSON document goes; None is stdout."""
+    """Stream of the JSON document; None is stdout."""
 
     @contextlib.contextmanager
     def stdout_kept(self) -> Iterator[None]:
-        """With --json, what others print on stdout goes to stderr: only the document is left there."""
+        """Redirect what libraries print on stdout to stderr with --json, so that stdout has only the document."""
         if not self.json or sys.stdout is None or sys.stderr is None:
             yield
             return
@@ -59,50 +57,51 @@ class Console:
             self.out = None
 
     def data(self, text: str) -> None:
-        """The result, as text for people; left out with --json."""
-        if not self.json and not self.follows:
+        """Print the result as text; with --json print nothing."""
+        if not self.json and not self.muted:
             _write(sys.stdout, text)
 
     def document(self, command: str, **content: Any) -> None:
-        """The result, as JSON; left out without --json."""
-        if self.json and not self.follows:
+        """Print the result as JSON; without --json print nothing."""
+        if self.json and not self.muted:
             self.has_document = True
-            _write(
-                self.out or sys.stdout,
-                json.dumps({"schema": SCHEMA_VERSION, "command": command, **content}, indent=2, default=str),
-            )
+            self._write_json(command=command, **content)
 
     def info(self, text: str) -> None:
-        """A message about what is being done."""
-        if not self.quiet and not self.follows:
+        """Print a message about progress, unless -q is set."""
+        if not self.quiet and not self.muted:
             _write(sys.stderr, text)
 
     def detail(self, text: str) -> None:
-        """A message for -v."""
-        if self.verbose and not self.quiet and not self.follows:
+        """Print a message if -v is set."""
+        if self.verbose and not self.quiet and not self.muted:
             _write(sys.stderr, text)
 
     def warn(self, text: str) -> None:
-        """Something the user should know, but that stops nothing."""
-        if self.follows:
-            return
-        _write(sys.stderr, f"warning: {_harmless(text)}")
+        """Print a non-fatal warning."""
+        if not self.muted:
+            _write(sys.stderr, f"warning: {_escaped(text)}")
 
-    def error(self, kind: str, code: int, message: str, hint: str | None, problems: list[dict[str, Any]]) -> None:
-        """Why the command failed."""
-        if self.follows and kind not in _OWN:
+    def error(self, error: RlcliError) -> None:
+        """Print the error that ended the command."""
+        if self.muted and error.kind not in _ERRORS_OF_ONE_RANK:
             return
-        if self.json and not self.follows and not self.has_document:
-            error = {"kind": kind, "exit_code": code, "message": message, "hint": hint, "problems": problems}
-            with contextlib.suppress(OSError):  # stdout may be what failed
-                _write(self.out or sys.stdout, json.dumps({"schema": SCHEMA_VERSION, "error": error}, indent=2))
-        lines = message.splitlines() or [""]
-        _write(sys.stderr, "\n".join(f"error: {_harmless(line)}" for line in lines))
-        if hint:
-            _write(sys.stderr, f"hint: {_harmless(hint)}")
+        if self.json and not self.muted and not self.has_document:
+            problems = [asdict(problem) for problem in error.problems] if isinstance(error, ConfigError) else []
+            content = {"kind": error.kind, "exit_code": error.exit_code, "message": error.message, "hint": error.hint}
+            with contextlib.suppress(OSError):  # stdout itself may be broken
+                self._write_json(error={**content, "problems": problems})
+        lines = error.message.splitlines() or [""]
+        _write(sys.stderr, "\n".join(f"error: {_escaped(line)}" for line in lines))
+        if error.hint:
+            _write(sys.stderr, f"hint: {_escaped(error.hint)}")
+
+    def _write_json(self, **content: Any) -> None:
+        text = json.dumps({"schema": SCHEMA_VERSION, **content}, indent=2, default=str)
+        _write(self.out or sys.stdout, text)
 
     def table(self, columns: list[str], rows: list[list[str]], title: str | None = None) -> None:
-        """A table on stdout: plain columns, or what fits on a terminal."""
+        """Print a table on stdout: padded columns in a pipe, a table that fits the width on a terminal."""
         if self.json:
             return
         if supports_styles(sys.stdout):
@@ -116,7 +115,7 @@ class Console:
             _write(sys.stdout, "  ".join(cells).rstrip())
 
     def heat_map(self, title: str, corner: str, heat_map: HeatMap) -> None:
-        """Print a map of numbers on stdout, in colours where stdout is a terminal: red is low, green is high."""
+        """Print a heat map on stdout, on a terminal in colours: red is low, green is high."""
         cells = zip(heat_map.rows.values, heat_map.cells, strict=True)
         rows = [[name, *(f"{number:.2f}" for number in numbers)] for name, numbers in cells]
         if self.json or not supports_styles(sys.stdout):
@@ -131,7 +130,7 @@ class Console:
 
 
 def _shade(share: float) -> str:
-    """Black on red at 0, yellow at a half, green at 1."""
+    """Return a style with black text: on red for 0, yellow for 0.5, green for 1."""
     red, green = min(1.0, 2.0 - 2.0 * share), min(1.0, 2.0 * share)
     return f"#000000 on #{round(225 * red):02x}{round(200 * green):02x}40"
 
@@ -140,7 +139,7 @@ console = Console()
 
 
 class _ConsoleHandler(logging.Handler):
-    """Handler that prints the records of the logger `rlcli`: warnings always, INFO unless -q, DEBUG with -v."""
+    """Logging handler that prints warnings always, INFO unless -q is set, and DEBUG with -v."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print one record on stderr."""
@@ -153,7 +152,7 @@ class _ConsoleHandler(logging.Handler):
 
 
 def print_log_records() -> None:
-    """Send the records of the logger `rlcli` to the console; repeated calls add nothing."""
+    """Add a handler to the logger `rlcli` that prints its records; further calls have no effect."""
     logger = logging.getLogger("rlcli")
     if not any(isinstance(handler, _ConsoleHandler) for handler in logger.handlers):
         logger.addHandler(_ConsoleHandler())
@@ -161,30 +160,30 @@ def print_log_records() -> None:
 
 
 def plain(text: str) -> str:
-    """Return text without control characters: text of an untrusted file may not steer the terminal."""
+    """Escape control characters, so that text of an untrusted file cannot control the terminal."""
     return UNSAFE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def discard(stream: Any) -> None:
-    """Write nothing more to a stream that cannot be written, at exit either."""
+    """Redirect a broken stream to the null device, so that nothing fails when Python flushes it at exit."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _harmless(text: str) -> str:
-    """Text that may come from an untrusted file, with escapes for the characters that are not printable."""
+def _escaped(text: str) -> str:
+    """Escape the characters of a text that are not printable, except newlines and tabs."""
     return "".join(c if c.isprintable() or c in "\n\t" else repr(c)[1:-1] for c in text)
 
 
 def _write(stream: Any, text: str) -> None:
-    if stream is None:  # closed by the parent process
+    if stream is None:  # the parent process closed it
         return
     text = plain(text)
     try:
         print(text, file=stream, flush=True)
     except OSError as error:
-        if error.errno not in _GONE and stream is not sys.stderr:
+        if error.errno not in _NO_READER and stream is not sys.stderr:
             raise
-        discard(stream)  # the reader is gone, or a log is full; the command goes on
+        discard(stream)  # the reader has ended, or the disk of a log is full: the command continues
     except UnicodeEncodeError:
         print(text.encode(stream.encoding, "backslashreplace").decode(stream.encoding), file=stream, flush=True)

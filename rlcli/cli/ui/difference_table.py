@@ -13,23 +13,24 @@ from rlcli.safe_text import shorten
 if TYPE_CHECKING:
     from rlcli.runs.config_diff import Difference, Section
 
-_MOST_ROWS = 10
+_MAX_ROWS = 10
 """Differences of one kind that the table shows without -v."""
 _WIDTH = 40
+"""Longest cell [characters]."""
 
 
 def report_differences(command: str, sections: Sequence[Section], left: str, right: str, **entries: Any) -> bool:
     """Print the result of comparing two sides.
 
     Args:
-        command: the command, for its document.
+        command: the command, for the JSON document.
         sections: the parts that were compared.
-        left: name of one side.
-        right: name of the other.
+        left: name of the left side.
+        right: name of the right side.
         entries: further entries of the document.
 
     Returns:
-        Whether the sides are equal but for what is cosmetic.
+        Whether the sides are equal, except for cosmetic differences.
     """
     from rlcli.runs.atomic_io import finite_json
     from rlcli.runs.config_diff import CATEGORIES
@@ -41,7 +42,7 @@ def report_differences(command: str, sections: Sequence[Section], left: str, rig
     if kinds := [f"{name} {counts[name]}" for name in CATEGORIES if counts[name]]:
         console.data(f"differences: {', '.join(kinds)}")
     if first is None:
-        console.data("no difference that is not cosmetic" if counts else "no difference")
+        console.data("no difference, except cosmetic ones" if counts else "no difference")
     else:
         section, found = first
         sides = " | ".join(_sides(found))
@@ -75,25 +76,25 @@ def _rows(section: Section) -> list[list[str]]:
     for each in section.differences:
         kind = each.category or section.name
         counts[kind] += 1
-        if counts[kind] <= _MOST_ROWS or console.verbose:
+        if counts[kind] <= _MAX_ROWS or console.verbose:
             rows.append([kind, _safe(each.where), *_sides(each)])
     for kind, count in counts.items():
-        if count > _MOST_ROWS and not console.verbose:
-            rows.append([kind, f"and {count - _MOST_ROWS} more (-v shows them)", "", ""])
+        if count > _MAX_ROWS and not console.verbose:
+            rows.append([kind, f"and {count - _MAX_ROWS} more (-v shows them)", "", ""])
     return rows
 
 
 def _sides(difference: Difference) -> list[str]:
-    """The value of each side, and where it was written."""
+    """Return the value of each side, and the file and line that set it."""
     sides = ((difference.left, difference.left_from), (difference.right, difference.right_from))
     return [f"{cell(value)} ({_safe(origin)})" if origin else cell(value) for value, origin in sides]
 
 
 def cell(value: object) -> str:
-    """Return a value as a cell of the table; `-` for None."""
+    """Format a value as a cell of the table; `-` for None."""
     return "-" if value is None else shorten(_safe(value if isinstance(value, str) else repr(value)), _WIDTH)
 
 
 def _safe(text: str) -> str:
-    """Text of an untrusted file, without control characters."""
+    """Escape the control characters in text of an untrusted file."""
     return text.encode("unicode_escape").decode("ascii") if not text.isprintable() else text

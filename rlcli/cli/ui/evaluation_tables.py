@@ -31,7 +31,7 @@ def show_summary(summary: Mapping[str, Any]) -> None:
 
 
 def show_comparison(comparison: Comparison) -> None:
-    """Print the policies side by side, and the paired differences from the first."""
+    """Print the metrics of all policies, and the paired differences of the first to each other policy."""
     from rlcli.evaluation.comparison import METRICS
 
     labels = _labels(comparison.names)
@@ -53,7 +53,7 @@ def show_comparison(comparison: Comparison) -> None:
 
 
 def show_stress(result: StressResult, against: str | None) -> None:
-    """Print a row for each variant of the task."""
+    """Print a table with a row for each variant of the task."""
     from rlcli.evaluation.stress_params import format_value
 
     metric = result.metric
@@ -63,7 +63,7 @@ def show_stress(result: StressResult, against: str | None) -> None:
     rows = []
     variants: list[tuple[Point | None, Summary]] = [(None, result.nominal), *result.grid.items()]
     for point, summary in variants:
-        row = ["as it is"] * len(result.sweeps) if point is None else [format_value(value) for value in point]
+        row = ["nominal"] * len(result.sweeps) if point is None else [format_value(value) for value in point]
         row += _cells(summary[metric])
         row += [f"{summary['return']['mean']:.4f}"] if metric != "return" else []
         row += _cells(result.reference[point][metric]) if result.reference else []
@@ -72,17 +72,17 @@ def show_stress(result: StressResult, against: str | None) -> None:
 
 
 def interval(entry: Mapping[str, Any]) -> str:
-    """Return the interval of a mean or a share as text."""
+    """Return the interval of a mean or a rate as text."""
     return "unknown" if entry["low"] is None else f"{entry['low']:.4f} .. {entry['high']:.4f}"
 
 
 def _cells(entry: Mapping[str, Any]) -> list[str]:
-    """A mean or a share, and its interval."""
+    """Return a mean or a rate, and its interval."""
     value = mean_or_rate(entry)
     return ["not finite" if value is None else f"{value:.4f}", interval(entry)]
 
 
 def _labels(names: Sequence[str]) -> Sequence[str]:
-    """Names of columns: the last part of a path where that tells them apart."""
+    """Return the names of columns: the last part of each path, if these parts differ."""
     short = [Path(name).name or name for name in names]
     return short if len(set(short)) == len(set(names)) else names

@@ -1,9 +1,11 @@
-"""Results of `check` and `lint`: a table, the findings, and how many there are."""
+"""Report of `check` and `lint`: a table of results, the findings, the JSON document and the exit code."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import typer
 
 from rlcli.cli.ui.console import console
 
@@ -11,44 +13,53 @@ if TYPE_CHECKING:
     from rlcli.testing import Finding, Remark
 
     AnyFinding = Finding | Remark
-    Results = Sequence[tuple[str, Sequence[AnyFinding] | None]]
-    """What was checked, and what was found; None: it did not run."""
 
 
-def show_findings(
-    task: str, title: str, results: Results, findings: Sequence[AnyFinding], notes: Mapping[str, str] | None = None
+def report_findings(
+    command: str,
+    task: str,
+    kind: str,
+    results: Sequence[tuple[str, Sequence[AnyFinding] | None]],
+    records: Sequence[dict[str, Any]],
+    *,
+    notes: Mapping[str, str] | None = None,
+    fail_on_warnings: bool = False,
 ) -> None:
-    """Print a table of results, the notes, the findings and their number.
+    """Print the results of checks or rules; exit with code 9 if the task does not pass.
 
     Args:
+        command: `check` or `lint`.
         task: the task.
-        title: head of the first column.
-        results: what was checked, and what was found.
-        findings: all findings.
-        notes: remarks about what was checked, by its name.
+        kind: `check` or `rule`.
+        results: names of the checks with their findings; None instead of findings: the check did not run.
+        records: all findings as JSON.
+        notes: name of a check -> its note.
+        fail_on_warnings: whether a task with warnings fails.
     """
-    console.table([title, "RESULT"], [[name, result_of(found)] for name, found in results])
+    findings = [finding for _, found in results for finding in found or ()]
+    console.table([kind.upper(), "RESULT"], [[name, _result_of(found)] for name, found in results])
     for name, text in (notes or {}).items():
         console.data(f"note: {name}: {text}")
     for finding in findings:
         console.data(str(finding))
-    errors = count_errors(findings)
+    errors = sum(finding.severity == "error" for finding in findings)
     warnings = len(findings) - errors
     console.data(f"{task}: {_count(errors, 'error')}, {_count(warnings, 'warning')}")
+    passed = not findings if fail_on_warnings else not errors
+    entries: list[dict[str, Any]] = [{"name": name, "result": _result_of(found)} for name, found in results]
+    if notes is not None:
+        entries = [{**entry, "note": notes.get(entry["name"])} for entry in entries]
+    console.document(command, task=task, passed=passed, **{f"{kind}s": entries}, findings=records)
+    if not passed:
+        raise typer.Exit(9)
 
 
-def result_of(found: Sequence[AnyFinding] | None) -> str:
-    """Return the result of one check as a word."""
+def _result_of(found: Sequence[AnyFinding] | None) -> str:
     if found is None:
         return "not run"
-    if count_errors(found):
+    if any(finding.severity == "error" for finding in found):
         return "error"
     return "warning" if found else "ok"
-
-
-def count_errors(findings: Iterable[AnyFinding]) -> int:
-    """Return how many findings are errors."""
-    return sum(finding.severity == "error" for finding in findings)
 
 
 def _count(number: int, word: str) -> str:

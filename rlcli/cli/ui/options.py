@@ -12,119 +12,106 @@ import typer
 
 from rlcli.cli.ui.completion import agents, checkpoints, runs, tasks, words
 from rlcli.cli.ui.console import console
+from rlcli.cli.ui.help_text import HelpCommand, read_docstring
 from rlcli.errors import MachineError, UsageError
 
 CHOOSE = "auto"
-"""Stands for a value that an option may leave out (`--video`)."""
-
-TaskName = Annotated[
-    str,
-    typer.Argument(autocompletion=tasks, help="A task's name, distribution:name, or a folder with a task.yaml."),
-]
-TaskOfPolicy = Annotated[
-    str | None,
-    typer.Argument(
-        autocompletion=tasks,
-        help="A task: its newest run is taken, else the policy it ships. Not needed with --checkpoint.",
-    ),
-]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="[KEY.PATH=VALUE]...", help="Overrides; agent.x=... addresses the chosen agent."),
-]
-RunRef = Annotated[str, typer.Argument(autocompletion=runs, metavar="RUN", help="A run's folder or name, or latest.")]
-
-
-def _set_quiet(given: bool) -> bool:
-    if given:
-        console.quiet, console.verbose = True, False
-    return given
-
-
-def _set_verbose(given: bool) -> bool:
-    if given:
-        console.quiet, console.verbose = False, True
-    return given
-
-
-ConfigFile = Annotated[
-    Path | None,
-    typer.Option("--config", help="YAML merged over the task; `agent:` in it addresses the chosen agent."),
-]
-Agent = Annotated[str | None, typer.Option("--agent", autocompletion=agents, help="Which of the task's agents.")]
-NumEnvs = Annotated[int | None, typer.Option("--num-envs", help="Short for scene.num_envs=N.")]
+"""Value of an option that is given without its value (`--video`)."""
 MAX_SEED = 2**62
-Seed = Annotated[
-    int,
-    typer.Option("--seed", min=-1, max=MAX_SEED, help="Seed of everything random; -1 draws one and records it."),
-]
-Device = Annotated[
-    str, typer.Option("--device", autocompletion=words("auto", "cpu", "cuda"), help="auto, cpu, cuda or cuda:N.")
-]
-RunName = Annotated[str | None, typer.Option("--name", help="Part of the run folder's name.")]
-MaxIterations = Annotated[int | None, typer.Option("--max-iterations", help="Iterations of each training.")]
-MaxSteps = Annotated[int | None, typer.Option("--max-steps", help="Environment steps of each training.")]
-TaskFolder = Annotated[
-    str | None,
-    typer.Option("--task", help="Where the code of a task that is not installed lies now: its folder."),
-]
-RunsDir = Annotated[Path | None, typer.Option("--runs-dir", help="Runs folder; else RLCLI_RUNS_DIR, settings, runs/.")]
-Record = Annotated[
-    Path | None, typer.Option("--record", help="Write the episodes, states and actions, to FILE; `replay` steps them.")
-]
-RecordMode = Annotated[
-    str,
-    typer.Option(
-        "--record-mode",
-        autocompletion=words("all", "succeeded", "failed", "separate"),
-        help="Which episodes: all, succeeded, failed, or separate (a file each).",
-    ),
-]
-CheckpointRef = Annotated[
-    str | None,
-    typer.Option(
-        "--checkpoint",
-        autocompletion=checkpoints,
-        help="RUN, RUN@best, RUN@step:N, a checkpoint folder, a bundle, latest, or shipped (the task's own policy).",
-    ),
-]
-Policy = Annotated[
-    str,
-    typer.Option(
-        "--policy", autocompletion=words("trained", "zero", "random", "lqr"), help="trained, zero, random or lqr."
-    ),
-]
+
+
+def choice(metavar: str, *names: str, help: str | None = None) -> Any:
+    """Return the declaration of an option whose values a shell completes."""
+    return typer.Option(autocompletion=words(*names), metavar=metavar, help=help)
+
+
+_TASK = typer.Argument(
+    autocompletion=tasks, metavar="TASK", help="Name of a task, distribution:name, or a folder with a task.yaml."
+)
+_POLICY_TASK = "Task: its newest run is used, else the policy shipped with the task. Not needed with --checkpoint."
+_OVERRIDES = "Overrides of settings; agent.KEY=VALUE changes the chosen agent."
+_AGENT = "Agent of the task. [default: the task's]"
+_CONFIG = "YAML file merged over the task; its key `agent` changes the chosen agent."
+_SEED = "Seed of all random numbers; -1 draws one and records it."
+_TASK_FOLDER = "Folder of the task's code, if the task is not installed and its folder has moved."
+_RUNS_DIR = "Folder of runs. [default: RLCLI_RUNS_DIR, the settings' runs_dir, or runs]"
+_RECORD_MODE = "Episodes to record: all, succeeded, failed, or separate (one file each for the last two)."
+_CHECKPOINT = "RUN, RUN@best, RUN@step:N, latest, a checkpoint folder, a bundle, or shipped (the task's own policy)."
+TaskName = Annotated[str, _TASK]
+OptionalTask = Annotated[str | None, _TASK]
+TaskOfPolicy = Annotated[str | None, typer.Argument(autocompletion=tasks, metavar="TASK", help=_POLICY_TASK)]
+Overrides = Annotated[list[str] | None, typer.Argument(metavar="KEY.PATH=VALUE", help=_OVERRIDES)]
+RunRef = Annotated[str, typer.Argument(autocompletion=runs, metavar="RUN", help="Folder or name of a run, or latest.")]
+ConfigFile = Annotated[Path | None, typer.Option(metavar="FILE", help=_CONFIG)]
+Agent = Annotated[str | None, typer.Option(autocompletion=agents, metavar="NAME", help=_AGENT)]
+NumEnvs = Annotated[int | None, typer.Option(help="Sets scene.num_envs. [default: the task's]")]
+Seed = Annotated[int, typer.Option(min=-1, max=MAX_SEED, help=_SEED)]
+Device = Annotated[str, choice("DEVICE", "auto", "cpu", "cuda", help="auto, cpu, cuda or cuda:N.")]
+RunName = Annotated[str | None, typer.Option(help="Text at the end of the run folder's name.")]
+MaxIterations = Annotated[int | None, typer.Option(help="Iterations of each training. [default: the agent's]")]
+MaxSteps = Annotated[int | None, typer.Option(help="Environment steps of each training. [default: the agent's]")]
+TaskFolder = Annotated[str | None, typer.Option(metavar="FOLDER", help=_TASK_FOLDER)]
+RunsDir = Annotated[Path | None, typer.Option(help=_RUNS_DIR)]
+Record = Annotated[Path | None, typer.Option(metavar="FILE", help="Record the episodes to FILE, for rlcli replay.")]
+RecordMode = Annotated[str, choice("MODE", "all", "succeeded", "failed", "separate", help=_RECORD_MODE)]
+CheckpointRef = Annotated[str | None, typer.Option(autocompletion=checkpoints, metavar="CHECKPOINT", help=_CHECKPOINT)]
+Policy = Annotated[str, choice("POLICY", "trained", "zero", "random", "lqr", help="trained, zero, random or lqr.")]
 Stochastic = Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")]
-ProbeTimeout = Annotated[
-    float, typer.Option("--probe-timeout", help="Seconds that each task, trainer or driver may take.")
-]
-Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Accepted; nothing opens a window unasked.")]
+ProbeTimeout = Annotated[float, typer.Option("--probe-timeout", help="Time limit per task, trainer or driver [s].")]
+Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Accepted; windows open only on request.")]
+
+
+def _set_quiet(is_set: bool) -> bool:
+    if is_set:
+        console.quiet, console.verbose = True, False
+    return is_set
+
+
+def _set_verbose(is_set: bool) -> bool:
+    if is_set:
+        console.quiet, console.verbose = False, True
+    return is_set
+
 
 _COMMON: dict[str, Any] = {
-    "json": typer.Option("--json", help="One JSON document on stdout."),
-    "quiet": typer.Option("--quiet", "-q", callback=_set_quiet, help="Errors and results only."),
-    "verbose": typer.Option("--verbose", "-v", callback=_set_verbose, help="Say more; of -q and -v the last holds."),
-    "debug": typer.Option("--debug", help="Tracebacks of errors."),
+    "json": typer.Option("--json", help="Print one JSON document on stdout."),
+    "quiet": typer.Option("--quiet", "-q", callback=_set_quiet, help="Print only results and errors."),
+    "verbose": typer.Option("--verbose", "-v", callback=_set_verbose, help="Print details; the last of -q, -v counts."),
+    "debug": typer.Option("--debug", help="Print the traceback of an error."),
 }
 """Options that every command has; the console holds their values."""
 
 
-def with_common_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add --json, --quiet, --verbose and --debug to a command, which does not receive them."""
-    signature = inspect.signature(command, eval_str=True)
+def add_command(app: typer.Typer, name: str, function: Callable[..., None], **settings: Any) -> None:
+    """Add a command to an app, with the common options and the help of the function's docstring.
+
+    The docstring may have the sections `Options:`, with the help of the parameters, and `Examples:`.
+    The function does not receive the common options.
+
+    Args:
+        app: the app or the group of commands.
+        name: the command.
+        function: the body of the command; its parameters are declared with typer.
+        settings: further settings of the command.
+    """
+    text, parameter_help, examples = read_docstring(function)
+    signature = inspect.signature(function, eval_str=True)
+    for parameter in signature.parameters.values():
+        if parameter.name in parameter_help:
+            parameter.annotation.__metadata__[0].help = parameter_help[parameter.name]
     common = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, option])
-        for name, option in _COMMON.items()
+        inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, info])
+        for option, info in _COMMON.items()
     ]
 
-    @functools.wraps(command)
+    @functools.wraps(function)
     def run(**values: Any) -> None:
-        command(**{name: value for name, value in values.items() if name not in _COMMON})
+        function(**{option: value for option, value in values.items() if option not in _COMMON})
 
     parameters = [*signature.parameters.values(), *common]
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return run
+    app.command(name, cls=HelpCommand, help=text, epilog=examples, **settings)(run)
 
 
 def budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
@@ -155,11 +142,11 @@ def video_file(video: Path | None, default: str) -> Path | None:
 
 
 def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> None:
-    """Refuse a file that cannot be written before anything is done for it.
+    """Check, before any work is done, that an output file can be written.
 
     Raises:
         UsageError: for a folder, or a suffix that is not one of `suffixes`.
-        MachineError: if its folder is not there.
+        MachineError: if its folder does not exist.
     """
     if output is None:
         return
@@ -172,7 +159,7 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
 
 
 def exit_on_failures(failures: list[str]) -> None:
-    """Print which limits failed, and end with exit code 9 if one did."""
+    """Print the limits that failed; exit with code 9 if there are any."""
     for failure in failures:
         console.info(f"failed: {failure}")
     if failures:

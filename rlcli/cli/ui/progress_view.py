@@ -1,10 +1,11 @@
-"""The view of a running training: a live table on a terminal, a line now and then elsewhere."""
+"""Views of running trainings: a live table on a terminal, else a line every few seconds."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
 import time
+from collections.abc import Sequence
 from typing import Any, Self
 
 from rlcli.cli.ui.console import console, plain
@@ -13,10 +14,10 @@ from rlcli.cli.ui.terminal import is_terminal, screen
 from rlcli.training.progress import PARTS, Progress
 
 LINE_EVERY_S = 5.0
-_MOST_ROWS = 100
-"""Of a table: metrics may be a stranger's."""
-_LONGEST_S = 1e10
-"""No training takes longer."""
+_MAX_ROWS = 100
+"""Rows of one table; an untrusted run may have any number of metrics."""
+_MAX_S = 1e10
+"""Longest time that is shown [s]."""
 _LINE_METRICS = (
     ("Train/mean_reward", "return", ".3f"),
     ("Train/mean_episode_length", "length", ".0f"),
@@ -25,7 +26,7 @@ _LINE_METRICS = (
 
 
 class LiveView:
-    """Context with a block on stderr that is redrawn, if stderr is a terminal."""
+    """Context with a block of lines on stderr that is redrawn; without a terminal there is no block."""
 
     def __init__(self, **options: Any) -> None:
         self._options = options
@@ -41,8 +42,14 @@ class LiveView:
 
     def __exit__(self, *error: Any) -> None:
         if self._live is not None:
-            with contextlib.suppress(OSError):  # the terminal may be gone
+            with contextlib.suppress(OSError):  # the terminal may be closed
                 self._live.__exit__(*error)
+
+    def update(self, lines: Sequence[str], *, refresh: bool = False) -> None:
+        """Replace the lines of the block."""
+        from rich.text import Text
+
+        self._live.update(Text("\n".join(lines)), refresh=refresh)
 
 
 class TrainingView(LiveView):
@@ -60,7 +67,7 @@ class TrainingView(LiveView):
             console.info(_line(self._last))
 
     def show(self, progress: Progress) -> None:
-        """Take in one iteration."""
+        """Show one iteration."""
         self._last = progress
         if self._live is not None:
             self._live.update(self._table(progress))
@@ -79,9 +86,9 @@ class TrainingView(LiveView):
         total = max(sum(progress.seconds.values()), 1e-9)
         split = [f"{part} {progress.seconds.get(part, 0.0) / total:4.0%}" for part in PARTS]
         speed = [f"{progress.env_steps:,} steps", f"{progress.steps_per_s:,.0f} steps/s"]
-        stands = [self._title, _iteration(progress), *speed, _left(progress)]
+        state = [self._title, _iteration(progress), *speed, _left(progress)]
         width = self._live.console.width
-        head = Text.assemble(("\n".join(flow(stands, width)), "bold"), "\n", ("\n".join(flow(split, width)), "dim"))
+        head = Text.assemble(("\n".join(flow(state, width)), "bold"), "\n", ("\n".join(flow(split, width)), "dim"))
         tables = []
         for heading, prefix in (
             ("training", "Train/"),
@@ -93,7 +100,7 @@ class TrainingView(LiveView):
             if not rows:
                 continue
             table = Table(heading, "", box=None, pad_edge=False, header_style="bold cyan")
-            for name, value in rows[:_MOST_ROWS]:
+            for name, value in rows[:_MAX_ROWS]:
                 is_share = prefix == "Episode_Termination/" or (name.endswith("_rate") and prefix == "Train/")
                 table.add_row(Text(plain(name.partition("/")[2])), f"{value:.1%}" if is_share else f"{value:.4g}")
             tables.append(table)
@@ -117,8 +124,8 @@ def _left(progress: Progress) -> str:
 
 
 def clock(seconds: float) -> str:
-    """Hours, minutes and seconds; of what no training has taken, a question mark."""
-    if not 0.0 <= seconds < _LONGEST_S:
+    """Return a time as hours, minutes and seconds; `?` for a negative or endless one."""
+    if not 0.0 <= seconds < _MAX_S:
         return "?"
     minutes, left = divmod(int(seconds), 60)
     return f"{minutes // 60}:{minutes % 60:02}:{left:02}" if minutes >= 60 else f"{minutes}:{left:02}"

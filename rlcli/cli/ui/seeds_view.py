@@ -1,4 +1,4 @@
-"""View of a study of several seeds: its progress while it trains, and a table at the end."""
+"""View of a study of several seeds: its progress during training, and the table at the end."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LINE_EVERY_S = 10.0
 
 
 def print_study(result: StudyResult) -> None:
-    """Print the table and the document of a study.
+    """Print the table and the JSON document of a study.
 
     Raises:
         Stopped: after the table, if a signal stopped the study.
@@ -26,7 +26,7 @@ def print_study(result: StudyResult) -> None:
     if result.together is not None:
         _print_table(result.runs, result.together)
     if result.stop_code is not None:
-        hint = f"rlcli train --resume {result.folder} goes on"
+        hint = f"rlcli train --resume {result.folder} continues it"
         raise Stopped("stopped on request", exit_code=result.stop_code, hint=hint)
     console.data(str(result.folder))
     console.document(
@@ -66,7 +66,7 @@ class SeedsView(LiveView):
         self._last = time.monotonic()
 
     def poll(self) -> None:
-        """Update the view if it is time to."""
+        """Update the view if the last update is old enough."""
         now = time.monotonic()
         if now - self._last < (1.0 if self._live is not None else _LINE_EVERY_S) or console.quiet:
             return
@@ -75,11 +75,8 @@ class SeedsView(LiveView):
         if self._live is None:
             console.info("; ".join(map(" ".join, seeds)))
             return
-        from rich.text import Text
-
-        width = self._live.console.width
-        lines = [self._title, *(line for cells in seeds for line in flow(cells, width))]
-        self._live.update(Text("\n".join(lines)), refresh=True)
+        lines = [line for cells in seeds for line in flow(cells, self._live.console.width)]
+        self.update([self._title, *lines], refresh=True)
 
 
 def _cells(run: Overview) -> list[str]:

@@ -1,4 +1,4 @@
-"""Tables and documents of sweeps: the trials of one, and the comparison of its best trial with the task's settings."""
+"""Tables and JSON documents of `sweep show` and `sweep compare`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def print_sweep(sweep: Sweep) -> None:
-    """Print the trials and the best one, as a table and as a document."""
+    """Print the trials and the best one, as a table and as a JSON document."""
     from rlcli.tuning.sweep import PRESET
 
     settings, best = sweep.settings, sweep.best()
@@ -45,7 +45,7 @@ def print_sweep(sweep: Sweep) -> None:
 
 
 def print_comparison(comparison: Comparison) -> None:
-    """Print the times of all trainings, as a table and as a document.
+    """Print the times of all trainings, as a table and as a JSON document.
 
     Raises:
         Stopped: after the table, if a signal stopped the comparison.
@@ -69,7 +69,7 @@ def print_comparison(comparison: Comparison) -> None:
     console.info(f"{comparison.task}: training until {threshold.key} >= {threshold.value:g}")
     console.table(["SEED", "DEFAULT S", "STEPS", f"TRIAL {comparison.trial} S", "STEPS"], rows)
     if comparison.stop_code is not None:
-        hint = "the same command again goes on"
+        hint = "run the same command again to continue"
         raise Stopped("stopped on request", exit_code=comparison.stop_code, hint=hint)
     console.document("sweep", **comparison.document())
 

@@ -1,4 +1,4 @@
-"""The terminal: whether a stream is one, its colours, and its width."""
+"""Properties of a terminal: its colours, its width, and whether a stream is one."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _ANY_WIDTH = 10_000
-"""Width of a pipe, where nothing has to fit."""
+"""Width of lines [characters] in a pipe, where lines need not fit."""
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Whether a stream is a terminal that can move its cursor."""
+    """Return whether a stream is a terminal that can move its cursor."""
     return stream is not None and stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
 
 
 def supports_styles(stream: TextIO | None) -> bool:
-    """Whether to print styled tables on a stream: it is a terminal, or colours are forced."""
+    """Return whether to print styled tables on a stream: it is a terminal, or colours are forced."""
     return stream is not None and (stream.isatty() or colors() == "always")
 
 
 def colors() -> str:
-    """Return never, always or auto (on a terminal): from NO_COLOR, FORCE_COLOR, or the user's settings."""
+    """Return never, always or auto (only on a terminal), from NO_COLOR, FORCE_COLOR or the user's settings."""
     if os.environ.get("NO_COLOR"):
         return "never"
     if os.environ.get("FORCE_COLOR"):
@@ -34,7 +34,7 @@ def colors() -> str:
 
 
 def screen(stream: TextIO) -> Console:
-    """Return rich's console on a stream, in colours or without."""
+    """Return a console of rich on a stream, with or without colours."""
     from rich.console import Console
 
     chosen, width = colors(), None if stream.isatty() or os.environ.get("COLUMNS") else _ANY_WIDTH

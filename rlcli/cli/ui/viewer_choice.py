@@ -1,4 +1,4 @@
-"""Choice of the viewer that `play` opens, and the report when it is closed."""
+"""Choice of the viewer that `play` opens, and the JSON document after the viewer is closed."""
 
 from __future__ import annotations
 
@@ -19,21 +19,23 @@ if TYPE_CHECKING:
 CHOICES = ("auto", *VIEWERS, "none")
 """Values of --viewer."""
 Choice = tuple[str, str]
-"""A viewer, and why it."""
+"""A viewer, and the reason for choosing it."""
 
 
 def require_viewer(viewer: str | None, port: int | None, *, drawn: bool) -> None:
-    """Refuse flags that contradict each other.
+    """Check that the options of the viewer do not contradict other options.
 
     Raises:
-        UsageError: naming both.
+        UsageError: with both options.
     """
     if viewer is not None:
         require_known(viewer, CHOICES, "viewer", "viewers")
     if drawn and viewer in VIEWERS:
-        raise UsageError(f"--viewer {viewer} is for watching, --video and --record write files", hint="leave one out")
+        raise UsageError(
+            f"--viewer {viewer} opens a viewer, but --video and --record only write files", hint="leave one out"
+        )
     if port is not None and (drawn or viewer in ("native", "none")):
-        raise UsageError("--port is of the viewer in the browser", hint="--viewer web")
+        raise UsageError("--port is an option of the web viewer", hint="--viewer web")
 
 
 def read_commands(texts: Sequence[str]) -> dict[str, float]:
@@ -54,15 +56,15 @@ def read_commands(texts: Sequence[str]) -> dict[str, float]:
 
 
 def choose_viewers(viewer: str | None, port: int | None, *, headless: bool) -> list[Choice]:
-    """Return the viewers to try, in this order; the last one always works, or raises the reason why it does not.
+    """Return the viewers to try, in this order; the error of the last one is raised to the user.
 
     Args:
-        viewer: the value of --viewer; None: the user's settings may choose.
+        viewer: the value of --viewer; None: the user's settings choose, if they have a viewer.
         port: the value of --port.
-        headless: whether nothing may be opened.
+        headless: whether opening a viewer is forbidden.
 
     Raises:
-        MachineError: if a window is wanted, and there is no display.
+        MachineError: for --viewer native without a display.
     """
     from rlcli.sim.gl import has_display
 
@@ -72,38 +74,40 @@ def choose_viewers(viewer: str | None, port: int | None, *, headless: bool) -> l
             hint="--viewer web shows it in the browser, --video FILE.mp4 draws offscreen, --viewer none prints numbers",
         )
     if viewer not in (None, "auto"):
-        return [(str(viewer), "as asked")]
+        return [(str(viewer), "--viewer is given")]
     if headless:
-        return [("none", "nothing is to be opened")]
+        return [("none", "no viewer is needed")]
     if port is not None:
         return [("web", "--port is given")]
     if console.json:
-        return [("none", "with --json nothing is opened unasked")]
+        return [("none", "--json is given without --viewer")]
     preferred = setting("viewer") if viewer is None else None
     if preferred in ("web", "none") or (preferred == "native" and has_display()):
-        return [(preferred, "as your settings say")]
-    watched = all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stdout))
+        return [(preferred, "viewer in your settings")]
+    in_terminal = all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stdout))
     display = "no display" if not has_display() else "no window"
-    after: list[Choice] = [("none", f"{display}, and no terminal asks; --viewer web shows it in the browser")]
-    if watched:
-        after = [("web", f"{display}; --viewer none prints numbers"), ("none", "nothing else works here")]
-    return [("native", "there is a display"), *after] if has_display() else after
+    fallbacks: list[Choice] = [
+        ("none", f"{display}, and not started from a terminal; --viewer web shows it in the browser")
+    ]
+    if in_terminal:
+        fallbacks = [("web", f"{display}; --viewer none prints numbers"), ("none", "no viewer works here")]
+    return [("native", "there is a display"), *fallbacks] if has_display() else fallbacks
 
 
 def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn: int) -> bool:
-    """Open the first viewer that works and stay until it is closed.
+    """Open the first viewer that works and wait until it is closed.
 
     Args:
         session: environments and policy.
         viewers: the viewers to try, in this order.
-        port: of the browser's viewer; None: the usual one.
-        drawn: how many environments are in the picture.
+        port: port of the web viewer; None: 8080.
+        drawn: number of environments in the picture.
 
     Returns:
-        Whether there was a viewer; without one numbers are left.
+        Whether a viewer was opened; if not, the caller prints numbers.
 
     Raises:
-        MachineError, DependencyError: if the last one does not work.
+        MachineError, DependencyError: if the last viewer does not work.
     """
     for position, (name, reason) in enumerate(viewers):
         if name == "none":
@@ -117,11 +121,11 @@ def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn
             console.info(f"viewer: not {name}: {error.message}{f'; {error.hint}' if error.hint else ''}")
             continue
         return True
-    raise AssertionError("there is always a viewer")
+    raise AssertionError("the list of viewers is never empty")
 
 
 def _open(session: Session, name: str, reason: str, port: int | None, drawn: int) -> None:
-    """Show the policy until the viewer is closed, and print the report."""
+    """Show the policy until the viewer is closed, then print the JSON document."""
     module, _, function = VIEWERS[name].partition(":")
     run: Viewer = getattr(importlib.import_module(module), function)
     playback, address = _playback(session), None
@@ -166,7 +170,7 @@ def _playback(session: Session) -> Playback:
 
 
 def _title(session: Session) -> str:
-    """Return the task and the run, checkpoint or policy that is shown."""
+    """Return the title of the viewer: the task and the run, checkpoint or policy."""
     policy = session.policy
     if policy.run is not None and policy.kind == "trained":
         shown = policy.run.folder.name

@@ -1,4 +1,4 @@
-"""`rlcli autopsy`: what a training kept, listed and shown, by whomever the run was written."""
+"""`rlcli autopsy`: recorded episodes of own and untrusted runs are listed and shown."""
 
 import json
 import os
@@ -21,7 +21,7 @@ TRAIN = ("--max-iterations", "3", "--logger", "none", "--quiet", "agent.autopsy.
 
 @pytest.fixture(scope="module")
 def trained_once(tmp_path_factory):
-    """A run of the coin, whose episodes fail at once or last to the end; made once."""
+    """Folder for a run of the coin task, whose episodes fail at once or last to the end; trained once."""
     return tmp_path_factory.mktemp("once")
 
 
@@ -38,12 +38,12 @@ def trained(coin, cli, trained_once, only_run):
         data["task"]["folder"] = moved
         record.write_text(json.dumps(data))
         for file in files(only_run()):
-            rewritten(file, document=lambda d: d["task"].update(folder=moved))
+            rewrite(file, document=lambda d: d["task"].update(folder=moved))
     return only_run()
 
 
-def rewritten(file, document=lambda d: None, tensors=lambda t: None):
-    """A case as an attacker may write it: with a digest that is right."""
+def rewrite(file, document=lambda d: None, tensors=lambda t: None):
+    """Rewrite a case as an attacker could, with a correct digest."""
     with safe_open(file, "pt") as opened:
         data = json.loads(opened.metadata()["rlcli"])
         values = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
@@ -58,7 +58,7 @@ def files(run):
     return sorted((run / "autopsy").glob("*.safetensors"))
 
 
-def test_the_list_says_when_where_and_why(trained, cli):
+def test_list_has_step_environment_and_reason(trained, cli):
     shown = cli("autopsy", trained)
     assert shown.code == 0
     lines = shown.out.splitlines()
@@ -78,7 +78,7 @@ def test_the_list_says_when_where_and_why(trained, cli):
         assert Path(case["file"]).is_file()
 
 
-def test_the_list_can_be_sorted_and_numbers_stay(trained, cli):
+def test_sorting_keeps_case_numbers(trained, cli):
     plain = {case["case"]: case["file"] for case in cli("autopsy", trained, "--json").json["cases"]}
     for order, key in (("length", "length"), ("return", "return"), ("kind", "kept_for")):
         cases = cli("autopsy", trained, "--sort", order, "--json").json["cases"]
@@ -86,7 +86,7 @@ def test_the_list_can_be_sorted_and_numbers_stay(trained, cli):
         assert {case["case"]: case["file"] for case in cases} == plain
 
 
-def test_a_case_is_shown_and_its_replay_is_equal(trained, cli):
+def test_case_is_shown_and_replays_bit_by_bit(trained, cli):
     shown = cli("autopsy", trained, "0")
     assert shown.code == 0
     assert "kept for: terminated; ended by: task" in shown.out
@@ -105,7 +105,7 @@ def test_a_case_is_shown_and_its_replay_is_equal(trained, cli):
         assert f"rlcli replay {file}" in cli("autopsy", trained, files(trained).index(file)).out
 
 
-def test_a_replay_against_another_model_differs(trained, cli):
+def test_replay_with_changed_model_differs(trained, cli):
     model = Path("coin/model.xml")
     model.write_text(model.read_text().replace('type="slide"', 'type="slide" stiffness="10" springref="1"'))
     shown = cli("replay", files(trained)[0], "--json")
@@ -113,27 +113,27 @@ def test_a_replay_against_another_model_differs(trained, cli):
     assert "the installed task's model is not the one of the training" in cli("autopsy", trained, "0").err
 
 
-def test_a_case_that_is_not_there_is_a_usage_error(trained, cli):
+def test_unknown_case_is_usage_error(trained, cli):
     shown = cli("autopsy", trained, "99", "--json")
     assert shown.code == 2
     assert f"it has {len(files(trained))}" in shown.json["error"]["hint"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["--sort", "lenth"], "did you mean 'length'"),
         (["--video", "x.mp4"], "--video draws one case"),
         (["0", "--video", "x.avi"], "is not a video file"),
     ],
 )
-def test_what_cannot_be_shown_is_refused(trained, cli, arguments, said):
+def test_invalid_options_are_usage_errors(trained, cli, arguments, message):
     shown = cli("autopsy", trained, *arguments)
     assert shown.code == 2
-    assert said in shown.err
+    assert message in shown.err
 
 
-def test_without_it_nothing_is_kept_and_no_folder_made(coin, cli, only_run):
+def test_disabled_autopsy_records_nothing(coin, cli, only_run):
     assert cli("train", coin, "--max-iterations", "1", "--logger", "none", "agent.autopsy=null").code == 0
     assert not (only_run() / "autopsy").exists()
     shown = cli("autopsy", only_run(), "--json")
@@ -141,7 +141,7 @@ def test_without_it_nothing_is_kept_and_no_folder_made(coin, cli, only_run):
     assert "agent.autopsy" in shown.json["why_none"]
 
 
-def test_a_run_of_a_gpu_says_why_there_is_nothing(trained, cli):
+def test_gpu_run_explains_missing_cases(trained, cli):
     for file in files(trained):
         file.unlink()
     record = json.loads((trained / "run.json").read_text()) | {"device": "cuda"}
@@ -152,14 +152,14 @@ def test_a_run_of_a_gpu_says_why_there_is_nothing(trained, cli):
     assert cli("autopsy", trained, "0").code == 2
 
 
-def test_code_that_nobody_named_is_not_run_and_the_rest_is_shown(trained, cli, monkeypatch, tmp_path):
-    monkeypatch.setenv("RLCLI_STATE_DIR", str(tmp_path / "nobody"))
+def test_untrusted_task_code_is_not_run(trained, cli, monkeypatch, tmp_path):
+    monkeypatch.setenv("RLCLI_STATE_DIR", str(tmp_path / "empty"))
     (Path("coin") / "task.py").write_text("import pathlib; pathlib.Path('executed').touch()")
     shown = cli("autopsy", trained, "0")
     assert shown.code == 0
     assert "no contacts: " in shown.err
     assert "code that you have not used on this machine" in shown.err
-    assert "REWARD A STEP" in shown.out
+    assert "REWARD PER STEP" in shown.out
     assert cli("autopsy", trained).code == 0
     assert cli("autopsy", trained, "0", "--video", "x.gif").code == 5
     assert not Path("executed").exists()
@@ -190,9 +190,9 @@ ATTACKS = {
 
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_a_strangers_case_is_passed_over_with_the_file_and_the_reason(trained, cli, attack):
+def test_corrupt_case_is_skipped_with_file_and_reason(trained, cli, attack):
     first, *others = files(trained)
-    rewritten(first, **ATTACKS[attack])
+    rewrite(first, **ATTACKS[attack])
     shown = cli("autopsy", trained, "--json")
     assert shown.code == 0
     assert [case["file"] for case in shown.json["cases"]] == [str(file) for file in others]
@@ -200,8 +200,8 @@ def test_a_strangers_case_is_passed_over_with_the_file_and_the_reason(trained, c
     assert cli("replay", first).code == 5
 
 
-def test_words_of_a_strangers_case_do_not_steer_the_terminal(trained, cli):
-    rewritten(files(trained)[0], document=lambda d: d["episodes"][0].update(causes=["\x1b[2J\x1b]0;owned\x07"]))
+def test_untrusted_text_has_no_control_characters(trained, cli):
+    rewrite(files(trained)[0], document=lambda d: d["episodes"][0].update(causes=["\x1b[2J\x1b]0;owned\x07"]))
     for arguments in ((), ("0",)):
         shown = cli("autopsy", trained, *arguments)
         assert shown.code == 0
@@ -212,7 +212,7 @@ def test_words_of_a_strangers_case_do_not_steer_the_terminal(trained, cli):
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes here")
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize("what", ["a link in the folder", "a link as the folder", "a pipe", "a folder", "half a file"])
-def test_what_is_no_file_of_the_run_is_not_followed_nor_waited_for(trained, cli, tmp_path, what):
+def test_links_pipes_and_folders_are_not_read(trained, cli, tmp_path, what):
     folder, first = trained / "autopsy", files(trained)[0]
     if what == "a link as the folder":
         folder.rename(tmp_path / "elsewhere")
@@ -232,7 +232,7 @@ def test_what_is_no_file_of_the_run_is_not_followed_nor_waited_for(trained, cli,
     assert ("is a link" if what.startswith("a link") else f"skipped: {first}") in shown.err
 
 
-def test_bars_follow_the_values():
+def test_sparkline_follows_values():
     assert sparkline([0.0, 1.0, 2.0, 7.0]) == "▁▂▃█"
     assert sparkline([5.0, 5.0]) == "▄▄"
     assert sparkline([0.0, float("nan"), 7.0]) == "▁?█"
@@ -242,7 +242,7 @@ def test_bars_follow_the_values():
 
 
 @pytest.mark.slow
-def test_a_case_is_drawn(trained, cli):
+def test_case_video_is_written(trained, cli):
     imageio = pytest.importorskip("imageio.v2")
     longest = max(cli("autopsy", trained, "--json").json["cases"], key=lambda case: case["length"])
     shown = cli("autopsy", trained, longest["case"], "--video", "x.gif", "--json")

@@ -1,4 +1,4 @@
-"""show, validate and train as far as the configuration: what they print, what they load, how they fail."""
+"""`show`, `validate` and the configuration step of `train`: output, imports and errors."""
 
 import json
 import subprocess
@@ -11,7 +11,7 @@ HEAVY = {"torch", "mujoco", "numpy", "stable_baselines3"}
 
 
 def modules_after(arguments, here):
-    """Exit code of a command, and the heavy modules that it loaded."""
+    """Run a command; return its exit code, the heavy modules that it imported, and its stderr."""
     program = (
         "import sys; from rlcli.cli.app import main; code = main(sys.argv[1:]);"
         f"print(); print(code, *sorted(set(sys.modules) & {HEAVY!r}))"
@@ -21,7 +21,7 @@ def modules_after(arguments, here):
     return int(code), loaded, done.stderr
 
 
-def test_a_mistyped_override_stops_train_in_a_second_without_torch(here, rlcli):
+def test_mistyped_override_fails_fast_without_torch(here, rlcli):
     start = time.perf_counter()
     done = rlcli("train", "cartpole", "rewards.alive.wieght=2")
     assert time.perf_counter() - start < 3.0
@@ -33,7 +33,7 @@ def test_a_mistyped_override_stops_train_in_a_second_without_torch(here, rlcli):
     assert modules_after(["train", "cartpole", "rewards.alive.wieght=2"], here)[:2] == (3, [])
 
 
-def test_mistakes_in_a_file_are_all_reported_with_line_and_column(here, small):
+def test_all_mistakes_in_file_have_line_and_column(here, small):
     task = small(
         ("decimation: 2", "decimation: -2"),
         ("{func: is_alive, weight: 1.0}", "{func: is_alive, weight: 1.0, wieght: 2}"),
@@ -63,16 +63,16 @@ def column(env, *, entity: Entity = "robot"):
         ("rewards:", "success:\n  func: column\nrewards:", "14:1: success"),
     ],
 )
-def test_a_term_that_gives_another_shape_is_reported_once_with_line_and_column(in_process, small, old, new, place):
+def test_wrong_shape_of_term_is_reported_once(in_process, small, old, new, place):
     task = small((old, new), terms=COLUMN)
-    told = "'column' gave a tensor of shape (4, 2), expected a tensor of shape (4,)"
+    message = "'column' gave a tensor of shape (4, 2), expected a tensor of shape (4,)"
     for command in (["play", task, "--policy", "zero", "--viewer", "none"], ["train", task]):
         code, _, err = in_process(*command)
         assert code == 3
-        assert [line for line in err.splitlines() if "error" in line] == [f"error: small/task.yaml:{place}: {told}"]
+        assert [line for line in err.splitlines() if "error" in line] == [f"error: small/task.yaml:{place}: {message}"]
 
 
-def test_a_task_without_an_agent_cannot_be_trained_and_says_so(in_process, small):
+def test_train_without_agent_is_config_error(in_process, small):
     task = small(("agents:\n  default: small\n  small: {trainer: sb3, algorithm: ppo, max_iterations: 1}\n", ""))
     code, _, err = in_process("train", task)
     assert code == 3
@@ -80,14 +80,14 @@ def test_a_task_without_an_agent_cannot_be_trained_and_says_so(in_process, small
     assert in_process("validate", task)[0] == 0
 
 
-def test_a_config_file_with_mistakes_is_named(in_process, here):
+def test_mistake_in_config_file_names_file(in_process, here):
     (here / "mine.yaml").write_text("rewards: {alive: {weight: x}}\n")
     code, _, err = in_process("train", "cartpole", "--config", "mine.yaml")
     assert code == 3
     assert "mine.yaml:1:19: rewards.alive.weight: expected a number, found 'x'" in err
 
 
-def test_terms_that_would_exit_on_import_are_checked_without_importing(here, small):
+def test_validate_does_not_import_terms(here, small):
     task = small(
         ("is_alive, weight", "mine, x: 2, weight"), terms="raise SystemExit(9)\ndef mine(env, *, x: int): ...\n"
     )
@@ -107,11 +107,11 @@ def test_terms_that_would_exit_on_import_are_checked_without_importing(here, sma
         ["show", "cartpole-direct", "--schema"],
     ],
 )
-def test_light_commands_load_nothing_heavy(here, arguments):
+def test_light_commands_import_nothing_heavy(here, arguments):
     assert modules_after(arguments, here)[:2] == (0, [])
 
 
-def test_show_prints_yaml_that_is_a_task_again(in_process, small, here):
+def test_show_prints_valid_task_yaml(in_process, small, here):
     task = small()
     _, shown, _ = in_process("show", task, "rewards.alive.weight=1e-5", 'summary="010"')
     (here / "small" / "again.yaml").write_text(shown)
@@ -121,7 +121,7 @@ def test_show_prints_yaml_that_is_a_task_again(in_process, small, here):
     assert in_process("show", task)[1] == shown
 
 
-def test_show_says_where_values_come_from(in_process, small):
+def test_show_origin(in_process, small):
     task = small()
     _, shown, _ = in_process("show", task, "--origin", "sim.dt=0.02", "--num-envs", "3")
     lines = {line.split(":")[0].strip(): line.partition("# ")[2] for line in shown.splitlines()}
@@ -139,7 +139,7 @@ def test_show_play_applies_the_play_patch(in_process):
     assert config["scene"]["num_envs"] == 16
 
 
-def test_show_schema_is_a_json_schema_with_the_terms_of_the_task(in_process, small):
+def test_show_schema_has_terms_of_task(in_process, small):
     task = small(terms='def mine(env, *, x: int):\n    """Mine."""\n')
     schema = json.loads(in_process("show", task, "--schema")[1])
     assert schema["$schema"].startswith("https://json-schema.org")
@@ -148,14 +148,14 @@ def test_show_schema_is_a_json_schema_with_the_terms_of_the_task(in_process, sma
 
 
 @pytest.mark.parametrize("name", ["terms", "task"])
-def test_show_schema_of_a_broken_source_is_a_configuration_error(in_process, small, name):
+def test_show_schema_of_broken_source_is_config_error(in_process, small, name):
     task = small(**{name: "def f(:\n"})
     code, _, err = in_process("show", task, "--schema")
     assert code == 3
     assert f"{name}.py:1:" in err
 
 
-def test_validate_takes_a_file_a_folder_and_a_name(in_process, small, here):
+def test_validate_accepts_file_folder_and_name(in_process, small, here):
     small()
     for target in ("small/task.yaml", "small", "./small", str(here / "small")):
         assert in_process("validate", target)[0] == 0
@@ -163,7 +163,7 @@ def test_validate_takes_a_file_a_folder_and_a_name(in_process, small, here):
     assert (document["command"], document["valid"], document["deep"]) == ("validate", True, False)
 
 
-def test_validate_keeps_the_class_of_an_installed_direct_task(in_process):
+def test_validate_keeps_class_of_installed_direct_task(in_process):
     from rlcli.registry import find_task
 
     file = find_task("cartpole-direct").config
@@ -173,7 +173,7 @@ def test_validate_keeps_the_class_of_an_installed_direct_task(in_process):
     assert "did you mean 'reset_dist'?" in err
 
 
-def test_validate_names_agents_that_it_could_not_check(in_process, small, monkeypatch):
+def test_validate_names_unchecked_agents(in_process, small, monkeypatch):
     monkeypatch.setenv("RLCLI_PLUGINS", "rlcli")
     task = small(
         ("max_iterations: 1}", "max_iterations: 1}\n  other: {trainer: rsl-rl, algorithm: ppo, max_iterations: 1}")
@@ -183,14 +183,14 @@ def test_validate_names_agents_that_it_could_not_check(in_process, small, monkey
     assert "other" in err
 
 
-def test_validate_deep_accepts_the_built_in_tasks(in_process):
+def test_validate_deep_accepts_built_in_tasks(in_process):
     for name in ("ant-direct", "cartpole", "cartpole-direct"):
         code, out, _ = in_process("validate", name, "--deep")
         assert code == 0
         assert "valid (files and model)" in out
 
 
-def test_validate_deep_reports_all_problems_of_the_model_at_once(in_process, small):
+def test_validate_deep_reports_all_problems_at_once(in_process, small):
     overrides = [
         "actions.push.joints=[sldier]",
         "observations.policy.pos.joints=leg_.*",
@@ -217,7 +217,7 @@ def test_validate_deep_reports_all_problems_of_the_model_at_once(in_process, sma
 
 
 @pytest.mark.parametrize(
-    ("model", "override", "said"),
+    ("model", "override", "message"),
     [
         (None, "", "no file 'model.xml'"),
         ("<mujoco>", "", "'model.xml' is not a valid MJCF"),
@@ -233,19 +233,19 @@ def test_validate_deep_reports_all_problems_of_the_model_at_once(in_process, sma
         ("<mujoco/>", "scene.entities.robot.model=task.yaml", "'task.yaml' is not a valid MJCF"),
     ],
 )
-def test_validate_deep_says_what_is_wrong_with_a_model(in_process, small, model, override, said):
+def test_validate_deep_of_broken_model(in_process, small, model, override, message):
     code, _, err = in_process("validate", small(model=model), "--deep", *filter(None, [override]))
     assert code == 3
-    assert said in err
+    assert message in err
     assert "Traceback" not in err
 
 
-def test_validate_deep_finds_elements_that_the_model_leaves_unnamed(in_process, small):
+def test_validate_deep_accepts_unnamed_elements(in_process, small):
     bare = "<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body></worldbody></mujoco>"
     assert in_process("validate", small(("[slider]", "[joint_0]"), model=bare), "--deep")[0] == 0
 
 
-def test_validate_deep_of_terms_that_do_not_import_is_a_broken_task(in_process, small):
+def test_validate_deep_of_failing_import_is_task_error(in_process, small):
     task = small(("is_alive, weight", "mine, weight"), terms="import no_such_module\ndef mine(env): ...\n")
     assert in_process("validate", task)[0] == 0
     code, _, err = in_process("validate", task, "--deep")

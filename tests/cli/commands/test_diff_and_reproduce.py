@@ -1,4 +1,4 @@
-"""`rlcli diff` names where two runs part; `rlcli reproduce` trains one again and compares."""
+"""`rlcli diff` reports the first difference of two runs; `rlcli reproduce` trains a run again and compares."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ SMALL += ("--logger", "none")
 
 @pytest.fixture
 def trained(cli, coin):
-    """Train the coin; its run folder."""
+    """Return a function that trains the coin task and returns the run folder."""
 
     def train(*arguments):
         result = cli("train", coin, *SMALL, *arguments)
@@ -30,7 +30,7 @@ def trained(cli, coin):
 
 
 _TRAINED = []
-"""The run of this process's tests: each gets a copy."""
+"""The run that all tests of this process copy."""
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def run(request):
 
 @pytest.fixture
 def copy(run):
-    """A copy of the run, to be changed."""
+    """A copy of the run for changes."""
     return Path(shutil.copytree(run, run.with_name("copy")))
 
 
@@ -58,7 +58,7 @@ def last(run):
 
 
 def replace(folder, part, change):
-    """Change a part of a checkpoint, and its manifest with it."""
+    """Change one file of a checkpoint, and its entry in the manifest."""
     file = folder / f"{part}.safetensors"
     tensors = load_file(file)
     change(tensors)
@@ -73,7 +73,7 @@ def sections(result):
 
 
 @pytest.mark.slow
-def test_two_runs_with_one_seed_have_no_difference(cli, trained):
+def test_runs_with_same_seed_have_no_difference(cli, trained):
     one, other = trained(), trained()
     result = cli("diff", one, other)
     assert (result.code, result.err) == (0, "")
@@ -82,7 +82,7 @@ def test_two_runs_with_one_seed_have_no_difference(cli, trained):
     assert "4 steps" in result.out
 
 
-def test_a_run_has_no_difference_to_itself_as_json(cli, run):
+def test_run_compared_with_itself_has_no_difference(cli, run):
     result = cli("diff", run, run.name, "--json")
     assert result.code == 0
     assert (result.json["command"], result.json["equal"], result.json["first"]) == ("diff", True, None)
@@ -90,7 +90,7 @@ def test_a_run_has_no_difference_to_itself_as_json(cli, run):
 
 
 @pytest.mark.slow
-def test_what_was_given_comes_first_with_its_place_and_its_consequences_follow(cli, trained, run):
+def test_configuration_difference_comes_before_its_effects(cli, trained, run):
     other = trained("--seed", "5", "params.chance=0.25")
     result = cli("diff", run, other, "--json")
     assert result.code == 9
@@ -113,7 +113,7 @@ def test_what_was_given_comes_first_with_its_place_and_its_consequences_follow(c
     assert found["policy"][0]["where"] == "step 192: policy.safetensors sha256"
 
 
-def test_a_run_is_compared_with_a_task_by_configuration_and_files(cli, run, coin):
+def test_run_and_task_compare_configuration_and_files(cli, run, coin):
     result = cli("diff", run, coin, "--json")
     assert result.code == 9
     found = {d["where"]: (d["left"], d["right"], d["category"]) for d in sections(result)["configuration"]}
@@ -124,14 +124,16 @@ def test_a_run_is_compared_with_a_task_by_configuration_and_files(cli, run, coin
     assert sections(result)["files"] == []
     same = cli("diff", coin, *SMALL[:3], "agent.max_iterations=3", run, "--json")
     assert (same.code, sections(same)["configuration"]) == (0, [])
-    model = Path(shutil.copytree(coin, "other")) / "model.xml"  # not of the task that this process's runs share
+    model = (
+        Path(shutil.copytree(coin, "other")) / "model.xml"
+    )  # a copy, because all runs of this process share the task
     model.write_text(model.read_text().replace('mass="1"', 'mass="2"'))
     changed = cli("diff", "./other", *SMALL[:3], "agent.max_iterations=3", run, "--json")
     assert (changed.code, [d["where"] for d in sections(changed)["files"]]) == (9, ["model.xml"])
     assert cli("diff", run, "sim.dt=0.1", coin).code == 2, "a run has no overrides"
 
 
-def test_the_environment_is_compared_by_what_changes_bits(cli, run, copy):
+def test_environment_section_has_facts_that_change_bits(cli, run, copy):
     def change(record):
         record["versions"]["torch"] = "2.10.0"
         record["variables"]["MKL_CBWR"] = "AVX2"
@@ -148,7 +150,7 @@ def test_the_environment_is_compared_by_what_changes_bits(cli, run, copy):
     assert cli("diff", run, copy, "--only", "metrics", "--only", "weights").code == 0
 
 
-def test_records_of_older_runs_are_compared_as_far_as_they_go(cli, run, copy):
+def test_older_records_compare_common_entries(cli, run, copy):
     def forget(record):
         for key in ("sources", "cpu", "variables", "torch", "model", "libc", "given"):
             del record[key]
@@ -159,7 +161,7 @@ def test_records_of_older_runs_are_compared_as_far_as_they_go(cli, run, copy):
     assert "the entries that both have recorded" in result.out
 
 
-def test_the_first_metric_that_differs_is_named_and_the_clock_is_not_compared(cli, run, copy):
+def test_first_differing_metric_ignores_timings(cli, run, copy):
     rows = [json.loads(line) for line in (copy / "metrics.jsonl").read_text().splitlines()]
     for row in rows:
         row["Perf/total_fps"] += 1.0
@@ -177,7 +179,7 @@ def test_the_first_metric_that_differs_is_named_and_the_clock_is_not_compared(cl
     assert cli("diff", f"{run}@step:64", copy, "--only", "metrics").code == 0, "as far as that checkpoint"
 
 
-def test_the_first_weight_that_differs_is_named_with_its_step_and_index(cli, run, copy):
+def test_first_differing_weight_has_step_and_index(cli, run, copy):
     def nudge(tensors):
         weight = tensors["actor.0.weight"]
         weight[3, 0] = torch.nextafter(weight[3, 0], torch.tensor(9.0))
@@ -206,14 +208,14 @@ def test_the_first_weight_that_differs_is_named_with_its_step_and_index(cli, run
         ("policy", lambda t: t.update({"actor.0.bias": t["actor.0.bias"].double()}), "policy actor.0.bias"),
     ],
 )
-def test_optimiser_generators_environment_and_shapes_are_compared_too(cli, run, copy, part, change, where):
+def test_compares_optimizer_rng_environment_and_shapes(cli, run, copy, part, change, where):
     replace(last(copy), part, change)
     result = cli("diff", run, copy, "--json")
     assert result.code == 9
     assert result.json["first"]["where"].startswith(f"step 192: {where}")
 
 
-def test_not_a_number_equals_itself_and_minus_zero_differs_from_zero(cli, run, copy):
+def test_nan_equals_nan_and_minus_zero_differs_from_zero(cli, run, copy):
     for folder in (run, copy):
         replace(last(folder), "env", lambda tensors: tensors["engine.state"].mul_(float("nan")))
     assert cli("diff", run, copy).code == 0
@@ -222,7 +224,7 @@ def test_not_a_number_equals_itself_and_minus_zero_differs_from_zero(cli, run, c
     assert cli("diff", run, copy).code == 9
 
 
-def test_a_damaged_file_is_named_and_not_compared(cli, run, copy):
+def test_corrupt_file_is_checkpoint_error(cli, run, copy):
     file = last(copy) / "policy.safetensors"
     data = bytearray(file.read_bytes())
     data[-1] ^= 1
@@ -233,7 +235,7 @@ def test_a_damaged_file_is_named_and_not_compared(cli, run, copy):
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "said"),
+    ("file", "content", "message"),
     [
         ("config.yaml", b"a: &a [*a]\n", "config.yaml:1:"),
         ("config.yaml", b"a: !!python/object/apply:os.system [true]\n", "config.yaml:1:"),
@@ -244,14 +246,14 @@ def test_a_damaged_file_is_named_and_not_compared(cli, run, copy):
         ("run.json", b"[" * 100_000, "run.json is corrupt"),
     ],
 )
-def test_a_file_that_no_run_has_is_refused(cli, run, copy, file, content, said):
+def test_malformed_run_file_is_checkpoint_error(cli, run, copy, file, content, message):
     (copy / file).write_bytes(content)
     result = cli("diff", run, copy)
     assert result.code == 5
-    assert said in result.err
+    assert message in result.err
 
 
-def test_text_of_a_stranger_cannot_drive_the_terminal(cli, run, copy):
+def test_untrusted_text_has_no_control_characters(cli, run, copy):
     edit(copy / "run.json", lambda record: record["versions"].update({"x\x1b[2J": "\x1b]0;gone\x07"}))
     result = cli("diff", run, copy)
     assert result.code == 9
@@ -260,7 +262,7 @@ def test_text_of_a_stranger_cannot_drive_the_terminal(cli, run, copy):
 
 
 @pytest.mark.parametrize("depth", [200, 900, 2000, 50_000])
-def test_values_that_are_nested_deeply_crash_nothing(cli, run, copy, depth):
+def test_deeply_nested_values_do_not_crash(cli, run, copy, depth):
     deep = "[" * depth + "]" * depth
     text = (copy / "run.json").read_text()
     (copy / "run.json").write_text(text.replace('"libc": ', f'"libc": {deep}, "was": ', 1))
@@ -268,7 +270,7 @@ def test_values_that_are_nested_deeply_crash_nothing(cli, run, copy, depth):
     assert result.code in (5, 9), result.err
 
 
-def test_what_cannot_be_compared_is_refused(cli, run, tmp_path):
+def test_invalid_comparison_is_refused(cli, run, tmp_path):
     assert cli("diff", run, tmp_path).code == 5
     assert cli("diff", run, "nowhere").code == 5
     assert cli("diff", run, f"{run}@step:7").code == 5
@@ -278,7 +280,7 @@ def test_what_cannot_be_compared_is_refused(cli, run, tmp_path):
     assert "weights" in result.err
 
 
-def test_a_run_of_two_lengths_is_compared_by_its_replay_rows(cli, coin, tmp_path):
+def test_replay_buffers_of_different_shards_are_compared_by_row(cli, coin, tmp_path):
     agent = tmp_path / "agent.yaml"
     agent.write_text(
         "agents: {x: {trainer: sb3, algorithm: sac, max_iterations: 4, train_freq: 4, gradient_steps: 1,"
@@ -304,7 +306,7 @@ def test_a_run_of_two_lengths_is_compared_by_its_replay_rows(cli, coin, tmp_path
 
 
 @pytest.mark.slow
-def test_a_run_is_reproduced_bit_by_bit(cli, run):
+def test_reproduce_is_bitwise_equal(cli, run):
     result = cli("reproduce", run, "--json")
     assert result.code == 0, result.err
     assert (result.json["equal"], result.json["iterations"], result.json["environment"]) == (True, 3, [])
@@ -315,7 +317,7 @@ def test_a_run_is_reproduced_bit_by_bit(cli, run):
     assert cli("diff", run, again).code == 0, "environment and configuration too"
 
 
-def test_only_the_beginning_is_reproduced_if_asked(cli, run):
+def test_reproduce_first_iterations_only(cli, run):
     result = cli("reproduce", run, "--iterations", "1", "--json")
     assert result.code == 0, result.err
     again = Path(result.json["right"])
@@ -323,7 +325,7 @@ def test_only_the_beginning_is_reproduced_if_asked(cli, run):
     assert len((again / "metrics.jsonl").read_text().splitlines()) == 1
 
 
-def test_a_run_that_does_not_come_again_is_told_with_the_first_difference(cli, run):
+def test_reproduce_reports_first_difference(cli, run):
     rows = (run / "metrics.jsonl").read_text().splitlines()
     rows[0] = json.dumps(json.loads(rows[0]) | {"Loss/value": 7.0})
     (run / "metrics.jsonl").write_text("\n".join(rows) + "\n")
@@ -332,7 +334,7 @@ def test_a_run_that_does_not_come_again_is_told_with_the_first_difference(cli, r
     assert "first difference: metrics iteration 1: Loss/value: 7.0 | " in result.out
 
 
-def test_another_environment_is_shown_before_anything_is_trained(cli, run):
+def test_reproduce_stops_before_training_in_changed_environment(cli, run):
     edit(run / "run.json", lambda record: record["versions"].update(mujoco="3.9.9"))
     result = cli("reproduce", run)
     assert result.code == 9
@@ -344,7 +346,7 @@ def test_another_environment_is_shown_before_anything_is_trained(cli, run):
     assert [row["name"] for row in forced.json["environment"]] == ["versions.mujoco"]
 
 
-def test_a_changed_model_of_the_task_is_a_changed_environment(cli, trained):
+def test_changed_model_file_is_changed_environment(cli, trained):
     run = trained()
     model = Path("coin/model.xml")
     model.write_text(model.read_text().replace('mass="1"', 'mass="1.5"'))
@@ -353,7 +355,7 @@ def test_a_changed_model_of_the_task_is_a_changed_environment(cli, trained):
     assert [row["name"] for row in result.json["environment"]] == ["sources.model.xml"]
 
 
-def test_what_only_the_built_model_shows_stops_before_training(cli, run):
+def test_changed_compiled_model_stops_before_training(cli, run):
     edit(run / "run.json", lambda record: record.update(model="0" * 64))
     result = cli("reproduce", run, "--json")
     assert result.code == 9
@@ -362,7 +364,7 @@ def test_what_only_the_built_model_shows_stops_before_training(cli, run):
 
 
 @pytest.mark.slow
-def test_a_run_that_was_stopped_and_resumed_is_reproduced(cli, trained, coin):
+def test_reproduce_of_resumed_run(cli, trained, coin):
     run = Path(cli("train", coin, *SMALL[:3], "--max-iterations", "1", "-q", "--logger", "none").out.strip())
     assert cli("train", "--resume", run, "--max-iterations", "3", "-q").code == 0
     assert cli("diff", run, trained(), "--only", "metrics", "--only", "weights").code == 0
@@ -370,7 +372,7 @@ def test_a_run_that_was_stopped_and_resumed_is_reproduced(cli, trained, coin):
     assert "resumed" not in json.loads((run / "run.json").read_text()), "in the same environment"
 
 
-def test_a_killed_run_is_reproduced_as_far_as_it_told(cli, run):
+def test_reproduce_of_killed_run_ends_at_last_metrics(cli, run):
     edit(run / "run.json", lambda record: (record.update(state="running"), record.pop("iteration")))
     shutil.rmtree(last(run))
     lines = (run / "metrics.jsonl").read_text().splitlines()
@@ -380,7 +382,7 @@ def test_a_killed_run_is_reproduced_as_far_as_it_told(cli, run):
     assert result.json["iterations"] == 2
 
 
-def test_a_run_resumed_in_another_environment_says_so(cli, run):
+def test_resume_in_changed_environment_warns(cli, run):
     edit(run / "run.json", lambda record: record.update(libc="another"))
     result = cli("train", "--resume", run, "--max-iterations", "4")
     assert result.code == 0
@@ -391,7 +393,7 @@ def test_a_run_resumed_in_another_environment_says_so(cli, run):
 
 
 @pytest.mark.slow
-def test_a_run_that_began_from_other_weights_begins_from_them_again(cli, trained, run):
+def test_reproduce_of_run_with_initial_weights(cli, trained, run):
     second = trained("--init-from", f"{run}@step:128")
     assert cli("reproduce", second).code == 0
     replace(run / "checkpoints" / f"{128:012d}", "policy", lambda tensors: tensors["actor.0.bias"].zero_())
@@ -401,14 +403,14 @@ def test_a_run_that_began_from_other_weights_begins_from_them_again(cli, trained
 
 
 @pytest.mark.parametrize("change", [{"device": "cuda"}, {"processes": 2}])
-def test_bits_are_promised_of_one_process_on_the_cpu_only(cli, run, change):
+def test_reproduce_refuses_gpu_and_multi_process_runs(cli, run, change):
     edit(run / "run.json", lambda record: record.update(change))
     result = cli("reproduce", run)
     assert result.code == 2
     assert ("cannot be reproduced bit by bit" if "device" in change else "trained by 2 processes") in result.err
 
 
-def test_a_run_without_an_iteration_cannot_be_reproduced(cli, run):
+def test_reproduce_without_iterations_is_refused(cli, run):
     (run / "metrics.jsonl").write_text("")
     assert cli("reproduce", run).code == 2
     assert cli("reproduce", "nowhere").code == 5

@@ -1,4 +1,4 @@
-"""`rlcli diff` on configurations: what differs is said with what it is of, and only the cosmetic is no difference."""
+"""`rlcli diff` on configurations: differences have a category, and cosmetic ones do not count."""
 
 import json
 
@@ -11,7 +11,7 @@ LIGHTER = ("joints: [slider]", "joints: [slider], scale: 2.0")
 
 @pytest.fixture
 def diff(in_process):
-    """diff(arguments...) -> (exit code, its document)."""
+    """Return a function that runs `rlcli diff` and returns (exit code, document)."""
 
     def run(*arguments):
         code, out, err = in_process("diff", *arguments, "--json")
@@ -22,11 +22,11 @@ def diff(in_process):
 
 
 def found(document):
-    """Where -> category of all that differs."""
+    """Return key -> category of all differences."""
     return {d["where"]: d["category"] for s in document["sections"] for d in s["differences"]}
 
 
-def test_each_override_is_said_with_its_kind_and_both_places(diff, small):
+def test_override_has_category_and_both_origins(diff, small):
     changes = ["sim.dt=0.005", "rewards.alive.weight=2", "agent.learning_rate=1e-3", "viewer.width=320"]
     code, document = diff(small(), *changes)
     assert code == 9
@@ -47,14 +47,14 @@ def test_each_override_is_said_with_its_kind_and_both_places(diff, small):
     "change",
     ["summary=other", "viewer.eye=[1,1,1]", "sim.engine_threads=1", "agent.save_interval=7", "scene.lights.dome=null"],
 )
-def test_what_nothing_computed_depends_on_is_no_difference(diff, small, change):
+def test_cosmetic_changes_are_no_difference(diff, small, change):
     code, document = diff(small(), change)
     assert (code, document["equal"], document["first"]) == (0, True, None)
     assert document["categories"]["cosmetic"] >= 1
     assert sum(document["categories"].values()) == document["categories"]["cosmetic"]
 
 
-def test_two_sides_may_have_overrides_each(diff, small):
+def test_both_sides_accept_overrides(diff, small):
     task = small()
     assert diff(task, "sim.dt=0.005", task, "sim.dt=0.005")[0] == 0
     code, document = diff(task, "sim.dt=0.005", task, "decimation=4")
@@ -62,11 +62,11 @@ def test_two_sides_may_have_overrides_each(diff, small):
     assert found(document) == {"sim.dt": "physics", "decimation": "MDP"}
 
 
-def test_one_number_written_in_two_ways_is_equal(diff, small):
+def test_equal_numbers_in_different_notation_are_equal(diff, small):
     assert diff(small(), "sim.dt=1/100", "rewards.alive.weight=1")[0] == 0
 
 
-def test_names_folders_and_files_are_compared_with_each_other(diff, small, here):
+def test_compares_names_folders_and_files(diff, small, here):
     task = small()
     (here / "other.yaml").write_text((here / "small/task.yaml").read_text().replace(*LIGHTER))
     (here / "other.yaml").rename(here / "small/other.yaml")
@@ -79,7 +79,7 @@ def test_names_folders_and_files_are_compared_with_each_other(diff, small, here)
     assert document["left"] == "cartpole"
 
 
-def test_models_and_code_of_the_tasks_are_compared_too(diff, small, here):
+def test_compares_models_and_code(diff, small, here):
     task = small(mine="X = 1\n")
     (here / "copy").mkdir()
     for file in (here / "small").iterdir():
@@ -93,7 +93,7 @@ def test_models_and_code_of_the_tasks_are_compared_too(diff, small, here):
     assert found(document) == {"model.xml": "physics", "mine.py": "MDP"}
 
 
-def test_the_chosen_agent_is_compared_whatever_it_is_called(diff, small):
+def test_compares_chosen_agent_under_any_name(diff, small):
     agents = "  default: small\n  small: {trainer: sb3, algorithm: ppo, max_iterations: 1}\n"
     twin = agents + "  twin: {trainer: sb3, algorithm: ppo, max_iterations: 1, gamma: 0.9}\n"
     task = small((agents, twin))
@@ -104,7 +104,7 @@ def test_the_chosen_agent_is_compared_whatever_it_is_called(diff, small):
     assert found(diff(task, "agent.gamma=0.5", "--agent", "twin")[1]) == {"agent.gamma": "agent"}
 
 
-def test_colours_count_where_the_policy_sees(diff):
+def test_lights_are_not_cosmetic_for_camera_tasks(diff):
     change = "scene.lights.dome.intensity=100"
     assert diff("cartpole", change)[0] == 0
     code, document = diff("cartpole-camera", change)
@@ -132,31 +132,31 @@ def test_colours_count_where_the_policy_sees(diff):
         ("sim.engine", "physics"),
     ],
 )
-def test_a_key_has_a_kind(path, kind):
+def test_category_of_key(path, kind):
     assert category(tuple(path.split("."))) == kind
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
-        (["cartpole"], 2, "two are compared, found 1: cartpole"),
+        (["cartpole"], 2, "two runs or tasks are compared, found 1: cartpole"),
         (["cartpole", "cartpole", "cartpole"], 2, "found 3"),
-        (["sim.dt=1", "cartpole"], 2, "what is 'sim.dt=1' an override of?"),
+        (["sim.dt=1", "cartpole"], 2, "the override 'sim.dt=1' comes before any task"),
         (["cartpoel", "cartpole"], 5, "did you mean 'cartpole'"),
         (["cartpole", "sim.tm=1"], 3, "unknown key 'tm'"),
         (["cartpole", "gone.yaml"], 4, "no file 'gone.yaml'"),
-        (["cartpole", "ant", "--only", "weights"], 2, "--only is of two runs"),
-        (["cartpole", "ant", "--agent", "nobody"], 3, "no agent 'nobody'"),
+        (["cartpole", "ant", "--only", "weights"], 2, "--only applies to two runs"),
+        (["cartpole", "ant", "--agent", "missing"], 3, "no agent 'missing'"),
     ],
 )
-def test_what_cannot_be_compared_is_one_message(in_process, arguments, code, said):
+def test_invalid_comparison_is_one_message(in_process, arguments, code, message):
     got, out, err = in_process("diff", *arguments)
     assert (got, out) == (code, "")
-    assert said in err
+    assert message in err
     assert "Traceback" not in err
 
 
-def test_many_differences_are_counted_and_v_shows_them(in_process):
+def test_verbose_shows_all_differences(in_process):
     code, out, _ = in_process("diff", "cartpole", "ant")
     assert code == 9
     assert "more (-v shows them)" in out

@@ -1,4 +1,4 @@
-"""`rlcli eval` and `rlcli play`: which policy, how it is judged, and what comes out."""
+"""`rlcli eval` and `rlcli play`: choice of the policy, limits, results, videos and exit codes."""
 
 import json
 import subprocess
@@ -22,8 +22,8 @@ print(json.dumps({"fps": meta.get("fps"), "duration": meta.get("duration"), "fra
 
 
 def read_video(file):
-    said = subprocess.run([sys.executable, "-c", READ, str(file)], capture_output=True, text=True)
-    return json.loads(said.stdout)
+    result = subprocess.run([sys.executable, "-c", READ, str(file)], capture_output=True, text=True)
+    return json.loads(result.stdout)
 
 
 @pytest.fixture
@@ -32,8 +32,8 @@ def trained(cli, only_run):
     return only_run()
 
 
-def test_the_mix_of_short_and_long_episodes_is_the_true_one(cli, coin):
-    # 400 short episodes end long before the first long one: counting the first to finish would find no success
+def test_short_episodes_are_not_overrepresented(cli, coin):
+    # 400 short episodes end before the first long one: counting the first to end would give a success rate of 0
     result = cli("eval", coin, "--policy", "zero", "--episodes", 400, "--json").json
     assert result["episodes"] == 400
     rate = result["success"]["rate"]
@@ -46,7 +46,7 @@ def test_the_mix_of_short_and_long_episodes_is_the_true_one(cli, coin):
 
 
 @pytest.mark.parametrize(("chance", "rate"), [("0.0", 1.0), ("1.0", 0.0)])
-def test_certain_outcomes_are_certain(cli, coin, chance, rate):
+def test_success_rate_of_deterministic_outcomes(cli, coin, chance, rate):
     result = cli(
         "eval", coin, f"params.chance={chance}", "--policy", "zero", "--episodes", 5, "--json", "--num-envs", 2
     ).json
@@ -54,12 +54,12 @@ def test_certain_outcomes_are_certain(cli, coin, chance, rate):
     assert result["episodes"] == 5
 
 
-def test_an_episode_that_times_out_off_target_is_no_success(cli, coin):
+def test_time_out_away_from_target_is_no_success(cli, coin):
     arguments = ("params.chance=0.0", "success.target=1.0", "--policy", "zero", "--episodes", 3, "--json")
     assert cli("eval", coin, *arguments).json["success"]["rate"] == 0.0
 
 
-def test_evaluation_repeats_with_its_seed(cli):
+def test_eval_is_reproducible_with_seed(cli):
     arguments = ("cartpole", "--policy", "random", "--episodes", 8, "--num-envs", 8, "--json")
     one, same, other = (cli("eval", *arguments, "--seed", seed).json["return"] for seed in (1, 1, 2))
     assert one == same != other
@@ -77,7 +77,7 @@ def test_evaluation_repeats_with_its_seed(cli):
         (("terminations.task=0.9", "terminations.task.low=0.5"), ["terminations.task", "terminations.task.low"]),
     ],
 )
-def test_falling_under_a_limit_is_a_negative_verdict(cli, coin, limits, failed):
+def test_fail_under_exits_with_9(cli, coin, limits, failed):
     options = [word for limit in limits for word in ("--fail-under", limit)]
     done = cli("eval", coin, "--policy", "zero", "--episodes", 64, "--json", *options)
     assert done.code == (9 if failed else 0)
@@ -100,20 +100,20 @@ def test_falling_under_a_limit_is_a_negative_verdict(cli, coin, limits, failed):
         "reward=1",
     ],
 )
-def test_a_malformed_limit_is_a_usage_error(cli, coin, text):
+def test_malformed_limit_is_usage_error(cli, coin, text):
     done = cli("eval", coin, "--policy", "zero", "--fail-under", text)
     assert done.code == 2
     assert text in done.err
 
 
-def test_a_limit_of_a_term_that_there_is_not_names_those_that_there_are(cli, coin):
+def test_limit_of_unknown_term_suggests_name(cli, coin):
     done = cli("eval", coin, "--policy", "zero", "--episodes", 2, "--fail-under", "terminations.time_ot=0.5")
     assert done.code == 2
     assert "no terminations.time_ot" in done.err
     assert "did you mean 'time_out'" in done.err
 
 
-def test_every_number_has_an_interval_that_holds_it(cli, coin):
+def test_intervals_contain_their_means(cli, coin):
     done = cli("eval", "cartpole", "--policy", "random", "--episodes", 12, "--num-envs", 4, "--json").json
     for group in ("reward_terms", "terminations"):
         for value in done[group].values():
@@ -122,7 +122,7 @@ def test_every_number_has_an_interval_that_holds_it(cli, coin):
     assert done["reward_terms"]["pole_pos"]["low"] < done["reward_terms"]["pole_pos"]["high"]
 
 
-def test_one_episode_has_no_interval(cli, coin):
+def test_single_episode_has_no_interval(cli, coin):
     arguments = ("eval", coin, "--policy", "zero", "--episodes", 1)
     assert cli(*arguments, "--json").json["return"]["low"] is None
     done = cli(*arguments, "--fail-under", "return.low=0")
@@ -131,30 +131,30 @@ def test_one_episode_has_no_interval(cli, coin):
     assert "return.low is unknown after one episode" in done.err
 
 
-def test_the_evaluation_of_a_checkpoint_stays_in_its_run(cli, trained):
+def test_evaluation_is_saved_in_run(cli, trained):
     from rlcli.runs.eval_store import read_evaluation
     from rlcli.runs.run import open_run
 
-    said = cli("eval", "--checkpoint", trained, "--episodes", 4, "--json").json
+    result = cli("eval", "--checkpoint", trained, "--episodes", 4, "--json").json
     kept = read_evaluation(open_run(trained), "000000000128")
-    assert kept == {key: value for key, value in said.items() if key in kept}
+    assert kept == {key: value for key, value in result.items() if key in kept}
     assert kept["command"] == "eval"
-    assert kept["return"] == said["return"]
+    assert kept["return"] == result["return"]
     assert read_evaluation(open_run(trained), "000000000000") is None
     cli("eval", "--checkpoint", trained, "--episodes", 5)
-    assert read_evaluation(open_run(trained), "000000000128")["episodes"] == 5  # the newest counts
+    assert read_evaluation(open_run(trained), "000000000128")["episodes"] == 5  # the newest evaluation is kept
 
 
 @pytest.mark.parametrize(
     "changed", [("episode_length_s=0.5",), ("--policy", "zero"), ("--stochastic",), ("--config", "more.yaml")]
 )
-def test_an_evaluation_of_something_else_than_was_trained_is_not_kept(cli, trained, changed):
+def test_evaluation_of_changed_task_is_not_saved(cli, trained, changed):
     Path("more.yaml").write_text("episode_length_s: 0.5\n")
     assert cli("eval", "--checkpoint", trained, "--episodes", 2, *changed).code == 0
     assert not (trained / "evaluations").exists()
 
 
-def test_an_evaluation_is_not_kept_where_a_run_leads_elsewhere(cli, trained, tmp_path):
+def test_evaluation_is_not_saved_through_link(cli, trained, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (trained / "evaluations").symlink_to(tmp_path / "elsewhere")
     done = cli("eval", "--checkpoint", trained, "--episodes", 2)
@@ -163,7 +163,7 @@ def test_an_evaluation_is_not_kept_where_a_run_leads_elsewhere(cli, trained, tmp
     assert "link" in done.err
 
 
-def test_a_task_without_success_has_none_and_cannot_be_judged_by_it(cli, coin):
+def test_success_limit_without_success_is_usage_error(cli, coin):
     arguments = ("success=null", "--policy", "zero", "--episodes", 4)
     assert "success" not in cli("eval", coin, *arguments, "--json").json
     done = cli("eval", coin, *arguments, "--fail-under", "success=0.5")
@@ -173,12 +173,12 @@ def test_a_task_without_success_has_none_and_cannot_be_judged_by_it(cli, coin):
 
 
 @pytest.mark.parametrize("episodes", ["0", "-1", "x"])
-def test_a_number_of_episodes_below_one_is_a_usage_error(cli, coin, episodes):
+def test_episodes_below_one_is_usage_error(cli, coin, episodes):
     assert cli("eval", coin, "--policy", "zero", "--episodes", episodes).code == 2
 
 
 @pytest.mark.parametrize("policy", ["zero", "random"])
-def test_a_policy_that_is_not_trained_needs_no_checkpoint(cli, policy):
+def test_untrained_policies_need_no_checkpoint(cli, policy):
     done = cli("eval", "cartpole", "--policy", policy, "--episodes", 8, "--num-envs", 8, "--json")
     assert done.code == 0
     assert done.json["checkpoint"] is None
@@ -187,7 +187,7 @@ def test_a_policy_that_is_not_trained_needs_no_checkpoint(cli, policy):
     assert total == pytest.approx(done.json["return"]["mean"], rel=1e-4)
 
 
-def test_the_document_of_eval(cli, trained):
+def test_eval_document(cli, trained):
     result = cli("eval", "cartpole", "--episodes", 4, "--json").json
     assert result["schema"] == 1
     assert result["command"] == "eval"
@@ -197,7 +197,7 @@ def test_the_document_of_eval(cli, trained):
     assert result["diverged"] == 0
 
 
-def test_stochastic_actions_differ_from_deterministic_ones(cli, trained):
+def test_stochastic_changes_returns(cli, trained):
     returns = [
         cli("eval", "cartpole", "--episodes", 8, "--json", *extra).json["return"]["mean"]
         for extra in ((), (), ("--stochastic",), ("--stochastic",))
@@ -206,7 +206,7 @@ def test_stochastic_actions_differ_from_deterministic_ones(cli, trained):
 
 
 @pytest.mark.parametrize("command", ["play", "eval"])
-def test_without_a_run_and_a_shipped_policy_the_hint_says_how_to_make_one(cli, coin, command):
+def test_missing_policy_has_training_hint(cli, coin, command):
     done = cli(command, coin)
     assert done.code == 5
     assert "rlcli train coin" in done.err
@@ -226,20 +226,20 @@ def test_without_a_run_and_a_shipped_policy_the_hint_says_how_to_make_one(cli, c
         (("cartpole", "--num-envs", "0"), 3),
     ],
 )
-def test_mistakes_are_one_message_and_a_code(cli, trained, command, arguments, code):
+def test_invalid_arguments_are_one_message_with_exit_code(cli, trained, command, arguments, code):
     done = cli(command, *arguments)
     assert done.code == code, done.err
     assert "error: " in done.err
     assert json.loads(cli(command, *arguments, "--json").out)["error"]["exit_code"] == code
 
 
-def test_a_checkpoint_of_another_task_than_the_one_named_is_refused(cli, trained):
+def test_checkpoint_of_other_task_is_usage_error(cli, trained):
     done = cli("eval", "cartpole-direct", "--checkpoint", trained)
     assert done.code == 2
     assert "run of cartpole" in done.err
 
 
-def test_play_without_a_display_gives_numbers(cli, trained):
+def test_play_without_display_prints_numbers(cli, trained):
     done = cli("play", "cartpole")
     assert done.code == 0
     assert f"checkpoint {trained}" in done.err
@@ -248,14 +248,14 @@ def test_play_without_a_display_gives_numbers(cli, trained):
     assert cli("play", "cartpole", "--json").json["video"] is None
 
 
-def test_a_window_without_a_display_is_a_machine_error(cli, trained):
+def test_native_viewer_without_display_is_machine_error(cli, trained):
     done = cli("play", "cartpole", "--viewer", "native")
     assert done.code == 10
     assert "no display" in done.err
     assert "--video" in done.err
 
 
-def test_an_unknown_viewer_is_a_usage_error(cli):
+def test_unknown_viewer_is_usage_error(cli):
     assert cli("play", "cartpole", "--viewer", "nativ").code == 2
 
 
@@ -263,7 +263,7 @@ def test_an_unknown_viewer_is_a_usage_error(cli):
 
 
 @pytest.mark.slow
-def test_a_video_shows_every_step_at_the_control_rate(cli, trained, start):
+def test_video_has_every_step_at_control_rate(cli, trained, start):
     done = start("play", "cartpole", "--video", "x.mp4", "--num-envs", 1, "viewer.width=160", "viewer.height=120")
     out, err = done.communicate(timeout=120)
     assert done.returncode == 0, err
@@ -278,7 +278,7 @@ def test_a_video_shows_every_step_at_the_control_rate(cli, trained, start):
 
 
 @pytest.mark.slow
-def test_a_video_goes_on_where_the_first_episode_soon_fails(cli):
+def test_video_continues_after_early_termination(cli):
     play = ("play", "cartpole-direct", "--policy", "random", "--json", "viewer.width=160", "viewer.height=120")
     first = cli(*play, "--video", "first.mp4", "--num-envs", 1).json
     more = cli(*play, "--video", "more.mp4", "--num-envs", 16).json
@@ -287,7 +287,7 @@ def test_a_video_goes_on_where_the_first_episode_soon_fails(cli):
 
 
 @pytest.mark.slow
-def test_a_gif_plays_in_real_time(cli, trained):
+def test_gif_plays_in_real_time(cli, trained):
     result = cli("play", "cartpole", "--video", "x.gif", "--num-envs", 1, "--json").json
     assert result["fps"] == pytest.approx(20)
     assert result["frames"] == -(-int(result["length"]["mean"]) // 3)
@@ -295,18 +295,18 @@ def test_a_gif_plays_in_real_time(cli, trained):
 
 
 @pytest.mark.parametrize("name", ["x.avi", "x", "x.mp4/"])
-def test_another_kind_of_video_is_refused_before_anything_heavy(start, name):
+def test_unknown_video_format_fails_before_heavy_imports(start, name):
     code = (
         "import sys; from rlcli.cli.app import main\n"
         f"code = main(['play', 'cartpole', '--policy', 'zero', '--video', {name + '.txt'!r}])\n"
         "print(code, [m for m in ('torch', 'mujoco') if m in sys.modules])"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert said.stdout.strip() == "2 []"
-    assert "is not a video file" in said.stderr
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.stdout.strip() == "2 []"
+    assert "is not a video file" in result.stderr
 
 
-def test_no_gl_is_a_machine_error_and_no_file(cli, trained, monkeypatch):
+def test_video_without_gl_is_machine_error(cli, trained, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
     done = cli("play", "cartpole", "--video", "x.mp4")
     assert done.code == 10
@@ -314,7 +314,7 @@ def test_no_gl_is_a_machine_error_and_no_file(cli, trained, monkeypatch):
     assert not list(Path().glob("*x*"))
 
 
-def test_no_imageio_is_a_missing_dependency(cli, monkeypatch):
+def test_missing_imageio_is_dependency_error(cli, monkeypatch):
     import importlib.util
 
     real = importlib.util.find_spec
@@ -324,10 +324,10 @@ def test_no_imageio_is_a_missing_dependency(cli, monkeypatch):
     assert 'pip install "rlcli[video]"' in done.err
 
 
-# --- a run needs nothing but itself ---
+# --- a run is self-contained ---
 
 
-def test_a_run_keeps_its_configuration_when_the_task_changes(cli, coin):
+def test_run_keeps_its_configuration_when_task_changes(cli, coin):
     assert cli("train", coin, "params.chance=0.0", *SMALL, "--max-iterations", 1).code == 0
     file = Path("coin/task.yaml")
     file.write_text(file.read_text().replace("chance: 0.5", "chance: 1.0").replace("1.0\nsim", "0.5\nsim"))
@@ -341,7 +341,7 @@ def test_a_run_keeps_its_configuration_when_the_task_changes(cli, coin):
     )
 
 
-def test_a_run_whose_task_is_gone_says_what_is_missing(cli, coin):
+def test_run_with_missing_task_folder_names_it(cli, coin):
     cli("train", coin, *SMALL, "--max-iterations", 1)
     Path("coin").rename("moved")
     done = cli("eval", "--checkpoint", "latest")
@@ -349,7 +349,7 @@ def test_a_run_whose_task_is_gone_says_what_is_missing(cli, coin):
     assert "coin" in done.err
 
 
-def test_a_run_of_a_distribution_that_is_gone_says_what_to_install(cli, trained):
+def test_run_with_missing_distribution_names_it(cli, trained):
     record = json.loads((trained / "run.json").read_text())
     record["task"] |= {"distribution": "robot-tasks", "version": "2.5"}
     (trained / "run.json").write_text(json.dumps(record))
@@ -359,7 +359,7 @@ def test_a_run_of_a_distribution_that_is_gone_says_what_to_install(cli, trained)
 
 
 @pytest.mark.parametrize("command", [("eval", "--checkpoint"), ("train", "--max-iterations", "3", "--resume")])
-def test_a_changed_observation_layout_is_shown_field_by_field(cli, trained, command):
+def test_changed_observation_layout_is_printed_by_field(cli, trained, command):
     file = trained / "config.yaml"
     file.write_text(file.read_text().replace("joint_vel_rel:\n", "velocity:\n", 1))
     done = cli(*command, trained)
@@ -369,7 +369,7 @@ def test_a_changed_observation_layout_is_shown_field_by_field(cli, trained, comm
     assert "policy[0]" not in done.err
 
 
-def test_a_damaged_policy_is_named(cli, trained):
+def test_corrupt_policy_names_file(cli, trained):
     file = trained / "checkpoints/000000000128/policy.safetensors"
     file.write_bytes(file.read_bytes()[:-5])
     done = cli("eval", "--checkpoint", f"{trained}@step:128")

@@ -1,4 +1,4 @@
-"""`rlcli new`: a package that installs, keeps the contract and learns; a name that cannot be is refused."""
+"""`rlcli new`: the package is complete and valid; invalid names are refused."""
 
 import ast
 import json
@@ -17,7 +17,7 @@ def files_of(folder):
 
 
 @pytest.mark.parametrize("flavour", FLAVOURS)
-def test_a_new_package_is_whole(in_process, here, flavour):
+def test_new_package_is_complete_and_valid(in_process, here, flavour):
     code, out, err = in_process("new", "my-arm-2", "--flavour", flavour, "--json")
     assert code == 0, err
     document = json.loads(out)
@@ -39,7 +39,7 @@ def test_a_new_package_is_whole(in_process, here, flavour):
 
 
 @pytest.mark.parametrize("flavour", FLAVOURS)
-def test_at_most_ten_lines_are_to_be_edited(flavour):
+def test_template_marks_five_to_ten_lines_to_edit(flavour):
     files = render("my-arm", flavour)
     marked = [
         line for path, text in files.items() if path != "README.md" for line in text.splitlines() if "yours" in line
@@ -48,7 +48,7 @@ def test_at_most_ten_lines_are_to_be_edited(flavour):
 
 
 @pytest.mark.parametrize("flavour", FLAVOURS)
-def test_what_is_written_is_formatted_and_holds_no_trace_of_the_template(flavour):
+def test_files_are_formatted_without_template_marks(flavour):
     for path, text in render("gitignore-arm", flavour).items():
         assert "{{" not in text, path
         assert "my-arm" not in text, path
@@ -57,7 +57,7 @@ def test_what_is_written_is_formatted_and_holds_no_trace_of_the_template(flavour
     assert "gitignore_arm/task.yaml" in render("gitignore-arm", flavour)
 
 
-def test_the_schema_knows_the_tasks_own_terms_and_finds_mistakes(in_process, here):
+def test_schema_has_own_terms_and_finds_mistakes(in_process, here):
     assert in_process("new", "my-arm")[0] == 0
     schema = json.loads((here / "my-arm" / "task.schema.json").read_text())
     task = yaml.safe_load((here / "my-arm" / "my_arm" / "task.yaml").read_text().replace("1e-3", "0.001"))
@@ -67,7 +67,7 @@ def test_the_schema_knows_the_tasks_own_terms_and_finds_mistakes(in_process, her
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("MyArm", "did you mean 'my-arm'?"),
         ("my_arm", "did you mean 'my-arm'?"),
@@ -89,20 +89,20 @@ def test_the_schema_knows_the_tasks_own_terms_and_finds_mistakes(in_process, her
         ("rlcli-tasks", "a Python module 'rlcli_tasks' already exists"),
     ],
 )
-def test_a_name_that_cannot_be_is_refused_and_nothing_is_written(in_process, here, name, said):
+def test_invalid_name_writes_nothing(in_process, here, name, message):
     code, _, err = in_process("new", name)
     assert code == 2
-    assert said in err
+    assert message in err
     assert not list(here.iterdir())
 
 
-def test_an_unknown_flavour_is_answered_with_those_there_are(in_process, here):
+def test_unknown_flavour_is_usage_error(in_process, here):
     code, _, err = in_process("new", "my-arm", "--flavour", "yml")
     assert (code, "did you mean 'yaml'?" in err) == (2, True)
     assert not list(here.iterdir())
 
 
-def test_a_folder_that_holds_something_is_left_alone(in_process, here):
+def test_non_empty_folder_is_not_changed(in_process, here):
     (here / "my-arm").mkdir()
     (here / "my-arm" / "notes.txt").write_text("mine")
     code, _, err = in_process("new", "my-arm")
@@ -113,25 +113,25 @@ def test_a_folder_that_holds_something_is_left_alone(in_process, here):
     assert files_of(here) == {"my-arm/notes.txt", "file"}
 
 
-def test_an_empty_folder_is_filled_and_a_deep_one_is_made(in_process, here):
+def test_empty_and_nested_folders_are_filled(in_process, here):
     (here / "empty").mkdir()
     before = (here / "empty").stat().st_ino
     assert in_process("new", "my-arm", "-o", "empty")[0] == 0
-    assert (here / "empty").stat().st_ino == before  # a shell may stand in it
+    assert (here / "empty").stat().st_ino == before  # it may be the current folder of a shell
     assert in_process("new", "my-arm", "-o", "deep/er/arm")[0] == 0
     assert files_of(here / "empty") == files_of(here / "deep" / "er" / "arm")
     assert {path.name for path in here.iterdir()} == {"empty", "deep"}
     assert [path.name for path in (here / "deep" / "er").iterdir()] == ["arm"]
 
 
-def test_here_is_a_folder_too(in_process, here):
+def test_current_folder_as_output(in_process, here):
     assert in_process("new", "my-arm", "-o", ".")[0] == 0
     assert (here / "my_arm" / "task.yaml").is_file()
     assert not [path for path in here.parent.iterdir() if path.name.startswith(".")]
 
 
-def test_a_failure_in_between_leaves_nothing(monkeypatch, here, capfd):
-    """The disk fills up while the last file is written."""
+def test_failed_write_leaves_nothing(monkeypatch, here, capfd):
+    """The disk is full when the last file is written."""
     import rlcli.config.dump
 
     def full(*arguments):

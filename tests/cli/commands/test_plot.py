@@ -1,4 +1,4 @@
-"""`rlcli plot`: which runs it finds, what it writes and where, and what it refuses."""
+"""`rlcli plot`: references of runs, contents and path of the figure, and invalid arguments."""
 
 import subprocess
 import sys
@@ -13,32 +13,32 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
 
 @pytest.fixture
 def runs(tmp_path):
-    """Three seeds of one configuration, and a run of another."""
+    """Three seeds of one configuration, and a run of another one."""
     folder = tmp_path / "runs"
     made = [write_run(folder, seed=seed, rows=learning(scale=seed)) for seed in (1, 2, 3)]
     return [*made, write_run(folder, "cartpole-direct", rows=learning())]
 
 
-def test_one_run_is_drawn_into_itself(cli, runs):
-    said = cli("plot", runs[0].folder)
+def test_single_run_is_drawn_into_its_folder(cli, runs):
+    result = cli("plot", runs[0].folder)
     file = runs[0].folder / "plots" / "curves.png"
-    assert (said.code, said.out.strip()) == (0, str(file))
+    assert (result.code, result.out.strip()) == (0, str(file))
     with Image.open(file) as image:
         assert image.width > 1000
         assert len(image.getcolors(1 << 20)) > 10
 
 
-def test_several_runs_are_drawn_here_and_seeds_are_one_curve(cli, runs, tmp_path):
-    said = cli("plot", "cartpole", "--json")
-    assert said.code == 0
-    assert said.json["file"] == "curves.png"
+def test_seeds_of_one_configuration_share_a_curve(cli, runs, tmp_path):
+    result = cli("plot", "cartpole", "--json")
+    assert result.code == 0
+    assert result.json["file"] == "curves.png"
     assert (tmp_path / "curves.png").is_file()
-    (curve,) = said.json["curves"]
+    (curve,) = result.json["curves"]
     assert [run["seed"] for run in curve["runs"]] == [1, 2, 3]
     last = curve["last"]["Train/mean_reward"]
     assert last["value"] == pytest.approx(20.0)
     assert 10.0 <= last["low"] < 20.0 < last["high"] <= 30.0
-    assert "interquartile mean" in said.err
+    assert "interquartile mean" in result.err
 
 
 @pytest.mark.parametrize(
@@ -52,17 +52,19 @@ def test_several_runs_are_drawn_here_and_seeds_are_one_curve(cli, runs, tmp_path
         (["FOLDER0", "FOLDER0", "cartpole"], [[1, 2, 3]]),
     ],
 )
-def test_runs_are_named_by_folder_name_task_or_latest(cli, runs, references, seeds):
+def test_run_references(cli, runs, references, seeds):
     names = {f"FOLDER{i}": run.folder for i, run in enumerate(runs)} | {
         f"NAME{i}": f"cartpole/{run.folder.name}" for i, run in enumerate(runs)
     }
-    said = cli("plot", *(names.get(each, each) for each in references), "-o", "x.svg", "--metrics", "return", "--json")
-    assert said.code == 0, said.err
-    assert [[run["seed"] for run in curve["runs"]] for curve in said.json["curves"]] == seeds
+    result = cli(
+        "plot", *(names.get(each, each) for each in references), "-o", "x.svg", "--metrics", "return", "--json"
+    )
+    assert result.code == 0, result.err
+    assert [[run["seed"] for run in curve["runs"]] for curve in result.json["curves"]] == seeds
 
 
 @pytest.mark.parametrize("kind", ["svg", "pdf", "png"])
-def test_the_same_runs_give_the_same_bytes(cli, runs, kind):
+def test_figure_bytes_are_reproducible(cli, runs, kind):
     pictures = []
     for name in ("a", "b"):
         assert cli("plot", "cartpole", "-o", f"{name}.{kind}", "--metrics", "return").code == 0
@@ -71,7 +73,7 @@ def test_the_same_runs_give_the_same_bytes(cli, runs, kind):
     assert pictures[0][:4] in (b"<?xm", b"%PDF", b"\x89PNG")
 
 
-def test_another_process_with_settings_of_its_own_gives_the_same_bytes(cli, runs, tmp_path, environment):
+def test_figure_ignores_matplotlibrc(cli, runs, tmp_path, environment):
     assert cli("plot", "cartpole", "-o", "a.svg", "--metrics", "return").code == 0
     (tmp_path / "matplotlibrc").write_text("lines.linewidth: 9\nfont.size: 30\nbackend: TkAgg\n")
     line = [sys.executable, "-m", "rlcli", "plot", "cartpole", "-o", "b.svg", "-q", "--metrics", "return"]
@@ -80,12 +82,12 @@ def test_another_process_with_settings_of_its_own_gives_the_same_bytes(cli, runs
     assert Path("a.svg").read_bytes() == Path("b.svg").read_bytes()
 
 
-def test_a_picture_holds_what_was_chosen_over_the_axis_that_was_chosen(cli, runs):
+def test_figure_has_chosen_metrics_and_axis(cli, runs):
     text = {}
     for axis in ("steps", "iterations", "time"):
         assert cli("plot", runs[0].folder, "-o", "x.svg", "--x", axis, "--metrics", "Loss,rewards").code == 0
         text[axis] = Path("x.svg").read_text()
-    assert "<!-- Loss/value -->" in text["steps"]  # text is drawn as paths, with what it says beside them
+    assert "<!-- Loss/value -->" in text["steps"]  # matplotlib writes the text of a path as a comment
     assert "<!-- effort -->" in text["steps"]
     assert "<!-- Return -->" not in text["steps"]
     for axis, label in (("steps", "environment steps"), ("iterations", "iterations"), ("time", "training time [s]")):
@@ -93,10 +95,10 @@ def test_a_picture_holds_what_was_chosen_over_the_axis_that_was_chosen(cli, runs
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["latest", "--metrics", "retrun"], 2, "did you mean 'return'"),
-        (["latest", "--metrics", ","], 2, "--metrics names none"),
+        (["latest", "--metrics", ","], 2, "--metrics names no metric"),
         (["latest", "--x", "step"], 2, "did you mean 'steps'"),
         (["latest", "-o", "x.jpg"], 2, "name it *.png, *.svg, *.pdf"),
         (["latest", "-o", "runs"], 2, "is not a picture"),
@@ -107,55 +109,55 @@ def test_a_picture_holds_what_was_chosen_over_the_axis_that_was_chosen(cli, runs
         ([], 2, "Missing argument"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_in_words(cli, runs, arguments, code, said):
+def test_invalid_arguments_are_one_message(cli, runs, arguments, code, message):
     Path("folder.png").mkdir()
     result = cli("plot", *arguments)
     assert (result.code, result.out) == (code, "")
-    assert said in result.err
+    assert message in result.err
     failed = cli("plot", *arguments, "--json")
     assert failed.json["error"]["exit_code"] == code
     assert [file.name for file in Path().glob("*.png")] == ["folder.png"]
 
 
-def test_without_matplotlib_the_message_has_the_pip_line(cli, runs, monkeypatch):
+def test_missing_matplotlib_names_pip_command(cli, runs, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: None)
-    said = cli("plot", "latest")
-    assert said.code == 7
-    assert 'pip install "rlcli[plot]"' in said.err
+    result = cli("plot", "latest")
+    assert result.code == 7
+    assert 'pip install "rlcli[plot]"' in result.err
 
 
-def test_a_run_without_metrics_is_refused_alone_and_passed_over_among_others(cli, runs, tmp_path):
+def test_run_without_metrics_is_skipped_among_others(cli, runs, tmp_path):
     empty = write_run(tmp_path / "runs", seed=9)
-    said = cli("plot", empty.folder)
-    assert said.code == 5
-    assert "has no metrics yet" in said.err
+    result = cli("plot", empty.folder)
+    assert result.code == 5
+    assert "has no metrics yet" in result.err
     assert not (empty.folder / "plots").exists()
-    said = cli("plot", "cartpole", "--json")
-    assert said.code == 0
-    assert any("has no metrics yet" in note for note in said.json["notes"])
+    result = cli("plot", "cartpole", "--json")
+    assert result.code == 0
+    assert any("has no metrics yet" in note for note in result.json["notes"])
 
 
-def test_a_link_in_the_place_of_the_plots_is_not_followed(cli, runs, tmp_path):
+def test_link_instead_of_plots_folder_is_not_followed(cli, runs, tmp_path):
     outside = tmp_path / "outside"
     outside.mkdir()
     (runs[0].folder / "plots").symlink_to(outside)
-    said = cli("plot", runs[0].folder)
-    assert said.code == 5
+    result = cli("plot", runs[0].folder)
+    assert result.code == 5
     assert list(outside.iterdir()) == []
 
 
-def test_names_of_strangers_are_drawn_as_text(cli, tmp_path):
+def test_untrusted_names_are_drawn_as_text(cli, tmp_path):
     odd = "$x^{2</text><script>alert(1)</script>\u202e\x07"
     rows = learning(**{f"Episode_Reward/{odd}": 1.0, "Episode_Reward/_hidden": 2.0, "Episode_Reward/漢字": 3.0})
     run = write_run(tmp_path / "runs", rows=rows, agent="td3")
-    said = cli("plot", run.folder, "-o", "x.svg")
-    assert said.code == 0, said.err
+    result = cli("plot", run.folder, "-o", "x.svg")
+    assert result.code == 0, result.err
     text = Path("x.svg").read_text()
     assert "<script" not in text
     assert "_hidden" in text
 
 
-def test_more_colours_than_there_are_are_told_apart_by_the_line(cli, tmp_path):
+def test_many_curves_differ_in_line_style(cli, tmp_path):
     run = write_run(tmp_path / "runs", rows=learning(**{f"Episode_Reward/term{i}": float(i) for i in range(12)}))
     assert cli("plot", run.folder, "-o", "x.svg", "--metrics", "rewards").code == 0
     assert "stroke-dasharray" in Path("x.svg").read_text()

@@ -1,4 +1,4 @@
-"""`rlcli runs` and `rlcli watch`: what became of trainings, told from their files, whoever wrote these."""
+"""`rlcli runs` and `rlcli watch`: state of trainings from the files of own and untrusted runs."""
 
 import json
 import os
@@ -40,7 +40,7 @@ def write_rows(run, *rows):
 
 @pytest.fixture
 def made():
-    """Make a run: its rows, how it ended (None: it still runs), and entries of run.json."""
+    """Return a function that makes a run from metric rows, a final state (None: running) and entries of run.json."""
     locked = []
 
     def make(name="a", rows=(), state=None, task="arm", checkpoint=True, started="2026-01-01T10:00:00+00:00", **record):
@@ -68,7 +68,7 @@ def listed(cli, *words):
     return done.json["runs"]
 
 
-def test_a_run_is_a_row_with_its_progress_and_score(cli, made):
+def test_run_row_has_progress_and_score(cli, made):
     write = {"Train/mean_reward": 3.25, "Train/success_rate": 0.5}
     made("first", [row(1, **write), row(2)], **{"device": "cuda"})
     (found,) = listed(cli)
@@ -88,7 +88,7 @@ def test_a_run_is_a_row_with_its_progress_and_score(cli, made):
 
 
 @pytest.mark.parametrize("state", ["finished", "stopped", "diverged", "failed"])
-def test_a_run_that_ended_says_how(cli, made, state):
+def test_ended_run_has_state_and_reason(cli, made, state):
     made("a", [row(1)], state, reason="the disk is full")
     (found,) = listed(cli)
     assert found["state"] == state
@@ -98,7 +98,7 @@ def test_a_run_that_ended_says_how(cli, made, state):
 
 
 @pytest.mark.parametrize(("checkpoint", "step", "resumable"), [(True, 64, True), (False, None, True)])
-def test_a_run_that_says_it_runs_and_is_not_locked_was_interrupted(cli, made, checkpoint, step, resumable):
+def test_unlocked_running_run_is_interrupted(cli, made, checkpoint, step, resumable):
     run = made("a", [row(1)], "running", checkpoint=checkpoint)
     if step is None:
         record = {key: value for key, value in run.record.items() if key not in ("step", "iteration")}
@@ -107,19 +107,19 @@ def test_a_run_that_says_it_runs_and_is_not_locked_was_interrupted(cli, made, ch
     assert (found["state"], found["resumable"]) == ("interrupted", resumable)
 
 
-def test_a_run_that_has_lost_its_checkpoints_is_not_resumable(cli, made):
+def test_run_without_checkpoints_is_not_resumable(cli, made):
     made("a", [row(1)], "running", checkpoint=False)
     assert not listed(cli)[0]["resumable"]
 
 
-def test_the_best_is_that_of_the_evaluations(cli, made):
+def test_best_score_comes_from_evaluations(cli, made):
     rows = [row(n, **{"Eval/mean_reward": float(n), "Eval/success_rate": n / 10}) for n in (1, 2, 3)]
     made("a", rows, "finished", best=128)
     assert listed(cli)[0]["best"] == {"step": 128, "return": 2.0, "success": 0.2}
     assert "20.0%" in cli("runs").out
 
 
-def test_what_eval_found_is_shown(cli, made):
+def test_saved_evaluation_is_shown(cli, made):
     run = made("a", [row(1)], "finished")
     mean, none = {"mean": 4.5, "std": 0.1, "low": 4.4, "high": 4.6}, {"rate": 0.875, "low": 0.5, "high": 1.0}
     document = {"command": "eval", "episodes": 8, "seed": 1, "return": mean, "length": mean, "success": none}
@@ -130,7 +130,7 @@ def test_what_eval_found_is_shown(cli, made):
     assert "87.5%" in cli("runs").out
 
 
-def test_newest_first_of_one_task_and_no_more_than_asked_for(cli, made):
+def test_runs_of_task_are_newest_first_with_limit(cli, made):
     days = {"old": 1, "new": 3, "middle": 2}
     for name, day in days.items():
         made(name, [], "finished", started=f"2026-01-0{day}T10:00:00+00:00")
@@ -142,7 +142,7 @@ def test_newest_first_of_one_task_and_no_more_than_asked_for(cli, made):
     assert cli("runs", "./arm").out == cli("runs", "arms:arm").out == cli("runs", "arm").out
 
 
-def test_no_run_is_said(cli, made):
+def test_empty_list_has_message(cli, made):
     done = cli("runs")
     assert (done.code, done.out) == (0, "")
     assert "no run in runs" in done.err
@@ -151,7 +151,7 @@ def test_no_run_is_said(cli, made):
     assert listed(cli, "leg") == []
 
 
-def test_trained_time_does_not_count_pauses(cli, made):
+def test_trained_time_excludes_pauses(cli, made):
     day = (datetime.now(UTC) - timedelta(days=1)).isoformat()
     made("a", [row(1)], "finished", trained_s=90.0, started=day)
     made("b", [row(1)], trained_s=90.0, since=(datetime.now(UTC) - timedelta(seconds=10)).isoformat())
@@ -183,7 +183,7 @@ def _edit(run, **entries):
 
 
 @pytest.mark.parametrize("kind", BROKEN)
-def test_a_broken_run_is_a_row_with_its_reason(cli, made, kind):
+def test_broken_run_row_has_reason(cli, made, kind):
     spoil, reason = BROKEN[kind]
     run = made("broken", [row(1)], "finished")
     made("good", [row(1)], "finished")
@@ -209,7 +209,7 @@ STRANGE = {
 
 
 @pytest.mark.parametrize("kind", STRANGE)
-def test_strange_metrics_are_passed_over(cli, made, kind):
+def test_malformed_metrics_are_skipped(cli, made, kind):
     run = made("a", [row(3, **{"Train/mean_reward": 1.5})], "finished")
     with run.metrics.open("ab") as file:
         file.write(STRANGE[kind])
@@ -217,7 +217,7 @@ def test_strange_metrics_are_passed_over(cli, made, kind):
     assert cli("watch").code == 0
 
 
-def test_a_training_without_end_in_sight_is_shown(cli, made):
+def test_endless_training_is_shown(cli, made):
     made("a", [row(1) | {"Perf/collection_time": 9e299}], "stopped", iterations=10**18, trained_s=1e300)
     done = cli("watch")
     assert (done.code, "? left" in done.err) == (0, True)
@@ -225,7 +225,7 @@ def test_a_training_without_end_in_sight_is_shown(cli, made):
     assert len(line) < 200
 
 
-def test_what_metrics_hold_cannot_steer_the_terminal(made):
+def test_untrusted_metric_names_have_no_control_characters(made):
     made("a", [row(1, **{"Train/\x1b]0;owned\x07[red]x": 1.0})], "finished")
     shown, code = on_a_terminal("watch")
     assert code == 0
@@ -233,7 +233,7 @@ def test_what_metrics_hold_cannot_steer_the_terminal(made):
     assert "[red]x" in shown
 
 
-def test_looking_at_runs_imports_nothing_heavy_and_writes_nothing(made, environment):
+def test_runs_and_watch_import_nothing_heavy_and_write_nothing(made, environment):
     made("a", [row(1)], "finished")
     before = {path: path.stat().st_mtime_ns for path in Path("runs").rglob("*")}
     for words in (["runs"], ["watch", "latest"], ["watch", "latest", "--json"]):
@@ -246,7 +246,7 @@ def test_looking_at_runs_imports_nothing_heavy_and_writes_nothing(made, environm
     assert {path: path.stat().st_mtime_ns for path in Path("runs").rglob("*")} == before
 
 
-def test_looking_whether_a_run_is_locked_keeps_nobody_out(made):
+def test_is_locked_does_not_block_writers(made):
     run = open_run(made("a", [], "finished").folder)
     over = threading.Event()
 
@@ -267,7 +267,7 @@ def test_looking_whether_a_run_is_locked_keeps_nobody_out(made):
             watcher.join()
 
 
-def test_a_run_that_ended_is_shown_as_it_ended(cli, made):
+def test_watch_shows_ended_run(cli, made):
     made("a", [row(n, **{"Train/mean_reward": 2.5, "Train/mean_episode_length": 9}) for n in (1, 2)], "stopped")
     done = cli("watch", "latest")
     assert done.code == 0
@@ -276,7 +276,7 @@ def test_a_run_that_ended_is_shown_as_it_ended(cli, made):
     assert "rlcli train --resume runs/arm/" in done.err
 
 
-def test_json_is_one_document_of_the_state_now(cli, made):
+def test_watch_json_prints_current_state(cli, made):
     made("a", [row(n, **{"Loss/value": 0.5}) for n in (1, 2)])
     found = cli("watch", "--json").json
     assert (found["state"], found["iteration"], found["iterations"]) == ("running", 2, 40)
@@ -286,7 +286,7 @@ def test_json_is_one_document_of_the_state_now(cli, made):
 
 
 @pytest.mark.parametrize("words", [("watch",), ("watch", "nothing"), ("watch", "--json")])
-def test_a_run_that_is_not_there_cannot_be_watched(cli, words):
+def test_watch_of_missing_run_is_checkpoint_error(cli, words):
     assert cli(*words).code == 5
 
 
@@ -297,13 +297,13 @@ def until(condition, seconds=60):
         time.sleep(0.05)
 
 
-def test_a_run_is_followed_to_its_end(start, made):
+def test_watch_follows_run_to_its_end(start, made):
     run = made("a", [row(1)])
     with Path("err").open("w") as err:
         process = start("watch", run.folder, stderr=err)
         until(lambda: "iteration 1/40" in Path("err").read_text())
         write_rows(run, row(2), row(3, **{"Train/success_rate": 0.75}))
-        time.sleep(1.0)  # the lines of a watcher are seconds apart
+        time.sleep(1.0)  # `watch` prints a line every few seconds
         assert process.poll() is None
         run.update(state="diverged", reason="the learner's loss is not finite", iteration=3, step=192)
         run.unlock()
@@ -315,7 +315,7 @@ def test_a_run_is_followed_to_its_end(start, made):
     assert "the learner's loss is not finite" in Path("err").read_text()
 
 
-def test_ctrl_c_ends_the_watcher_and_leaves_the_run_alone(start, made):
+def test_ctrl_c_stops_watch_but_not_the_run(start, made):
     run = made("a", [row(1)])
     with Path("err").open("w") as err:
         process = start("watch", "latest", stderr=err)
@@ -323,13 +323,13 @@ def test_ctrl_c_ends_the_watcher_and_leaves_the_run_alone(start, made):
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
     assert process.returncode == 130
-    assert "the run is left alone" in Path("err").read_text()
+    assert "the training continues" in Path("err").read_text()
     assert is_locked(run.folder)
     assert json.loads((run.folder / "run.json").read_text())["state"] == "running"
 
 
 def on_a_terminal(*words):
-    """What a command writes to a terminal, and its exit code."""
+    """Run a command on a terminal; return its output and its exit code."""
     pid, terminal = pty.fork()
     if pid == 0:
         os.environ.update(TERM="xterm-256color", COLUMNS="160", LINES="50")
@@ -347,7 +347,7 @@ def on_a_terminal(*words):
     return shown.decode(errors="replace"), os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
 
-def test_a_terminal_shows_the_table_of_the_training(made):
+def test_watch_shows_live_table_on_terminal(made):
     metrics = {"Train/mean_reward": 2.5, "Episode_Reward/alive": 1.0, "Episode_Termination/fell": 0.25, "Loss/value": 3}
     made("a", [row(2, **metrics)], "finished")
     shown, code = on_a_terminal("watch", "latest")
@@ -355,23 +355,23 @@ def test_a_terminal_shows_the_table_of_the_training(made):
     assert code == 0
     for word in ("iteration 2/40", "128 steps", "physics  50%", "reward terms", "alive", "fell", "25.0%", "learner"):
         assert word in text, word
-    assert shown.count("\x1b[?25l") <= shown.count("\x1b[?25h")  # the cursor is back
+    assert shown.count("\x1b[?25l") <= shown.count("\x1b[?25h")  # the cursor is visible again
 
 
 @pytest.mark.parametrize(
     ("value", "words"), [(0.4, "0 s"), (59, "59 s"), (60, "1 min"), (7200, "2 h"), (86400 * 3, "3 d")]
 )
-def test_ages_in_their_largest_unit(value, words):
+def test_age_in_largest_unit(value, words):
     assert age(value) == words
 
 
 @pytest.mark.parametrize(("value", "words"), [(0, "0 B"), (999, "999 B"), (1500, "1.5 kB"), (2.5e12, "2500.0 GB")])
-def test_sizes_in_a_fitting_unit(value, words):
+def test_size_with_unit(value, words):
     assert size(value) == words
 
 
 @pytest.mark.slow
-def test_a_training_is_seen_by_others_from_its_first_moment_to_its_end(cli, start):
+def test_training_is_visible_to_other_processes(cli, start):
     words = ("train", *SMALL, "agent.save_interval=1")
     training = start(*words, "--max-iterations", 100_000)
     until(lambda: len(overviews(Path("runs"))) == 1)
@@ -395,14 +395,14 @@ def test_a_training_is_seen_by_others_from_its_first_moment_to_its_end(cli, star
 
 
 @pytest.mark.slow
-def test_a_training_that_diverges_says_so_afterwards(cli):
+def test_diverged_training_has_state_and_reason(cli):
     assert cli("train", *SMALL, "agent.learning_rate=1e30").code == 6
     (found,) = listed(cli)
     assert found["state"] == "diverged"
     assert "not finite" in found["reason"]
 
 
-def test_a_run_that_is_being_created_is_not_called_broken(cli):
+def test_run_being_created_is_not_broken(cli):
     folder = Path("runs/arm/2026-01-01_10-00-00")
     (folder / "checkpoints").mkdir(parents=True)
     assert listed(cli)[0]["state"] == "running"

@@ -26,7 +26,7 @@ def files_of(run, step):
     return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
-def test_a_run_holds_what_the_page_of_names_says(cli, only_run):
+def test_run_folder_contents(cli, only_run):
     done = cli("train", "cartpole", *SMALL, "--max-iterations", 2, "--name", "first", "--json")
     assert done.code == 0
     run = only_run()
@@ -44,7 +44,7 @@ def test_a_run_holds_what_the_page_of_names_says(cli, only_run):
     assert yaml.safe_load((run / "config.yaml").read_text())["scene"]["num_envs"] == 8
 
 
-def test_metrics_have_rsl_rls_names_and_a_line_an_iteration(cli, only_run):
+def test_metrics_have_rsl_rl_names_and_one_row_per_iteration(cli, only_run):
     overrides = ("scene.num_envs=32", "episode_length_s=0.3", "agent.torch_threads=1")
     cli("train", "cartpole", *overrides, "--max-iterations", 3, "-q")
     rows = [json.loads(line) for line in (only_run() / "metrics.jsonl").read_text().splitlines()]
@@ -60,7 +60,7 @@ def test_metrics_have_rsl_rls_names_and_a_line_an_iteration(cli, only_run):
 
 
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
-def test_two_trainings_with_one_seed_are_identical_and_another_seed_is_not(cli, weights, task):
+def test_same_seed_gives_identical_weights(cli, weights, task):
     folders = []
     for runs, seed in (("a", 1), ("b", 1), ("c", 2)):
         cli("train", task, *SMALL, "--max-iterations", 3, "--seed", seed, "--runs-dir", runs)
@@ -71,7 +71,7 @@ def test_two_trainings_with_one_seed_are_identical_and_another_seed_is_not(cli, 
 
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
 @pytest.mark.parametrize("schedule", [(), ("agent.schedule=linear",)])
-def test_resuming_is_the_same_as_never_having_stopped(cli, task, schedule):
+def test_resumed_run_equals_uninterrupted_run(cli, task, schedule):
     # save at 3, then make as if the process had died there
     budget = ("--max-iterations", 6, "agent.save_interval=3", "episode_length_s=0.4")
     cli("train", task, *SMALL, *schedule, *budget, "--runs-dir", "whole")
@@ -87,7 +87,7 @@ def test_resuming_is_the_same_as_never_having_stopped(cli, task, schedule):
 
 
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
-def test_three_iterations_and_three_more_are_six(cli, task):
+def test_extended_run_equals_longer_run(cli, task):
     constant = (*SMALL, "agent.schedule=constant")  # another schedule depends on the budget
     cli("train", task, *constant, "--max-iterations", 6, "--runs-dir", "six")
     cli("train", task, *constant, "--max-iterations", 3, "--runs-dir", "three")
@@ -104,7 +104,7 @@ def test_three_iterations_and_three_more_are_six(cli, task):
     assert cli("train", "--resume", "latest", "--runs-dir", "three", "--json").json["state"] == "finished"
 
 
-def test_resuming_a_finished_run_says_so(cli, only_run):
+def test_resume_of_finished_run_changes_nothing(cli, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     before = {p: p.stat().st_mtime_ns for p in only_run().rglob("*")}
     done = cli("train", "--resume", "latest")
@@ -113,7 +113,7 @@ def test_resuming_a_finished_run_says_so(cli, only_run):
     assert {p: p.stat().st_mtime_ns for p in only_run().rglob("*")} == before
 
 
-def test_resuming_an_earlier_step_drops_the_later_ones(cli, only_run):
+def test_resume_of_earlier_step_drops_later_steps(cli, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 4, "agent.save_interval=1")
     run = only_run()
     whole = files_of(run, 512)
@@ -127,7 +127,7 @@ def test_resuming_an_earlier_step_drops_the_later_ones(cli, only_run):
     assert [row["iteration"] for row in metrics(run)] == [1, 2, 3, 4]
 
 
-def test_a_step_budget_replaces_the_agents_iterations(cli):
+def test_max_steps_replaces_agent_budget(cli):
     done = cli("train", "cartpole", *SMALL, "--max-steps", 300, "--json")
     assert done.json["step"] == 384  # whole iterations of 8 x 16
     more = cli("train", "--resume", "latest", "--max-steps", 500, "-q", "--json")
@@ -146,14 +146,14 @@ def test_a_step_budget_replaces_the_agents_iterations(cli):
         (("--init-from", "latest"), "--init-from"),
     ],
 )
-def test_resume_takes_no_other_changes(cli, only_run, extra, named):
+def test_resume_rejects_configuration_changes(cli, only_run, extra, named):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     done = cli("train", *extra, "--resume", "latest", "--max-iterations", 2)
     assert done.code == 2
     assert named in done.err
 
 
-def test_resume_of_another_task_is_refused(cli):
+def test_resume_rejects_other_task(cli):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     assert cli("train", "cartpole-direct", "--resume", "latest").code == 5
     run = next(Path("runs/cartpole").iterdir())
@@ -161,7 +161,7 @@ def test_resume_of_another_task_is_refused(cli):
     assert cli("train", "cartpole", "--resume", run).code == 0
 
 
-def test_init_from_takes_the_weights_alone(cli, weights):
+def test_init_from_loads_only_weights(cli, weights):
     cli("train", "cartpole", *SMALL, "--max-iterations", 2)
     first = next(Path("runs").glob("*/*"))
     done = cli(
@@ -175,7 +175,7 @@ def test_init_from_takes_the_weights_alone(cli, weights):
 
 
 @pytest.mark.parametrize("change", ["agent.policy.hidden=[8]", "agent.policy.hidden=[32, 32, 32]"])
-def test_init_from_weights_that_do_not_fit_leaves_no_run(cli, change):
+def test_init_from_wrong_shapes_creates_no_run(cli, change):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     done = cli("train", "cartpole", *SMALL, change, "--init-from", "latest")
     assert done.code == 5, done.err
@@ -183,7 +183,7 @@ def test_init_from_weights_that_do_not_fit_leaves_no_run(cli, change):
     assert len(list(Path("runs").glob("*/*"))) == 1
 
 
-def test_init_from_another_task_shows_what_differs(cli):
+def test_init_from_other_task_prints_differences(cli):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     done = cli("train", "cartpole-direct", *SMALL, "--init-from", "latest")
     assert done.code == 5
@@ -209,7 +209,7 @@ def test_init_from_another_task_shows_what_differs(cli):
         (("--init-from", "nowhere"), 5),
     ],
 )
-def test_a_mistake_leaves_no_run_behind(cli, extra, code):
+def test_invalid_command_line_creates_no_run(cli, extra, code):
     done = cli("train", "cartpole", *SMALL, *extra)
     assert done.code == code, done.err
     assert done.err.startswith("error:")
@@ -218,19 +218,19 @@ def test_a_mistake_leaves_no_run_behind(cli, extra, code):
 
 @pytest.mark.parametrize("task", ["cartpole", "cartpole-direct"])
 @pytest.mark.parametrize("envs", [1, 7, pytest.param(4096, marks=pytest.mark.slow)])
-def test_any_number_of_environments_trains(cli, task, envs):
+def test_train_with_any_number_of_environments(cli, task, envs):
     done = cli("train", task, *SMALL, f"scene.num_envs={envs}", "--max-iterations", 2, "--json")
     assert done.code == 0, done.err
     assert done.json["step"] == 2 * 16 * envs
 
 
-def test_a_rollout_smaller_than_its_minibatches_is_explained(cli):
+def test_too_small_rollout_is_config_error(cli):
     done = cli("train", "cartpole", "scene.num_envs=1", "agent.n_steps=2", "-q")
     assert done.code == 3
     assert "4 minibatches cannot be made: a rollout holds n_steps x num_envs = 2 x 1 = 2 samples" in done.err
 
 
-def test_a_learner_that_diverges_keeps_the_last_good_checkpoint(cli, only_run):
+def test_diverged_learner_keeps_last_good_checkpoint(cli, only_run):
     done = cli("train", "cartpole", *SMALL, "agent.learning_rate=1e30")
     assert done.code == 6, done.err
     assert "not finite" in done.err
@@ -239,13 +239,13 @@ def test_a_learner_that_diverges_keeps_the_last_good_checkpoint(cli, only_run):
 
 
 @pytest.mark.parametrize("rate", ["1e-5", "1e-05", "2e16", "1/3", "3.0e-4"])
-def test_a_number_in_any_notation_survives_the_run(cli, only_run, rate):
+def test_number_notations_survive_save_and_resume(cli, only_run, rate):
     assert cli("train", "cartpole", *SMALL, "--max-iterations", 1, f"agent.ent_coef={rate}", "--json").code in (0, 6)
     assert cli("eval", "--checkpoint", "latest", "--episodes", 1, "-q").code == 0
     assert cli("train", "--resume", "latest", "-q").code in (0, 6)
 
 
-def test_a_simulation_that_diverges_stops_the_run(cli, only_run):
+def test_diverged_simulation_stops_training(cli, only_run):
     done = cli("train", "cartpole-direct", *SMALL, "params.max_effort=1e30", "--max-iterations", 3)
     assert done.code == 6, done.err
     assert "diverged" in done.err
@@ -253,7 +253,7 @@ def test_a_simulation_that_diverges_stops_the_run(cli, only_run):
     assert (only_run() / "checkpoints/000000000000/manifest.json").is_file()
 
 
-def test_the_runs_folder_comes_from_the_environment_and_the_flag_wins(cli, monkeypatch):
+def test_runs_dir_flag_overrides_environment_variable(cli, monkeypatch):
     monkeypatch.setenv("RLCLI_RUNS_DIR", "mine")
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     cli("train", "cartpole", *SMALL, "--max-iterations", 1, "--runs-dir", "given")
@@ -262,14 +262,14 @@ def test_the_runs_folder_comes_from_the_environment_and_the_flag_wins(cli, monke
     assert cli("eval", "--checkpoint", "latest", "--episodes", 1, "--json").json["checkpoint"].startswith("mine/")
 
 
-def test_a_folder_task_trains_and_resumes(cli, coin, weights):
+def test_task_in_folder_trains_and_resumes(cli, coin, weights):
     for runs, budget in (("two", 2), ("one", 1)):
         assert cli("train", coin, *SMALL, "--max-iterations", budget, "--runs-dir", runs).code == 0
     assert cli("train", coin, "--resume", "latest", "--runs-dir", "one", "--max-iterations", 2, "-q").code == 0
     assert weights(next(Path("one").glob("*/*"))) == weights(next(Path("two").glob("*/*")))
 
 
-def test_a_task_without_agents_cannot_be_trained(cli, coin):
+def test_train_without_agent_is_config_error(cli, coin):
     file = Path("coin/task.yaml")
     file.write_text(file.read_text().partition("agents:")[0])
     done = cli("train", coin)
@@ -278,7 +278,7 @@ def test_a_task_without_agents_cannot_be_trained(cli, coin):
     assert cli("eval", coin, "--policy", "random", "--episodes", 2, "-q").code == 0
 
 
-def test_a_run_being_written_to_is_left_alone(cli, only_run):
+def test_resume_of_locked_run_is_machine_error(cli, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     holder = subprocess.Popen(
         [sys.executable, "-c",
@@ -294,7 +294,7 @@ def test_a_run_being_written_to_is_left_alone(cli, only_run):
     assert cli("train", "--resume", "latest", "--max-iterations", 2, "-q").code == 0
 
 
-def test_leftovers_of_a_killed_writer_go_at_the_next_start(cli, only_run):
+def test_resume_removes_temporary_files(cli, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     (only_run() / "checkpoints/.tmp-99-dead").mkdir()
     (only_run() / "checkpoints/.tmp-99-dead/policy.json").touch()
@@ -311,7 +311,7 @@ def test_leftovers_of_a_killed_writer_go_at_the_next_start(cli, only_run):
         (lambda run: (run / "config.yaml").write_text("a: ["), 3),
     ],
 )
-def test_a_damaged_run_is_one_message(cli, only_run, damage, code):
+def test_resume_of_damaged_run_is_one_message(cli, only_run, damage, code):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     damage(only_run())
     done = cli("train", "--resume", only_run(), "--max-iterations", 2)
@@ -320,7 +320,7 @@ def test_a_damaged_run_is_one_message(cli, only_run, damage, code):
 
 
 @pytest.mark.parametrize("garbage", ['{"iteration": 1}', '{"iteration": "x", "policy": {}}', "[]"])
-def test_a_state_that_lacks_something_cannot_be_resumed(cli, only_run, garbage):
+def test_resume_of_incomplete_state_is_checkpoint_error(cli, only_run, garbage):
     import hashlib
 
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
@@ -335,7 +335,7 @@ def test_a_state_that_lacks_something_cannot_be_resumed(cli, only_run, garbage):
 
 
 @pytest.mark.parametrize("call", ["fsync", "rename"])
-def test_a_disk_that_fills_during_training_is_one_message_and_resumable(cli, only_run, monkeypatch, call):
+def test_disk_error_during_training_is_one_message(cli, only_run, monkeypatch, call):
     cli("train", "cartpole", *SMALL, "--max-iterations", 2)
 
     def refuse(*arguments):
@@ -350,7 +350,7 @@ def test_a_disk_that_fills_during_training_is_one_message_and_resumable(cli, onl
     assert not list(Path("runs").rglob("*.tmp-*"))
 
 
-def test_a_run_folder_that_vanishes_is_a_machine_error(cli, only_run, monkeypatch):
+def test_deleted_run_folder_is_machine_error(cli, only_run, monkeypatch):
     from rlcli.rl.sb3.trainer import Sb3Trainer
 
     real = Sb3Trainer.iterate
@@ -366,7 +366,7 @@ def test_a_run_folder_that_vanishes_is_a_machine_error(cli, only_run, monkeypatc
     assert not Path("runs").exists()
 
 
-def test_a_runs_folder_that_is_a_file(cli):
+def test_runs_dir_that_is_a_file_is_machine_error(cli):
     Path("runs").touch()
     done = cli("train", "cartpole", *SMALL)
     assert done.code == 10
@@ -374,7 +374,7 @@ def test_a_runs_folder_that_is_a_file(cli):
 
 
 @pytest.mark.slow
-def test_a_full_disk_ends_training_with_a_message_and_the_old_checkpoint(cli, start):
+def test_full_disk_keeps_last_checkpoint(cli, start):
     small = Path("small")
     small.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "none", small], capture_output=True).returncode:

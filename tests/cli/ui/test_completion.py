@@ -1,4 +1,4 @@
-"""Completion of a line: what is offered, in a real bash and by the shells' protocols, and that nothing heavy loads."""
+"""Completion of command lines: in bash and by the protocols of the shells, without heavy imports."""
 
 import os
 import shlex
@@ -9,7 +9,7 @@ import sys
 import pytest
 
 HEAVY = ("torch", "mujoco", "numpy", "stable_baselines3", "gymnasium")
-ASKED = f"""
+PROGRAM = f"""
 import atexit, sys
 atexit.register(lambda: print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr))
 from rlcli.cli.app import main
@@ -17,37 +17,37 @@ sys.exit(main())
 """
 
 
-def question(words, shell):
-    """What a shell sets in the environment to ask how the last word may go on."""
+def completion_environment(words, shell):
+    """Return the environment variables that a shell sets to complete the last word."""
     line = ["rlcli", *words]
-    asked = {"_RLCLI_COMPLETE": f"complete_{shell}"}
+    variables = {"_RLCLI_COMPLETE": f"complete_{shell}"}
     if shell == "bash":
-        return asked | {"COMP_WORDS": "\n".join(line), "COMP_CWORD": str(len(words))}
-    said = f"{shlex.join(line[:-1])} {words[-1]}"
-    return asked | {"_TYPER_COMPLETE_ARGS": said, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+        return variables | {"COMP_WORDS": "\n".join(line), "COMP_CWORD": str(len(words))}
+    line_so_far = f"{shlex.join(line[:-1])} {words[-1]}"
+    return variables | {"_TYPER_COMPLETE_ARGS": line_so_far, "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
 
 
 @pytest.fixture
 def offered(in_process, monkeypatch, tmp_path, capfd):
-    """offered(words..., last) -> what a shell is told for the last one."""
+    """Return a function that returns the completions of the last of some words."""
 
-    def ask(*words, shell="bash"):
+    def complete(*words, shell="bash"):
         with monkeypatch.context() as patched:
             patched.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-            for name, value in question(words, shell).items():
+            for name, value in completion_environment(words, shell).items():
                 patched.setenv(name, value)
-            with pytest.raises(SystemExit, match=r"^0$"):  # it has answered, and is done
+            with pytest.raises(SystemExit, match=r"^0$"):  # completion exits the process
                 in_process()
         out, err = capfd.readouterr()
         assert err == ""
         return [line for line in out.splitlines() if line]
 
-    return ask
+    return complete
 
 
 @pytest.fixture
 def a_run(here):
-    """A run folder with two checkpoints' folders, as `find_run` needs it."""
+    """Return a function that makes a run folder with a checkpoint, as `find_run` needs it."""
 
     def make(name, task="cartpole", runs="runs"):
         folder = here / runs / task / name
@@ -58,7 +58,7 @@ def a_run(here):
     return make
 
 
-def test_commands_options_and_tasks_are_offered(offered):
+def test_completion_of_commands_options_and_tasks(offered):
     assert offered("tra") == ["train"]
     assert offered("train", "cartpole-") == ["cartpole-camera", "cartpole-direct"]
     assert "--max-iterations" in offered("train", "cartpole", "--max")
@@ -76,11 +76,11 @@ def test_commands_options_and_tasks_are_offered(offered):
         (("import", "s"), ["sb3"]),
     ],
 )
-def test_choices_are_offered(offered, words, expected):
+def test_completion_of_choices(offered, words, expected):
     assert offered(*words) == expected
 
 
-def test_agents_are_those_of_the_task_on_the_line(offered, small):
+def test_completion_of_agents_uses_task_on_command_line(offered, small):
     agents = "  small: {trainer: sb3, algorithm: ppo, max_iterations: 1}\n"
     task = small((agents, agents + "  smart: {trainer: sb3, algorithm: sac, max_iterations: 1}\n"))
     assert offered("train", task, "--agent", "") == ["small", "smart"]
@@ -89,7 +89,7 @@ def test_agents_are_those_of_the_task_on_the_line(offered, small):
     assert offered("train", "no-such-task", "--agent", "") == []
 
 
-def test_runs_are_offered_newest_first_from_the_folder_that_holds_them(offered, a_run, monkeypatch):
+def test_completion_of_runs_is_newest_first_from_runs_dir(offered, a_run, monkeypatch):
     for age, name in ((200, "older"), (100, "newer")):
         folder = a_run(name)
         os.utime(folder, (1e9 - age, 1e9 - age))
@@ -101,27 +101,27 @@ def test_runs_are_offered_newest_first_from_the_folder_that_holds_them(offered, 
     monkeypatch.setenv("RLCLI_RUNS_DIR", "mine")
     assert offered("watch", "e") == ["elsewhere"]
     assert offered("diff", "cartpole-c") == ["cartpole-camera"]
-    assert offered("watch", "runs/") == [], "paths are left to the shell"
+    assert offered("watch", "runs/") == [], "the shell completes paths"
 
 
 @pytest.mark.parametrize("words", [("train", "cartpole-"), ("train", "cartpole", "--agent", ""), ("watch", "")])
-def test_nothing_heavy_is_imported_for_a_key_press(here, words):
-    command = [sys.executable, "-c", ASKED]
-    env = os.environ | question(words, "bash")
+def test_completion_imports_nothing_heavy(here, words):
+    command = [sys.executable, "-c", PROGRAM]
+    env = os.environ | completion_environment(words, "bash")
     done = subprocess.run(command, env=env, capture_output=True, text=True, cwd=here, timeout=120)
     assert done.stdout
     assert done.stderr.strip() == "[]"
 
 
-def test_zsh_and_fish_are_told_what_a_task_is(offered):
+def test_completion_in_zsh_and_fish_has_task_summaries(offered):
     (line,) = offered("train", "cartpole-d", shell="fish")
-    name, said = line.split("\t")
+    name, summary = line.split("\t")
     assert name == "cartpole-direct"
-    assert "direct" in said
+    assert "direct" in summary
     assert '"cartpole-direct":"' in "\n".join(offered("train", "cartpole-d", shell="zsh"))
 
 
-def test_broken_settings_and_broken_tasks_disturb_no_completion(offered, small, tmp_path, monkeypatch):
+def test_completion_works_with_broken_settings_and_tasks(offered, small, tmp_path, monkeypatch):
     (tmp_path / "mine.yaml").write_text("[")
     monkeypatch.setenv("RLCLI_SETTINGS", str(tmp_path / "mine.yaml"))
     assert offered("tra") == ["train"]
@@ -130,7 +130,7 @@ def test_broken_settings_and_broken_tasks_disturb_no_completion(offered, small, 
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash on this machine")
-def test_bash_completes_with_the_function_that_rlcli_prints(here, tmp_path):
+def test_bash_completion_function_works(here, tmp_path):
     program = tmp_path / "bin" / "rlcli"
     program.parent.mkdir()
     program.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m rlcli "$@"\n')

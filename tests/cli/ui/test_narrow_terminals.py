@@ -1,4 +1,4 @@
-"""Forty columns, and no terminal at all: what commands print stays whole, and a pipe holds text alone."""
+"""Output on a terminal of 40 columns is complete, and output in a pipe is plain text."""
 
 import os
 import pty
@@ -11,7 +11,7 @@ import pytest
 
 from rlcli.cli.app import COMMANDS
 
-fcntl = pytest.importorskip("fcntl", reason="pseudo-terminals are those of Unix")
+fcntl = pytest.importorskip("fcntl", reason="pseudo-terminals need Unix")
 termios = pytest.importorskip("termios")
 
 STYLES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
@@ -19,7 +19,7 @@ STYLES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 @pytest.fixture
 def narrow(here):
-    """narrow(arguments...) -> (exit code, lines) of a command on a terminal of 40 columns."""
+    """Return a function that runs a command on a terminal of 40 columns and returns (exit code, lines)."""
 
     def run(*arguments):
         leader, follower = pty.openpty()
@@ -34,21 +34,21 @@ def narrow(here):
             env=env | {"TERM": "xterm-256color"},
         )
         os.close(follower)
-        said = b""
+        output = b""
         try:
             while chunk := os.read(leader, 65536):
-                said += chunk
-        except OSError:  # Linux's way to say that the other end is closed
+                output += chunk
+        except OSError:  # Linux raises this when the other end is closed
             pass
         os.close(leader)
         code = process.wait()
-        return code, STYLES.sub("", said.decode()).replace("\r\n", "\n").split("\n")
+        return code, STYLES.sub("", output.decode()).replace("\r\n", "\n").split("\n")
 
     return run
 
 
 @pytest.mark.slow
-def test_tables_fit_forty_columns_and_no_letter_is_lost(narrow, rlcli):
+def test_tables_fit_forty_columns_without_truncation(narrow, rlcli):
     code, lines = narrow("list-tasks", "cartpole")
     assert code == 0
     assert max(map(len, lines)) <= 40
@@ -61,13 +61,13 @@ def test_tables_fit_forty_columns_and_no_letter_is_lost(narrow, rlcli):
 
 
 @pytest.mark.slow
-def test_differences_are_whole_on_forty_columns(narrow, small):
+def test_diff_is_complete_on_forty_columns(narrow, small):
     code, lines = narrow("diff", small(), "sim.dt=0.005", "viewer.width=320")
     assert code == 9
     assert "Traceback" not in "\n".join(lines)
     flat = "".join(lines).replace(" ", "")
-    for said in ("sim.dt", "0.005", "override'sim.dt=0.005'", "viewer.width", "differences:physics1,cosmetic1"):
-        assert said in flat
+    for output in ("sim.dt", "0.005", "override'sim.dt=0.005'", "viewer.width", "differences:physics1,cosmetic1"):
+        assert output in flat
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_differences_are_whole_on_forty_columns(narrow, small):
         ["train", "nothing"], ["watch"], ["report", "latest"], ["import", "oige", "gone.yaml"], ["plot", "latest"],
     ],
 )  # fmt: skip
-def test_a_pipe_holds_text_alone(in_process, arguments):
+def test_pipe_output_has_no_control_characters(in_process, arguments):
     _, out, err = in_process(*arguments)
     assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f]", out + err)
     assert "Traceback" not in err
@@ -86,7 +86,7 @@ def test_a_pipe_holds_text_alone(in_process, arguments):
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_every_command_can_be_quiet_and_say_more_and_has_a_summary_that_is_whole(in_process, command):
+def test_command_has_common_options_and_complete_summary(in_process, command):
     code, out, _ = in_process(command, "--help")
     assert code == 0
     for option in ("-q, --quiet", "-v, --verbose", "--json", "--debug"):

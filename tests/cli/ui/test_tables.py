@@ -1,4 +1,4 @@
-"""Tables on a terminal fit its width: nothing is cut, and a row that is too wide becomes a block of lines."""
+"""Tables fit the width of a terminal: nothing is truncated, and a row that is too wide becomes a block of lines."""
 
 import io
 import re
@@ -22,7 +22,7 @@ ROWS = [
 
 @pytest.fixture
 def terminal(monkeypatch, capsys):
-    """Of a given width; what was printed on it, as lines."""
+    """Return a function that prints on a terminal of a given width and returns the lines."""
 
     def shown(width, draw):
         monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
@@ -34,7 +34,7 @@ def terminal(monkeypatch, capsys):
     return shown
 
 
-def test_a_table_that_fits_has_a_line_for_each_row(terminal):
+def test_fitting_table_has_one_line_per_row(terminal):
     lines = terminal(120, lambda: console.table(COLUMNS, ROWS))
     assert len(lines) == 3
     assert lines[0].split() == COLUMNS
@@ -42,25 +42,25 @@ def test_a_table_that_fits_has_a_line_for_each_row(terminal):
 
 
 @pytest.mark.parametrize("width", [80, 40])
-def test_a_table_that_does_not_fit_loses_no_letter(terminal, width):
+def test_wide_table_becomes_blocks_without_truncation(terminal, width):
     lines = terminal(width, lambda: console.table(COLUMNS, ROWS))
     assert max(map(len, lines)) <= width
-    said = "\n".join(lines)
-    assert "…" not in said
+    output = "\n".join(lines)
+    assert "…" not in output
     assert "RUN cartpole/2026-11-21_17-35-25" in lines
     assert "RUN cartpole/2026-11-21_17-32-47" in lines
     for name, cell in zip(COLUMNS[1:6], ROWS[0][1:6], strict=True):
-        assert f"{name} {cell}" in said
-    assert "STATE interrupted: resumable" in said
+        assert f"{name} {cell}" in output
+    assert "STATE interrupted: resumable" in output
 
 
-def test_what_is_not_known_is_left_out_of_a_block(terminal):
+def test_empty_cells_are_left_out_of_blocks(terminal):
     lines = terminal(40, lambda: console.table(COLUMNS, ROWS))
     assert sum("SUCCESS" in line for line in lines) == 1
     assert not any("REMARK" in line for line in lines)
 
 
-def test_a_sentence_is_broken_at_its_words_and_a_short_cell_is_not(terminal):
+def test_long_cells_wrap_at_spaces_and_short_cells_do_not(terminal):
     found = "of four environments that began alike two parted in the third step"
     lines = terminal(60, lambda: console.table(["CHECK", "RESULT"], [["same seed, same life", found]]))
     assert lines[0].split() == ["CHECK", "RESULT"]
@@ -70,7 +70,7 @@ def test_a_sentence_is_broken_at_its_words_and_a_short_cell_is_not(terminal):
 
 
 @pytest.mark.parametrize(("width", "headers"), [(80, 1), (24, 2)])
-def test_a_map_too_wide_goes_on_below(terminal, width, headers):
+def test_wide_heat_map_continues_below(terminal, width, headers):
     sweeps = read_sweeps(["body_mass.pole=0.5,2", "action_delay=0:4"], 5)
     values = {(y, x): 0.11 * x + y / 100 for y in sweeps[0].values for x in sweeps[1].values}
     drawn = heat_map("success", sweeps, values, (0.0, 1.0))
@@ -82,7 +82,7 @@ def test_a_map_too_wide_goes_on_below(terminal, width, headers):
     assert light == [f"{0.11 * x + 0.005:.2f}" for x in range(5)]
 
 
-def test_parts_stay_whole_and_in_order():
+def test_flow_keeps_parts_whole_and_in_order():
     assert flow(["iteration 80/240", "655,360 steps", "0:23 left"], 32) == [
         "iteration 80/240  655,360 steps",
         "0:23 left",
@@ -92,7 +92,7 @@ def test_parts_stay_whole_and_in_order():
 
 
 @pytest.mark.parametrize("width", [80, 40])
-def test_the_live_table_breaks_no_number_from_its_unit(width):
+def test_live_table_keeps_numbers_with_their_units(width):
     from rich.console import Console
     from rich.live import Live
 
@@ -101,14 +101,14 @@ def test_the_live_table_breaks_no_number_from_its_unit(width):
     screen = Console(file=io.StringIO(), width=width)
     view._live = Live(console=screen)
     screen.print(view._table(progress_from_metrics([row], 240, 12.0)))
-    said = screen.file.getvalue()
+    output = screen.file.getvalue()
     for whole in ("rlcli train cartpole", "iteration 80/240", "655,360 steps", "54,613 steps/s", "0:24 left"):
-        assert whole in said
+        assert whole in output
 
 
-def test_what_is_left_counts_what_lies_between_iterations():
-    """Clips, evaluations and checkpoints take time that no iteration tells."""
+def test_remaining_time_includes_time_between_iterations():
+    """Videos, evaluations and checkpoints take time that is not part of any iteration."""
     row = {"iteration": 50, "step": 5000, "Perf/collection_time": 0.1, "Perf/learning_time": 0.1}
     assert progress_from_metrics([row], 100, 10.0).remaining_s == pytest.approx(10.0)
     assert progress_from_metrics([row], 100, 30.0).remaining_s == pytest.approx(30.0)
-    assert progress_from_metrics([row], 100, 0.0).remaining_s == pytest.approx(10.0)  # how long it trained is not known
+    assert progress_from_metrics([row], 100, 0.0).remaining_s == pytest.approx(10.0)  # the trained time is unknown

@@ -1,4 +1,4 @@
-"""Which viewer `play` opens and why, and the mistakes that may be made on the way."""
+"""Choice of the viewer of `play`, invalid combinations of options, and missing display, OpenGL or viewer."""
 
 import contextlib
 import hashlib
@@ -38,69 +38,71 @@ def names(*arguments, **settings):
     return [name for name, _ in viewer_choice.choose_viewers(*arguments, **{"headless": False, **settings})]
 
 
-def test_with_a_display_it_is_a_window(monkeypatch):
+def test_display_selects_native_viewer(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     assert names("auto", None) == ["native", "none"]
 
 
-def test_without_a_display_a_terminal_gets_the_browser(monkeypatch):
+def test_terminal_without_display_selects_web_viewer(monkeypatch):
     at_a_terminal(monkeypatch)
     assert names("auto", None) == ["web", "none"]
 
 
-def test_where_no_window_opens_a_terminal_gets_the_browser(monkeypatch):
+def test_web_viewer_follows_native_viewer_in_terminal(monkeypatch):
     at_a_terminal(monkeypatch)
     monkeypatch.setenv("DISPLAY", ":0")
     assert names("auto", None) == ["native", "web", "none"]
 
 
-def test_a_script_without_a_display_gets_numbers():
+def test_script_without_display_selects_no_viewer():
     assert names("auto", None) == ["none"]
 
 
 @pytest.mark.parametrize("display", ["", ":0"])
-def test_headless_opens_nothing(monkeypatch, display):
+def test_headless_selects_no_viewer(monkeypatch, display):
     at_a_terminal(monkeypatch)
     monkeypatch.setenv("DISPLAY", display)
     assert names("auto", None, headless=True) == ["none"]
 
 
-def test_a_port_is_the_browsers(monkeypatch):
+def test_port_selects_web_viewer(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     assert names("auto", 9000) == ["web"]
 
 
 @pytest.mark.parametrize("viewer", ["web", "none"])
-def test_what_is_asked_for_is_not_doubted(viewer):
-    assert viewer_choice.choose_viewers(viewer, None, headless=True) == [(viewer, "as asked")]
+def test_explicit_viewer_is_chosen(viewer):
+    assert viewer_choice.choose_viewers(viewer, None, headless=True) == [(viewer, "--viewer is given")]
 
 
 @pytest.mark.parametrize("place", VIEWERS.values())
-def test_viewers_have_the_parameters_of_the_protocol(place):
+def test_viewers_have_protocol_parameters(place):
     module, _, function = place.partition(":")
     run = getattr(importlib.import_module(module), function)
     expected = [name for name in inspect.signature(Viewer.__call__).parameters if name != "self"]
     assert list(inspect.signature(run).parameters) == expected
 
 
-def test_the_choice_and_its_reason_are_said(cli):
+def test_play_prints_viewer_and_reason(cli):
     done = cli(*ZERO)
     assert done.code == 0
-    assert "viewer: none (no display, and no terminal asks; --viewer web shows it in the browser)" in done.err
-    assert "viewer: none (as asked)" in cli(*ZERO, "--viewer", "none").err
+    assert (
+        "viewer: none (no display, and not started from a terminal; --viewer web shows it in the browser)" in done.err
+    )
+    assert "viewer: none (--viewer is given)" in cli(*ZERO, "--viewer", "none").err
     assert cli(*ZERO, "--json").json["video"] is None
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--viewer", "wbe"), "did you mean 'web'"),
         (("--viewer", "browser"), "auto, native, web, none"),
-        (("--viewer", "none", "--port", "8080"), "--port is of the viewer in the browser"),
-        (("--viewer", "native", "--port", "0"), "--port is of the viewer in the browser"),
+        (("--viewer", "none", "--port", "8080"), "--port is an option of the web viewer"),
+        (("--viewer", "native", "--port", "0"), "--port is an option of the web viewer"),
         (("--viewer", "web", "--port", "70000"), "'--port'"),
         (("--viewer", "web", "--video", "x.gif"), "leave one out"),
-        (("--port", "0", "--video", "x.gif"), "--port is of the viewer in the browser"),
+        (("--port", "0", "--video", "x.gif"), "--port is an option of the web viewer"),
         (("--show", "3"), "there are 2 environments; hint: --num-envs 3"),
         (("--show", "0"), "'--show'"),
         (("--command", "vx"), "--command 'vx' is not NAME=NUMBER"),
@@ -110,10 +112,10 @@ def test_the_choice_and_its_reason_are_said(cli):
         (("--command", "vx=1", "--record", "x.safetensors"), "--record with --command"),
     ],
 )
-def test_flags_that_make_no_sense_are_usage_errors(cli, arguments, said):
+def test_contradicting_flags_are_usage_errors(cli, arguments, message):
     done = cli(*ZERO, *arguments)
     assert done.code == 2
-    assert said in done.err.replace("\nhint: ", "; hint: ")
+    assert message in done.err.replace("\nhint: ", "; hint: ")
     assert done.out == ""
     assert not list(Path().iterdir())
 
@@ -125,35 +127,35 @@ def walker(tmp_path):
     task["commands"] = {
         "velocity": {"func": "uniform_velocity", "resampling_time_s": [0.1, 0.2], "lin_vel_x": [0.9, 1.0]}
     }
-    task["rewards"] = {"asked": {"func": "asked", "weight": 1.0}}
+    task["rewards"] = {"command": {"func": "command", "weight": 1.0}}
     folder = tmp_path / "walker"
     folder.mkdir()
     (folder / "critter.xml").write_text(CRITTER)
     (folder / "terms.py").write_text(
-        "def asked(env):\n    '''The command. (num_envs,)'''\n"
+        "def command(env):\n    '''The command. (num_envs,)'''\n"
         "    return env.command_manager.get_command('velocity')[:, 0]\n"
     )
     (folder / "task.yaml").write_text(yaml.safe_dump(task, sort_keys=False))
     return "./walker"
 
 
-def test_commands_are_held_in_numbers_too(cli, walker):
+def test_command_is_held_without_viewer(cli, walker):
     arguments = ("play", walker, "--policy", "zero", "--viewer", "none", "--json")
     drawn, held = (cli(*arguments, *more).json for more in ((), ("--command", "vx=-2.0,wz=0", "--command", "vy=0.5")))
-    assert drawn["reward_terms"]["asked"]["mean"] > 0.0
-    assert held["reward_terms"]["asked"]["mean"] / held["length"]["mean"] == pytest.approx(-2.0 * 0.02, rel=0.05)
+    assert drawn["reward_terms"]["command"]["mean"] > 0.0
+    assert held["reward_terms"]["command"]["mean"] / held["length"]["mean"] == pytest.approx(-2.0 * 0.02, rel=0.05)
 
 
-def test_a_wrong_command_lists_the_right_ones(cli, walker):
+def test_unknown_command_lists_valid_ones(cli, walker):
     done = cli("play", walker, "--policy", "zero", "--command", "vz=1")
     assert done.code == 2
     assert "commands: vx, vy, wz" in done.err
 
 
-# --- what the machine lacks ---
+# --- missing display, viewer or OpenGL ---
 
 
-def test_on_a_mac_outside_mjpython_the_right_command_is_said(cli, monkeypatch):
+def test_macos_without_mjpython_names_command(cli, monkeypatch):
     import mujoco.viewer
 
     monkeypatch.setattr(sys, "platform", "darwin")
@@ -169,7 +171,7 @@ def test_on_a_mac_outside_mjpython_the_right_command_is_said(cli, monkeypatch):
     assert "episodes" in auto.out
 
 
-def test_on_a_mac_outside_mjpython_a_terminal_gets_the_browser(cli, monkeypatch):
+def test_macos_without_mjpython_falls_back_to_web_viewer(cli, monkeypatch):
     import mujoco.viewer
 
     from rlcli.viewer import web
@@ -186,8 +188,8 @@ def test_on_a_mac_outside_mjpython_a_terminal_gets_the_browser(cli, monkeypatch)
     assert opened == [8080]
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="X is asked here")
-def test_a_display_that_is_gone_is_said_and_not_waited_for(start, environment):
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs X")
+def test_unreachable_display_fails_at_once(start, environment):
     done = start(*ZERO, "--viewer", "native", env={**environment, "DISPLAY": ":4242"})
     out, err = done.communicate(timeout=120)
     assert done.returncode == 10
@@ -210,7 +212,7 @@ def without(module, name):
     ("module", "name"),
     [("web_viewer", "WebViewer"), ("web.web_server", "bind_public_socket"), ("messages", "StateSnapshot")],
 )
-def test_another_mujoco_whose_viewer_does_not_fit_is_said(cli, module, name):
+def test_incompatible_mujoco_viewer_is_dependency_error(cli, module, name):
     with without(importlib.import_module(f"mujoco.studio.{module}"), name):
         done = cli(*ZERO, "--viewer", "web", "--port", "0")
     assert done.code == 7
@@ -219,15 +221,15 @@ def test_another_mujoco_whose_viewer_does_not_fit_is_said(cli, module, name):
     assert done.out == ""
 
 
-def test_a_mujoco_without_the_viewer_is_said(cli, monkeypatch):
+def test_mujoco_without_web_viewer_is_dependency_error(cli, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco.studio.web_viewer", None)
     done = cli(*ZERO, "--viewer", "web", "--port", "0")
     assert done.code == 7
     assert "the browser's viewer does not work with the installed mujoco" in done.err
 
 
-def test_a_server_that_does_not_ask_the_gate_is_ended():
-    """Were MuJoCo to serve in another way, requests would come past the gate: that is found out before they do."""
+def test_server_without_access_checks_is_stopped():
+    """If another version of MuJoCo served requests without the access checks, the server must not start."""
     code = (
         "import sys; from rlcli.viewer import secured_web_server as server; from rlcli.cli.app import main\n"
         "server._serve_with_checks = lambda server, port: server.serve\n"
@@ -239,7 +241,7 @@ def test_a_server_that_does_not_ask_the_gate_is_ended():
     assert done.stdout == ""
 
 
-def test_a_viewer_that_does_not_work_is_followed_by_the_next(monkeypatch, capsys):
+def test_failing_viewer_falls_back_to_next(monkeypatch, capsys):
     tried = []
 
     def fail(session, name, *_):
@@ -285,7 +287,7 @@ def has_osmesa():
 
 @pytest.mark.slow
 @pytest.mark.skipif(not has_osmesa(), reason="libosmesa6 is not installed")
-def test_without_egl_osmesa_draws():
+def test_rendering_without_egl_uses_osmesa():
     done = hiding(["egl"], *ZERO, "--video", "x.gif", "--json", "viewer.width=160", "viewer.height=120")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["gl"] == "osmesa"
@@ -300,7 +302,7 @@ def contents(folder):
     }
 
 
-def test_without_any_gl_it_is_said_and_the_run_is_untouched(cli, only_run):
+def test_rendering_without_gl_fails_and_leaves_run_unchanged(cli, only_run):
     words = ("scene.num_envs=4", "sim.engine_threads=1", "agent.torch_threads=1", "--logger", "none", "-q")
     assert cli("train", "cartpole", *words, "--max-iterations", 1).code == 0
     before = contents(only_run())
@@ -314,7 +316,7 @@ def test_without_any_gl_it_is_said_and_the_run_is_untouched(cli, only_run):
     assert contents(only_run()) == before
 
 
-def test_a_checkpoint_of_another_task_is_a_table_in_play(cli, only_run):
+def test_play_of_changed_observation_layout_prints_table(cli, only_run):
     words = ("scene.num_envs=4", "sim.engine_threads=1", "agent.torch_threads=1", "--logger", "none", "-q")
     assert cli("train", "cartpole", *words, "--max-iterations", 1).code == 0
     file = only_run() / "config.yaml"
