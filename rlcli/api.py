@@ -20,10 +20,10 @@ from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.evaluation.session import PolicyRequest, open_session, run_episodes
 from rlcli.registry.find import find_task
-from rlcli.rl.acting import acting
+from rlcli.rl.acting import trained_policy
 from rlcli.runs.checkpoint import open_checkpoint
 from rlcli.runs.policy_ref import choose
-from rlcli.runs.restore import policy_of, require_fit
+from rlcli.runs.restore import require_fit
 from rlcli.runs.run_ref import default_runs_dir
 from rlcli.training.job import Job, TrainingResult
 from rlcli.training.launch import TrainingRequest, broadcast_job, setup_job
@@ -168,7 +168,7 @@ def load_policy(
     """
     saved = open_checkpoint(_find(checkpoint, env.resolved.source.name, runs_dir))
     require_fit(saved, env.layout)
-    return acting(env, policy_of(saved), stochastic=stochastic)
+    return trained_policy(env, saved.policy(), stochastic=stochastic)
 
 
 def export(

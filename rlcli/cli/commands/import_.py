@@ -117,10 +117,10 @@ def _create_run(
 ) -> None:
     """Write an imported policy as a run."""
     from rlcli.runs.run_ref import default_runs_dir
-    from rlcli.training.import_checkpoint import as_run
+    from rlcli.training.import_checkpoint import create_imported_run
 
     record = {"imported": {"form": form, "file": file.name, "algorithm": policy.algorithm}}
-    run = as_run(policy, resolved, record, runs_dir or default_runs_dir(), name)
+    run = create_imported_run(policy, resolved, record, runs_dir or default_runs_dir(), name)
     spec = policy.spec
     hidden = " x ".join(map(str, spec["hidden"])) or "none"
     bound = "unbounded" if spec["action_bound"] is None else f"within +-{spec['action_bound']:g}"
