@@ -1,7 +1,7 @@
 """Learning curves of runs as one small CSV and one SVG: `python benchmarks/learning_curves.py NAME RUN ...`.
 
-It writes docs/reference/curves/NAME.csv and docs/reference/curves/NAME.svg: the success rate of each run over its environment steps, during
-training, with exploration. The label of a run is its seed.
+It writes NAME.csv and NAME.svg to docs/reference/curves: the success rate of each run over its environment steps,
+during training, with exploration. The label of a run is its seed.
 """
 
 import csv

@@ -1,4 +1,4 @@
-"""Tables of `docs/explanation/benchmarks.md`: results are stored in `results.json`, and the pages are written from them.
+"""Tables of `docs/explanation/benchmarks.md`: results are stored in `results.json`, pages are written from them.
 
 A table is a module with `NAME`, `measure(quick)`, which returns a JSON object, and `markdown(result)`. Run as a
 program, the module measures, stores the result and writes it into the pages; `--quick` is a short trial that only

@@ -7,7 +7,7 @@
                                                    uses documents of `rlcli eval --json` in that folder
     python benchmarks/zoo.py adopt TASK OTHER      ship the policy of the task's other form, evaluated in this form
     python benchmarks/zoo.py picture TASK          draw a strip of pictures of the shipped policy
-    python benchmarks/zoo.py pages                 fill the generated parts of docs/reference/zoo/*.md, and write its index
+    python benchmarks/zoo.py pages                 fill the generated parts of docs/reference/zoo/*.md, and its index
 
 `learn` exits with 9 if the bar or the time limit is missed, and appends a line to RUNS/learn.jsonl.
 """

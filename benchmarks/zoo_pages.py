@@ -1,4 +1,4 @@
-"""Generated parts of docs/reference/zoo/*.md: the task card, the results of the trainings, and their learning curves."""
+"""Generated parts of docs/reference/zoo/*.md: the task card, the results of the trainings, and the curves."""
 
 from __future__ import annotations
 
