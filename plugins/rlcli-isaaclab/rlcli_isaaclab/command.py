@@ -15,7 +15,7 @@ def import_run(
     agent: Annotated[Path | None, typer.Argument(metavar="[AGENT.yaml]", help="params/agent.yaml of RSL-RL.")] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Folder to write; a new one named after the task if left out."),
+        typer.Option("--output", "-o", help="Folder to write. [default: imported]"),
     ] = None,
     model: Annotated[
         list[str] | None, typer.Option("--model", help="ENTITY=FILE.xml: the MJCF of a robot or object; repeatable.")
@@ -25,8 +25,8 @@ def import_run(
     from rlcli.errors import UsageError
     from rlcli_isaaclab.importer import convert
 
-    models = dict(given.partition("=")[::2] for given in model or [])
+    models = dict(item.partition("=")[::2] for item in model or [])
     for name, file in models.items():
         if not file or not Path(file).is_file():
-            raise UsageError(f"--model {name}={file}: there is no such file", hint="--model robot=robot.xml")
+            raise UsageError(f"--model {name}={file}: file not found", hint="--model robot=robot.xml")
     return convert(env, agent, output or Path("imported"), models)
