@@ -51,7 +51,7 @@ class TerrainImporterCfg:
 
 def _sub_terrain(name: str, function: str, **settings: Any) -> Any:
     """Return the class of a sub-terrain. Its settings keep Isaac Lab's names."""
-    common = {"function": function, "proportion": 1.0, "size": None, "flat_patch_sampling": None}
+    common: dict[str, Any] = {"function": function, "proportion": 1.0, "size": None, "flat_patch_sampling": None}
     return make_config_class(name, f"Sub-terrain `{function}`.", **common, **settings)
 
 

@@ -17,10 +17,10 @@ def import_task(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Folder to write; a new one named after the task if left out."),
+        typer.Option("--output", "-o", help="Folder to write. [default: the task's name]"),
     ] = None,
 ) -> Imported:
-    """Import a task's YAML of OmniIsaacGymEnvs. Its class goes on as it is."""
+    """Import a task's YAML of OmniIsaacGymEnvs. Its class stays unchanged except for import lines."""
     from rlcli_oige.importer import convert
 
     return convert([task] if train is None else [task, train], output)

@@ -1,4 +1,4 @@
-"""An rl_games YAML that cannot be learned from as it is: said with the key, never a traceback."""
+"""Mistakes in an rl_games YAML: the error names the key, without a traceback."""
 
 import pytest
 from reacher import TRAIN, arm_folder
@@ -80,7 +80,7 @@ SPACE = TRAIN[TRAIN.index("    space: {") : TRAIN.index("    mlp: {")]
         ),
     ],
 )
-def test_what_an_agent_cannot_be_is_refused_at_its_key(tmp_path, old, new, key, message, hint):
+def test_invalid_agent_value_error_has_key(tmp_path, old, new, key, message, hint):
     with pytest.raises(ConfigError) as caught:
         resolved(tmp_path, edited(old, new))
     found = next(p for p in caught.value.problems if message in p.message)
@@ -108,12 +108,12 @@ def test_what_an_agent_cannot_be_is_refused_at_its_key(tmp_path, old, new, key, 
         ("reward_shaper: {scale_value: 0.1}", "reward_shaper: {}", {"reward_scale": 1.0}),
     ],
 )
-def test_what_an_agent_says_is_what_it_learns_with(tmp_path, old, new, expected):
+def test_agent_settings_reach_trainer(tmp_path, old, new, expected):
     agent = resolved(tmp_path, edited(old, new)).agent
     assert {key: getattr(agent, key) for key in expected} == expected
 
 
-def test_a_recurrent_network_has_the_size_that_is_written(tmp_path):
+def test_recurrent_network_has_configured_size(tmp_path):
     agent = resolved(tmp_path, edited("separate: False", "rnn: {name: lstm, units: 24, layers: 2}")).agent
     assert (agent.rnn.hidden, agent.rnn.layers) == (24, 2)
 
@@ -141,6 +141,6 @@ def test_a_recurrent_network_has_the_size_that_is_written(tmp_path):
         ),
     ],
 )
-def test_what_is_only_near_is_noted_as_such(tmp_path, old, new, key, status):
+def test_approximated_key_is_noted(tmp_path, old, new, key, status):
     notes = {note.key: note.status for note in resolved(tmp_path, edited(old, new)).notes}
     assert notes[key] == status

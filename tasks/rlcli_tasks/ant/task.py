@@ -23,7 +23,7 @@ class AntTask(LocomotionTask):
     action_names = JOINTS
 
     class Params(LocomotionTask.Params):
-        """The task's own settings."""
+        """Settings of the task."""
 
         effort: float = Field(7.5, gt=0, description="Torque at action 1 [N m].")
         termination_height: float = Field(0.31, description="Torso height below which the episode fails [m].")
@@ -39,9 +39,9 @@ class AntTask(LocomotionTask):
     params: Params
 
     def efforts(self) -> tuple[float, ...]:
-        """The same for every joint."""
+        """Return the same torque for every joint."""
         return (self.params.effort,) * len(JOINTS)
 
     def at_limits(self, position: Tensor) -> Tensor:
-        """1 for each that is."""
+        """Return 1 for each joint at a limit."""
         return position.abs() > 0.99
