@@ -205,8 +205,8 @@ class LocomotionTask(DirectTask):
     def _measure_speed(self) -> None:
         """Compute the speed towards the target: how much the distance decreased over the step.
 
-        |a| - |b| = (a - b) (a + b) / (|a| + |b|), where a - b is the movement in the step. A float32 distance of 1000 m is exact to
-        0.06 mm only, which is 4 mm/s at 60 Hz.
+        |a| - |b| = (a - b) (a + b) / (|a| + |b|), where a - b is the movement in the step. A float32 distance of 1000 m
+        is exact to 0.06 mm only, which is 4 mm/s at 60 Hz.
         """
         position = self.robot.data.root_pos_w[:, :2]
         way = position - self.position_before

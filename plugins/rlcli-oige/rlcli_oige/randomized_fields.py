@@ -151,7 +151,7 @@ def _state_field(view: Any, attribute: str, env: OigeEnv) -> RandomizedField:
         "joint_positions": lambda ids, v: view.set_joint_positions(v, ids),
         "joint_velocities": lambda ids, v: view.set_joint_velocities(v, ids),
         "joint_efforts": lambda ids, v: view.set_joint_efforts(v, ids),
-        "force": lambda ids, v: env.push_later(view, rows(ids), flat(v, 3)),
+        "force": lambda ids, v: env.queue_forces(view, rows(ids), flat(v, 3)),
     }
     change = _apply_rotation if attribute == "orientation" else apply_operation
     return RandomizedField(readers[attribute], writers[attribute], env, change, state=True)

@@ -98,7 +98,7 @@ def test_class_is_found_by_task_name(tmp_path):
     assert find_task(str(folder)).task.endswith("arm.py:ArmTask")
     assert find_task(str(folder / "Arm.yaml")).task.endswith("arm.py:ArmTask")
     (folder / "arm.py").write_text("class Other:\n    pass\n")
-    with pytest.raises(TaskError, match="no task class in any Python file there; 'ArmTask' was looked for"):
+    with pytest.raises(TaskError, match="no task class in any Python file of the folder; expected 'ArmTask'"):
         find_task(str(folder))
 
 

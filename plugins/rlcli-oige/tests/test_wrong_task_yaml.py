@@ -20,11 +20,11 @@ def problem_of(place, yaml, message):
 @pytest.mark.parametrize(
     ("old", "new", "key", "message", "hint"),
     [
-        ("name: Arm\n", "name: Arm\ndefaults: [_self_]\n", "defaults", "defaults list is not followed", "one file"),
+        ("name: Arm\n", "name: Arm\ndefaults: [_self_]\n", "defaults", "defaults lists are not supported", "one file"),
         ("  physx:\n", "  physx: 3\n  other:\n", "sim.physx", "expected a mapping, found 3", None),
         ("  dt: 0.01", "  dt: 0.01\n  substep: 2", "sim.substep", "unknown key 'substep'", "did you mean 'substeps'"),
         ("mjcf:\n", "viewport: {camera_psition: [1, 1, 1]}\nmjcf:\n", "viewport.camera_psition", "unknown key", None),
-        ("mjcf:\n  /World/envs/.*/Arm: arm.xml", "mjcf: arm.xml", "mjcf", "expected a mapping of robots", None),
+        ("mjcf:\n  /World/envs/.*/Arm: arm.xml", "mjcf: arm.xml", "mjcf", "expected a mapping from robots", None),
         (
             "  /World/envs/.*/Arm: arm.xml",
             "  Arm: {model: arm.xml, joint: {a: b}}",
@@ -88,20 +88,20 @@ NOISE = f"{BLOCK}.randomization_params.observations.on_reset"
         (
             {"randomization_params": {"simulation": {"wind": {"on_reset": GATE}}}},
             f"{BLOCK}.randomization_params.simulation.wind",
-            "'wind' cannot be randomised",
-            "of simulation: gravity",
+            "'wind' cannot be randomized",
+            "expected gravity",
         ),
         (
             views("body_mass", on_reset=GATE),
             f"{BLOCK}.randomization_params.articulation_views.arm_view.body_mass",
-            "'body_mass' cannot be randomised",
+            "'body_mass' cannot be randomized",
             "did you mean 'body_masses'",
         ),
         (noise("on_rest"), f"{BLOCK}.randomization_params.observations.on_rest", "unknown key 'on_rest'", "on_reset"),
         (
             noise("on_startup"),
             f"{BLOCK}.randomization_params.observations.on_startup",
-            "observations cannot be randomised on_startup",
+            "observations cannot be randomized on_startup",
             "on_reset or on_interval",
         ),
         ({"randomization_params": {"observations": {"on_reset": 3}}}, NOISE, "expected a mapping", None),
@@ -109,16 +109,16 @@ NOISE = f"{BLOCK}.randomization_params.observations.on_reset"
         (
             {"randomization_params": {"observations": {"on_reset": without("distribution")}}},
             NOISE,
-            "needs distribution",
+            "missing distribution",
             None,
         ),
         (
             noise("on_interval"),
             f"{BLOCK}.randomization_params.observations.on_interval",
-            "needs frequency_interval",
+            "missing frequency_interval",
             None,
         ),
-        (noise(operation="add"), f"{NOISE}.operation", "no operation 'add'", "additive"),
+        (noise(operation="add"), f"{NOISE}.operation", "unknown operation 'add'", "additive"),
         (noise(distribution="normall"), f"{NOISE}.distribution", "no distribution 'normall'", "did you mean 'normal'"),
         (noise(schedule="cubic"), f"{NOISE}.schedule", "no schedule 'cubic'", "constant"),
         (noise(operation="direct"), f"{NOISE}.operation", "noise is additive or scaling", None),
