@@ -264,7 +264,7 @@ def test_goals_are_uniform_rotations(env):
     goals = torch.cat(goals)
     assert len(goals.unique(dim=0)) == 1000
     angle = turn_between(goals, torch.tensor([LEVEL]).expand_as(goals))
-    assert float(angle.mean()) == pytest.approx(math.pi / 2 + 2 / math.pi, abs=0.06)  # mean angle of the uniform distribution
+    assert float(angle.mean()) == pytest.approx(math.pi / 2 + 2 / math.pi, abs=0.06)  # mean of the uniform one
 
 
 # --- ends and starts ---

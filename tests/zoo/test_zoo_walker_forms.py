@@ -46,7 +46,7 @@ def test_both_forms_agree_step_by_step(name, size, low):
                 managed.engine.field("qpos")[rows][:, :7], direct.engine.field("qpos")[rows][:, :7], "where they start"
             )
         falls, outs = falls + int(a.terminated.sum()), outs + int(a.truncated.sum())
-        same_states(managed, direct, torch.arange(n))  # otherwise rounding errors would grow, and new initial states differ
+        same_states(managed, direct, torch.arange(n))  # initial states differ, and rounding errors would grow
     assert falls >= 3
     assert outs >= 5
 

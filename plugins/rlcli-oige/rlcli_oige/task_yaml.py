@@ -1,8 +1,8 @@
 """Translation of OmniIsaacGymEnvs' task YAML to a task of rlcli.
 
 The user's file stays unchanged. Settings of the simulation and the environment (time step, number of environments,
-ground, ...) become keys of `TaskConfig`. All other settings go to `oige:`, where the task's class reads them. A note for
-every key records whether it is mapped, approximated or ignored. One key is added to the format: `mjcf:` names the model
+ground, ...) become keys of `TaskConfig`. All other settings go to `oige:`, where the task's class reads them. A note
+for every key records whether it is mapped, approximated or ignored. One key is added to the format: `mjcf:` names the model
 of each robot.
 """
 

@@ -40,7 +40,13 @@ SPACE = TRAIN[TRAIN.index("    space: {") : TRAIN.index("    mlp: {")]
         ),
         ("    separate: False", "    cnn: {}", "params.network.cnn", "unknown key 'cnn'", "keys: name, separate"),
         (UNITS, "mlp: [32, 16]", "params.network.mlp", "expected a mapping", None),
-        ("activation: elu", "activation: gelu", "params.network.mlp.activation", "unknown activation 'gelu'", "known: elu"),
+        (
+            "activation: elu",
+            "activation: gelu",
+            "params.network.mlp.activation",
+            "unknown activation 'gelu'",
+            "known: elu",
+        ),
         ("activation: elu", "activation: [elu]", "params.network.mlp.activation", "unknown activation", "known: elu"),
         ("activation: elu", "activation: elu, d2rl: True", "params.network.mlp.d2rl", "d2rl networks are not", None),
         (
@@ -70,7 +76,13 @@ SPACE = TRAIN[TRAIN.index("    space: {") : TRAIN.index("    mlp: {")]
             "unknown schedule 'cosine'",
             "known: ",
         ),
-        ("lr_schedule: adaptive", "lr_schedule: {a: 1}", "params.config.lr_schedule", "unknown schedule", "known: adaptive"),
+        (
+            "lr_schedule: adaptive",
+            "lr_schedule: {a: 1}",
+            "params.config.lr_schedule",
+            "unknown schedule",
+            "known: adaptive",
+        ),
         (
             "schedule_type: standard",
             "schedule_type: x",

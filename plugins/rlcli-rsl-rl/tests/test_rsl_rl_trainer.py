@@ -328,9 +328,7 @@ def test_settings_that_do_not_fit_env_name_their_key(overrides, place, words):
 
 
 @pytest.mark.parametrize("reference", ["stranger:mirror", "stranger.mirror", "{folder}/stranger.py:mirror"])
-def test_symmetry_function_is_imported_only_from_task_and_plugins(
-    reference, tmp_path, monkeypatch
-):
+def test_symmetry_function_is_imported_only_from_task_and_plugins(reference, tmp_path, monkeypatch):
     (tmp_path / "stranger.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\ndef mirror(**_): ...\n")
     monkeypatch.syspath_prepend(tmp_path)
     named = reference.format(folder=tmp_path)
