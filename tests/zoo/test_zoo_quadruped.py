@@ -232,7 +232,7 @@ def test_terrain_levels_rise_with_distance():
 
 
 def test_play_spreads_terrain_levels():
-    resolved = resolve(find_tset_command("quadruped-rough"), play=True)
+    resolved = resolve(find_task("quadruped-rough"), play=True)
     env = make_env(resolved, seed=1)
     env.reset()
     seen = [env.terrain.levels.clone()]

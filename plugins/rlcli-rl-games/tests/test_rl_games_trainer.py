@@ -119,7 +119,7 @@ def outcomes_of(trainer, monkeypatch):
         seen.append((result.reward.clone(), cut.clone(), result.terminated.clone(), final))
         return result
 
-    monkeypatch.setattr(trainer.env, "step", watched)
+    monkeypatch.setattr(trainer.env, "step", record_step)
     return seen
 
 
