@@ -51,15 +51,15 @@ def observation_units(joints: int, feet: int, *, rate: str, joint_rate: str, for
 class LocomotionTask(DirectTask):
     """Run towards the target.
 
-    A robot says what its joints are, how much torque they get and what is scaled how. Its `Params` add
+    A subclass defines the joints, their torques and the scales of observations. Its `Params` add
     `termination_height`, `death_reward`, `alive_weight`, `action_cost`, `energy_cost`, `limit_cost` and
-    `joint_pos_noise`, whose values are a robot's own.
+    `joint_pos_noise`, whose values depend on the robot.
     """
 
     class Params(StrictModel):
         """Settings of all locomotion tasks."""
 
-        target: tuple[float, float] = Field((1000.0, 0.0), description="Where to run, x and y [m].")
+        target: tuple[float, float] = Field((1000.0, 0.0), description="Target position, x and y [m].")
         progress_weight: float = Field(1.0, description="Reward on the speed towards the target [s/m].")
         up_weight: float = Field(0.1, description="Reward where the torso is upright to within acos(0.93).")
         heading_weight: float = Field(0.5, description="Reward where the torso faces the target, to within acos(0.8).")

@@ -132,7 +132,7 @@ def evaluation(success=0.9, **values):
 
 
 @pytest.mark.parametrize(
-    ("bar", "found", "said"),
+    ("bar", "found", "message"),
     [
         ({"success": 0.9}, evaluation(0.9), []),
         ({"success": 0.95}, evaluation(0.9), ["success is 0.9, below 0.95"]),
@@ -144,8 +144,8 @@ def evaluation(success=0.9, **values):
         ({"success": 0.95, "length": 20}, evaluation(), ["success is 0.9, below 0.95", "length is 10, below 20"]),
     ],
 )
-def test_bar_is_missed_by_value_on_wrong_side(bar, found, said):
-    assert zoo.Entry("x", "A", "cpu", 1, bar).missed(found) == said
+def test_bar_is_missed_by_value_on_wrong_side(bar, found, message):
+    assert zoo.Entry("x", "A", "cpu", 1, bar).missed(found) == message
 
 
 def test_recorded_command_omits_output_folder():
@@ -162,19 +162,19 @@ def test_page_without_results(tmp_path):
 
 
 def test_thick_line_is_median_of_seeds():
-    class Told:
+    class RunCurves:
         def __init__(self, seed, level):
             self.run = type("Run", (), {"record": {"seed": seed}})
             self.axes = {"steps": np.arange(1.0, 301.0) * 1000, "time": np.arange(1.0, 301.0)}
             self.metrics = {zoo_curves.RETURN: np.full(300, level), zoo_curves.SUCCESS: np.linspace(0.0, level, 300)}
 
-    told = [Told(1, 0.1), Told(2, 0.9), Told(3, 0.5)]
-    lines = [row.split(",") for row in zoo_curves.table(told).splitlines()]
+    runs = [RunCurves(1, 0.1), RunCurves(2, 0.9), RunCurves(3, 0.5)]
+    lines = [row.split(",") for row in zoo_curves.table(runs).splitlines()]
     assert lines[0] == ["seed", "steps", "seconds", "success", "return"]
     assert len(lines) == 1 + 3 * zoo_curves.ROWS
     assert [row[0] for row in lines[1 :: zoo_curves.ROWS]] == ["1", "2", "3"]
     assert lines[-1] == ["3", "300000", "300.0", "0.5", "0.5"]
-    root = ElementTree.fromstring(zoo_curves.drawing("x", told))
+    root = ElementTree.fromstring(zoo_curves.drawing("x", runs))
     thick = [line for line in root.iter("{http://www.w3.org/2000/svg}polyline") if line.get("stroke-width") == "2.2"]
     bottom, top = zoo_curves._HEIGHT - zoo_curves._BOTTOM, zoo_curves._TOP
     ends = float(thick[0].get("points").split()[-1].split(",")[1])
@@ -210,19 +210,19 @@ def test_learn_writes_results_curves_and_policy(tmp_path):
     assert "mujoco" in logged["machine"]
     folder = next((tmp_path / "runs" / "cartpole").iterdir())
     held.write_text(text.replace(before, short + "bar: {success: 0.0}", 1))
-    said = subprocess.run(
+    message = subprocess.run(
         [sys.executable, "-m", "rlcli", "eval", "--checkpoint", str(folder), "--episodes", "16", "--num-envs", "16",
          "--json"], cwd=tmp_path, capture_output=True, text=True, timeout=280,
     )  # fmt: skip
     shutil.rmtree(folder / "evaluations")  # as on another machine, where only the document was kept
-    (tmp_path / "runs" / "cartpole.eval.json").write_text(said.stdout)
+    (tmp_path / "runs" / "cartpole.eval.json").write_text(message.stdout)
     collected = run("collect", "--all", "runs", "--ship")
     assert collected.returncode == 0, collected.stderr
     assert "cartpole, seed 5: within its bar" in collected.stdout
     assert (copy / "docs" / "reference" / "zoo" / "pictures" / "cartpole.jpg").stat().st_size < 80_000
     (row,) = json.loads((copy / "docs" / "reference" / "zoo" / "results" / "cartpole.json").read_text())
     assert (row["seed"], row["agent"], row["evaluation"]["episodes"]) == (5, "sb3-ppo", 16)
-    assert row["evaluation"]["return"] == json.loads(said.stdout)["return"]
+    assert row["evaluation"]["return"] == json.loads(message.stdout)["return"]
     shipped = copy / "tasks" / "rlcli_tasks" / "cartpole" / "policies" / "cartpole"
     assert open_bundle(shipped).manifest["evaluation"]["return"] == row["evaluation"]["return"]
     page = (copy / "docs" / "reference" / "zoo" / "cartpole.md").read_text()

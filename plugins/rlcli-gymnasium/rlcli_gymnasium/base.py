@@ -22,7 +22,7 @@ class GymnasiumTask(DirectTask):
     """One of Gymnasium's MuJoCo tasks.
 
     `observation` (num_envs, k) and `reward` (num_envs,) are what the buffers hold, before the cast to float32. `ended`
-    (num_envs,) is where the task ends the episode: it is judged once a step, for the reward as well.
+    (num_envs,) is where the task terminates the episode; it is computed once per step, also for the reward.
     """
 
     motors = False

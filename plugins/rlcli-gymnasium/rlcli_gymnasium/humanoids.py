@@ -73,7 +73,7 @@ class Humanoid(_Humanoid):
         )
         healthy_reward: float = Field(5.0, description="Reward of a step that does not end the episode.")
         healthy_z_range: tuple[float, float] = Field(
-            (1.0, 2.0), description="Height of a torso that has not failed [m]."
+            (1.0, 2.0), description="Range of the torso's height; outside it the episode terminates [m]."
         )
 
     params: Params

@@ -33,7 +33,7 @@ class Ant(GymnasiumTask):
         contact_cost_weight: float = Field(5e-4, ge=0, description="Penalty on the sum of squared contact forces.")
         healthy_reward: float = Field(1.0, description="Reward of a step that does not end the episode.")
         healthy_z_range: tuple[float, float] = Field(
-            (0.2, 1.0), description="Height of a torso that has not failed [m]."
+            (0.2, 1.0), description="Range of the torso's height; outside it the episode terminates [m]."
         )
         contact_force_range: tuple[float, float] = Field((-1.0, 1.0), description="Clip of contact forces [N, N m].")
         reset_noise_scale: float = Field(0.1, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
@@ -150,7 +150,7 @@ class Walker2d(GymnasiumTask):
         ctrl_cost_weight: float = Field(1e-3, ge=0, description="Penalty on the sum of squared actions.")
         healthy_reward: float = Field(1.0, description="Reward of a step that does not end the episode.")
         healthy_z_range: tuple[float, float] = Field(
-            (0.8, 2.0), description="Height of a torso that has not failed [m]."
+            (0.8, 2.0), description="Range of the torso's height; outside it the episode terminates [m]."
         )
         healthy_angle_range: tuple[float, float] = Field((-1.0, 1.0), description="Its pitch [rad].")
         reset_noise_scale: float = Field(5e-3, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
@@ -196,7 +196,8 @@ class Hopper(Walker2d):
         healthy_reward: float = Field(1.0, description="Reward of a step that does not end the episode.")
         healthy_state_range: tuple[float, float] = Field((-100.0, 100.0), description="All of the state but x and z.")
         healthy_z_range: tuple[float, float | None] = Field(
-            (0.7, None), description="Height of a torso that has not failed [m]; null: no upper end."
+            (0.7, None),
+            description="Range of the torso's height; outside it the episode terminates [m]; null: no upper end.",
         )
         healthy_angle_range: tuple[float, float] = Field((-0.2, 0.2), description="Its pitch [rad].")
         reset_noise_scale: float = Field(5e-3, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")

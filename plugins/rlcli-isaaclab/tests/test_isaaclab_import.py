@@ -80,13 +80,13 @@ def leaves(value, key=()):
 
 def test_every_key_is_reported(imported):
     _, document, _, _ = imported()
-    told = {tuple(row["key"].split(".")): row for row in document["keys"]}
+    reported = {tuple(row["key"].split(".")): row for row in document["keys"]}
     text = ENV.read_text().replace("!!python/tuple", "").replace("!!python/object/apply:builtins.slice", "")
     text = text.replace("!!python/object/apply:isaaclab.managers.recorder_manager.DatasetExportMode", "")
     missing = []
     for key in leaves(yaml.safe_load(text)):
         above = [".".join(key[:length]) for length in range(1, len(key) + 1)]
-        if not any(".".join(known) in above for known in told):
+        if not any(".".join(known) in above for known in reported):
             missing.append(key)
     assert missing == []
     status = {row["key"]: row["status"] for row in document["keys"]}

@@ -274,13 +274,13 @@ def rows(section):
     ],
 )
 def test_every_listed_term_maps_to_listed_counterpart(source, section, tried):
-    said = rows(section)
-    assert set(said) - ELSEWHERE == set(tried)
+    listed = rows(section)
+    assert set(listed) - ELSEWHERE == set(tried)
     made = to_data(resolve(source()))[section]
     made = made["policy"] if section == "observations" else made
     for name in tried:
         found = {term["func"] for key, term in made.items() if key == name or key.startswith(f"{name}_")}
-        assert said[name] in found, name
+        assert listed[name] in found, name
     assert set(EVENTS) - ELSEWHERE <= set(EVENT_TERMS)
 
 

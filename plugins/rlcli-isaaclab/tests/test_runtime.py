@@ -54,10 +54,10 @@ def test_written_joint_is_read_back_and_others_keep(robot):
     position, velocity = robot.data.joint_pos.clone(), robot.data.joint_vel.clone()
     ids, names = robot.find_joints(["hip_br", "hip_fl"])
     assert names == [robot.joint_names[i] for i in ids]
-    asked = torch.tensor([[0.3, -0.2]])
-    robot.write_joint_position_to_sim(asked, joint_ids=torch.tensor(ids), env_ids=[2])
-    robot.write_joint_velocity_to_sim(10 * asked, joint_ids=torch.tensor(ids), env_ids=[2])
-    position[2, ids], velocity[2, ids] = asked[0], 10 * asked[0]
+    target = torch.tensor([[0.3, -0.2]])
+    robot.write_joint_position_to_sim(target, joint_ids=torch.tensor(ids), env_ids=[2])
+    robot.write_joint_velocity_to_sim(10 * target, joint_ids=torch.tensor(ids), env_ids=[2])
+    position[2, ids], velocity[2, ids] = target[0], 10 * target[0]
     assert torch.allclose(robot.data.joint_pos, position)
     assert torch.allclose(robot.data.joint_vel, velocity)
     robot.write_joint_state_to_sim(torch.full((4, 4), 0.1), torch.full((4, 4), -1.0))

@@ -2,8 +2,8 @@
 
 The user's file stays unchanged. Settings of the simulation and the environment (time step, number of environments,
 ground, ...) become keys of `TaskConfig`. All other settings go to `oige:`, where the task's class reads them. A note
-for every key records whether it is mapped, approximated or ignored. One key is added to the format: `mjcf:` names the model
-of each robot.
+records for every key whether it is mapped, approximated or ignored. One key is added to the format: `mjcf:` names the
+model of each robot.
 """
 
 from __future__ import annotations

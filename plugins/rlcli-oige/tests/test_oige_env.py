@@ -60,13 +60,13 @@ def as_package(folder):
 def test_package_keeps_folders_and_star_import_finds_all(tmp_path, name):
     folder = as_package(tmp_path / "arms")
     action = torch.linspace(-1.0, 1.0, 4)[:, None]
-    lives = []
+    rollouts = []
     for env in (build(folder / name), build(arm_folder(tmp_path / "arm"))):
         torch.manual_seed(0)
         env.reset()
-        lives.append([(step.obs["policy"].clone(), step.reward.clone()) for step in map(env.step, [action] * 15)])
+        rollouts.append([(step.obs["policy"].clone(), step.reward.clone()) for step in map(env.step, [action] * 15)])
     assert all(
-        torch.equal(a, b) for ours, theirs in zip(*lives, strict=True) for a, b in zip(ours, theirs, strict=True)
+        torch.equal(a, b) for ours, theirs in zip(*rollouts, strict=True) for a, b in zip(ours, theirs, strict=True)
     )
     assert resolve(find_task(str(folder / name))).agent.num_epochs == 3  # of cfg/train
 

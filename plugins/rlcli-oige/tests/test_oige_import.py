@@ -27,13 +27,13 @@ def test_imported_task_equals_original_step_by_step(tmp_path):
     assert now.task.model_dump(exclude={"agents"}) == was.task.model_dump(exclude={"agents"})
     assert now.agent == was.agent
     assert now.notes == ()
-    lives = []
+    rollouts = []
     for resolved in (was, now):
         torch.manual_seed(0)
         env = make_env(resolved, seed=1)
         env.reset()
-        lives.append(torch.stack([env.step(torch.ones(4, 1)).obs["policy"].clone() for _ in range(20)]))
-    assert torch.equal(*lives)
+        rollouts.append(torch.stack([env.step(torch.ones(4, 1)).obs["policy"].clone() for _ in range(20)]))
+    assert torch.equal(*rollouts)
 
 
 @pytest.mark.parametrize("name", ["../../evil", "..", "{tmp}/evil", "a\\nb", "x" * 300])

@@ -136,11 +136,11 @@ def test_efforts_are_limited_by_max_efforts(tmp_path):
     driven = arms.get_dof_index("right_a")
     arms.set_max_efforts(torch.tensor([[0.5]]), indices=[0], joint_indices=[driven])
     motor = arms._drives["motor"][1][arms._drives["motor"][0] == column]
-    for asked in (5.0, -5.0):
-        arms.set_joint_efforts(torch.full((4, 2), asked), joint_indices=[column, driven])
-        control = env.engine.field("ctrl")[:, motor].flatten() / asked
+    for target in (5.0, -5.0):
+        arms.set_joint_efforts(torch.full((4, 2), target), joint_indices=[column, driven])
+        control = env.engine.field("ctrl")[:, motor].flatten() / target
         assert (5 * control).tolist() == pytest.approx([1.5, 1.5, 0.5, 1.5]), "half of the effort: the gear is 2"
-        beside = env.engine.field("qfrc_applied")[:, arms._dof_columns[driven]] / asked
+        beside = env.engine.field("qfrc_applied")[:, arms._dof_columns[driven]] / target
         assert (5 * beside).tolist() == pytest.approx([0.5, 5.0, 5.0, 5.0])
 
 

@@ -215,8 +215,8 @@ class RunnerConfig(AgentConfig):
     """Steps per environment and iteration."""
     obs_groups: dict[str, Annotated[list[str], Field(min_length=1)]] = _NO_GROUPS
     """Which observation groups the actor (`actor`, or `policy` as before RSL-RL 5), the `critic` and the curiosity
-    (`rnd_state`) see. Not given: the critic sees the group critic if the task has one, else policy; the others see
-    policy."""
+    (`rnd_state`) observe. Default: the critic observes the group critic if the task has one, else policy; the others
+    observe policy."""
     policy: PolicyConfig | None = None
     """Both networks, in the older form; if actor and critic are null too: RSL-RL's defaults."""
     actor: ModelConfig | None = None
@@ -315,8 +315,7 @@ class RunnerConfig(AgentConfig):
     @property
     def not_read(self) -> list[str]:
         """Return the settings that have no effect, each with what to use instead."""
-        said = [f"{key}: {flag} decides" for key, (usual, flag) in _ELSEWHERE.items() if getattr(self, key) != usual]
-        return said
+        return [f"{key}: use {flag}" for key, (default, flag) in _ELSEWHERE.items() if getattr(self, key) != default]
 
 
 def _tuples(data: dict[str, Any]) -> dict[str, Any]:

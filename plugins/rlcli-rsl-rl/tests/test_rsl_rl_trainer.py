@@ -375,17 +375,17 @@ def test_checkpoint_of_other_trainer_is_refused_with_names(tmp_path, capsys, mon
     monkeypatch.chdir(tmp_path)
     small = ("--num-envs", 8, "--max-iterations", 1, "--logger", "none", "-q")
     run = Path(rlcli(capsys, "train", "cartpole", "--agent", "rsl-rl", *small).out.strip())
-    said = rlcli(capsys, "train", "cartpole", "--agent", "sac", *small, "--init-from", run, code=5).err
-    assert "'rsl-rl'" in said
-    assert "'sb3'" in said
-    assert "squashed-gaussian-mlp" in said
+    error = rlcli(capsys, "train", "cartpole", "--agent", "sac", *small, "--init-from", run, code=5).err
+    assert "'rsl-rl'" in error
+    assert "'sb3'" in error
+    assert "squashed-gaussian-mlp" in error
     step = next(folder for folder in (run / "checkpoints").iterdir() if folder.name == f"{128:012d}")
     manifest = json.loads((step / "manifest.json").read_text())
     assert manifest["trainer"] == "rsl-rl"
     (step / "manifest.json").write_text(json.dumps({**manifest, "trainer": "sb3"}))
-    said = rlcli(capsys, "train", "--resume", run, "--max-iterations", 2, code=5).err
-    assert "a checkpoint of trainer 'sb3'" in said
-    assert "one of 'rsl-rl'" in said
+    error = rlcli(capsys, "train", "--resume", run, "--max-iterations", 2, code=5).err
+    assert "a checkpoint of trainer 'sb3'" in error
+    assert "one of 'rsl-rl'" in error
 
 
 def test_init_from_other_trainer_with_same_policy_form(tmp_path, capsys, monkeypatch):

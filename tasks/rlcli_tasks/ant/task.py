@@ -28,7 +28,7 @@ class AntTask(LocomotionTask):
         effort: float = Field(7.5, gt=0, description="Torque at action 1 [N m].")
         termination_height: float = Field(0.31, description="Torso height below which the episode fails [m].")
         death_reward: float = Field(-2.0, description="Reward of the step that fails, in place of all others.")
-        alive_weight: float = Field(0.5, description="Reward a step.")
+        alive_weight: float = Field(0.5, description="Reward per step.")
         action_cost: float = Field(0.005, ge=0, description="Penalty on squared actions.")
         energy_cost: float = Field(0.05, ge=0, description="Penalty on |action x joint velocity / (5 rad/s)|.")
         limit_cost: float = Field(

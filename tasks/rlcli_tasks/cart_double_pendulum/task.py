@@ -1,7 +1,7 @@
 """Cart with two links: a force on the cart and a torque between the links balance both.
 
-The original is a task for two agents, the cart and the pendulum. One policy plays both here: it sees what either sees,
-its two actions are theirs, and its reward is the sum of theirs.
+The original is a task for two agents, the cart and the pendulum. Here one policy controls both: it has the observations
+and actions of both, and its reward is the sum of theirs.
 """
 
 from __future__ import annotations

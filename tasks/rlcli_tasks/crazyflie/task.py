@@ -30,13 +30,17 @@ class CrazyflieTask(FlightTask):
     class Params(FlightTask.Params):
         """Settings of the task."""
 
-        thrust_to_weight: float = Field(1.9, gt=1, description="All four motors at full speed, over the weight.")
+        thrust_to_weight: float = Field(
+            1.9, gt=1, description="Thrust of all four motors at full speed, divided by the weight."
+        )
         motor_time: float = Field(
             0.15, gt=0, description="Time in which a motor's speed settles [s]; 4 time constants."
         )
-        thrust_noise: float = Field(0.01, ge=0, description="Noise of a thrust, over what is asked of it (deviation).")
+        thrust_noise: float = Field(
+            0.01, ge=0, description="Standard deviation of the thrust noise, divided by the commanded thrust."
+        )
         target_low: tuple[float, float, float] = Field(
-            (0.0, 0.0, 2.0), description="Targets: lower corner of the box they are drawn from [m]."
+            (0.0, 0.0, 2.0), description="Targets: lower corner of the box from which they are sampled [m]."
         )
         target_high: tuple[float, float, float] = Field((0.0, 0.0, 2.0), description="Targets: upper corner [m].")
         height_range: tuple[float, float] = Field((0.5, 5.0), description="Heights outside which it fails [m].")
@@ -68,12 +72,12 @@ class CrazyflieTask(FlightTask):
         """Set the commanded thrusts. Motor speeds follow with a lag; the thrust is the square of the speed."""
         self.move_target()
         self.actions.copy_(actions)
-        asked = (actions + 1.0).mul_(0.5).clamp_(0.0, 1.0)
-        self.speeds.lerp_(asked.sqrt(), self.follow)
+        command = (actions + 1.0).mul_(0.5).clamp_(0.0, 1.0)
+        self.speeds.lerp_(command.sqrt(), self.follow)
         everyone = self.selection(self.everywhere, "thrust")
         assert everyone is not None
         noise = everyone.normal(0.0, self.params.thrust_noise, (len(MOTORS),))
-        thrusts = torch.addcmul(self.speeds.square(), asked, noise).clamp_(0.0, 1.0)
+        thrusts = torch.addcmul(self.speeds.square(), command, noise).clamp_(0.0, 1.0)
         self.env.engine.field("ctrl").copy_(thrusts.mul_(self.max_thrust))
 
     def get_observations(self) -> None:

@@ -58,14 +58,23 @@ class HandTask(DirectTask):
     class Params(StrictModel):
         """Settings of the task."""
 
-        goal_pos: tuple[float, float, float] = Field((-0.01, 0.0, 0.55), description="Where the cube belongs [m].")
-        shown_pos: tuple[float, float, float] = Field((0.12, 0.2, 0.62), description="Where the goal is shown [m].")
+        goal_pos: tuple[float, float, float] = Field(
+            (-0.01, 0.0, 0.55), description="Position where the cube should stay [m]."
+        )
+        shown_pos: tuple[float, float, float] = Field(
+            (0.12, 0.2, 0.62), description="Position where the goal is displayed [m]."
+        )
         smoothing: float = Field(
-            0.5, gt=0, le=1, description="Share of the new target in a step; the rest is the last step's target."
+            0.5,
+            gt=0,
+            le=1,
+            description="Weight of the new target in a step; the rest is the weight of the previous target.",
         )
         success_tolerance: float = Field(0.4, gt=0, description="Angle at which a goal counts as reached [rad].")
-        fall_distance: float = Field(0.24, gt=0, description="Distance from its place at which the cube is lost [m].")
-        distance_weight: float = Field(-10.0, description="Reward on the distance from the cube's place [1/m].")
+        fall_distance: float = Field(
+            0.24, gt=0, description="Distance from that position at which the cube counts as lost [m]."
+        )
+        distance_weight: float = Field(-10.0, description="Reward on the distance of the cube from its position [1/m].")
         rotation_weight: float = Field(1.0, description="Reward on 1 / (angle to the goal + rotation_eps) [rad].")
         rotation_eps: float = Field(0.1, gt=0, description="See rotation_weight [rad].")
         action_weight: float = Field(-0.0002, description="Reward on the sum of squared actions.")
@@ -73,7 +82,10 @@ class HandTask(DirectTask):
         fall_reward: float = Field(0.0, description="Reward of the step in which the cube is lost, besides the others.")
         position_noise: float = Field(0.01, ge=0, description="Start: position of the cube +- [m].")
         joint_noise: float = Field(
-            0.2, ge=0, le=1, description="Start: share of the way from the default to a position drawn in the range."
+            0.2,
+            ge=0,
+            le=1,
+            description="Start: fraction of the way from the default to a position sampled in the range.",
         )
 
     params: Params

@@ -35,7 +35,7 @@ class HumanoidTask(LocomotionTask):
         power: float = Field(1.0, gt=0, description="Factor on the motors' torques.")
         termination_height: float = Field(0.8, description="Torso height below which the episode fails [m].")
         death_reward: float = Field(-1.0, description="Reward of the step that fails, in place of all others.")
-        alive_weight: float = Field(2.0, description="Reward a step.")
+        alive_weight: float = Field(2.0, description="Reward per step.")
         action_cost: float = Field(0.01, ge=0, description="Penalty on squared actions.")
         energy_cost: float = Field(
             0.05, ge=0, description="Penalty on |action x joint velocity / (10 rad/s)| x the motor's share of 135 N m."

@@ -33,14 +33,14 @@ class IngenuityTask(FlightTask):
         max_thrust: float = Field(20.0, gt=0, description="Largest thrust of a rotor, either way [N].")
         lateral: float = Field(0.2, ge=0, description="Largest share of the thrust along each of x and y.")
         target_low: tuple[float, float, float] = Field(
-            (-1.0, -1.0, 1.0), description="Targets: lower corner of the box they are drawn from [m]."
+            (-1.0, -1.0, 1.0), description="Targets: lower corner of the box from which they are sampled [m]."
         )
         target_high: tuple[float, float, float] = Field((1.0, 1.0, 2.0), description="Targets: upper corner [m].")
         start_offset: float = Field(0.5, ge=0, description="Start: offset from the default position +- [m].")
         max_distance: float = Field(20.0, gt=0, description="Distance to the target beyond which it fails [m].")
         min_height: float = Field(0.5, description="Height below which it fails [m].")
         steadiness: float = Field(
-            0.0, ge=0, description="Weight of nearness / (1 + 10 speed^2) in the reward, which upstream's lacks [1]."
+            0.0, ge=0, description="Weight of nearness / (1 + 10 speed^2), a term that the original reward lacks [1]."
         )
 
     params: Params
@@ -54,9 +54,9 @@ class IngenuityTask(FlightTask):
     def pre_physics_step(self, actions: Tensor) -> None:
         """Set each rotor's thrust, and two sideways fractions of it."""
         self.move_target()
-        asked = actions.view(-1, len(ROTORS), 3).clamp(-1.0, 1.0)
-        thrust = asked[..., 2:] * self.params.max_thrust
-        torch.mul(asked[..., :2], thrust * self.params.lateral, out=self.forces[..., :2])
+        command = actions.view(-1, len(ROTORS), 3).clamp(-1.0, 1.0)
+        thrust = command[..., 2:] * self.params.max_thrust
+        torch.mul(command[..., :2], thrust * self.params.lateral, out=self.forces[..., :2])
         self.forces[..., 2:].copy_(thrust)
         self.env.engine.field("ctrl").copy_(self.forces.view(-1, 6))
 

@@ -48,7 +48,9 @@ class DrawerTask(DirectTask):
         """Settings of the task."""
 
         action_scale: float = Field(2.5, gt=0, description="Speed of a joint's target at action 1 [rad/s].")
-        finger_speed: float = Field(0.1, gt=0, description="Of the fingers' targets, as a share of that [m/rad].")
+        finger_speed: float = Field(
+            0.1, gt=0, description="Speed of the fingers' targets, as a fraction of it [m/rad]."
+        )
         velocity_scale: float = Field(0.1, gt=0, description="Factor on observed joint velocities.")
         start_noise: float = Field(0.125, ge=0, description="Start: joints +- about their default [rad, m].")
         start_opening: float = Field(0.01, ge=0, description="Start: the drawer is up to this far open [m].")
@@ -58,7 +60,7 @@ class DrawerTask(DirectTask):
         finger_weight: float = Field(100.0, description="Reward on how near to its height these are [1/m].")
         close_weight: float = Field(10.0, description="Reward on fingers closed at the handle [1/m].")
         open_weight: float = Field(7.5, description="Reward on the drawer's opening, half as much again if held [1/m].")
-        reach: float = Field(0.05, gt=0, description="From how far on fingers count as about the handle [m].")
+        reach: float = Field(0.05, gt=0, description="Distance from which fingers count as around the handle [m].")
         action_cost: float = Field(0.01, ge=0, description="Penalty on squared actions.")
 
     params: Params
