@@ -133,7 +133,7 @@ def test_a_value_that_the_installed_task_no_longer_has_is_a_line_of_the_run(cli,
 def test_a_direct_tasks_page_has_its_parameters_and_words(cli, tmp_path):
     write_run(tmp_path / "runs", "cartpole-direct", rows=learning())
     page = read(cli("report", "latest").out.strip())
-    assert "Upright and calm is good" in page.text
+    assert "Reward an upright pole and slow joints" in page.text
     assert "Force at action 1 [N]." in page.text
 
 

@@ -40,7 +40,7 @@ def serve() -> None:
         if "start" in request:
             child = os.fork()
             if child == 0:
-                live(**request["start"])
+                run_child(**request["start"])
             answer(pid=child)
         else:
             answer(status=waited(request["wait"], request["seconds"]))
@@ -63,7 +63,9 @@ def waited(pid: int, seconds: float) -> int | None:
     return None
 
 
-def live(arguments: list[str], folder: str, output: str, faults: list[dict[str, object]], signals: list[str]) -> None:
+def run_child(
+    arguments: list[str], folder: str, output: str, faults: list[dict[str, object]], signals: list[str]
+) -> None:
     """Run a command line in a folder as the child, with faults in its system calls, and exit."""
     os.chdir(folder)
     nothing = os.open(os.devnull, os.O_RDONLY)

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from rlcli.runs.trusted_tasks import named_task
-from support.worlds import actions, build, clone, dump, life, same, write
+from support.worlds import actions, build, clone, dump, results_of_env, same, write
 
 N = 5
 WHO = (0, 2, N - 1)
@@ -305,7 +305,7 @@ def pair(folder: Path, fault: Fault, *overrides: str):
     return envs
 
 
-def lives(envs, steps: int, seed: int):
+def step_both(envs, steps: int, seed: int):
     """Step both environments with the same actions."""
     size = envs[0].layout.action_size
     return [[clone(env.step(a)) for env in envs] for a in actions(steps, N, size, seed)]
@@ -314,4 +314,4 @@ def lives(envs, steps: int, seed: int):
 def untouched(results, who) -> bool:
     """Return whether all other environments have equal trajectories in both."""
     left, right = zip(*results, strict=True)
-    return all(same(life(list(left), i), life(list(right), i)) for i in range(N) if i not in who)
+    return all(same(results_of_env(list(left), i), results_of_env(list(right), i)) for i in range(N) if i not in who)

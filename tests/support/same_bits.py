@@ -52,7 +52,7 @@ def place_of(task: str, folder: Path) -> Path | str:
     return critter(folder, edited(CRITTER_TASK, events=_EVENTS, commands=_COMMANDS, observations=_NOISY))
 
 
-class Life:
+class HashedRollout:
     """Running trajectory: hashes of every environment's states, observations, rewards and dones."""
 
     def __init__(self, env: VecEnv, seed: int = 0, steps: int = STEPS) -> None:
@@ -78,12 +78,12 @@ class Life:
                 digest.update(row[index].tobytes())
 
 
-def live(env: VecEnv, seed: int = 0, steps: int = STEPS) -> list[str]:
+def rollout_hashes(env: VecEnv, seed: int = 0, steps: int = STEPS) -> list[str]:
     """Return one hash per environment of the whole trajectory."""
-    life = Life(env, seed, steps)
+    rollout = HashedRollout(env, seed, steps)
     for _ in range(steps):
-        life.step()
-    return life.hashes()
+        rollout.step()
+    return rollout.hashes()
 
 
 def against_plain_steps(env: VecEnv) -> list[int]:

@@ -202,7 +202,7 @@ def run(env: VecEnv, steps: int, seed: int = 0, reset: bool = True) -> list[Step
     return [clone(env.step(a)) for a in actions(steps, env.num_envs, env.layout.action_size, seed)]
 
 
-def life(results: list[StepResult], env: int) -> list[Tensor]:
+def results_of_env(results: list[StepResult], env: int) -> list[Tensor]:
     """Return all results of one environment, for a comparison bit by bit."""
     return [
         torch.cat([*(v[env] for v in r.obs.values()), r.reward[env : env + 1], r.terminated[env : env + 1].float(),
