@@ -14,7 +14,7 @@ def import_hint(error: BaseException) -> str | None:
     if isinstance(error, ModuleNotFoundError):
         if top in _ISAAC_LAB:
             where = f"rlcli_isaaclab{f'.{rest}' if top == 'isaaclab' and rest else ''}"
-            return f"import it from {where}: docs/from-isaac-lab.md lists the lines"
+            return f"import it from {where}: docs/guides/isaac-lab.md lists the lines"
         if top in _ISAAC_SIM:
             return f"'{top}' belongs to Isaac Sim: remove the import and the code that uses it"
         return None
@@ -30,15 +30,15 @@ def import_hint(error: BaseException) -> str | None:
     if name.removesuffix("Cfg") in _UNSUPPORTED:
         return _UNSUPPORTED[name.removesuffix("Cfg")]
     near = did_you_mean(name, dir(sys.modules[module]))
-    return near or "docs/from-isaac-lab.md and docs/isaaclab-terms.md list the names"
+    return near or "docs/guides/isaac-lab.md and docs/reference/isaac-lab-terms.md list the names"
 
 
 _ISAAC_LAB = ("isaaclab", "isaaclab_tasks", "isaaclab_assets", "isaaclab_rl", "isaaclab_contrib", "isaaclab_mimic")
 _ISAAC_SIM = ("isaacsim", "omni", "pxr", "carb", "usdrt", "Semantics")
 _UNSUPPORTED = {
-    "DirectRLEnv": "write a DirectRLEnv as a direct task: docs/from-isaac-lab.md, 'A DirectRLEnv'",
+    "DirectRLEnv": "write a DirectRLEnv as a direct task: docs/guides/isaac-lab.md, 'A DirectRLEnv'",
     "DirectMARLEnv": "rlcli has no multi-agent tasks",
-    "ActionTerm": "write your own action as a class for rlcli: docs/from-isaac-lab.md, 'What is what'",
+    "ActionTerm": "write your own action as a class for rlcli: docs/guides/isaac-lab.md, 'What is what'",
     "AppLauncher": "there is no app to launch: use rlcli train, play and eval instead of your scripts",
     "SimulationContext": "rlcli steps the simulation: terms read its state from env.scene",
     "InteractiveScene": "rlcli builds the scene of your InteractiveSceneCfg: terms read it from env.scene",

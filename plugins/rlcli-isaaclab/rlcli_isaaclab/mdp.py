@@ -136,7 +136,9 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(name)
     if not _has_counterpart(name):
         near = did_you_mean(name, _names())
-        raise AttributeError(f"rlcli_isaaclab.mdp has no '{name}'; {near or 'docs/isaaclab-terms.md lists the terms'}")
+        raise AttributeError(
+            f"rlcli_isaaclab.mdp has no '{name}'; {near or 'docs/reference/isaac-lab-terms.md lists the terms'}"
+        )
     return _function(name)
 
 

@@ -1,6 +1,6 @@
 """Configuration classes of the simulation and of what is spawned. Names as in `isaaclab.sim`, often `sim_utils`.
 
-Settings of Isaac Sim without a counterpart are accepted and reported; docs/from-isaac-lab.md lists those with one.
+Settings of Isaac Sim without a counterpart are accepted and reported; docs/guides/isaac-lab.md lists those with one.
 """
 
 from __future__ import annotations

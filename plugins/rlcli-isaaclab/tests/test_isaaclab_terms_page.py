@@ -1,4 +1,4 @@
-"""The page docs/isaaclab-terms.md: every term that it lists exists."""
+"""The page docs/reference/isaac-lab-terms.md: every term that it lists exists."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The example of docs/from-omniisaacgymenvs.md works as printed."""
+"""The example of docs/guides/omniisaacgymenvs.md works as printed."""
 
 import re
 from pathlib import Path

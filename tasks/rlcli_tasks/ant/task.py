@@ -1,4 +1,4 @@
-"""Ant in the direct workflow: four legs run towards a far target. docs/reference/zoo/ant-direct.md lists its 60 columns."""
+"""Ant in the direct workflow: run on four legs towards a far target. See docs/reference/zoo/ant-direct.md."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ GOAL = slice(45, 53)
 
 
 class HandTask(DirectTask):
-    """Turn the cube to the goal, again and again. Observations: docs/reference/zoo/hand-reorient.md lists the 69 columns.
+    """Turn the cube to one goal after another. Observations: docs/reference/zoo/hand-reorient.md lists the 69 columns.
 
     The critic's states are these and what the ends of the fingers do and feel, 145 columns in all.
     """

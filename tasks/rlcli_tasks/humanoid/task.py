@@ -1,4 +1,4 @@
-"""Humanoid in the direct workflow: a humanoid robot runs towards a far target. docs/zoo/humanoid-direct.md."""
+"""Humanoid in the direct workflow: run on two legs towards a far target. See docs/reference/zoo/humanoid-direct.md."""
 
 from __future__ import annotations
 

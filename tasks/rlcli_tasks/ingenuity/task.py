@@ -15,7 +15,7 @@ ROTORS = ("lower", "upper")
 
 
 class IngenuityTask(FlightTask):
-    """Hover at the target, which changes. Observations: docs/zoo/ingenuity.md lists the 13 columns."""
+    """Hover at the target, which changes. Observations: docs/reference/zoo/ingenuity.md lists the 13 columns."""
 
     num_observations = 13
     num_actions = 6

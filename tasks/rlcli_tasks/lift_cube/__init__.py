@@ -1,4 +1,7 @@
-"""Lift: an arm grasps a cube and holds it at a commanded position. Numbers and sources: docs/zoo/lift-cube.md."""
+"""Lift: an arm grasps a cube and holds it at a commanded position.
+
+Numbers and their sources: docs/reference/zoo/lift-cube.md.
+"""
 
 from rlcli.task import TaskSpec
 
