@@ -140,7 +140,7 @@ def evaluation(success=0.9, **values):
         ({"speed": 5.0}, evaluation(speed=4.0), ["speed is 4, below 5"]),
         ({"error": {"max": 0.25}}, evaluation(**{"walk/error": 0.2}), []),
         ({"error": {"max": 0.25}}, evaluation(**{"walk/error": 0.3}), ["error is 0.3, above 0.25"]),
-        ({"speed": 5.0}, evaluation(), ["speed is not known"]),
+        ({"speed": 5.0}, evaluation(), ["speed is unknown"]),
         ({"success": 0.95, "length": 20}, evaluation(), ["success is 0.9, below 0.95", "length is 10, below 20"]),
     ],
 )

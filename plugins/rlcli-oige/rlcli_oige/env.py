@@ -63,7 +63,7 @@ class OigeEnv(DirectEnv):
             self.stage.attach(scene, joint_forces=self._mentions(_FORCE_METHODS))
         if self._mentions(_GRAVITY_METHODS):  # MuJoCo skips gravity compensation in a model without it
             scene.spec.bodies[-1].gravcomp = scene.spec.bodies[-1].gravcomp or _TINY_GRAVITY_COMPENSATION
-        scene.add_motors()
+        scene.joints.add_motors()
         _set_ground_material(scene, self.block.get("sim", {}).get("default_physics_material") or {})
 
     def _settings(self) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from rlcli.config.layers import marked
+from rlcli.config.layers import document_origins
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.errors import Problem
 from rlcli.formats import Note, Status
@@ -35,7 +35,7 @@ class YamlTranslator:
 
     def where(self, path: Path) -> str:
         """Return `file:line:column` of a key."""
-        return marked(self.document, self.label, "task")(path).where
+        return document_origins(self.document, self.label, "task")(path).where
 
     def note(self, path: Path, status: Status, text: str = "") -> None:
         """Record how a key was translated."""
