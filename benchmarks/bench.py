@@ -77,8 +77,8 @@ def readme(kept: dict[str, Any]) -> str:
     rows = kept["trainers"]["rows"]
     times = next(row["times"]["ppo"]["ratio"] for row in rows if row["name"] == "dummy")
     return (
-        f"- **{times:.1f} times** the training speed of Stable-Baselines3 on a plain Gymnasium cartpole, on the same two"
-        " cores."
+        f"- **{times:.1f} times** the training speed of Stable-Baselines3 on a plain Gymnasium cartpole, on the same"
+        " two cores."
     )
 
 

@@ -1,6 +1,6 @@
 """Generator of the reference pages: task schema, agents, terms, commands and the Python API.
 
-`python docs/reference.py` writes the pages into `docs/reference/`, where they are committed, and the two lists of public
+`python docs/reference.py` writes the pages into `docs/reference/`, where they are committed, and the lists of public
 names. `tests/docs/test_reference_pages.py` fails while a page differs from the code.
 """
 
@@ -286,41 +286,41 @@ def _commands() -> Iterator[str]:
 
 def _help_text(command: Any) -> str:
     """Return the help of a command; its examples as a block of commands."""
-    text, _, examples = inspect.cleandoc(command.help or "").replace("\b", "").partition("Examples:")
-    lines = [line.strip() for line in [*examples.splitlines(), *(getattr(command, "epilog", None) or "").splitlines()]]
-    shown = [line for line in lines if line and line != "Examples:"]
-    text = text.strip()
-    return text + (
-        "\n\n<!-- not run: the names of runs and files are yours -->\n```sh\n" + "\n".join(shown) + "\n```"
-        if shown
-        else ""
+    text = inspect.cleandoc(command.help or "")
+    if not command.epilog:
+        return text
+    lines = [f"# {line.strip()}" if line.startswith(" ") else line for line in command.epilog.strip().splitlines()]
+    return f"{text}\n\n<!-- not run: names of runs and files are examples; a test parses each command -->\n```sh\n" + (
+        "\n".join(lines) + "\n```"
     )
 
 
 def _spellings(parameter: Any) -> str:
     """Return the spellings of an option with its metavar, or the name of an argument."""
-    if not parameter.opts[0].startswith("-"):
-        return f"`{(parameter.metavar or parameter.name).upper()}`"
     metavar = parameter.metavar or _METAVARS.get(parameter.type_descriptor.annotation, "TEXT")
+    if parameter.param_type_name == "argument":
+        return f"`{parameter.metavar or parameter.name.upper()}`"
     value = "" if parameter.is_flag else f" {metavar}"
     return ", ".join(f"`{option}{value}`" for option in (*parameter.opts, *parameter.secondary_opts))
 
 
 _METAVARS: dict[Any, str] = {int: "INTEGER", float: "FLOAT", Path: "PATH"}
+_DEFAULT = re.compile(r"\s*\[default: (.+)\]$")
 
 
 def _default_text(parameter: Any) -> str:
     """Return the default of a parameter, empty where there is none."""
-    value = parameter.default
     if parameter.required:
         return "required"
-    if isinstance(parameter.show_default, str):
-        return parameter.show_default
+    named = _DEFAULT.search(parameter.help or "")
+    if named:
+        return named[1]
+    value = parameter.default
     return f"`{value}`" if isinstance(value, (str, int, float)) and not isinstance(value, bool) and value != "" else ""
 
 
 def _help(parameter: Any) -> str:
-    return _one_line(getattr(parameter, "help", None) or "")
+    return _DEFAULT.sub("", _one_line(parameter.help or ""))
 
 
 # Python

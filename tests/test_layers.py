@@ -1,4 +1,4 @@
-"""The structure of the package: the order of its folders, no import circles, small modules, light imports."""
+"""The structure of the package: order of its folders, no import circles, short modules, light imports."""
 
 import ast
 import subprocess
@@ -17,11 +17,11 @@ LAYERS = """
     registry  config  sim  scene  managers  envs  mdp  rl  runs  replay  evaluation  deploy  viewer  reporting  testing
     training  adapters  tuning  doctor  scaffold  api  cli  gym  pytest_plugin
 """
-"""Lowest first. The names of the first line stand side by side; each later name is a layer of its own."""
+"""Lowest first. All names of the first line are one layer; each later name is a separate layer."""
 INNER = ["rl < rl.ppo rl.sb3", "mdp < mdp.rewards mdp.randomization", "cli.ui < cli.commands < cli.app"]
-"""Orders within a folder: the modules of a folder itself, or of a folder in it."""
+"""Orders within a folder: its own modules, and its subfolders."""
 ANYWHERE = {"rlcli", "rlcli.__main__"}
-"""The package itself, which imports nothing, and the module that starts the command line."""
+"""The package, which imports nothing, and the module that starts the command line."""
 MOST_LINES = 450
 
 HEAVY = {"torch", "mujoco", "numpy", "stable_baselines3", "gymnasium"}
@@ -60,10 +60,13 @@ def ranks():
 RANKS = ranks()
 FILES = sorted(file for file in PACKAGE.rglob("*.py") if "templates" not in file.relative_to(PACKAGE).parts)
 MODULES = {module_name(file) for file in FILES}
+PLUGINS = REPOSITORY / "plugins"
+PLUGIN_FILES = sorted(file for file in PLUGINS.glob("*/rlcli_*/**/*.py"))
+"""Modules of the plugins' packages, without their tests."""
 
 
 def imports(file, *, everywhere=True):
-    """(line, module) of each import in a file; of those at its top alone if not everywhere. Types only do not count."""
+    """Yield (line, module) of each import in a file, or only of top-level ones. TYPE_CHECKING blocks are skipped."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
     skipped = {
         id(inner)
@@ -86,12 +89,12 @@ def imports(file, *, everywhere=True):
 
 
 def own_imports(file):
-    """(line, module) of each import of the package's own modules in a file."""
+    """Return (line, module) of each import of the package's own modules in a file."""
     return [(line, name) for line, name in imports(file) if name.split(".")[0] == "rlcli" and name != "rlcli"]
 
 
 def folder(module):
-    """`rlcli.rl.ppo.loss` -> `rl.ppo`, `rlcli.rl.policy` -> `rl`, `rlcli.cli.app` -> `cli.app`."""
+    """Return the folder: `rlcli.rl.ppo.loss` -> `rl.ppo`, `rlcli.rl.policy` -> `rl`, `rlcli.cli.app` -> `cli.app`."""
     inner = module.removeprefix("rlcli.")
     if inner == "cli.app" or (PACKAGE / inner.replace(".", "/")).is_dir():
         return inner
@@ -103,7 +106,7 @@ def test_every_module_belongs_to_a_layer():
     assert tops == set(RANKS)
 
 
-def test_modules_import_only_their_own_layer_and_those_below():
+def test_modules_import_only_own_and_lower_layers():
     wrong = [
         f"{file}:{line}: {module_name(file)} imports {imported}"
         for file in FILES
@@ -115,13 +118,13 @@ def test_modules_import_only_their_own_layer_and_those_below():
 
 
 @pytest.mark.parametrize("order", INNER)
-def test_folders_within_a_folder_have_an_order(order):
+def test_order_of_subfolders(order):
     levels = {name: level for level, names in enumerate(order.split(" < ")) for name in names.split()}
     wrong = []
     for file in FILES:
         name = module_name(file)
         own = levels.get(folder(name))
-        # the __init__ of a package of terms hands on the names of all its modules
+        # the __init__ of a package of terms exports the names of all its modules
         if own is None or (file.name == "__init__.py" and order.startswith("mdp")):
             continue
         for line, imported in own_imports(file):
@@ -130,7 +133,7 @@ def test_folders_within_a_folder_have_an_order(order):
     assert wrong == []
 
 
-def test_no_module_imports_itself_through_others():
+def test_no_import_circle():
     graph = {module_name(file): {name for _, name in own_imports(file)} & MODULES for file in FILES}
     for name, needed in graph.items():
         needed.discard(name)
@@ -140,12 +143,13 @@ def test_no_module_imports_itself_through_others():
         pytest.fail("import circle: " + " <- ".join(error.args[1]))
 
 
-def test_no_module_is_long():
-    lengths = {module_name(file): len(file.read_text(encoding="utf-8").splitlines()) for file in FILES}
+def test_modules_are_short():
+    assert PLUGIN_FILES
+    lengths = {str(file): len(file.read_text(encoding="utf-8").splitlines()) for file in [*FILES, *PLUGIN_FILES]}
     assert {name: length for name, length in lengths.items() if length > MOST_LINES} == {}
 
 
-def test_the_check_sees_imports_at_the_top_and_inside_functions(tmp_path):
+def test_imports_are_found_at_top_and_in_functions(tmp_path):
     file = tmp_path / "module.py"
     file.write_text(
         "from typing import TYPE_CHECKING\nfrom rlcli import random\nfrom rlcli.runs.run import Run\n"
@@ -160,9 +164,9 @@ def test_the_check_sees_imports_at_the_top_and_inside_functions(tmp_path):
 
 
 @pytest.mark.parametrize("part", LIGHT)
-def test_light_modules_import_nothing_heavy_at_their_top(part):
-    place = PACKAGE / part
-    files = sorted(place.rglob("*.py")) if place.is_dir() else [place]
+def test_light_modules_import_nothing_heavy_at_top(part):
+    path = PACKAGE / part
+    files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
     wrong = []
     for file in files:
         for line, imported in imports(file, everywhere=False):
@@ -171,12 +175,12 @@ def test_light_modules_import_nothing_heavy_at_their_top(part):
     assert wrong == []
 
 
-def test_nothing_knows_the_built_in_tasks_by_name():
+def test_package_does_not_name_built_in_tasks():
     for file in FILES:
         assert "rlcli_tasks" not in file.read_text(encoding="utf-8"), file
 
 
-def test_tasks_use_the_package_and_not_the_other_way_round():
+def test_tasks_import_no_private_modules():
     root = REPOSITORY / "tasks" / "rlcli_tasks"
     private = [
         f"{file}:{line}: {imported}"
@@ -187,13 +191,13 @@ def test_tasks_use_the_package_and_not_the_other_way_round():
     assert private == []
 
 
-def test_importing_the_package_imports_nothing_else():
+def test_importing_package_imports_nothing_else():
     program = "import sys; before = set(sys.modules); import rlcli; print(sorted(set(sys.modules) - before))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "['rlcli']"
 
 
-def test_training_on_the_cpu_loads_nothing_of_the_gpu_engine(tmp_path):
+def test_training_on_cpu_loads_no_gpu_engine(tmp_path):
     words = ["train", "cartpole", "--agent", "ppo", "--device", "cpu", "--num-envs", "4", "--max-iterations", "1"]
     words += ["--logger", "none", "-q", "--runs-dir", str(tmp_path)]
     modules = [name for name in MODULES if name.startswith("rlcli.sim.warp") or name == "rlcli.sim.mask_selection"]

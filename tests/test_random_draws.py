@@ -19,20 +19,20 @@ def one(seed, env, counter, index, stream=S):
     return random.uniform(keys(seed, [env], [counter]), stream, index, 1)[0, 0]
 
 
-def test_a_draw_does_not_depend_on_the_company_of_its_row():
+def test_sample_does_not_depend_on_other_rows():
     alone = random.normal(keys(3, [7], [2]), S, 5, 4)
     crowd = random.normal(keys(3, np.arange(50), np.full(50, 2)), S, 5, 4)
     np.testing.assert_array_equal(alone[0], crowd[7])
 
 
-def test_words_of_a_stream_are_the_same_however_they_are_asked_for():
+def test_words_of_stream_do_not_depend_on_chunk_size():
     at_once = random.bits(keys(1, [4]), S, 0, 6)[0]
     one_by_one = [random.bits(keys(1, [4]), S, i, 1)[0, 0] for i in range(6)]
     np.testing.assert_array_equal(at_once, one_by_one)
 
 
 @pytest.mark.parametrize("other", [(1, 5, 2, 3), (0, 6, 2, 3), (0, 5, 3, 3), (0, 5, 2, 4)])
-def test_every_argument_changes_the_draw(other):
+def test_every_argument_changes_sample(other):
     assert one(0, 5, 2, 3) != one(*other)
 
 
@@ -41,19 +41,19 @@ def test_streams_differ_by_name():
 
 
 @pytest.mark.parametrize(("a", "b"), [((0, 1, 0), (1, 0, 0)), ((0, 0, 1), (0, 1, 0)), ((1, 0, 0), (0, 0, 1))])
-def test_swapping_seed_environment_and_counter_gives_other_draws(a, b):
+def test_swapped_seed_env_and_counter_give_other_samples(a, b):
     assert not np.array_equal(
         random.bits(keys(a[0], [a[1]], [a[2]]), S, 0, 8), random.bits(keys(b[0], [b[1]], [b[2]]), S, 0, 8)
     )
 
 
-def test_no_two_of_many_environments_seeds_and_counters_share_a_key():
+def test_keys_are_unique_over_envs_seeds_and_counters():
     grid = np.stack(np.meshgrid(np.arange(200), np.arange(200)), -1).reshape(-1, 2)
     all_keys = np.concatenate([keys(seed, grid[:, 0], grid[:, 1]) for seed in (0, 1, 2, -1)])
     assert len(np.unique(all_keys)) == len(all_keys)
 
 
-def test_uniform_has_the_range_and_moments_of_a_uniform():
+def test_uniform_range_and_moments():
     u = random.uniform(keys(), S, 0, 1)[:, 0].astype(np.float64)
     assert u.dtype == np.float64
     assert 0.0 <= u.min() < 1e-3
@@ -64,7 +64,7 @@ def test_uniform_has_the_range_and_moments_of_a_uniform():
     assert abs(counts - N / 20).max() < 6 * np.sqrt(N / 20)
 
 
-def test_normal_has_the_moments_and_tails_of_a_gaussian():
+def test_normal_moments_and_tails():
     z = random.normal(keys(), S, 0, 1)[:, 0].astype(np.float64)
     assert np.isfinite(z).all()
     assert abs(z.mean()) < 0.02
@@ -74,7 +74,7 @@ def test_normal_has_the_moments_and_tails_of_a_gaussian():
     assert abs((np.abs(z) > 2).mean() - 0.0455) < 0.005
 
 
-def test_integers_are_whole_in_range_and_equally_likely():
+def test_integers_are_in_range_and_uniform():
     k = random.integers(keys(), S, 0, 1, 7)[:, 0]
     assert k.dtype == np.int64
     counts = np.bincount(k, minlength=7)
@@ -99,12 +99,12 @@ def draws_of(kind):
 
 
 @pytest.mark.parametrize("kind", ["environments", "counters", "indices", "seeds", "streams"])
-def test_neighbouring_draws_are_uncorrelated(kind):
+def test_neighbouring_samples_are_uncorrelated(kind):
     a, b = draws_of(kind)
     assert abs(np.corrcoef(a, b)[0, 1]) < 0.015
 
 
-def test_derived_seeds_are_31_bits_and_differ_by_name_and_seed():
+def test_derived_seeds_have_31_bits_and_differ():
     seeds = {random.derive(seed, name) for seed in (0, 1, 42, -1, 2**40) for name in ("play", "evaluation")}
     assert len(seeds) == 10
     assert all(0 <= seed < 2**31 for seed in seeds)
@@ -115,7 +115,7 @@ def selection(ids, counters=None, seed=0):
     return IdSelection(ids, seed, np.zeros_like(ids) if counters is None else np.asarray(counters), S)
 
 
-def test_a_selections_successive_draws_differ_and_do_not_depend_on_its_other_rows():
+def test_selection_samples_differ_and_ignore_other_rows():
     def draw(ids):
         s = selection(ids)
         return s.uniform(-2, 3, (2,)), s.normal(1.0, 2.0, (3,)), s.choice(5), s.uniform(-2, 3, (2,))
@@ -127,13 +127,13 @@ def test_a_selections_successive_draws_differ_and_do_not_depend_on_its_other_row
     assert not torch.equal(few[0], few[3])
 
 
-def test_a_selections_uniform_stays_in_its_bounds():
+def test_selection_uniform_stays_in_bounds():
     drawn = selection(range(N)).uniform(-0.3, 0.7)
     assert -0.3 <= float(drawn.min()) < -0.299
     assert 0.699 < float(drawn.max()) <= 0.7
 
 
-def test_a_selection_reads_writes_and_adds_only_its_rows():
+def test_selection_reads_writes_and_adds_only_its_rows():
     field = torch.zeros(5, 4, dtype=torch.float64)
     s = selection([1, 3])
     s.write(field, torch.ones(2, 4))

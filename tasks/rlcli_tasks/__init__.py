@@ -1,1 +1,1 @@
-"""The built-in tasks, one folder each."""
+"""Built-in tasks, one folder each."""

@@ -1,4 +1,4 @@
-"""What flyers in the direct workflow have in common that go from point to point.
+"""Base of the direct tasks that fly from point to point.
 
 The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, and
 what outlives a step is written in place.
@@ -23,7 +23,7 @@ class FlightTask(DirectTask):
     """
 
     class Params(StrictModel):
-        """What every flyer is asked."""
+        """Settings of all flight tasks."""
 
         target_period: int = Field(500, gt=0, description="Steps from one target to the next.")
         start_offset: float = Field(0.3, ge=0, description="Start: offset from the default position +- [m].")
@@ -32,21 +32,21 @@ class FlightTask(DirectTask):
     params: Any
 
     def post_reset(self) -> None:
-        """Make what the hooks use: constants, and buffers that keep their place."""
+        """Create constants and buffers. The hooks write the buffers in place."""
         params, n = self.params, self.num_envs
         self.robot, self.goal = self.env.entities["robot"], self.env.entities["target"]
         self.target_low = torch.tensor(params.target_low, device=self.device)
         self.target_high = torch.tensor(params.target_high, device=self.device)
         phases = -(-self.max_episode_length // params.target_period)
         self.targets = torch.zeros(n, phases, 3, device=self.device)
-        """Those of the running episode, in turn. (n, phases, 3) [m]"""
+        """Targets of the current episode, in order. (n, phases, 3) [m]"""
         self.target = torch.zeros(n, 3, device=self.device)
-        """The present one. (n, 3) [m]"""
+        """Current target. (n, 3) [m]"""
         self.distance = torch.zeros(n, device=self.device)
-        self.extras["distance"] = self.distance  # to the target [m]
+        self.extras["distance"] = self.distance  # distance to the target [m]
 
     def reset(self, selection: Selection) -> None:
-        """About the default position, level and at rest; the episode's targets are drawn."""
+        """Set the robot near its default position, level and at rest, and sample the targets of the episode."""
         offset, phases = self.params.start_offset, self.targets.shape[1]
         default = selection.read_view(self.robot.data.default_root_state)
         self.robot.write_root_pose(
@@ -58,7 +58,7 @@ class FlightTask(DirectTask):
         self.goal.write_root_pose(selection, targets[:, 0], selection.read(self.goal.data.default_root_state[:, 3:7]))
 
     def move_target(self) -> None:
-        """Put the target where it is in the step to come."""
+        """Set the target of the next step."""
         phase = (self.progress_buf // self.params.target_period).clamp_(max=self.targets.shape[1] - 1)
         self.target.copy_(self.targets.gather(1, phase[:, None, None].expand(-1, 1, 3)).squeeze(1))
         self.env.engine.field("mocap_pos")[:, self.goal.mocap].copy_(self.target)

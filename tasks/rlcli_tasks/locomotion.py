@@ -1,4 +1,4 @@
-"""What walkers in the direct workflow have in common: a robot with a torso, joints and feet runs to a far target.
+"""Base of the direct locomotion tasks: a robot with a torso, joints and feet runs to a far target.
 
 The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, what
 outlives a step is written in place, and tensors are few.
@@ -26,7 +26,7 @@ _JOINTS_FROM = 12
 
 
 def observation_names(joints: tuple[str, ...], feet: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of the columns."""
+    """Return the names of the columns."""
     return (
         *("height", "vel_x", "vel_y", "vel_z", "rate_x", "rate_y", "rate_z", "yaw", "roll", "target_angle"),
         *("up", "heading"),
@@ -38,7 +38,7 @@ def observation_names(joints: tuple[str, ...], feet: tuple[str, ...]) -> tuple[s
 
 
 def observation_units(joints: int, feet: int, *, rate: str, joint_rate: str, force: str) -> tuple[str, ...]:
-    """Units of the columns; rate, joint_rate and force are what a 1 stands for, force without its unit."""
+    """Return the units of the columns; rate, joint_rate and force are the value of 1, force without its unit."""
     return (
         *("m", "m/s", "m/s", "m/s", rate, rate, rate, "rad", "rad", "rad", "", ""),
         *("half range",) * joints,
@@ -51,37 +51,37 @@ def observation_units(joints: int, feet: int, *, rate: str, joint_rate: str, for
 class LocomotionTask(DirectTask):
     """Run towards the target.
 
-    A robot says what its joints are, how much torque they get and what is scaled how. Its `Params` add
+    A subclass defines the joints, their torques and the scales of observations. Its `Params` add
     `termination_height`, `death_reward`, `alive_weight`, `action_cost`, `energy_cost`, `limit_cost` and
-    `joint_pos_noise`, whose values are a robot's own.
+    `joint_pos_noise`, whose values depend on the robot.
     """
 
     class Params(StrictModel):
-        """What every walker is asked."""
+        """Settings of all locomotion tasks."""
 
-        target: tuple[float, float] = Field((1000.0, 0.0), description="Where to run, x and y [m].")
+        target: tuple[float, float] = Field((1000.0, 0.0), description="Target position, x and y [m].")
         progress_weight: float = Field(1.0, description="Reward on the speed towards the target [s/m].")
         up_weight: float = Field(0.1, description="Reward where the torso is upright to within acos(0.93).")
         heading_weight: float = Field(0.5, description="Reward where the torso faces the target, to within acos(0.8).")
         joint_vel_noise: float = Field(0.1, ge=0, description="Start: joint velocities +- [rad/s].")
 
     joints: ClassVar[tuple[str, ...]]
-    """In the order of observations and actions, which is the model's."""
+    """Joint names in the order of observations and actions, which is the model's order."""
     rate_scale: ClassVar[float]
-    """On the torso's angular velocity."""
+    """Factor of the torso's angular velocity."""
     joint_vel_scale: ClassVar[float]
-    """On joint velocities."""
+    """Factor of joint velocities."""
     force_scale: ClassVar[float]
-    """On forces and torques of the feet."""
+    """Factor of forces and torques of the feet."""
 
     params: Any
 
     def efforts(self) -> tuple[float, ...]:
-        """Torque of each joint at action 1 [N m]."""
+        """Return the torque of each joint at action 1 [N m]."""
         raise NotImplementedError
 
     def at_limits(self, position: Tensor) -> Tensor:
-        """What each joint pays for being at a limit, before `limit_cost`, of positions in half ranges. (n, joints)"""
+        """Return each joint's cost near a limit, before `limit_cost`; positions are in half ranges. (n, joints)"""
         raise NotImplementedError
 
     def set_up_scene(self, scene) -> None:
@@ -89,7 +89,7 @@ class LocomotionTask(DirectTask):
         self.robots = scene.add(ArticulationView("robot"))
 
     def post_reset(self) -> None:
-        """Make what the hooks use: constants, and buffers that keep their place."""
+        """Create constants and buffers. The hooks write the buffers in place."""
         self.robot = self.env.entities["robot"]
         data, params, n, k = self.robot.data, self.params, self.num_envs, len(self.joints)
         self.joint_pos = slice(_JOINTS_FROM, _JOINTS_FROM + k)
@@ -109,13 +109,13 @@ class LocomotionTask(DirectTask):
         self.start_distance = torch.linalg.vector_norm(self.target - self.start, dim=1)
         self.distance, self.distance_before = self.start_distance.clone(), self.start_distance.clone()
         self.speed = torch.zeros(n, device=self.device)
-        self.extras["speed"] = self.speed  # towards the target [m/s]
+        self.extras["speed"] = self.speed  # speed towards the target [m/s]
         self.actions = torch.zeros(n, self.num_actions, device=self.device)
-        # the velocity of the torso and the three axes of the world, all to be seen from the torso
+        # rows to rotate into the torso's frame: its velocity and the world's three axes
         self.seen = torch.cat([torch.zeros(1, 3), torch.eye(3)]).to(self.device).repeat(n, 1, 1)
 
     def reset(self, selection: Selection) -> None:
-        """Joints about their default and within their limits, the torso where the scene puts it, at rest."""
+        """Set joints near their defaults and within limits, and the torso to its initial pose, at rest."""
         noise = self.params.joint_vel_noise
         shape = (self.num_actions,)
         position = selection.uniform(self.start_low, self.start_high, shape).clamp_(self.low, self.high)
@@ -126,15 +126,15 @@ class LocomotionTask(DirectTask):
         selection.write(self.actions, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Torques on the joints."""
+        """Apply torques to the joints."""
         self.actions.copy_(actions)
         self.robots.set_joint_efforts(self.effort * actions)
 
     def get_observations(self) -> None:
         """Fill obs_buf."""
         data = self.robot.data
-        velocity, x_axis, y_axis, z_axis = self._from_the_torso(data.root_quat_w, data.root_lin_vel_w)
-        ahead_x, ahead_y, up = x_axis[:, 0], y_axis[:, 0], z_axis[:, 2]  # the torso's x axis, in the world
+        velocity, x_axis, y_axis, z_axis = self._in_torso_frame(data.root_quat_w, data.root_lin_vel_w)
+        ahead_x, ahead_y, up = x_axis[:, 0], y_axis[:, 0], z_axis[:, 2]  # from the torso's x axis in the world frame
 
         to_target = self.target - data.root_pos_w[:, :2]
         torch.linalg.vector_norm(to_target, dim=1, out=self.distance)
@@ -145,7 +145,7 @@ class LocomotionTask(DirectTask):
             torch.stack([ahead_y, z_axis[:, 1], across], dim=1),  # yaw, roll, target
             torch.stack([ahead_x, up, along], dim=1),
         )
-        # a new episode has had no physics step: what the sensors show is not of its state
+        # no physics step yet in a new episode: sensor values belong to the old state
         felt = (self.progress_buf > 0).mul(self.force_scale)
         torch.cat(
             [
@@ -165,7 +165,7 @@ class LocomotionTask(DirectTask):
         )
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]]:
-        """The same in the vocabulary of manager-based tasks."""
+        """Return the observations as terms of a manager-based task."""
         target = (*self.params.target, 0.0)
         scale = dict(zip(self.joints, self.efforts(), strict=True))
         return {
@@ -186,7 +186,7 @@ class LocomotionTask(DirectTask):
         }
 
     def calculate_metrics(self) -> None:
-        """Progress, posture and life, less what they cost; a fall costs the rest."""
+        """Reward progress, posture and survival, minus costs; a fall replaces the reward by its cost."""
         params, obs, actions = self.params, self.obs_buf, self.actions
         cost = (actions * obs[:, self.joint_vel]).abs_().mul_(self.energy_cost)
         cost.addcmul_(actions, actions, value=params.action_cost)
@@ -199,14 +199,14 @@ class LocomotionTask(DirectTask):
         self.rew_buf.copy_(reward.masked_fill_(self._fallen(), params.death_reward))
 
     def is_done(self) -> None:
-        """The torso is too low; the framework adds the time-out."""
+        """Terminate where the torso is too low. The environment adds the time-out."""
         self.reset_buf.copy_(self._fallen())
 
     def _measure_speed(self) -> None:
-        """How much nearer the torso has come to the target, over the step.
+        """Compute the speed towards the target: how much the distance decreased over the step.
 
-        |a| - |b| = (a - b) (a + b) / (|a| + |b|), where a - b is the way of the step: distances of 1000 m are known to
-        0.06 mm only, which is 4 mm/s at 60 Hz.
+        |a| - |b| = (a - b) (a + b) / (|a| + |b|), where a - b is the movement in the step. A float32 distance of 1000 m
+        is exact to 0.06 mm only, which is 4 mm/s at 60 Hz.
         """
         position = self.robot.data.root_pos_w[:, :2]
         way = position - self.position_before
@@ -216,8 +216,8 @@ class LocomotionTask(DirectTask):
         self.position_before.copy_(position)
         self.distance_before.copy_(self.distance)
 
-    def _from_the_torso(self, quat: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
-        """The torso's velocity and the world's axes in the torso's frame, four rotations as one. (n, 3) each"""
+    def _in_torso_frame(self, quat: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
+        """Return the torso's velocity and the world's axes in the torso's frame, with one rotation call. (n, 3) each"""
         self.seen[:, 0].copy_(velocity)
         w, axis = quat[:, None, :1], quat[:, None, 1:]
         turned = torch.linalg.cross(axis, self.seen)

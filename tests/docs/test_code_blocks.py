@@ -23,7 +23,7 @@ from rlcli.registry import find_task
 
 DOCS = REPOSITORY / "docs"
 GENERATED = ("commands.md", "task-schema.md", "agents.md", "terms", "python")
-"""Pages in `docs/reference/` that `docs/reference.py` writes; tests/docs/test_reference_pages.py checks their examples."""
+"""Pages that `docs/reference.py` writes; tests/docs/test_reference_pages.py checks their examples."""
 PAGES = [
     page
     for page in sorted(DOCS.rglob("*.md"))
@@ -51,9 +51,9 @@ RUN_BY = {
     "isaac-lab.md": f"{OF_PAGES}::test_isaac_lab_examples_train",
     "omniisaacgymenvs.md": "plugins/rlcli-oige/tests/test_oige_page.py::"
     "test_the_example_validates_and_a_push_towards_the_middle_earns_more_than_none",
-    "train-on-a-gpu.md: On a cluster": f"{HERE}::test_the_script_for_a_cluster_trains_and_goes_on_when_it_is_begun_again",
+    "train-on-a-gpu.md: On a cluster": f"{HERE}::test_cluster_script_trains_and_resumes",
     "python-api.md": f"{HERE}::test_the_scripts_of_the_python_page_run_as_written",
-    "put-a-policy-on-a-robot.md": "tests/docs/test_robot_page.py::test_the_loop_of_the_page_balances_the_pole_in_time",
+    "put-a-policy-on-a-robot.md": "tests/docs/test_robot_page.py::test_control_loop_balances_the_pole",
     "play.md": f"{HERE}::test_the_commands_of_a_page_run_as_written",
     "plots-and-reports.md": f"{OF_PAGES}::test_plots_and_reports_page_works",
     "plots-and-reports.md: The card of a task": f"{OF_PAGES}::test_task_card_of_page_is_printed",
@@ -277,7 +277,7 @@ STUBS = {
 
 
 @pytest.mark.slow
-def test_the_script_for_a_cluster_trains_and_goes_on_when_it_is_begun_again(tmp_path):
+def test_cluster_script_trains_and_resumes(tmp_path):
     (script,) = [b for b in all_blocks(DOCS / "tutorials" / "train-on-a-gpu.md") if b.file == "train.sbatch"]
     (tmp_path / "train.sbatch").write_text(script.text)
     for name, text in STUBS.items():

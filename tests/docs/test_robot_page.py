@@ -26,7 +26,7 @@ LOOP = [Block("sh", None, "python loop.py 5\n")]
 
 
 @pytest.mark.slow
-def test_the_loop_of_the_page_balances_the_pole_in_time(robot):
+def test_control_loop_balances_the_pole(robot):
     """on-a-robot.md; a machine that is slow moves the simulation no slower, so that the steps are the same."""
     loop = robot / "loop.py"
     loop.write_text(loop.read_text().replace("MOST_LATE = 5", "MOST_LATE = 1_000"))  # the tests' machine is not idle

@@ -1,7 +1,7 @@
 import pytest
 import torch
 import yaml
-from support.worlds import CRITTER_TASK, build, critter, dump, edited, life, run, same
+from support.worlds import CRITTER_TASK, build, critter, dump, edited, results_of_env, run, same
 
 TASKS = ["ant-direct", "cartpole", "cartpole-direct", "critter"]
 
@@ -23,7 +23,7 @@ def test_first_env_is_bit_identical_for_any_num_envs_and_threads(name, place):
     assert ended >= 2, "the trajectory must cross resets"
     for num_envs, threads in [(8, 2), (64, 4), (64, 1), (3, 1), (1, 4)]:
         env = build(task, num_envs, f"sim.engine_threads={threads}", "episode_length_s=0.6")
-        assert same(life(run(env, steps), 0), life(reference, 0)), (num_envs, threads)
+        assert same(results_of_env(run(env, steps), 0), results_of_env(reference, 0)), (num_envs, threads)
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -31,14 +31,14 @@ def test_equal_seeds_repeat_and_other_seeds_differ(name, place):
     task = place(name)
     first, again, other = (run(build(task, 4, seed=seed), 40) for seed in (5, 5, 6))
     for env in range(4):
-        assert same(life(first, env), life(again, env))
-        assert not same(life(first, env), life(other, env))
+        assert same(results_of_env(first, env), results_of_env(again, env))
+        assert not same(results_of_env(first, env), results_of_env(other, env))
 
 
 @pytest.mark.parametrize("name", TASKS)
 def test_environments_of_one_run_differ(name, place):
     results = run(build(place(name), 4), 5)
-    assert not same(life(results, 0), life(results, 1))
+    assert not same(results_of_env(results, 0), results_of_env(results, 1))
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -48,7 +48,7 @@ def test_reset_with_seed_equals_new_environment(name, place):
     run(used, 30)
     used.reset(seed=9)
     fresh = build(task, 4, seed=9)
-    assert same(life(run(used, 30, reset=False), 2), life(run(fresh, 30), 2))
+    assert same(results_of_env(run(used, 30, reset=False), 2), results_of_env(run(fresh, 30), 2))
 
 
 def test_reset_without_seed_begins_other_episodes(place):
@@ -67,7 +67,7 @@ def test_episodes_independent_of_resets_of_others(place):
     ends = [[bool(r.truncated[i]) for r in results] for results in (reference, disturbed) for i in (0,)]
     assert ends[0] != ends[1]
     for i in (1, 3, 4, 7):
-        assert same(life(disturbed, i), life(reference, i))
+        assert same(results_of_env(disturbed, i), results_of_env(reference, i))
 
 
 def test_episodes_independent_of_other_events(tmp_path):
@@ -81,13 +81,13 @@ def test_episodes_independent_of_other_events(tmp_path):
     more = critter(tmp_path / "more", dump(data))
     reference = run(build(critter(tmp_path), 8), 60)
     results = run(build(more, 8), 60)
-    assert same(life(results, 7), life(reference, 7))
+    assert same(results_of_env(results, 7), results_of_env(reference, 7))
 
 
 def test_interval_event_draws_independent_of_other_envs(tmp_path):
     task = critter(tmp_path, edited(CRITTER_TASK, episode_length_s=5.0))
     few, many = run(build(task, 2), 60), run(build(task, 16), 60)
-    assert same(life(few, 1), life(many, 1))
+    assert same(results_of_env(few, 1), results_of_env(many, 1))
 
 
 def test_reward_sum_is_equal_for_any_num_envs(tmp_path):

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from support.worlds import PENDULUM, build, clone, life, same, write
+from support.worlds import PENDULUM, build, clone, results_of_env, same, write
 
 CODE = '''
 import torch
@@ -109,7 +109,7 @@ def test_state_dict_restores_draws(task):
     fresh = build(task, 3, seed=8)
     fresh.load_state_dict(saved)
     found = [clone(fresh.step(torch.zeros(3, 1))) for _ in range(20)]
-    assert all(same(life(expected, row), life(found, row)) for row in range(3))
+    assert all(same(results_of_env(expected, row), results_of_env(found, row)) for row in range(3))
 
 
 @pytest.mark.parametrize("engine", ["batch", "warp"])

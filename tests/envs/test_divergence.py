@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from support.worlds import PENDULUM, PENDULUM_TASK, build, clone, critter, edited, life, pendulum, same, write
+from support.worlds import PENDULUM, PENDULUM_TASK, build, clone, critter, edited, pendulum, results_of_env, same, write
 
 from rlcli.errors import DivergedError
 
@@ -68,7 +68,9 @@ def test_divergence_terminates_only_its_env(tmp_path, what, number):
     results = [(expected, found)]
     results += [(clone(sound.step(action)), clone(sick.step(action))) for _ in range(15)]
     for i in rest:
-        assert same(life([r[1] for r in results], i), life([r[0] for r in results], i)), f"environment {i} was touched"
+        assert same(results_of_env([r[1] for r in results], i), results_of_env([r[0] for r in results], i)), (
+            f"environment {i} was touched"
+        )
     assert all(r[1].obs["policy"].isfinite().all() for r in results)
     assert sick.engine.state_dict()["state"].isfinite().all()
     assert sick.divergences == 1

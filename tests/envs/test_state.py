@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from support.worlds import CRITTER_TASK, actions, build, clone, critter, edited, life, same
+from support.worlds import CRITTER_TASK, actions, build, clone, critter, edited, results_of_env, same
 
 TASKS = ["ant-direct", "cartpole", "cartpole-direct", "critter"]
 
@@ -35,7 +35,7 @@ def test_load_state_dict_repeats_steps_bit_for_bit(name, place, moment):
         assert torch.equal(obs[group], value), "the observation of that moment"
     found = [clone(fresh.step(action)) for action in action_list[moment:]]
     for i in range(n):
-        assert same(life(found, i), life(expected, i))
+        assert same(results_of_env(found, i), results_of_env(expected, i))
     for a, b in zip(expected, found, strict=True):
         assert (a.episodes is None) == (b.episodes is None)
         if a.episodes is not None:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from support.diverging_worlds import FAULTS, PLAIN_TASK, WHO, N, faults, lives, machine, pair, untouched
+from support.diverging_worlds import FAULTS, PLAIN_TASK, WHO, N, faults, machine, pair, step_both, untouched
 from support.fault_sizes import chosen
 from support.worlds import build, clone
 
@@ -21,23 +21,23 @@ def test_diverged_environment_is_detected_dumped_and_isolated(tmp_path, caplog, 
     fault = FAULTS[name]
     sound, sick = pair(tmp_path, fault)
     CrashDumper(sick, tmp_path / "dumps")
-    before = lives((sound, sick), 4, seed=1)
+    before = step_both((sound, sick), 4, seed=1)
     assert untouched(before, ())
     fault.strike(sick, [who])
     if name == "reset writes nan":
         sound.episode_length_buf[who] = sound.max_episode_length
-    results = lives((sound, sick), 1, seed=2)
+    results = step_both((sound, sick), 1, seed=2)
     assert sick.causes == {fault.cause: 1}, "found in the same step, and counted by its cause"
     fault.cure(sick, [who])
     if fault.written:
         assert all(value.isfinite().all() for value in results[0][1].obs.values())
-        results += lives((sound, sick), 1, seed=3)
+        results += step_both((sound, sick), 1, seed=3)
     struck = results[-1][1]
     assert struck.terminated.tolist() == [i == who for i in range(N)]
     assert not struck.truncated.any()
     assert struck.reward.isfinite().all()
     assert all(value[who].isfinite().all() for value in struck.final_obs.values())
-    results += lives((sound, sick), 12, seed=4)
+    results += step_both((sound, sick), 12, seed=4)
     assert untouched(results, [who])
     assert sick.causes == {fault.cause: 1}, "and it does not come again"
     assert sick.engine.state_dict()["state"].isfinite().all()

@@ -5,7 +5,7 @@ import random
 import numpy as np
 import pytest
 import torch
-from support.diverging_worlds import FAULTS, lives, pair
+from support.diverging_worlds import FAULTS, pair, step_both
 from support.fault_sizes import chosen
 from support.run_comparison import content, leftovers, newest, rows_of
 from support.small_trainings import AGENTS, Case, resolved_of, train
@@ -266,15 +266,15 @@ def test_diverged_episode_is_recorded_with_its_cause(tmp_path, name):
     fault = FAULTS[name]
     sound, sick = pair(tmp_path, fault)
     kept = recorder_of(sick, tmp_path / "run", seconds=1.0)
-    lives((sound, sick), 4, seed=1)
+    step_both((sound, sick), 4, seed=1)
     fault.strike(sick, [2])
     if name == "reset writes nan":
         sound.episode_length_buf[2] = sound.max_episode_length
-    lives((sound, sick), 1, seed=2)
+    step_both((sound, sick), 1, seed=2)
     fault.cure(sick, [2])
     if fault.written:
-        lives((sound, sick), 1, seed=3)
-    lives((sound, sick), 3, seed=4)
+        step_both((sound, sick), 1, seed=3)
+    step_both((sound, sick), 3, seed=4)
     kept.commit(1, 99)
     kept.write(kept.take(99))
     (case,) = [case for case in cases(tmp_path / "run") if case.failure.kind == "diverged"]

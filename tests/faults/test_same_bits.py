@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from support.fault_sizes import SIZE, amount, chosen
-from support.same_bits import ENVS, STEPS, TASKS, Life, against_plain_steps, live, make, other_work
+from support.same_bits import ENVS, STEPS, TASKS, HashedRollout, against_plain_steps, make, other_work, rollout_hashes
 
 from rlcli.sim.selection import IdSelection
 
@@ -40,7 +40,7 @@ def reference(folder):
     @functools.cache
     def trajectories(task, seed=42):
         torch.set_num_threads(1)
-        life = Life(make(task, folder, ENVS, seed=seed))
+        life = HashedRollout(make(task, folder, ENVS, seed=seed))
         differing = against_plain_steps(life.env)
         for _ in range(STEPS):
             life.step()
@@ -55,8 +55,10 @@ def reference(folder):
 @pytest.mark.parametrize(
     ("task", "num_envs", "threads", "seed"), chosen(list(product(TASKS, NUM_ENVS, THREADS, SEEDS)), 7)
 )
-def test_trajectories_equal_mj_step_for_any_threads_and_num_envs(task, num_envs, threads, seed, folder, reference):
-    assert live(make(task, folder, num_envs, threads, seed)) == reference(task, seed)[:num_envs]
+def test_lives_equal_plain_steps_at_any_number_of_threads_and_environments(
+    task, num_envs, threads, seed, folder, reference
+):
+    assert rollout_hashes(make(task, folder, num_envs, threads, seed)) == reference(task, seed)[:num_envs]
 
 
 @pytest.mark.parametrize(("task", "order"), chosen(list(product(TASKS, range(amount(6, 6, 30)))), 4))
@@ -67,7 +69,7 @@ def test_partial_reset_does_not_depend_on_order_or_grouping(task, order, folder)
     parts = [np.sort(part) for part in np.array_split(rng.permutation(ids), int(rng.integers(2, len(ids) + 1)))]
     hashes = []
     for env, groups in ((together, [ids]), (apart, parts)):
-        life = Life(env, steps=60)
+        life = HashedRollout(env, steps=60)
         for _ in range(20):
             life.step()
         env.episode_index[ids] += 1
@@ -83,11 +85,11 @@ def test_partial_reset_does_not_depend_on_order_or_grouping(task, order, folder)
 PROCESS = """
 import json, sys, pathlib, torch
 torch.set_num_threads(1)
-from same_bits import TASKS, live, make, other_work
+from same_bits import TASKS, rollout_hashes, make, other_work
 for work in other_work().values():
     work()
 torch.set_num_threads(1)
-print(json.dumps({task: live(make(task, pathlib.Path(sys.argv[1]), 7, int(sys.argv[2]))) for task in TASKS}))
+print(json.dumps({task: rollout_hashes(make(task, pathlib.Path(sys.argv[1]), 7, int(sys.argv[2]))) for task in TASKS}))
 """
 
 
@@ -117,9 +119,9 @@ def test_another_process_and_hash_seed_give_equal_trajectories(hash_seed, task, 
 
 
 @pytest.mark.parametrize(("one", "other"), chosen(list(combinations_with_replacement(TASKS, 2)), 2))
-def test_two_environments_in_one_process_are_independent(one, other, folder, reference):
-    trajectories = [Life(make(one, folder, 7, 2)), Life(make(other, folder, 3, 1, seed=5))]
-    alone = live(make(other, folder, 3, 1, seed=5))
+def test_two_environments_of_one_process_do_not_touch_each_other(one, other, folder, reference):
+    lives = [HashedRollout(make(one, folder, 7, 2)), HashedRollout(make(other, folder, 3, 1, seed=5))]
+    alone = rollout_hashes(make(other, folder, 3, 1, seed=5))
     for _ in range(STEPS):
         for life in trajectories:
             life.step()
@@ -129,8 +131,8 @@ def test_two_environments_in_one_process_are_independent(one, other, folder, ref
 
 
 @pytest.mark.parametrize(("task", "work"), chosen(list(product(TASKS, sorted(other_work()))), 3))
-def test_other_work_between_steps_changes_nothing(task, work, folder, reference):
-    life = Life(make(task, folder, 7, 2))
+def test_other_work_in_between_changes_nothing(task, work, folder, reference):
+    life = HashedRollout(make(task, folder, 7, 2))
     for step in range(STEPS):
         if step % 20 == 0:
             other_work()[work]()

@@ -133,7 +133,7 @@ def test_origin_of_changed_value_is_run_file(cli, tmp_path):
 def test_direct_task_page_has_parameters_and_docstrings(cli, tmp_path):
     write_run(tmp_path / "runs", "cartpole-direct", rows=learning())
     page = read(cli("report", "latest").out.strip())
-    assert "Upright and calm is good" in page.text
+    assert "Reward an upright pole and slow joints" in page.text
     assert "Force at action 1 [N]." in page.text
 
 

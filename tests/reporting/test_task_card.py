@@ -122,7 +122,7 @@ def test_direct_task_card_has_parameters_and_docstrings():
         "Parameter": "max_effort", "Value": "250", "What": "Force at action 1 [N].", "Default": "400",
     }  # fmt: skip
     words = rows(content, "Docstrings of the task")
-    assert words["Reward"]["What"] == "Upright and calm is good, out of bounds costs 2."
+    assert words["Reward"]["What"] == "Reward an upright pole and slow joints; a failure costs 2."
     assert words["Start of an episode"]["Hook"] == "reset_idx"
     assert rows(content, "Observations: policy")["pole_vel"]["Unit"] == "rad/s"
     assert dict(content.facts)["Observations are clipped to"] == "±5"

@@ -5,7 +5,7 @@ import math
 import mujoco
 import pytest
 import torch
-from support.worlds import CRITTER_TASK, actions, build, critter, dump, edited, life, run, same, write
+from support.worlds import CRITTER_TASK, actions, build, critter, dump, edited, results_of_env, run, same, write
 
 from rlcli.errors import ConfigError
 
@@ -174,7 +174,7 @@ def test_trajectory_with_objects_is_independent_of_num_envs(tmp_path):
     task = edited(CRITTER_TASK, scene={"entities": {
         "robot": {"model": "critter.xml", "joints": {".*": {"kp": 20.0, "kv": 0.5}}}, **ball}})  # fmt: skip
     many, few = (run(build(critter(tmp_path / name, task), n), 30) for name, n in (("a", 17), ("b", 2)))
-    assert same(life(many, 1), life(few, 1))
+    assert same(results_of_env(many, 1), results_of_env(few, 1))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.worlds import CRITTER_TASK, actions, build, critter, edited, life, run, same
+from support.worlds import CRITTER_TASK, actions, build, critter, edited, results_of_env, run, same
 
 from rlcli.config.schema import TerrainGeneratorConfig
 from rlcli.errors import ConfigError
@@ -331,7 +331,7 @@ def test_start_levels_depend_on_seed_and_are_bounded(tmp_path):
 def test_trajectory_on_terrain_is_independent_of_num_envs(tmp_path):
     hills = generator(sub_terrains={"a": {"kind": "noise"}, "b": {"kind": "stairs"}})
     many, few = (run(on_terrain(tmp_path, hills, n, folder=name), 30) for name, n in (("a", 19), ("b", 3)))
-    assert all(same(life(many, env), life(few, env)) for env in range(3))
+    assert all(same(results_of_env(many, env), results_of_env(few, env)) for env in range(3))
 
 
 def test_state_dict_restores_levels_and_origins(tmp_path):

@@ -1,4 +1,4 @@
-"""Checkpoints and run folders that nobody should trust: what is done to a good one, by name.
+"""Damaged and malicious checkpoints and run folders, made from a good one; each damage has a name.
 
 Each maker gets the folder of a good checkpoint and changes it. Where `rehash` is called the manifest agrees with the
 change afterwards: whoever can write the files can write their hashes.
@@ -20,7 +20,7 @@ import torch
 from support.saved_states import rehash
 
 PLAYED = ("play", "eval", "export", "init")
-"""Commands that read the policy alone."""
+"""Commands that read only the policy."""
 EVERY = (*PLAYED, "resume")
 RESUMED = ("resume",)
 FILES = (
@@ -36,24 +36,24 @@ FILES = (
 
 @dataclass(frozen=True)
 class Case:
-    """A damage, who must refuse it, and of which run: `ppo`, normalised, or `sac`, with a replay buffer."""
+    """A damage, the commands that refuse it, and the run: `ppo` with normalization, or `sac` with a buffer."""
 
     name: str
     damage: Callable[[Path], None]
     readers: tuple[str, ...]
     run: str = "ppo"
     bomb: bool = False
-    """Whether it asks for more memory than there may be."""
+    """Whether the file requests more memory than allowed."""
 
 
 class Bomb:
-    """Says so if it is unpickled."""
+    """Object that reports when it is unpickled."""
 
     def __reduce__(self):
         return (os.system, ("touch executed",))
 
 
-# --- what is changed ---
+# --- kinds of damage ---
 
 
 def manifest(change):
@@ -96,7 +96,7 @@ def content(name, data):
 
 
 def header(name, length=None, **entries):
-    """A safetensors file with this header; `length` is what it says of its own length."""
+    """Replace the header of a safetensors file; `length` is the length that the file states."""
 
     def damage(folder):
         text = json.dumps(entries).encode() if entries else b"{}"
@@ -149,7 +149,7 @@ def missing(name):
 
 
 def linked(name, target):
-    """A link in place of a file; the manifest fits what it leads to."""
+    """Replace a file by a link; the manifest fits the link's target."""
 
     def damage(folder):
         file = folder / name
@@ -178,7 +178,7 @@ def a_folder(name):
 
 
 def sparse(name, size):
-    """Gigabytes that lie on no disk."""
+    """Replace a file by a sparse file of gigabytes."""
 
     def damage(folder):
         with (folder / name).open("wb") as file:
@@ -204,7 +204,7 @@ def pickled(name, kind):
 
 
 def setting(*path, to):
-    """Set what lies at a path of a JSON document."""
+    """Return a change that sets the value at a path of a JSON document."""
 
     def change(value):
         for key in path[:-1]:
@@ -219,12 +219,12 @@ def without(key):
 
 
 def put(name, make):
-    """Replace a tensor by what `make` makes of it."""
+    """Return a change that replaces a tensor by `make(tensor)`."""
     return lambda values: values.update({name: make(values[name])})
 
 
 def first(prefix, make, suffix=""):
-    """The same of the first tensor whose name begins so."""
+    """Return a change that replaces the first tensor whose name has a prefix."""
 
     def change(values):
         name = next(key for key in sorted(values) if key.startswith(prefix) and key.endswith(suffix))
@@ -246,7 +246,7 @@ def every(make):
 
 
 def written(slot, value):
-    """An attribute of the task with a value that is no tensor."""
+    """Return a change that stores an attribute of the task with a value that is no tensor."""
 
     def change(values):
         data = json.dumps({slot: json.dumps(value)}).encode()
@@ -267,7 +267,7 @@ def nested(depth):
     return b'{"a":' * depth + b"1" + b"}" * depth
 
 
-# --- the cases ---
+# --- cases ---
 
 
 def manifests():
@@ -380,7 +380,7 @@ def weights():
 
 
 def places():
-    """Files that are none, for those who read them."""
+    """Return cases with directories, pipes and missing files in place of files."""
     for name in FILES:
         who = EVERY if name.startswith(("manifest", "policy")) else RESUMED
         yield Case(f"{name} missing", missing(name), who)
@@ -551,7 +551,7 @@ def learners():
 
 
 def rows(change):
-    """Change what a file of the replay buffer's rows holds."""
+    """Return a damage that changes a file of the replay buffer's rows."""
 
     def damage(folder):
         document = json.loads((folder / "manifest.json").read_text())
@@ -567,7 +567,7 @@ def rows(change):
 
 
 def on_rows(damage):
-    """Do something to that file, without its manifest."""
+    """Return a damage of that file that leaves its manifest unchanged."""
 
     def outer(folder):
         (file,) = (folder.parent / "logs/replay").glob("*.safetensors")
@@ -619,14 +619,14 @@ def logs():
 
 
 def named():
-    """All cases that have a name."""
+    """Return all cases with a name."""
     found = [Case(name, damage, EVERY) for some in (manifests, policies, weights) for name, damage in some()]
     found += [Case(name, damage, RESUMED) for name, damage in states()]
     return [*found, *places(), *layouts(), *learners(), *logs()]
 
 
 def cut_and_flipped(count):
-    """Truncations and flipped bits all over the files, as a disk does it: the manifest does not agree."""
+    """Return truncations and flipped bits all over the files, as disk errors make them: hashes do not match."""
     for number in range(count):
         name = FILES[1:][number % 6]
         where, who = (number * 0.6180339887) % 1.0, EVERY if name.startswith("policy") else RESUMED
@@ -635,7 +635,7 @@ def cut_and_flipped(count):
 
 
 def forged(count):
-    """The same with hashes that agree: what can be read then is a policy like any other, what cannot is refused."""
+    """Return the same damages with matching hashes: the file is read as a policy or refused."""
     for number in range(count):
         name = FILES[number % 7]
         where = (number * 0.7548776662) % 1.0

@@ -1,4 +1,4 @@
-"""Plugins that are broken, each in its own way: the arguments of the fixture `plugins`, and what is said of them."""
+"""Broken plugins: arguments of the fixture `plugins`, and the expected message for each."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,15 +23,15 @@ FILES = {"task.yaml": TASK.format(summary="Slide."), "model.xml": MODEL}
 
 @dataclass(frozen=True)
 class Case:
-    """A plugin; `said` is in the reason of its row after a probe, None if its task works all the same."""
+    """A plugin. `said` is part of the reason in its row of the probe; None if its task works."""
 
     said: str | None
     source: str = SPEC
     options: dict[str, Any] = field(default_factory=dict)
     unreadable: bool = False
-    """It has no row: its distribution is among those whose metadata cannot be read."""
+    """Whether its metadata cannot be read: it has no row, and is listed among such distributions."""
     foreign: bool = False
-    """It has no row at all: it has nothing to do with rlcli."""
+    """Whether it has no row because it does not belong to rlcli."""
 
 
 def with_files(**changed):

@@ -1,4 +1,4 @@
-"""The pages as a reader sees them: built by Sphinx without network, and read back from the HTML."""
+"""Pages built by Sphinx without network, and read back from the HTML."""
 
 import re
 import subprocess
@@ -19,7 +19,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 def build(folder):
-    """Build all pages into `folder`; any warning is a failure."""
+    """Build all pages into `folder`; every warning is an error."""
     command = [sys.executable, "-c", _NO_NETWORK, "-q", "-W", "--keep-going", "-b", "html"]
     where = [REPOSITORY / "docs", folder / "html"]
     done = subprocess.run([*command, *where], capture_output=True, text=True, cwd=REPOSITORY)
@@ -29,7 +29,7 @@ def build(folder):
 
 @dataclass
 class Page(HTMLParser):
-    """What a page has: ids, targets of links and pictures, text, and blocks of code with the comment before each."""
+    """Content of a page: ids, targets of links and pictures, text, and code blocks with the comment before each."""
 
     file: Path
     ids: set = field(default_factory=set)
@@ -49,7 +49,7 @@ class Page(HTMLParser):
         if "id" in found:
             self.ids.add(found["id"])
         self.targets += [found[name] for name in ("href", "src") if found.get(name)]
-        if tag in ("script", "img", "link", "iframe", "video"):  # what the browser fetches by itself
+        if tag in ("script", "img", "link", "iframe", "video"):  # the browser loads these without a click
             self.loaded |= {found[name] for name in ("href", "src") if found.get(name)}
         language = re.match(r"highlight-(\S+) notranslate", found.get("class") or "")
         if language:

@@ -1,4 +1,4 @@
-"""Commands as children of a warm parent: `child(...)` starts one, `ended(...)` waits for it."""
+"""Commands as children of a warm parent process: `child(...)` starts one, `ended(...)` waits for its end."""
 
 import json
 import os
@@ -18,7 +18,7 @@ SMALL = ("scene.num_envs=4", "sim.engine_threads=1", "agent.torch_threads=1", "-
 @dataclass
 class Ended:
     code: int | None
-    """Exit code, or minus the signal; None: it had to be killed because it did not end."""
+    """Exit code, or minus the signal; None: it did not end in time and was killed."""
     out: str
     err: str
 
@@ -38,11 +38,11 @@ class Child:
         return self.output.with_suffix(".err").read_text()
 
     def runs(self) -> bool:
-        """Whether it is alive, and not a process that has ended and waits to be asked for."""
+        """Return whether the process runs; a zombie does not."""
         return Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
 
     def until(self, condition: Callable[[], Any], seconds: float = 60) -> Any:
-        """Wait for something that the child does."""
+        """Wait until a condition holds."""
         deadline = time.monotonic() + seconds
         while not (found := condition()):
             assert time.monotonic() < deadline, self.said()
@@ -53,7 +53,7 @@ class Child:
 
 @contextmanager
 def warm_parent() -> Iterator[Callable[..., Child]]:
-    """A function that starts `rlcli ARGUMENTS` in a folder; faults are what `fault_points.plant` takes."""
+    """Yield a function that starts `rlcli ARGUMENTS` in a folder; faults are arguments of `fault_points.plant`."""
     variables = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "GOMP_SPINCOUNT": "1000"}
     for name in ("RLCLI_RUNS_DIR", "RLCLI_TEST_SIZE"):
         variables.pop(name, None)

@@ -1,4 +1,4 @@
-"""A warm process that forks one child for each command: torch is imported once, and the children are real processes.
+"""Warm process that forks one child per command: torch is imported once, and children are real processes.
 
 Speaks JSON lines: {"start": {...}} forks and answers with a pid, {"wait": pid, "seconds": s} with an exit status.
 """
@@ -32,7 +32,7 @@ def serve() -> None:
 
     torch.set_num_threads(1)
     for task in ("cartpole", "cartpole-direct"):
-        resolve(find_task(task))  # signatures of terms and schemas of parameters are read once
+        resolve(find_task(task))  # read signatures of terms and schemas once, before forking
     tasks = len(os.listdir("/proc/self/task"))
     answer(ready=True, threads=tasks)
     for line in sys.stdin:
@@ -40,7 +40,7 @@ def serve() -> None:
         if "start" in request:
             child = os.fork()
             if child == 0:
-                live(**request["start"])
+                run_child(**request["start"])
             answer(pid=child)
         else:
             answer(status=waited(request["wait"], request["seconds"]))
@@ -51,7 +51,7 @@ def answer(**content: object) -> None:
 
 
 def waited(pid: int, seconds: float) -> int | None:
-    """The exit code, negative for a signal; None if the child had to be killed because it did not end."""
+    """Return the exit code, negative for a signal; None if the child did not end in time and was killed."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         done, status = os.waitpid(pid, os.WNOHANG)
@@ -63,8 +63,10 @@ def waited(pid: int, seconds: float) -> int | None:
     return None
 
 
-def live(arguments: list[str], folder: str, output: str, faults: list[dict[str, object]], signals: list[str]) -> None:
-    """The child: a command line in a folder, with faults in its system calls. Ends as a process that was started."""
+def run_child(
+    arguments: list[str], folder: str, output: str, faults: list[dict[str, object]], signals: list[str]
+) -> None:
+    """Run a command line in a folder as the child, with faults in its system calls, and exit."""
     os.chdir(folder)
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)

@@ -1,4 +1,4 @@
-"""A real Chromium without a display, and the flags with which it draws on a CPU."""
+"""Headless Chromium, and the flags with which it renders on a CPU."""
 
 import shutil
 

@@ -1,4 +1,4 @@
-"""The command line, in process and as a process, in an empty working folder."""
+"""Fixtures that run the command line, in process or as a process, in an empty working folder."""
 
 import json
 import os
@@ -62,7 +62,7 @@ class Task(DirectTask):
 
 @pytest.fixture
 def empty_folder(tmp_path, monkeypatch):
-    """An empty working folder; torch's threads are restored."""
+    """Change to an empty working folder; restore torch's threads afterwards."""
     monkeypatch.chdir(tmp_path)
     for name in ("RLCLI_RUNS_DIR", "MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -73,7 +73,7 @@ def empty_folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def cli(capfd):
-    """Run a command in this process: its code, stdout, stderr, and stdout as JSON."""
+    """Return a function that runs a command in this process: exit code, stdout, stderr, and stdout as JSON."""
 
     def run(*arguments):
         capfd.readouterr()
@@ -87,7 +87,7 @@ def cli(capfd):
 
 @pytest.fixture
 def start():
-    """Start a command as a process of its own."""
+    """Return a function that starts a command as a separate process."""
     started = []
 
     def begin(*arguments, **settings):
@@ -105,7 +105,7 @@ def start():
 
 @pytest.fixture
 def coin(tmp_path):
-    """A task folder whose success rate is known."""
+    """Return a task folder with a known success rate."""
     folder = tmp_path / "coin"
     folder.mkdir()
     for name, text in (("task.yaml", COIN), ("task.py", COIN_TASK), ("model.xml", MODEL)):
@@ -115,7 +115,7 @@ def coin(tmp_path):
 
 @pytest.fixture
 def only_run():
-    """The only run folder under `runs/`."""
+    """Return a function that finds the only run folder under `runs/`."""
 
     def find(runs="runs"):
         (folder,) = Path(runs).glob("*/*")
@@ -126,7 +126,7 @@ def only_run():
 
 @pytest.fixture
 def weights():
-    """The last policy file of a run."""
+    """Return a function that reads the last policy file of a run."""
 
     def read(run):
         return sorted(Path(run).glob("checkpoints/*/policy.safetensors"))[-1].read_bytes()
@@ -136,5 +136,5 @@ def weights():
 
 @pytest.fixture
 def environment():
-    """A copy of the environment variables."""
+    """Return a copy of the environment variables."""
     return dict(os.environ)

@@ -1,4 +1,4 @@
-"""Transcripts of a shell on a page: what is typed after `$`, below it what is printed, and if that is what comes.
+"""Transcripts of a shell in a page: commands after `$`, and below them the expected output.
 
 `...` alone on a line stands for any lines, within a line for any text. Runs of spaces count as one. Numbers are equal,
 or as near as the page allows: `within` is relative to the larger of 1 and the number that is shown.
@@ -17,7 +17,7 @@ class Command:
 
 
 def commands(transcript):
-    """The commands of a transcript, each with what it prints; a line that ends in a backslash goes on."""
+    """Return the commands of a transcript with their output; a line that ends in a backslash continues."""
     found = []
     for part in re.split(r"^\$ ", transcript, flags=re.MULTILINE)[1:]:
         typed, _, printed = re.match(r"((?:[^\n]*\\\n)*[^\n]*)(\n?)(.*)", part, re.DOTALL).groups()
@@ -26,10 +26,10 @@ def commands(transcript):
 
 
 def difference(shown, printed, within=0.0):
-    """None if `printed` is what the page shows, else what is not."""
+    """Return None if `printed` equals the output in the page, otherwise the difference."""
     wanted = [_plain(line) for line in shown.splitlines() if line.strip()]
     given = [_plain(line) for line in printed.splitlines() if line.strip()]
-    reached = {0}  # how many lines of `given` the lines of the page so far may account for
+    reached = {0}  # possible numbers of printed lines that match the page's lines so far
     for line in wanted:
         if line == "...":
             reached = set(range(min(reached), len(given) + 1))

@@ -1,4 +1,4 @@
-"""Tasks that can be driven into every kind of divergence, and how each kind is brought about."""
+"""Tasks that can diverge in every way, and how to cause each kind of divergence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from rlcli.runs.trusted_tasks import named_task
-from support.worlds import actions, build, clone, dump, life, same, write
+from support.worlds import actions, build, clone, dump, results_of_env, same, write
 
 N = 5
 WHO = (0, 2, N - 1)
@@ -43,19 +43,19 @@ BAD = {}
 
 
 def _rows(selection, what, values):
-    """The selected environments that the fault is for."""
+    """Return the selected environments that the fault applies to."""
     return [i for i in BAD.get(what, ()) if i in selection.ids.tolist()]
 
 
 def start(env, selection, *, entity: Entity = "robot"):
-    """Swing a little; a start state of the fault's where it says so."""
+    """Sample small joint positions; a fault may replace the initial state."""
     selection.write(entity.engine.field("qpos"), selection.uniform(-0.3, 0.3, (1,)).double(), slice(0, 1))
     for i in _rows(selection, "reset", None):
         entity.engine.field("qpos")[i, 0] = BAD["value"]
 
 
 def shove(env, selection, *, entity: Entity = "robot"):
-    """Push a little; as the fault says where it says so."""
+    """Push a little; a fault may replace the push."""
     qvel = entity.engine.field("qvel")
     for i in selection.ids.tolist():
         qvel[i, 0] += 0.01
@@ -64,7 +64,7 @@ def shove(env, selection, *, entity: Entity = "robot"):
 
 
 class Turned:
-    """The controls; as the fault says where it says so."""
+    """Action term that sets the controls; a fault may replace them."""
 
     def __init__(self, env, *, entity: Entity = "robot") -> None:
         self.size, self.elements, self.unit = 2, ("turn", "push"), ""
@@ -120,7 +120,7 @@ BOXES = f"""
   {"".join(_BOX.format(i, 5 * i) for i in range(4))}
 </worldbody></mujoco>
 """
-"""Boxes that lie apart: one upon the other they need more memory than there is."""
+"""Boxes that are apart; stacked, their contacts need more memory than available."""
 BOXES_TASK = {
     **TASK,
     "sim": {"dt": 0.01, "gravity": [0.0, 0.0, 0.0]},
@@ -165,7 +165,7 @@ LEARNERS = {
     "sb3-sac": {"trainer": "sb3", "algorithm": "sac", "train_freq": 4, "gradient_steps": 2, "learning_starts": 8},
     "sb3-td3": {"trainer": "sb3", "algorithm": "td3", "train_freq": 4, "gradient_steps": 2, "learning_starts": 8},
 }
-"""Agents of every algorithm with the least that they need."""
+"""Minimal agents of every algorithm."""
 LEARNING_TASK = {
     **PLAIN_TASK,
     "agents": {
@@ -177,7 +177,7 @@ LEARNING_TASK = {
 
 
 def machine(folder: Path, task: dict | None = None):
-    """A task with activations, controls, a mocap body, events and terms that can go wrong."""
+    """Write a task with activations, controls, a mocap body, events and terms that can fail."""
     arm = MACHINE[: MACHINE.index("  <actuator>")] + "</mujoco>"
     return write(
         folder / "machine", dump(task or TASK), machine_xml=MACHINE, target_xml=TARGET, arm_xml=arm, boxes_xml=BOXES,
@@ -186,27 +186,27 @@ def machine(folder: Path, task: dict | None = None):
 
 
 def faults(env) -> dict:
-    """What the terms of the task look at."""
+    """Return the faults that the terms of the task read."""
     return env.reward_manager.terms[-1].instance.func.__globals__["BAD"]
 
 
 @dataclass(frozen=True)
 class Fault:
-    """How a simulation is made to go wrong in some environments."""
+    """A way to make the simulation diverge in some environments."""
 
     strike: Callable
     """(env, environments)"""
     cause: str
-    """What the guard calls it."""
+    """Cause that the guard reports."""
     detail: str = ""
-    """Part of what it says of it."""
+    """Part of the guard's message."""
     cure: Callable = lambda env, who: None
-    """Takes the fault away."""
+    """Removes the fault."""
     expands: tuple[str, ...] = ()
-    """Model fields that each environment has for itself."""
+    """Model fields that must be expanded per environment."""
     task: dict | None = None
     written: bool = False
-    """Whether an event or a reset writes it: then the episode ends with the next step."""
+    """Whether an event or a reset causes it: then the episode ends with the next step."""
 
 
 def _writes(field: str, value: float, *columns: int) -> Callable:
@@ -251,7 +251,7 @@ def _piles_up(env, who):
 
 
 def _starts_badly(env, who):
-    """Ends the episodes of some environments, whose new ones begin badly."""
+    """End the episodes of some environments; their new initial states are bad."""
     faults(env).update({"reset": list(who), "value": math.nan})
     for i in who:
         env.episode_length_buf[i] = env.max_episode_length
@@ -292,9 +292,9 @@ FAULTS = {
 
 
 def pair(folder: Path, fault: Fault, *overrides: str):
-    """Two equal environments, one step apart from nothing: what is struck, and what it is compared with."""
+    """Build two equal environments: one gets the fault, the other is the reference."""
     task = machine(folder, fault.task)
-    named_task(str(task))  # its user has: a dump of it is loaded
+    named_task(str(task))  # trust the task: a dump of it is loaded later
     envs = [build(task, N, *overrides) for _ in range(2)]
     for env in envs:
         for field in fault.expands:
@@ -305,13 +305,13 @@ def pair(folder: Path, fault: Fault, *overrides: str):
     return envs
 
 
-def lives(envs, steps: int, seed: int):
-    """Both step the same actions."""
+def step_both(envs, steps: int, seed: int):
+    """Step both environments with the same actions."""
     size = envs[0].layout.action_size
     return [[clone(env.step(a)) for env in envs] for a in actions(steps, N, size, seed)]
 
 
 def untouched(results, who) -> bool:
-    """Whether all other environments lived the same life in both."""
+    """Return whether all other environments have equal trajectories in both."""
     left, right = zip(*results, strict=True)
-    return all(same(life(list(left), i), life(list(right), i)) for i in range(N) if i not in who)
+    return all(same(results_of_env(list(left), i), results_of_env(list(right), i)) for i in range(N) if i not in who)

@@ -1,4 +1,4 @@
-"""A virtual environment with what some requirements ask for, and nothing else: no network, no copies.
+"""Virtual environment with only the given requirements: no network, no copies.
 
 What is there comes from this interpreter's own installation, linked one distribution at a time. So a package that rlcli
 imports and does not declare is missing there, as it is on a user's machine.
@@ -17,7 +17,7 @@ OWN = "rlcli"
 
 
 def requirements_of_rlcli(*extras):
-    """What rlcli's own pyproject.toml asks for, with some of its extras."""
+    """Return the requirements in rlcli's pyproject.toml, with some of its extras."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     wanted = list(project["dependencies"])
     for extra in extras:
@@ -28,7 +28,7 @@ def requirements_of_rlcli(*extras):
 
 
 def distributions(requirements) -> dict[str, Distribution]:
-    """The installed distributions that fulfil requirements, and those which these need in turn."""
+    """Return the installed distributions that fulfil the requirements, and their dependencies."""
     found: dict[str, Distribution] = {}
     seen = set()
     waiting = [(Requirement(line), "") for line in requirements]
@@ -47,7 +47,7 @@ def distributions(requirements) -> dict[str, Distribution]:
 
 
 def make(folder, requirements):
-    """Make the environment in `folder`; returns its Python."""
+    """Create the environment in `folder`; return its Python."""
     subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
     python = folder / "bin" / "python"
     ask = "import sysconfig; print(sysconfig.get_path('purelib'))"

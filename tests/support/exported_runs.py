@@ -1,4 +1,4 @@
-"""Runs to export, trained once a module; tasks whose commands are worth a look."""
+"""Runs to export, trained once per module, and tasks whose commands are checked."""
 
 from pathlib import Path
 
@@ -67,7 +67,7 @@ SHORT = ("--num-envs", "32", "--max-iterations", "4", "--logger", "none", "-q")
 
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory) -> Path:
-    """A runs folder with short runs: PPO and SAC of each built-in cartpole, one SAC normalised, and the arm."""
+    """Return a runs folder with short runs: PPO and SAC of each cartpole, one normalized SAC, and the arm."""
     folder = tmp_path_factory.mktemp("trained")
     arm = folder / "arm"
     arm.mkdir()
@@ -86,7 +86,7 @@ def runs(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def newest(runs):
-    """A task, or a task and `sac`, -> the folder of the newest checkpoint of its run."""
+    """Return a function: task, or task and `sac` -> folder of the newest checkpoint of its run."""
 
     def find(label):
         task, _, name = label.partition(" ")

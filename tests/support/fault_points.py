@@ -1,4 +1,4 @@
-"""Faults at named moments of a process, put into its system calls: nothing of rlcli is replaced.
+"""Faults at named moments of a process, injected into its system calls; no code of rlcli is replaced.
 
 A point is a call and what it is called with; the fault happens the n-th time that it is reached, and, where it is an
 error of the machine, every time from then on.
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 KILLED_AT = {
-    # point -> (call, pattern of the path, before or after the call, or in the middle of what it writes)
+    # point -> (call, pattern of the path, before or after the call, or in the middle of a write)
     "temporary folder made": ("mkdir", r"checkpoints/\.tmp-[^/]*$", "after"),
     "in the middle of a file": ("write", r"checkpoints/\.tmp-.*/trainer\.safetensors$", "middle"),
     "before a file's fsync": ("fsync", r"checkpoints/\.tmp-.*/[^/]+\.\w+$", "before"),
@@ -43,7 +43,7 @@ KILLED_AT = {
     "in the middle of TensorBoard's cut": ("write", r"/tb/\.events.*tmp-", "middle"),
     "after TensorBoard's cut": ("replace", r"/tb/events", "after"),
 }
-"""Where a process is killed."""
+"""Moments at which a process is killed."""
 
 
 _SLOW = 12
@@ -52,7 +52,7 @@ _SLOW = 12
 def plant(
     kind: str, call: str, pattern: str, when: str = "before", nth: int = 1, code: str = "EIO", seconds: float = 0.0
 ) -> None:
-    """Put a fault into this process.
+    """Inject a fault into this process.
 
     Args:
         kind: kill, error (raise `code` from now on), short (write half, then `code`), full (the file is /dev/full),
@@ -83,7 +83,7 @@ def plant(
         elif kind == "limit":
             soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
             resource.setrlimit(resource.RLIMIT_FSIZE, (int(code), hard))
-            # what counts covered lines writes its file after the program has ended
+            # coverage writes its file after the program has ended
             atexit.register(resource.setrlimit, resource.RLIMIT_FSIZE, (soft, hard))
         elif kind == "clock":
             real, shift = time.time, float(code)

@@ -1,4 +1,4 @@
-"""How many cases of a suite run: a sample in `make test`, all in `make test-faults`, more with `-long`."""
+"""Number of cases in fault tests: a sample in `make test`, all in `make test-faults`, more with `-long`."""
 
 import os
 from collections.abc import Sequence
@@ -9,12 +9,12 @@ assert SIZE in ("sample", "full", "long"), f"RLCLI_TEST_SIZE is '{SIZE}': sample
 
 
 def amount(sample: int, full: int, long: int | None = None) -> int:
-    """The number of cases at the size that was asked for."""
+    """Return the number of cases for the chosen size."""
     return {"sample": sample, "full": full, "long": full if long is None else long}[SIZE]
 
 
 def chosen(cases: Sequence[Any], sample: int) -> list[Any]:
-    """All cases, or an evenly spread sample of them."""
+    """Return all cases, or an evenly spread sample."""
     cases = list(cases)
     if SIZE != "sample" or sample >= len(cases):
         return cases

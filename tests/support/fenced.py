@@ -1,4 +1,4 @@
-"""Fenced blocks of documentation pages: files that a page tells to write, and commands that it tells to run."""
+"""Fenced blocks of documentation pages: files that a page shows, and commands that it lists."""
 
 import os
 import re
@@ -23,13 +23,13 @@ class Block:
     file: str | None
     text: str
     not_run: str | None = None
-    """Why nobody runs it, from the comment `<!-- not run: WHY -->` on the line above."""
+    """Reason why it is not run, from the comment `<!-- not run: WHY -->` on the line above."""
     section: str = ""
-    """The heading that it stands under."""
+    """Heading of its section."""
 
 
 def all_blocks(page, below="", above=None):
-    """The blocks of a page, or of the part that begins with the line `below` and ends before the line `above`."""
+    """Return the blocks of a page, or of the part from the line `below` to the line `above`."""
     text = page.read_text(encoding="utf-8")
     text = text[text.index(below) :]
     text = text[: text.index(above)] if above else text
@@ -43,7 +43,7 @@ def all_blocks(page, below="", above=None):
 
 
 def blocks(page, below="", above=None):
-    """Those of them that are to be run."""
+    """Return the blocks that are run."""
     return [block for block in all_blocks(page, below, above) if block.not_run is None]
 
 
@@ -62,11 +62,11 @@ def write_files(found, folder):
 
 
 _PYTHON = 'python() { if [[ "$1" == *.py ]]; then PYTHONSAFEPATH= "$PY" "$@"; else "$PY" "$@"; fi; }'
-"""A script finds the files beside it; `python -m` does not find those of the folder it is called in."""
+"""Line that makes a script find the files of the working folder."""
 
 
 def shortened(block):
-    """The block with trainings, sweeps and evaluations of a few steps, and no bar for what they reach."""
+    """Return a block with trainings, sweeps and evaluations of a few steps, without bars."""
     brief = (
         (r"^(rlcli train (?:(?!--max-iterations|--resume|#).)*?)(?=\s*(?:#.*)?$)", r"\1 --max-iterations 2"),
         (r"--episodes [0-9]+", "--episodes 4"),
@@ -81,7 +81,7 @@ def shortened(block):
 
 
 def run_commands(found, folder, *, site=None, languages=("sh",), run=None):
-    """Run the blocks of these languages one after the other as a user would, and return what they printed.
+    """Run the blocks of these languages in order, as a user would. Return what they printed.
 
     The word `RUN` of a command stands for `run`.
     `rlcli` and `python` are this interpreter's; with `site`, pip installs there, without network, and rlcli is found
@@ -118,10 +118,10 @@ def run_commands(found, folder, *, site=None, languages=("sh",), run=None):
 
 
 def success_rate(output):
-    """The first success rate that was printed: that of the trained policy."""
+    """Return the first printed success rate: that of the trained policy."""
     return success_rates(output)[0]
 
 
 def success_rates(output):
-    """The success rate of each evaluation."""
+    """Return the success rate of each evaluation."""
     return [float(rate) for rate in re.findall(r"^success rate +(\S+)", output, re.MULTILINE)]

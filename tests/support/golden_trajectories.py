@@ -1,4 +1,4 @@
-"""Recorded trajectories of the built-in tasks, and how they are recorded anew.
+"""Recorded trajectories of the built-in tasks, and the command that records them again.
 
 `python tests/support/golden_trajectories.py` from the repository's root rewrites them: after a change that is meant to
 give other numbers, and never otherwise. The commit says why.
@@ -26,18 +26,18 @@ TASKS = ("ant-direct", "cartpole", "cartpole-direct")
 SEEDS = (0, 1)
 NUM_ENVS, STEPS, CLOSE_STEPS, EVERY = 4, 500, 100, 25
 TOLERANCE = 1e-9
-"""How far joint positions and velocities may be from the recorded ones on another machine, for CLOSE_STEPS steps."""
+"""Allowed deviation of joint positions and velocities on other machines, for CLOSE_STEPS steps."""
 
 
 def machine() -> dict[str, str]:
-    """What the bits of a trajectory depend on besides rlcli."""
+    """Return the properties of the machine that change the bits of a trajectory."""
     versions = {name: metadata.version(name) for name in ("mujoco", "torch", "numpy")}
     libc = os.confstr("CS_GNU_LIBC_VERSION") if hasattr(os, "confstr") else None
     return {**versions, "libc": libc or "", "kernels": processor()["kernels"]}
 
 
 def trajectory(task: str, seed: int) -> dict[str, Any]:
-    """The hash of a trajectory, and its states at some of the first steps."""
+    """Return the hash of a trajectory, and its states at some of the first steps."""
     torch.set_num_threads(1)
     env = make_env(resolve(find_task(task), overrides=[f"scene.num_envs={NUM_ENVS}"]), seed=seed)
     digest = hashlib.sha256()
@@ -54,17 +54,17 @@ def trajectory(task: str, seed: int) -> dict[str, Any]:
 
 
 def recorded() -> dict[str, Any]:
-    """What the file holds."""
+    """Return the content of the file."""
     return json.loads(FILE.read_text(encoding="utf-8"))
 
 
 def furthest(states: list[list[float]], others: list[list[float]]) -> float:
-    """The largest deviation between two lists of states."""
+    """Return the largest deviation between two lists of states."""
     return max(abs(a - b) for row, twin in zip(states, others, strict=True) for a, b in zip(row, twin, strict=True))
 
 
 def _action(env: VecEnv, step: int) -> torch.Tensor:
-    """Whole numbers of 1/64, from arithmetic that is exact on any machine."""
+    """Return actions in multiples of 1/64, from arithmetic that is exact on every machine."""
     size = env.layout.action_size
     numbers = (torch.arange(NUM_ENVS * size) * 7919 + step * 104729) % 129 - 64
     return (numbers.float() / 64).reshape(NUM_ENVS, size)

@@ -1,4 +1,4 @@
-"""Run folders as somebody with bad intentions would make them; code that ran leaves a canary."""
+"""Malicious run folders; code that was executed leaves a canary file."""
 
 import json
 import os
@@ -19,7 +19,7 @@ def code(canary, rest=""):
 
 
 def evil_task(folder, canary, config):
-    """A task whose every Python file is the attacker's."""
+    """Write a task with malicious code in every Python file."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "task.yaml").write_text(config)
     for name in ("task.py", "terms.py", "__init__.py", "evil.py", "mujoco.py", "cartpole.py"):
@@ -58,7 +58,7 @@ def pipe(path):
     os.mkfifo(path)
 
 
-# --- whose code: name -> what makes the attack, given `at` (run, evil, cwd) ---
+# --- code execution: name -> function that prepares the attack; `at` has run, evil and cwd ---
 
 
 def _named(**task):
@@ -87,7 +87,7 @@ def _oige(at):
 
 
 def _spelled_like_a_known_one(at):
-    """A file of the run whose spelling ends, read as one path, at a folder that the user has named."""
+    """Refer to a file of the run by a path that ends like a trusted folder's path."""
     from rlcli.runs.trusted_tasks import named_task
 
     known = at.cwd / "known"
@@ -121,10 +121,10 @@ CODE = {
     "a null byte": _named(folder="{evil}\0"),
     "a home folder": _named(folder="~/evil"),
 }
-"""Refused whatever the command, with 5 or 4."""
+"""Refused by every command, with exit code 5 or 4."""
 
 
-# --- what the configuration says ---
+# --- malicious configurations ---
 
 
 def _config(old, new):
@@ -157,7 +157,7 @@ CONFIG = {
     "nothing": lambda at: (at.run / "config.yaml").unlink(),
     "a folder": lambda at: ((at.run / "config.yaml").unlink(), (at.run / "config.yaml").mkdir()),
 }
-"""Refused by whatever reads the configuration, with 3 or 5."""
+"""Refused by every command that reads the configuration, with exit code 3 or 5."""
 
 
 def _everywhere(file, old, new):
@@ -169,7 +169,7 @@ def _grow(file):
         opened.truncate(100 << 20)
 
 
-# --- what run.json says ---
+# --- malicious run.json ---
 
 
 def _record(**entries):
@@ -222,10 +222,10 @@ RECORD = {
     "threads below one": _record(torch_threads=0),
     "threads that are text": _record(torch_threads="four"),
 }
-"""Refused whatever the command, with 5."""
+"""Refused by every command, with exit code 5."""
 
 
-# --- links and pipes in the run: what a command would write to is not followed out of it ---
+# --- links and pipes in the run: commands must not write through them ---
 
 
 def _linked_file(name, content="victim"):
@@ -270,11 +270,11 @@ LINKS = {
     "the exports": _linked_folder("exports"),
     "a link that leads nowhere": lambda at: link(at.run / "tb", at.cwd / "not-there"),
 }
-"""Refused by what goes on writing the run, with 5; nothing outside is changed."""
+"""Refused by commands that write to the run, with exit code 5; nothing outside of the run changes."""
 
 
 def place(tmp_path, run):
-    """A copy of a good run in a folder of its own, an evil task beside it, and where a canary would sit."""
+    """Copy a good run to a new folder, with a malicious task beside it. Return the paths, with that of the canary."""
     cwd = tmp_path / "cwd"
     runs = cwd / "runs" / "cartpole"
     runs.mkdir(parents=True)
@@ -286,6 +286,6 @@ def place(tmp_path, run):
 
 
 def outside(at):
-    """Everything beside the run, to compare: the names and contents of plain files."""
+    """Return the names and contents of all plain files beside the run."""
     files = [file for file in sorted(Path(at.cwd).rglob("*")) if not file.is_relative_to(at.run)]
     return {str(file): file.read_bytes() if file.is_file() else None for file in files}

@@ -1,4 +1,4 @@
-"""Installed distributions, made of files in a folder on the path."""
+"""Installed distributions, created from files in a folder on the path."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ from support.broken_plugins import BROKEN, FILES, SPEC
 
 @pytest.fixture
 def plugins(tmp_path, monkeypatch):
-    """plugins(name, module=source, points=..., ...) makes an installed distribution and puts it on the path."""
+    """Return plugins(name, module=source, points=..., ...), which creates a distribution and puts it on the path."""
     site = tmp_path / "site"
     site.mkdir()
     monkeypatch.syspath_prepend(str(site))
@@ -47,7 +47,7 @@ def plugins(tmp_path, monkeypatch):
 
 @pytest.fixture
 def broken_plugins(plugins):
-    """broken_plugins(names...) installs these of `BROKEN`, and a distribution `good` whose task works."""
+    """Return broken_plugins(*names), which installs some of `BROKEN`, and a distribution `good` that works."""
 
     def install(*names):
         plugins("good", SPEC, files=FILES)
@@ -64,7 +64,7 @@ def spec():
 
 @pytest.fixture
 def cli(tmp_path):
-    """cli(arguments...) -> the finished process of `rlcli`, started in an empty folder."""
+    """Return cli(*arguments) -> the finished `rlcli` process, started in an empty folder."""
 
     def run(*arguments, **environment):
         here = tmp_path / "here"

@@ -1,4 +1,4 @@
-"""Mutants of the built-in models, read and compiled in children under limits."""
+"""Mutants of the built-in models, read and compiled in child processes with limits."""
 
 import os
 import random
@@ -43,7 +43,7 @@ def mutant(draw):
 
 
 def try_mutants(seed, folder):
-    """In a child under limits: read and compile; 0 if each was taken or refused in words, and not all were alike."""
+    """Read and compile mutants in a child process; return 0 if each was accepted or refused with a message."""
     import resource
 
     signal.alarm(60)
@@ -59,12 +59,12 @@ def try_mutants(seed, folder):
             read_mjcf(file, [folder]).compile()
             taken += 1
         except ValueError:
-            pass  # of ours or MuJoCo's compiler: words, which the scene passes on
+            pass  # an error message of rlcli or of MuJoCo's compiler
     return 0 if taken < BATCH else 3
 
 
 def main(first, count, folder):
-    """One child a seed, forked of a process that has no threads; what the last one said of its mutants."""
+    """Run one child per seed, forked from a process without threads; report the last message about its mutants."""
     for seed in range(first, first + count):
         child = os.fork()
         if child == 0:

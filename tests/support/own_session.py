@@ -1,4 +1,4 @@
-"""Fixtures that every suite of the repository shares: nothing is noted in the folders of whoever runs the tests."""
+"""Fixtures for all test suites: tests write no state outside of their folders."""
 
 import os
 import signal
@@ -8,7 +8,7 @@ import pytest
 
 from rlcli.cli.ui.console import console
 
-# A shell's background job ignores the one, what nohup starts the other: what the tests start would inherit it.
+# Background jobs ignore SIGINT, nohup ignores SIGHUP, and child processes of the tests would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
@@ -17,7 +17,7 @@ if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_I
 
 @pytest.fixture(scope="session", autouse=True)
 def own_state(tmp_path_factory):
-    """Tasks that the tests use are noted in a folder of the tests, and nobody's preferences are followed."""
+    """Keep trusted tasks and user settings in a folder of the tests."""
     own = {"RLCLI_STATE_DIR": str(tmp_path_factory.mktemp("state")), "RLCLI_SETTINGS": "none"}
     before = {name: os.environ.get(name) for name in own}
     os.environ.update(own)
@@ -31,7 +31,7 @@ def own_state(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def own_console():
-    """What a command was told to print ends with the test that ran it."""
+    """Restore the console's settings after each test."""
     before = replace(console)
     yield
     for field in fields(console):

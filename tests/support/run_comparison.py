@@ -1,4 +1,4 @@
-"""Whether two runs are the same: what they learned bit for bit, what they logged, and that nothing else lies about."""
+"""Comparison of two runs: trained weights bit for bit, logs, and no leftover files."""
 
 import hashlib
 import json
@@ -14,11 +14,11 @@ from rlcli.runs.run import open_run
 from rlcli.training.loggers import read_metrics
 
 CONSTANT = "Perf/"
-"""Metrics that begin with this are times."""
+"""Prefix of metrics that are times."""
 
 
 def rows_of(run: Path) -> list[dict[str, Any]]:
-    """The metrics but for times."""
+    """Return the metrics without times."""
     return [{k: v for k, v in row.items() if not k.startswith(CONSTANT)} for row in read_metrics(run / "metrics.jsonl")]
 
 
@@ -27,7 +27,7 @@ def newest(run: Path) -> Checkpoint:
 
 
 def content(checkpoint: Checkpoint) -> dict[str, str]:
-    """sha256 of every part of a checkpoint, and of the rows that belong to it, however they are divided into files."""
+    """Return the sha256 of every part of a checkpoint and of its rows, independent of how files divide them."""
     hashes = {name: entry["sha256"] for name, entry in checkpoint.manifest["files"].items()}
     for name, log in checkpoint.state().logs.items():
         for column, values in log.read(log.first, log.stop).items():
@@ -37,13 +37,13 @@ def content(checkpoint: Checkpoint) -> dict[str, str]:
 
 
 def assert_loads(run: Path) -> None:
-    """Every checkpoint of a run is complete: each file is what its manifest says, each row that it needs is there."""
+    """Check that every checkpoint of a run is complete: files match the manifest, and all rows exist."""
     for step in steps(run / "checkpoints"):
         assert content(open_checkpoint(run / "checkpoints" / f"{step:012d}"))
 
 
 def leftovers(run: Path) -> list[str]:
-    """Temporary files, and rows of logs that no checkpoint needs."""
+    """Return temporary files, and rows of logs that no checkpoint needs."""
     found = [str(file) for file in run.rglob("*") if ".tmp" in file.name]
     needed = set()
     for step in steps(run / "checkpoints"):
@@ -54,7 +54,7 @@ def leftovers(run: Path) -> list[str]:
 
 
 def assert_cases(run: Path) -> None:
-    """Every kept episode is whole, belongs to the run that was finished, and is there once."""
+    """Check that every recorded episode is complete, belongs to the finished run, and exists once."""
     keys = []
     for file in (run / FOLDER).glob("*.safetensors"):
         header = read_trajectory(file).header
@@ -65,7 +65,7 @@ def assert_cases(run: Path) -> None:
 
 
 def tensorboard_steps(run: Path) -> dict[str, list[int]]:
-    """Steps of every scalar but times, in the order of the files."""
+    """Return the steps of every scalar except times, in the order of the files."""
     from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
     found: dict[str, list[int]] = {}
@@ -77,7 +77,7 @@ def tensorboard_steps(run: Path) -> dict[str, list[int]]:
 
 
 def assert_same_run(run: Path, whole: Path, *, state: str = "finished") -> None:
-    """A run that was interrupted and resumed is the one that never was."""
+    """Check that an interrupted and resumed run equals an uninterrupted one."""
     assert_cases(run)
     assert rows_of(run) == rows_of(whole)
     wanted, found = content(newest(whole)), content(newest(run))
@@ -96,7 +96,7 @@ def assert_same_run(run: Path, whole: Path, *, state: str = "finished") -> None:
 
 
 def same_tensors(left: dict[str, torch.Tensor], right: dict[str, torch.Tensor]) -> list[str]:
-    """Names of what differs by a bit."""
+    """Return the names of tensors that differ in any bit."""
     if left.keys() != right.keys():
         return sorted(left.keys() ^ right.keys())
     return [name for name in left if left[name].numpy().tobytes() != right[name].numpy().tobytes()]

@@ -1,4 +1,4 @@
-"""Trajectories as hashes, one an environment, and the plain MuJoCo loop that they must equal."""
+"""Trajectories as hashes, one per environment, and the plain MuJoCo loop that must give the same."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from support.fault_sizes import amount
 from support.worlds import CRITTER_TASK, actions, build, critter, edited
 
 TASKS = ["cartpole", "cartpole-direct", "ant-direct", "critter"]
-"""The built-in tasks, and one with contacts, commands, noise and models that differ between worlds."""
+"""The built-in tasks, and one with contacts, commands, noise and models that differ between environments."""
 STEPS, ENVS = amount(60, 200), amount(8, 64)
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _EVENTS = {
@@ -40,20 +40,20 @@ _NOISY = {
 
 
 def make(task: str, folder: Path, num_envs: int, threads: int = 1, seed: int = 42) -> VecEnv:
-    """An environment whose episodes are short enough to cross resets."""
+    """Return an environment with short episodes, so that trajectories include resets."""
     place = place_of(task, folder)
     return build(place, num_envs, f"sim.engine_threads={threads}", "episode_length_s=0.6", seed=seed)
 
 
 def place_of(task: str, folder: Path) -> Path | str:
-    """How a command line names the task; the critter is written to a folder."""
+    """Return the task's name on the command line; the critter is written to a folder."""
     if task != "critter":
         return task
     return critter(folder, edited(CRITTER_TASK, events=_EVENTS, commands=_COMMANDS, observations=_NOISY))
 
 
-class Life:
-    """A running trajectory: every environment's states, observations, rewards and ends, hashed."""
+class HashedRollout:
+    """Running trajectory: hashes of every environment's states, observations, rewards and dones."""
 
     def __init__(self, env: VecEnv, seed: int = 0, steps: int = STEPS) -> None:
         self.env = env
@@ -78,16 +78,16 @@ class Life:
                 digest.update(row[index].tobytes())
 
 
-def live(env: VecEnv, seed: int = 0, steps: int = STEPS) -> list[str]:
-    """One hash an environment, of its whole life."""
-    life = Life(env, seed, steps)
+def rollout_hashes(env: VecEnv, seed: int = 0, steps: int = STEPS) -> list[str]:
+    """Return one hash per environment of the whole trajectory."""
+    rollout = HashedRollout(env, seed, steps)
     for _ in range(steps):
-        life.step()
-    return life.hashes()
+        rollout.step()
+    return rollout.hashes()
 
 
 def against_plain_steps(env: VecEnv) -> list[int]:
-    """From now on every engine step is also made by `mj_step`, world by world; steps that differ are listed."""
+    """Repeat every engine step with `mj_step` in each environment. Return the list of steps that differ."""
     differing: list[int] = []
     models: dict[int, mujoco.MjModel] = {}
     batch, data, whole = env.engine._batch, mujoco.MjData(env.engine.model), env.engine.step
@@ -118,7 +118,7 @@ def against_plain_steps(env: VecEnv) -> list[int]:
 
 
 def other_work() -> dict[str, Callable[[], object]]:
-    """What else a process may have done with torch, by name."""
+    """Return other uses of torch in the same process, by name."""
     return {
         "draws": lambda: (torch.rand(1000), np.random.rand(10), random.random()),
         "seeds": lambda: (torch.manual_seed(7), np.random.seed(7), random.seed(7)),

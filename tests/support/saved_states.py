@@ -1,4 +1,4 @@
-"""A small state to save, and what an attacker does to what was saved."""
+"""A small saved state, and manipulations of it."""
 
 import hashlib
 import json
@@ -21,7 +21,7 @@ def state_of(seed=0):
 
 
 def rehash(folder: Path, *names: str) -> None:
-    """Make the manifest agree with changed files, as an attacker would."""
+    """Update the manifest to match changed files, as an attacker would."""
     manifest = json.loads((folder / "manifest.json").read_text())
     for name in names:
         data = (folder / name).read_bytes()

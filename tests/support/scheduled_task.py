@@ -1,4 +1,4 @@
-"""A task whose episodes end on schedule: files of its folder."""
+"""Files of a task whose episodes end at fixed steps."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ agents:
   ppo: {trainer: sb3, algorithm: ppo, max_iterations: 2, n_steps: 8, num_minibatches: 2}
 """
 TASK = '''
-"""Env 0 ends by itself at step 2, env 1 by time at step 3, env 2 both at step 3, env 3 by itself at step 1."""
+"""Env 0 terminates at step 2, env 1 is truncated at step 3, env 2 both at step 3, env 3 terminates at step 1."""
 import torch
 from rlcli.envs.direct import DirectTask
 
@@ -43,7 +43,7 @@ class Task(DirectTask):
 
 @pytest.fixture
 def scheduled(tmp_path: Path) -> str:
-    """A task folder whose episodes end on schedule."""
+    """Write a task folder whose episodes end at fixed steps."""
     folder = tmp_path / "scheduled"
     folder.mkdir()
     for name, text in (("task.yaml", YAML), ("task.py", TASK), ("model.xml", MODEL)):
@@ -53,7 +53,7 @@ def scheduled(tmp_path: Path) -> str:
 
 @pytest.fixture
 def make():
-    """Task and overrides -> (environment, agent configuration)."""
+    """Return make(task, *overrides) -> (environment, agent configuration)."""
 
     def build(task: str, *overrides: str, seed: int = 3):
         resolved = resolve(find_task(task), overrides=overrides)

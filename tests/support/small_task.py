@@ -1,4 +1,4 @@
-"""The smallest task with every part that the tests change."""
+"""The smallest task with all parts that the tests change."""
 
 TASK = """\
 summary: a small task

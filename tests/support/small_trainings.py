@@ -1,4 +1,4 @@
-"""Small trainings with everything that has a memory, in process: `train` begins, goes on, and stops when told."""
+"""Small in-process trainings with every kind of state: `train` starts, resumes, and stops on request."""
 
 import random
 import signal
@@ -51,11 +51,11 @@ class Case:
     agent: str
     normalize: bool
     more: str = ""
-    """Further settings of the agent."""
+    """More settings of the agent."""
 
 
 def everything() -> str:
-    """The critter with noise, bias, history, delay, a command, a curriculum, fields of its own, and motors."""
+    """Return the critter's YAML with noise, bias, history, delay, command, curriculum, model fields and motors."""
     task = yaml.safe_load(CRITTER_TASK)
     robot = {k: v for k, v in task["scene"]["entities"]["robot"].items() if k != "joints"}
     uniform = {"kind": "uniform", "low": -0.05, "high": 0.05}
@@ -121,7 +121,7 @@ def train(
     eval_interval: int | None = None,
     autopsy: AutopsyConfig | None = None,
 ) -> Run:
-    """Train as `rlcli train` does, or go on.
+    """Train as `rlcli train` does, or resume.
 
     Args:
         run: its folder.
@@ -144,7 +144,7 @@ def train(
     if threads != 1:
         sim = resolved.task.sim.model_copy(update={"engine_threads": threads})
         resolved = replace(resolved, task=resolved.task.model_copy(update={"sim": sim}))
-    # a resumed trainer is made of other seeds: what it goes on from is in the checkpoint
+    # a resumed trainer is created with other seeds: its state must come from the checkpoint
     seed = 5 if new else random.Random(str(run)).randrange(1000, 2000)
     torch.manual_seed(seed)
     env = make_env(resolved, seed=derive(seed, "environments"))
@@ -192,7 +192,7 @@ def train(
 
 
 class _Stopper(StepObserver):
-    """Asks for a stop in one step of one iteration."""
+    """Requests a stop in one step of one iteration."""
 
     def __init__(self, stop: StopRequest, trainer: Any, within: tuple[int, int] | None) -> None:
         self.stop, self.trainer, self.within = stop, trainer, within

@@ -1,4 +1,4 @@
-"""One thread of torch for every test of a folder."""
+"""Fixture that sets one torch thread for every test of a folder."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""`rlcli play` as a process of its own, and what it says while it runs."""
+"""`rlcli play` as a separate process, with its output."""
 
 import os
 import re
@@ -14,7 +14,7 @@ PATIENCE = 120.0
 
 
 class Playing:
-    """A running `rlcli play ... --viewer web`; gone at the end of the block."""
+    """A running `rlcli play ... --viewer web`, stopped at the end of the block."""
 
     def __init__(self, *arguments, **variables):
         self._folder = tempfile.TemporaryDirectory()
@@ -43,15 +43,15 @@ class Playing:
 
     @property
     def err(self):
-        """What it has said on stderr until now."""
+        """Return the output on stderr so far."""
         return self._files[1].read_text() if self._files[1].exists() else self.err_at_end
 
     def interrupt(self):
-        """Ctrl-C; its exit code."""
+        """Send Ctrl-C; return the exit code."""
         self.process.send_signal(signal.SIGINT)
         return self.process.wait(timeout=PATIENCE)
 
     def answers(self):
-        """Whether something listens at its port."""
+        """Return whether its port accepts connections."""
         with socket.socket() as probe:
             return probe.connect_ex(("127.0.0.1", self.port)) == 0

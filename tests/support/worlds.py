@@ -1,4 +1,4 @@
-"""Small real models and tasks for the tests, and how to build environments of them."""
+"""Small real models and tasks for the tests, and functions that build environments of them."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ terminations: {time_out: {func: time_out, time_out: true}}
 
 
 def write(folder: Path, task: str, **files: str) -> Path:
-    """A task folder; `model_xml="..."` becomes model.xml, `terms_py` terms.py."""
+    """Write a task folder; `model_xml="..."` becomes model.xml, `terms_py` becomes terms.py."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "task.yaml").write_text(task)
     for name, text in files.items():
@@ -158,7 +158,7 @@ def pendulum(folder: Path, task: str = PENDULUM_TASK, **files: str) -> Path:
 
 
 def edited(task: str, **changes: object) -> str:
-    """A YAML document with top-level keys replaced (dictionaries are merged one level deep)."""
+    """Return a YAML document with replaced top-level keys; dictionaries are merged one level deep."""
     data = yaml.safe_load(task)
     for key, value in changes.items():
         data[key] = {**data[key], **value} if isinstance(value, dict) and isinstance(data.get(key), dict) else value
@@ -166,7 +166,7 @@ def edited(task: str, **changes: object) -> str:
 
 
 def dump(data: object) -> str:
-    """YAML without anchors."""
+    """Return YAML without anchors."""
     dumper = type("Dumper", (yaml.SafeDumper,), {"ignore_aliases": lambda *_: True})
     return yaml.dump(data, Dumper=dumper, sort_keys=False)
 
@@ -177,7 +177,7 @@ def build(task: Path | str, num_envs: int | None = None, *overrides: str, seed: 
 
 
 def actions(steps: int, num_envs: int, size: int, seed: int = 0) -> list[Tensor]:
-    """The same actions for environment i whatever the number of environments."""
+    """Return actions; those of environment i do not depend on the number of environments."""
     rows = [
         torch.rand(steps, size, generator=torch.Generator().manual_seed(1000 * seed + env)) * 2 - 1
         for env in range(num_envs)
@@ -202,8 +202,8 @@ def run(env: VecEnv, steps: int, seed: int = 0, reset: bool = True) -> list[Step
     return [clone(env.step(a)) for a in actions(steps, env.num_envs, env.layout.action_size, seed)]
 
 
-def life(results: list[StepResult], env: int) -> list[Tensor]:
-    """Everything one environment saw, for comparing bit by bit."""
+def results_of_env(results: list[StepResult], env: int) -> list[Tensor]:
+    """Return all results of one environment, for a comparison bit by bit."""
     return [
         torch.cat([*(v[env] for v in r.obs.values()), r.reward[env : env + 1], r.terminated[env : env + 1].float(),
                    r.truncated[env : env + 1].float()])

@@ -1,4 +1,4 @@
-"""Runs written by hand, as training leaves them, in no time."""
+"""Run folders written by hand, as training leaves them, without training."""
 
 import functools
 import json
@@ -10,7 +10,7 @@ from rlcli.runs.run import create_run
 
 
 def write_run(runs, task="cartpole", *, seed=1, overrides=(), rows=(), agent=None, config=None, **record):
-    """A run of a task, finished, without checkpoints; `rows` are (iteration, step, metrics)."""
+    """Write a finished run without checkpoints; `rows` are (iteration, step, metrics)."""
     source, resolved, text = _resolved(str(task), agent, tuple(overrides))
     entries = {
         "seed": seed,
@@ -43,7 +43,7 @@ def write_metrics(run, rows):
 
 
 def learning(count=10, steps=100, scale=1.0, **more):
-    """Rows of a return that rises by `scale` an iteration, with success, length, two reward terms and two ends."""
+    """Return metrics whose return rises by `scale` per iteration, with success, length, two rewards and two causes."""
     return [
         (
             i,

@@ -1,4 +1,4 @@
-"""The collection of built-in tasks: every one has a page, a bar and what its page says; results are judged rightly."""
+"""The built-in tasks: each has a page, a bar, and results that fit both."""
 
 import json
 import os
@@ -34,7 +34,7 @@ MEGABYTE = 1_000_000
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_built_in_task_has_a_page_a_bar_a_summary_and_a_success(task):
+def test_task_has_page_bar_summary_and_success(task):
     page = zoo.ZOO / f"{task}.md"
     assert page.is_file()
     entry, resolved = ENTRIES[task], resolve(find_task(task))
@@ -49,12 +49,12 @@ def test_a_built_in_task_has_a_page_a_bar_a_summary_and_a_success(task):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_the_linter_has_nothing_to_remark_on_a_built_in_task(task):
+def test_lint_passes(task):
     assert lint_task(task) == []
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_success_asks_nothing_of_the_host_when_it_is_first_judged_in_a_step(task):
+def test_success_runs_without_host_sync(task):
     env = make_env(resolve(find_task(task), flags={"scene.num_envs": 2}))
     env.reset()
     with HostSyncGuard():
@@ -63,23 +63,23 @@ def test_success_asks_nothing_of_the_host_when_it_is_first_judged_in_a_step(task
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
-def test_a_built_in_task_keeps_the_contract(task):
+def test_contract(task):
     assert check_task(task) == []
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_the_generated_parts_of_a_page_are_up_to_date(task):
+def test_generated_parts_of_page_are_current(task):
     text = (zoo.ZOO / f"{task}.md").read_text(encoding="utf-8")
     assert text == zoo_pages.filled(text, zoo.ZOO, ENTRIES[task]), "python benchmarks/zoo.py pages"
 
 
-def test_the_index_has_a_row_of_every_task():
+def test_index_lists_every_task():
     text = (zoo.ZOO / "index.md").read_text(encoding="utf-8")
     assert [task for task in TASKS if f"({task}.md)" not in text] == [], "python benchmarks/zoo.py pages"
 
 
 @pytest.mark.parametrize("task", TRAINED)
-def test_results_are_of_the_policy_that_is_shipped_and_reach_the_bar(task):
+def test_results_belong_to_shipped_policy_and_reach_bar(task):
     rows = json.loads((zoo.ZOO / "results" / f"{task}.json").read_text(encoding="utf-8"))
     bundle = open_bundle(find_task(task).policy)
     (own,) = [row for row in rows if row["seed"] == bundle.manifest["seed"] and row["agent"] == bundle.agent]
@@ -90,7 +90,7 @@ def test_results_are_of_the_policy_that_is_shipped_and_reach_the_bar(task):
 
 
 @pytest.mark.parametrize("task", [task for task in TASKS if find_task(task).policy is not None])
-def test_a_shipped_policy_is_small_and_fits_its_task(task):
+def test_shipped_policy_is_small_and_fits_task(task):
     folder = find_task(task).policy
     assert sum(file.stat().st_size for file in folder.iterdir()) <= 2.5 * MEGABYTE
     checkpoint, bundle = open_checkpoint(folder), open_bundle(folder)
@@ -104,7 +104,7 @@ def test_a_shipped_policy_is_small_and_fits_its_task(task):
 
 
 @pytest.mark.parametrize("task", TRAINED)
-def test_curves_and_pictures_are_small_and_well_formed(task):
+def test_curves_and_pictures_are_small_and_valid(task):
     svg = zoo.ZOO / "curves" / f"{task}.svg"
     assert svg.stat().st_size < 60_000
     root = ElementTree.parse(svg).getroot()
@@ -132,7 +132,7 @@ def evaluation(success=0.9, **values):
 
 
 @pytest.mark.parametrize(
-    ("bar", "found", "said"),
+    ("bar", "found", "message"),
     [
         ({"success": 0.9}, evaluation(0.9), []),
         ({"success": 0.95}, evaluation(0.9), ["success is 0.9, below 0.95"]),
@@ -144,16 +144,16 @@ def evaluation(success=0.9, **values):
         ({"success": 0.95, "length": 20}, evaluation(), ["success is 0.9, below 0.95", "length is 10, below 20"]),
     ],
 )
-def test_a_bar_is_missed_where_a_number_is_on_its_wrong_side(bar, found, said):
-    assert zoo.Entry("x", "A", "cpu", 1, bar).missed(found) == said
+def test_bar_is_missed_by_value_on_wrong_side(bar, found, message):
+    assert zoo.Entry("x", "A", "cpu", 1, bar).missed(found) == message
 
 
-def test_a_command_is_told_without_where_it_wrote_to():
+def test_recorded_command_omits_output_folder():
     words = ["__main__.py", "train", "ant", "--seed", "3", "--runs-dir", "/home/x", "--name=y", "agent.gamma=1", "-q"]
     assert zoo._command(words) == "rlcli train ant --seed 3 agent.gamma=1"
 
 
-def test_a_page_without_results_says_so(tmp_path):
+def test_page_without_results(tmp_path):
     text = "# X\n\n<!-- results -->\n<!-- end results -->\n\n<!-- curves -->\nold\n<!-- end curves -->\n"
     filled = zoo_pages.filled(text, tmp_path, ENTRIES["cartpole"])
     assert "Not trained yet." in zoo_pages.block(filled, "results")
@@ -161,20 +161,20 @@ def test_a_page_without_results_says_so(tmp_path):
     assert zoo_pages.filled(filled, tmp_path, ENTRIES["cartpole"]) == filled
 
 
-def test_the_thick_line_is_the_median_of_the_seeds():
-    class Told:
+def test_thick_line_is_median_of_seeds():
+    class RunCurves:
         def __init__(self, seed, level):
             self.run = type("Run", (), {"record": {"seed": seed}})
             self.axes = {"steps": np.arange(1.0, 301.0) * 1000, "time": np.arange(1.0, 301.0)}
             self.metrics = {zoo_curves.RETURN: np.full(300, level), zoo_curves.SUCCESS: np.linspace(0.0, level, 300)}
 
-    told = [Told(1, 0.1), Told(2, 0.9), Told(3, 0.5)]
-    lines = [row.split(",") for row in zoo_curves.table(told).splitlines()]
+    runs = [RunCurves(1, 0.1), RunCurves(2, 0.9), RunCurves(3, 0.5)]
+    lines = [row.split(",") for row in zoo_curves.table(runs).splitlines()]
     assert lines[0] == ["seed", "steps", "seconds", "success", "return"]
     assert len(lines) == 1 + 3 * zoo_curves.ROWS
     assert [row[0] for row in lines[1 :: zoo_curves.ROWS]] == ["1", "2", "3"]
     assert lines[-1] == ["3", "300000", "300.0", "0.5", "0.5"]
-    root = ElementTree.fromstring(zoo_curves.drawing("x", told))
+    root = ElementTree.fromstring(zoo_curves.drawing("x", runs))
     thick = [line for line in root.iter("{http://www.w3.org/2000/svg}polyline") if line.get("stroke-width") == "2.2"]
     bottom, top = zoo_curves._HEIGHT - zoo_curves._BOTTOM, zoo_curves._TOP
     ends = float(thick[0].get("points").split()[-1].split(",")[1])
@@ -182,7 +182,7 @@ def test_the_thick_line_is_the_median_of_the_seeds():
 
 
 @pytest.mark.slow
-def test_learning_is_judged_and_logged_and_becomes_results_curves_and_a_policy(tmp_path):
+def test_learn_writes_results_curves_and_policy(tmp_path):
     copy = tmp_path / "repository"
     for part in ("benchmarks", "docs/reference/zoo", "tasks"):
         shutil.copytree(REPOSITORY / part, copy / part, ignore=shutil.ignore_patterns("__pycache__"))
@@ -210,19 +210,19 @@ def test_learning_is_judged_and_logged_and_becomes_results_curves_and_a_policy(t
     assert "mujoco" in logged["machine"]
     folder = next((tmp_path / "runs" / "cartpole").iterdir())
     held.write_text(text.replace(before, short + "bar: {success: 0.0}", 1))
-    said = subprocess.run(
+    message = subprocess.run(
         [sys.executable, "-m", "rlcli", "eval", "--checkpoint", str(folder), "--episodes", "16", "--num-envs", "16",
          "--json"], cwd=tmp_path, capture_output=True, text=True, timeout=280,
     )  # fmt: skip
-    shutil.rmtree(folder / "evaluations")  # as of another machine, where only the document was kept
-    (tmp_path / "runs" / "cartpole.eval.json").write_text(said.stdout)
+    shutil.rmtree(folder / "evaluations")  # as on another machine, where only the document was kept
+    (tmp_path / "runs" / "cartpole.eval.json").write_text(message.stdout)
     collected = run("collect", "--all", "runs", "--ship")
     assert collected.returncode == 0, collected.stderr
     assert "cartpole, seed 5: within its bar" in collected.stdout
     assert (copy / "docs" / "reference" / "zoo" / "pictures" / "cartpole.jpg").stat().st_size < 80_000
     (row,) = json.loads((copy / "docs" / "reference" / "zoo" / "results" / "cartpole.json").read_text())
     assert (row["seed"], row["agent"], row["evaluation"]["episodes"]) == (5, "sb3-ppo", 16)
-    assert row["evaluation"]["return"] == json.loads(said.stdout)["return"]
+    assert row["evaluation"]["return"] == json.loads(message.stdout)["return"]
     shipped = copy / "tasks" / "rlcli_tasks" / "cartpole" / "policies" / "cartpole"
     assert open_bundle(shipped).manifest["evaluation"]["return"] == row["evaluation"]["return"]
     page = (copy / "docs" / "reference" / "zoo" / "cartpole.md").read_text()

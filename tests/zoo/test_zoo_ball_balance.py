@@ -1,9 +1,10 @@
-"""The task `ball-balance`: its model, what it observes, what it pays, where it ends, how it starts."""
+"""The task `ball-balance`: model, observations, rewards, terminations, initial states."""
 
 import math
 
 import pytest
 import torch
+from support.direct_states import observe, reward_and_done
 from support.worlds import actions, build
 
 TASK = "ball-balance"
@@ -19,29 +20,15 @@ def env():
 
 
 def put_ball(env, row=0, position=(0.0, 0.0, 0.7), velocity=(0.0, 0.0, 0.0)):
-    """Put the ball of one environment somewhere; the table stays as it is."""
+    """Set the ball of one environment; the table stays unchanged."""
     root, dof = env.entities["ball"].floating()
     env.engine.field("qpos")[row, root : root + 3] = torch.tensor(position).double()
     env.engine.field("qvel")[row, dof : dof + 3] = torch.tensor(velocity).double()
     env.sim.refresh()
 
 
-def look(env, row=0):
-    """Column name -> value of the observation."""
-    env.task.get_observations()
-    return dict(zip(env.task.observation_names, env.task.obs_buf[row].tolist(), strict=True))
-
-
-def pay(env, row=0):
-    """Reward of the state as it is, and whether it ends the episode."""
-    env.task.get_observations()
-    env.task.calculate_metrics()
-    env.task.is_done()
-    return float(env.task.rew_buf[row]), bool(env.task.reset_buf[row])
-
-
 def hold(env, action, steps):
-    """Take an action for a while; the ball is far away."""
+    """Repeat an action for some steps while the ball is far away."""
     for _ in range(steps):
         for row in range(env.num_envs):
             put_ball(env, row, (0.0, 0.0, 3.0))
@@ -50,7 +37,7 @@ def hold(env, action, steps):
 
 
 def height(env, row=0):
-    """Of the tray's middle [m]."""
+    """Return the height of the tray's middle [m]."""
     return float(env.entities["robot"].data.root_pos_w[row, 2])
 
 
@@ -66,13 +53,13 @@ def test_masses_follow_from_sizes_and_densities():
     assert float(model.body("ball/ball").mass[0]) == pytest.approx(200 * 4 / 3 * math.pi * 0.1**3)
 
 
-def test_the_tray_lies_where_two_links_at_45_degrees_carry_it():
+def test_tray_height_follows_from_links():
     env = build(TASK, 1)
     env.reset()
     assert height(env) == pytest.approx(2 * 0.36 * math.sin(RIGHT_ANGLE) + 0.02 + 0.03, abs=1e-5)
 
 
-def test_feet_stay_in_their_places_while_the_table_moves(env):
+def test_feet_do_not_move_with_table(env):
     model, _ = env.world()
     feet = [model.body(f"robot/lower_leg{leg}").id for leg in (0, 1, 2)]
     for action in actions(60, 3, 3):
@@ -86,7 +73,7 @@ def test_feet_stay_in_their_places_while_the_table_moves(env):
 
 
 @pytest.mark.slow
-def test_random_actions_never_blow_the_simulation_up():
+def test_random_actions_keep_simulation_stable():
     env = build(TASK, 64, "params.fall_height=-100")
     env.reset()
     for action in actions(600, 64, 3):
@@ -97,7 +84,7 @@ def test_random_actions_never_blow_the_simulation_up():
     assert float(tray[:, 2].max()) < 0.9
 
 
-def test_a_ball_on_a_level_table_stays_in_the_middle_by_itself(env):
+def test_ball_on_level_table_stays(env):
     put_ball(env, 0, (0.0, 0.0, 0.67))
     for _ in range(100):
         env.step(torch.zeros(3, 3))
@@ -109,7 +96,7 @@ def test_a_ball_on_a_level_table_stays_in_the_middle_by_itself(env):
 # --- actions ---
 
 
-def test_stretching_all_knees_lifts_the_table_level_and_bending_them_lowers_it(env):
+def test_all_knees_lift_and_lower_table(env):
     begin = height(env)
     for sign in (1.0, -1.0):
         env.reset()
@@ -121,7 +108,7 @@ def test_stretching_all_knees_lifts_the_table_level_and_bending_them_lowers_it(e
         assert data.projected_gravity_b[0].tolist() == pytest.approx([0.0, 0.0, -1.0], abs=1e-3)
 
 
-def test_stretching_one_knee_tilts_the_table_away_from_it(env):
+def test_one_knee_tilts_table(env):
     hold(env, [0.25, 0.0, 0.0], 4)
     hold(env, [0.0] * 3, 40)
     down = env.entities["robot"].data.projected_gravity_b[0]
@@ -129,7 +116,7 @@ def test_stretching_one_knee_tilts_the_table_away_from_it(env):
     assert abs(float(down[1])) < 2e-3
 
 
-def test_an_action_moves_the_target_by_its_rate_and_never_past_the_limits(env):
+def test_action_moves_target_within_limits(env):
     env.step(torch.tensor([[1.0, -0.5, 0.0]] * 3))
     assert env.task.targets[0, 1::2].tolist() == pytest.approx([0.2, -0.1, 0.0])
     assert not env.task.targets[:, ::2].any(), "hips have no motor"
@@ -138,7 +125,7 @@ def test_an_action_moves_the_target_by_its_rate_and_never_past_the_limits(env):
     assert env.task.targets[0, 1::2].tolist() == pytest.approx([math.radians(90), math.radians(-70), math.radians(90)])
 
 
-def test_targets_start_anew_with_an_episode(env):
+def test_targets_are_reset(env):
     env.step(torch.full((3, 3), 1.0))
     env.episode_length_buf[1] = env.max_episode_length - 1
     env.step(torch.full((3, 3), 1.0))
@@ -149,10 +136,10 @@ def test_targets_start_anew_with_an_episode(env):
 # --- observations ---
 
 
-def test_knees_and_ball_are_those_of_the_state(env):
+def test_observation_of_knees_and_ball(env):
     hold(env, [0.5, -0.5, 0.25], 3)
     put_ball(env, 0, (0.1, -0.2, 0.9), (1.0, -2.0, -4.0))
-    seen, data = look(env), env.entities["robot"].data
+    seen, data = observe(env), env.entities["robot"].data
     assert [seen[f"knee{leg}_pos"] for leg in (0, 1, 2)] == pytest.approx(data.joint_pos[0, 1::2].tolist())
     assert [seen[f"knee{leg}_vel"] for leg in (0, 1, 2)] == pytest.approx(data.joint_vel[0, 1::2].tolist())
     assert seen["knee0_vel"] > 0.1
@@ -165,10 +152,10 @@ def test_observations_are_clipped_to_five(env):
     assert float(env.step(torch.zeros(3, 3)).obs["policy"][0, 11]) == -5.0
 
 
-def test_force_columns_are_the_sensors_readings_leg_by_leg(env):
+def test_force_columns_are_sensor_values_per_leg(env):
     hold(env, [0.3, -0.1, 0.2], 5)
     readings = env.entities["robot"].data.sensordata[0].reshape(3, 6)
-    seen = look(env)
+    seen = observe(env)
     for leg in (0, 1, 2):
         assert seen[f"leg{leg}_force_x"] == pytest.approx(float(readings[leg, 0]) / 20, abs=1e-6)
         for axis in (0, 1, 2):
@@ -177,7 +164,7 @@ def test_force_columns_are_the_sensors_readings_leg_by_leg(env):
             )
 
 
-def test_the_legs_carry_tray_and_ball(env):
+def test_leg_forces_carry_tray_and_ball(env):
     """The forces on the tray at rest balance its weight; each sensor's frame is its upper leg's."""
     for _ in range(150):
         put_ball(env, 0, (0.0, 0.0, height(env) + 0.1095))
@@ -191,7 +178,7 @@ def test_the_legs_carry_tray_and_ball(env):
     assert abs(lifted) == pytest.approx(weight, rel=0.1)
 
 
-def test_a_new_episode_has_felt_nothing_yet(env):
+def test_new_episode_has_zero_sensors(env):
     for action in actions(5, 3, 3):
         result = env.step(action)
     assert result.obs["policy"][:, 12:].any(dim=1).all()
@@ -213,18 +200,18 @@ def test_a_new_episode_has_felt_nothing_yet(env):
         ((0.0, 0.3, 0.3), (2.0, 0.0, 0.0), 1 / 1.5 / 3),
     ],
 )
-def test_near_the_middle_and_slow_is_good(env, position, velocity, reward):
+def test_reward_of_ball_state(env, position, velocity, reward):
     put_ball(env, 0, position, velocity)
-    assert pay(env) == (pytest.approx(reward, abs=1e-5), False)
+    assert reward_and_done(env) == (pytest.approx(reward, abs=1e-5), False)
 
 
 @pytest.mark.parametrize(("height", "failed"), [(0.151, False), (0.149, True)])
-def test_a_ball_below_the_height_has_fallen(env, height, failed):
+def test_ball_below_height_terminates(env, height, failed):
     put_ball(env, 0, (0.7, 0.0, height))
-    assert pay(env)[1] is failed
+    assert reward_and_done(env)[1] is failed
 
 
-def test_a_fall_terminates_and_time_truncates(env):
+def test_fall_terminates_and_time_out_truncates(env):
     assert env.max_episode_length == 600
     put_ball(env, 1, (0.8, 0.0, 0.16), (0.0, 0.0, -3.0))
     env.episode_length_buf[2] = 599
@@ -236,7 +223,7 @@ def test_a_fall_terminates_and_time_truncates(env):
 # --- starts ---
 
 
-def test_balls_start_above_the_table_fall_and_move_inwards():
+def test_initial_balls_fall_inwards():
     env = build(TASK, 1000)
     env.reset()
     ball, table = env.entities["ball"].data, env.entities["robot"].data
@@ -263,7 +250,7 @@ def test_balls_start_above_the_table_fall_and_move_inwards():
 
 
 @pytest.mark.parametrize(("place", "succeeds"), [(0.05, True), (0.2, False)])
-def test_success_is_a_ball_that_stays_in_the_middle(place, succeeds):
+def test_success_is_ball_in_middle(place, succeeds):
     env = build(TASK, 1, "episode_length_s=0.6", "success.hold_s=0.3")
     env.reset()
     while True:

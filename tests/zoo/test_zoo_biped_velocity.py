@@ -1,4 +1,4 @@
-"""The task `biped-velocity`: servos, commands, what is observed and paid, ends, success."""
+"""The task `biped-velocity`: servos, commands, observations, rewards, terminations, success."""
 
 import math
 
@@ -28,7 +28,7 @@ def biped(num_envs=2, *overrides):
 
 def put(env, row, *, height=1.26, quat=(1.0, 0.0, 0.0, 0.0), linear=(0, 0, 0), angular=(0, 0, 0), joints=POSE,
         rates=0.0):  # fmt: skip
-    """Put one environment into a state; linear in the world's frame, angular in the torso's."""
+    """Set the state of one environment; linear velocity in the world frame, angular in the torso's frame."""
     qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")
     qpos[row] = torch.cat([torch.tensor([0.0, 0.0, height, *quat], dtype=torch.float64), joints])
     qvel[row, :6] = torch.tensor([*linear, *angular], dtype=torch.float64)
@@ -37,12 +37,12 @@ def put(env, row, *, height=1.26, quat=(1.0, 0.0, 0.0, 0.0), linear=(0, 0, 0), a
     env.sim.forward_moved()
 
 
-def ask(env, *command):
+def set_command(env, *command):
     env.command_manager.get_command("walk")[:] = torch.tensor(command)
 
 
-def paid(env, row=0):
-    """Reward terms of the state as it is, weights and the step's 0.02 s taken out."""
+def reward_terms(env, row=0):
+    """Return the reward terms of the current state, without weights and step time."""
     env.reward_manager.compute()
     return {
         term.name: float(value) / 0.02 / term.config.weight
@@ -50,7 +50,7 @@ def paid(env, row=0):
     }
 
 
-def test_each_joint_is_a_servo_as_strong_as_the_humanoids_motor_and_has_no_spring():
+def test_joints_are_servos_with_humanoid_torque():
     env = biped(1)
     model = env.engine.model
     position = [model.actuator(i) for i in range(model.nu) if model.actuator_biastype[i] == 1]
@@ -63,7 +63,7 @@ def test_each_joint_is_a_servo_as_strong_as_the_humanoids_motor_and_has_no_sprin
     torch.testing.assert_close(targets, POSE + 0.5 * action[0].double(), rtol=0, atol=1e-6)
 
 
-def test_it_starts_with_level_soles_just_above_the_ground():
+def test_initial_pose_has_level_soles_above_ground():
     env = biped(8)
     model, data = env.world(0)
     assert data.ncon == 0
@@ -82,7 +82,7 @@ def test_it_starts_with_level_soles_just_above_the_ground():
     assert env.sensors["feet"].force[..., 2].sum(dim=1).tolist() == pytest.approx([weight] * 8, rel=0.15)
 
 
-def test_commands_fill_their_ranges():
+def test_commands_fill_ranges():
     env = build("biped-velocity", 2000, "commands.walk.rel_heading=0.0")
     env.reset()
     asked = env.command_manager.get_command("walk")
@@ -95,11 +95,11 @@ def test_commands_fill_their_ranges():
     assert (moving.amax(dim=0) > high - 0.02).all()
 
 
-def test_the_observation_of_a_state():
+def test_observation_of_state():
     env = biped()
     quat = (math.cos(0.2), math.sin(0.2), 0.0, 0.0)  # rolled by 0.4 rad
     put(env, 1, quat=quat, linear=(0.5, 0.0, 0.2), angular=(0.1, 0.2, 0.3), joints=POSE + 0.05, rates=0.5)
-    ask(env, 0.4, -0.3, 0.2)
+    set_command(env, 0.4, -0.3, 0.2)
     seen = env._compute_observations()["policy"][1].tolist()
     assert seen[:3] == pytest.approx([0.5, 0.2 * math.sin(0.4), 0.2 * math.cos(0.4)], abs=1e-5)
     assert seen[3:6] == pytest.approx([0.1, 0.2, 0.3], abs=1e-5)
@@ -110,32 +110,32 @@ def test_the_observation_of_a_state():
     assert seen[54:] == [0.0] * 21
 
 
-def test_tracking_pays_by_the_error_in_the_heading_frame():
+def test_tracking_reward_uses_heading_frame():
     env = biped()
     put(env, 0, linear=(0.6, 0.1, 0.3), angular=(0.0, 0.0, 0.4))
-    ask(env, 0.8, 0.0, 0.1)
-    terms = paid(env)
+    set_command(env, 0.8, 0.0, 0.1)
+    terms = reward_terms(env)
     assert terms["track_lin_vel"] == pytest.approx(math.exp(-(0.2**2 + 0.1**2) / 0.25), abs=1e-5)
     assert terms["track_ang_vel"] == pytest.approx(math.exp(-(0.3**2) / 0.25), abs=1e-5)
     assert terms["tilt"] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_posture_costs_where_joints_leave_the_rest_pose():
+def test_posture_cost_of_joint_deviation():
     env = biped()
     joints = POSE.clone()
     for name, off in {"hip_yaw_l": 0.2, "hip_pitch_l": 0.3, "shoulder_1_r": -0.4, "waist_roll": 0.1}.items():
         joints[JOINTS.index(name)] += off
     put(env, 0, joints=joints)
-    terms = paid(env)
+    terms = reward_terms(env)
     assert [terms[n] for n in ("hips", "arms", "waist")] == pytest.approx([0.2, 0.4, 0.1], abs=1e-5)
     limit = math.radians(50) * 0.9
     joints[JOINTS.index("ankle_roll_r")] = limit + 0.05
     put(env, 0, joints=joints)
-    assert paid(env)["ankle_limits"] == pytest.approx(0.05, abs=1e-4)
+    assert reward_terms(env)["ankle_limits"] == pytest.approx(0.05, abs=1e-4)
 
 
 @pytest.mark.parametrize(("height", "roll", "cause"), [(0.79, 0.0, "low"), (1.5, 1.01, "tilted"), (0.9, 0.9, None)])
-def test_low_or_tilted_bipeds_have_fallen(height, roll, cause):
+def test_low_or_tilted_torso_terminates(height, roll, cause):
     env = biped(2)
     put(env, 0, height=height, quat=(math.cos(roll / 2), math.sin(roll / 2), 0.0, 0.0))
     env.termination_manager.compute(None)
@@ -143,7 +143,7 @@ def test_low_or_tilted_bipeds_have_fallen(height, roll, cause):
 
 
 @pytest.mark.parametrize(("speed", "succeeds"), [(0.5, True), (0.75, True), (0.85, False)])
-def test_an_episode_that_ends_at_the_asked_velocity_is_a_success(speed, succeeds):
+def test_success_requires_commanded_velocity(speed, succeeds):
     env = biped(2, "episode_length_s=0.4", "success.hold_s=0.2", "commands.walk.lin_vel_x=[0.5,0.5]",
                 "commands.walk.lin_vel_y=[0.0,0.0]", "commands.walk.ang_vel_z=[0.0,0.0]", "events.base.yaw=[0.0,0.0]",
                 "sim.gravity=[0.0,0.0,0.0]")  # fmt: skip

@@ -1,10 +1,11 @@
-"""The task `cart-double-pendulum`: its model, what it observes, what it pays, where it ends, how it starts."""
+"""The task `cart-double-pendulum`: model, observations, rewards, terminations, initial states."""
 
 import math
 
 import mujoco
 import pytest
 import torch
+from support.direct_states import observe, reward_and_done
 from support.worlds import actions, build
 
 from rlcli.mdp import observations
@@ -20,27 +21,13 @@ def env():
 
 
 def put(env, row=0, positions=(0.0, 0.0, 0.0), velocities=(0.0, 0.0, 0.0)):
-    """Put one environment into a state: cart, pole, pendulum."""
+    """Set the state of one environment: cart, pole, pendulum."""
     env.engine.field("qpos")[row] = torch.tensor(positions).double()
     env.engine.field("qvel")[row] = torch.tensor(velocities).double()
     env.sim.refresh()
 
 
-def look(env, row=0):
-    """Column name -> value of the observation."""
-    env.task.get_observations()
-    return dict(zip(env.task.observation_names, env.task.obs_buf[row].tolist(), strict=True))
-
-
-def pay(env, row=0):
-    """Reward of the state as it is, and whether it ends the episode."""
-    env.task.get_observations()
-    env.task.calculate_metrics()
-    env.task.is_done()
-    return float(env.task.rew_buf[row]), bool(env.task.reset_buf[row])
-
-
-def test_cart_pole_and_pendulum_weigh_a_kilogram_each_and_stand_on_one_another():
+def test_masses_and_geometry():
     model, data = build(TASK, 1).world()
     assert [float(model.body(f"robot/{name}").mass[0]) for name in ("cart", "pole", "pendulum")] == [1.0, 1.0, 1.0]
     data.qpos[:] = 0.0
@@ -50,7 +37,7 @@ def test_cart_pole_and_pendulum_weigh_a_kilogram_each_and_stand_on_one_another()
     assert data.ncon == 0
 
 
-def test_the_first_action_pushes_the_cart_and_the_second_turns_the_pendulum_against_the_pole(env):
+def test_actions_push_cart_and_turn_pendulum(env):
     for force, torque in ((1.0, 0.0), (0.0, 1.0), (-0.5, 0.25)):
         env.step(torch.tensor([[force, torque]]).repeat(3, 1))
         efforts = env.entities["robot"].data.applied_effort[0].tolist()
@@ -62,36 +49,36 @@ def test_actions_are_clipped_to_one(env):
     assert env.entities["robot"].data.applied_effort[0].tolist() == pytest.approx([100.0, 0.0, 50.0])
 
 
-def test_the_observation_is_what_the_cart_and_the_pendulum_see(env):
+def test_observation_of_cart_and_pendulum(env):
     put(env, positions=(0.5, 0.3, -0.4), velocities=(1.0, -2.0, 3.0))
-    assert look(env) == pytest.approx(
+    assert observe(env) == pytest.approx(
         {"cart_pos": 0.5, "cart_vel": 1.0, "pole_pos": 0.3, "pole_vel": -2.0}
         | {"pendulum_tilt": -0.1, "pendulum_pos": -0.4, "pendulum_vel": 3.0}
     )
 
 
 @pytest.mark.parametrize("turns", [-2, 1, 3])
-def test_a_pendulum_that_has_turned_round_looks_and_pays_as_one_that_has_not(env, turns):
+def test_full_turns_do_not_change_obs_and_reward(env, turns):
     put(env, 0, (0.0, 0.2, 0.5))
     put(env, 1, (0.0, 0.2, 0.5 + 2 * math.pi * turns))
-    assert look(env, 0) == pytest.approx(look(env, 1), abs=1e-5)
-    assert pay(env, 0)[0] == pytest.approx(pay(env, 1)[0], abs=1e-5)
+    assert observe(env, 0) == pytest.approx(observe(env, 1), abs=1e-5)
+    assert reward_and_done(env, 0)[0] == pytest.approx(reward_and_done(env, 1)[0], abs=1e-5)
 
 
-def test_a_tilt_of_more_than_half_a_turn_is_the_rest_of_the_turn(env):
+def test_tilt_wraps_at_half_turn(env):
     put(env, positions=(0.0, 1.0, 3.0))
-    assert look(env)["pendulum_tilt"] == pytest.approx(4.0 - 2 * math.pi)
-    assert pay(env)[0] == pytest.approx(2.0 - 1.0 - (4.0 - 2 * math.pi) ** 2, abs=1e-4)
+    assert observe(env)["pendulum_tilt"] == pytest.approx(4.0 - 2 * math.pi)
+    assert reward_and_done(env)[0] == pytest.approx(2.0 - 1.0 - (4.0 - 2 * math.pi) ** 2, abs=1e-4)
 
 
-def test_upright_and_still_pays_two(env):
+def test_upright_and_still_is_rewarded_with_two(env):
     put(env, positions=(2.0, 0.0, 0.0))
-    assert pay(env) == (2.0, False)
+    assert reward_and_done(env) == (2.0, False)
 
 
-def test_tilts_of_both_links_and_speeds_of_all_joints_cost(env):
+def test_tilt_and_speed_costs(env):
     put(env, positions=(0.0, 0.3, -0.5), velocities=(2.0, -3.0, 4.0))
-    assert pay(env)[0] == pytest.approx(2.0 - 0.09 - 0.04 - 0.01 * 9.0, abs=1e-6)
+    assert reward_and_done(env)[0] == pytest.approx(2.0 - 0.09 - 0.04 - 0.01 * 9.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -104,20 +91,20 @@ def test_tilts_of_both_links_and_speeds_of_all_joints_cost(env):
         ((0, -1.58, 0), True),
     ],
 )
-def test_it_fails_where_the_cart_leaves_the_rail_or_the_pole_lies(env, positions, failed):
+def test_terminates_off_rail_or_pole_down(env, positions, failed):
     put(env, positions=positions)
-    reward, ended = pay(env)
+    reward, ended = reward_and_done(env)
     assert ended is failed
     tilts = positions[1] ** 2 + (positions[1] + positions[2]) ** 2
     assert reward == pytest.approx((-4.0 if failed else 2.0) - tilts, abs=1e-5)
 
 
-def test_a_hanging_pendulum_alone_is_no_failure(env):
+def test_hanging_pendulum_does_not_terminate(env):
     put(env, positions=(0.0, 0.0, math.pi))
-    assert pay(env)[1] is False
+    assert reward_and_done(env)[1] is False
 
 
-def test_starts_fill_a_quarter_turn_either_way_and_are_at_rest_in_the_middle():
+def test_initial_states_fill_ranges():
     env = build(TASK, 500)
     env.reset()
     qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")
@@ -130,7 +117,7 @@ def test_starts_fill_a_quarter_turn_either_way_and_are_at_rest_in_the_middle():
     assert float(torch.corrcoef(qpos[:, 1:].T)[0, 1].abs()) < 0.2
 
 
-def test_time_truncates_after_five_seconds(env):
+def test_time_out_after_five_seconds(env):
     assert env.max_episode_length == 300
     env.episode_length_buf[1] = 299
     put(env, 1)
@@ -140,7 +127,7 @@ def test_time_truncates_after_five_seconds(env):
 
 
 @pytest.mark.parametrize(("pendulum", "succeeds"), [(0.05, True), (0.2, False)])
-def test_success_is_both_links_upright_to_the_end(pendulum, succeeds):
+def test_success_requires_upright_links(pendulum, succeeds):
     env = build(TASK, 1, "episode_length_s=1.0", "success.hold_s=0.5")
     env.reset()
     while True:
@@ -151,7 +138,7 @@ def test_success_is_both_links_upright_to_the_end(pendulum, succeeds):
     assert result.episodes.success.tolist() == [succeeds]
 
 
-def test_its_terms_compute_what_its_hooks_observe():
+def test_terms_equal_hooks():
     env = build(TASK, 4)
     env.reset()
     terms = env.task.in_terms()
@@ -163,7 +150,7 @@ def test_its_terms_compute_what_its_hooks_observe():
 
 
 def term_value(env, func, joints):
-    """An observation term of rlcli.mdp on joints by name."""
+    """Return the value of an observation term of rlcli.mdp for some joints."""
     robot = env.entities["robot"]
     columns, _ = robot.select("Joints", joints)
     return getattr(observations, func)(env, entity=robot, joints=columns)

@@ -1,4 +1,4 @@
-"""The task `cartpole-camera`: what its pictures show, and that all else is `cartpole`'s."""
+"""The task `cartpole-camera`: its images; everything else equals `cartpole`."""
 
 import math
 
@@ -26,7 +26,7 @@ def env():
 
 
 def show(env, cart, pole):
-    """The pictures of carts and poles put there. (num_envs, 32, 96) [m]"""
+    """Return the images of carts and poles at given positions. (num_envs, 32, 96) [m]"""
     env.engine.field("qpos")[:] = torch.tensor([cart, pole]).double().T
     env.sensors["camera"].update(env.step_dt)
     return env.sensors["camera"].image[..., 0]
@@ -37,7 +37,7 @@ def middle(weights):
     return (weights.sum(dim=0) * torch.arange(WIDE)).sum() / weights.sum()
 
 
-def test_the_cart_is_seen_where_it_stands(env):
+def test_cart_is_visible_at_its_position(env):
     """The camera looks along x, so that y points to the left."""
     carts = [-2.5, 0.0, 2.9]
     pictures = show(env, carts, [math.pi] * 3)  # poles hang
@@ -46,7 +46,7 @@ def test_the_cart_is_seen_where_it_stands(env):
         assert float(middle(cart)) == pytest.approx(47.5 - y / PIXEL, abs=1.0)
 
 
-def test_all_that_may_happen_is_in_the_picture(env):
+def test_whole_range_is_in_image(env):
     """Carts to 10 cm before where the episode ends, and poles all around: the tip is 0.97 m from the pivot."""
     for pole in (0.0, math.pi):
         left, _, right = show(env, [2.9, 0.0, -2.9], [pole] * 3)
@@ -57,7 +57,7 @@ def test_all_that_may_happen_is_in_the_picture(env):
         assert float(middle(right[row : row + 1])) == pytest.approx(47.5 + 2.9 / PIXEL, abs=1.0)
 
 
-def test_a_lean_of_a_hundredth_of_a_radian_shows_and_its_side_too(env):
+def test_small_lean_and_its_side_are_visible(env):
     """A fifth of the tolerance of success, a sixth of a pixel at the tip."""
     pictures = show(env, [0.4, 0.4, 0.4], [-0.02, 0.0, 0.02])
     tops = [float(middle(picture[1:8])) for picture in pictures]
@@ -67,22 +67,22 @@ def test_a_lean_of_a_hundredth_of_a_radian_shows_and_its_side_too(env):
     assert abs(low[0] - low[2]) * PIXEL == pytest.approx(2 * math.sin(0.3) * 0.75, abs=0.1)
 
 
-def test_the_policy_sees_three_pictures_alone_and_the_critic_the_state(env):
+def test_actor_observes_three_images_and_critic_state(env):
     (image,) = env.layout.observations["policy"]
     assert (image.shape, image.history, image.size) == ((1, HIGH, WIDE), 3, 3 * HIGH * WIDE)
     obs = env.reset(seed=2)
     assert obs["critic"].shape == (3, 4)
     frames = obs["policy"].unflatten(1, (3, HIGH, WIDE))
-    assert torch.equal(frames[:, 0], frames[:, 2])  # an episode's first picture stands for those before it
+    assert torch.equal(frames[:, 0], frames[:, 2])  # the first image fills the history
     assert 1.95 < float(frames.max()) < 2.16  # 7 m are 2.1
-    assert float((frames == 0.0).float().mean()) > 0.8  # what is empty is 0
+    assert float((frames == 0.0).float().mean()) > 0.8  # empty space is 0
     frames = env.step(torch.full((3, 1), 1.0)).obs["policy"].unflatten(1, (3, HIGH, WIDE))
     assert torch.equal(frames[:, 0], frames[:, 1])
     assert not torch.equal(frames[:, 1], frames[:, 2])
 
 
-def test_all_but_what_is_observed_is_cartpoles():
-    """The same states, rewards and ends under the same actions, through several episodes."""
+def test_states_rewards_and_dones_equal_cartpole():
+    """Compare with `cartpole` under the same actions through several episodes."""
     one, other = (build(task, 4) for task in (TASK, "cartpole"))
     obs, seen = one.reset(seed=5), other.reset(seed=5)
     generator = torch.Generator().manual_seed(0)
@@ -102,7 +102,7 @@ def test_all_but_what_is_observed_is_cartpoles():
         assert getattr(mine, part) == getattr(theirs, part), part
 
 
-def test_final_pictures_are_of_the_state_that_ended_the_episode(env):
+def test_final_images_show_last_state(env):
     env.reset(seed=3)
     while True:
         step = env.step(torch.full((3, 1), 4.0))  # off the rail to the left

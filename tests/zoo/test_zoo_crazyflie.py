@@ -1,10 +1,11 @@
-"""The task `crazyflie`: its model and motors, what it observes, what it pays, where it ends, how it starts."""
+"""The task `crazyflie`: model, motors, observations, rewards, terminations, initial states."""
 
 import math
 
 import pytest
 import torch
-from support.flight import about, hover_for_a_second, look, pay, put, weight
+from support.direct_states import observe, quat_around, reward_and_done
+from support.flight import hover_for_a_second, put, weight
 from support.worlds import build
 
 HOVER = 2.0 / 1.9 - 1.0
@@ -19,7 +20,7 @@ def env():
 
 
 def fly(env, action, steps, settled=True):
-    """Hold an action; with `settled`, motors turn as it asks from the start."""
+    """Hold an action; with `settled`, motors have the commanded speed from the start."""
     action = torch.as_tensor(action).expand(env.num_envs, 4)
     if settled:
         env.task.speeds.copy_(((action + 1) / 2).sqrt())
@@ -30,7 +31,7 @@ def fly(env, action, steps, settled=True):
 # --- the model and its motors ---
 
 
-def test_it_weighs_28_grams_and_turns_like_a_crazyflie_of_five_times_the_size(env):
+def test_mass_and_inertia(env):
     model = env.engine.model
     body = env.entities["robot"].root_body
     assert weight(env) == pytest.approx(0.028 * 9.81)
@@ -40,13 +41,13 @@ def test_it_weighs_28_grams_and_turns_like_a_crazyflie_of_five_times_the_size(en
     assert places[:, :2].sign().tolist() == [[1, -1], [-1, -1], [-1, 1], [1, 1]]
 
 
-def test_full_thrust_lifts_it_with_nine_tenths_of_gravity(env):
+def test_full_thrust_acceleration(env):
     put(env)
     fly(env, 1.0, 10)
     assert float(env.entities["robot"].data.root_lin_vel_w[0, 2]) == pytest.approx(0.1 * 0.9 * 9.81, rel=1e-3)
 
 
-def test_motors_that_carry_the_weight_hold_it_in_the_air(env):
+def test_thrust_equal_to_weight_hovers(env):
     put(env, position=(0, 0, 2))
     fly(env, HOVER, 100)
     data = env.entities["robot"].data
@@ -54,9 +55,9 @@ def test_motors_that_carry_the_weight_hold_it_in_the_air(env):
     assert data.root_lin_vel_w[0].abs().max() < 1e-3
 
 
-def test_motors_follow_in_speed_and_thrust_is_its_square(env):
+def test_motors_lag_and_thrust_is_square_of_speed(env):
     share = 4 * 0.01 / 0.15
-    fly(env, 0.28, 1, settled=False)  # asks for 0.64 of the thrust: 0.8 of the speed
+    fly(env, 0.28, 1, settled=False)  # commands 0.64 of the thrust: 0.8 of the speed
     for step in range(1, 10):
         expected = 0.8 * (1 - (1 - share) ** step)
         assert env.task.speeds[0].tolist() == pytest.approx([expected] * 4, rel=1e-5)
@@ -65,7 +66,7 @@ def test_motors_follow_in_speed_and_thrust_is_its_square(env):
         fly(env, 0.28, 1, settled=False)
 
 
-def test_a_motor_asked_for_nothing_stops_and_never_pulls(env):
+def test_motor_without_command_stops(env):
     put(env)
     fly(env, 1.0, 1)
     fly(env, -1.0, 40, settled=False)
@@ -78,7 +79,7 @@ def test_a_motor_asked_for_nothing_stops_and_never_pulls(env):
     [((0, 1), 0, -1, (1, 1)), ((2, 3), 0, 1, (1, -1)), ((0, 3), 1, -1, (0, -1)), ((1, 2), 1, 1, (0, 1))],
     ids=["right", "left", "front", "back"],
 )
-def test_it_leans_away_from_strong_motors_and_flies_where_it_leans(env, strong, axis, turn, drift):
+def test_unequal_motors_tilt_and_move(env, strong, axis, turn, drift):
     put(env, position=(0, 0, 2))
     action = torch.full((4,), HOVER - 0.05)
     action[list(strong)] += 0.1
@@ -89,7 +90,7 @@ def test_it_leans_away_from_strong_motors_and_flies_where_it_leans(env, strong, 
     assert float(data.root_lin_vel_w[0, way]) * sign > 0.01
 
 
-def test_thrust_noise_is_a_hundredth_of_what_is_asked_for_and_of_each_motor_and_step():
+def test_thrust_noise_is_one_percent_per_motor_and_step():
     env = build("crazyflie", 200)
     env.reset()
     noises = []
@@ -103,7 +104,7 @@ def test_thrust_noise_is_a_hundredth_of_what_is_asked_for_and_of_each_motor_and_
         assert own.std().item() == pytest.approx(0.005 * math.sqrt(2), rel=0.15), "two that are drawn apart"
 
 
-def test_noise_depends_on_the_seed_and_the_environment_and_not_on_how_many_there_are():
+def test_noise_does_not_depend_on_num_envs():
     def thrusts(num_envs, seed):
         env = build("crazyflie", num_envs, seed=seed)
         env.reset()
@@ -117,9 +118,9 @@ def test_noise_depends_on_the_seed_and_the_environment_and_not_on_how_many_there
 # --- observations ---
 
 
-def test_the_state_is_observed(env):
-    put(env, position=(0.5, -1.0, 1.25), quat=about(3, math.pi / 2), linear=(1, 2, -3), angular=(0.5, 0.25, -1))
-    seen = look(env)
+def test_observation_of_state(env):
+    put(env, position=(0.5, -1.0, 1.25), quat=quat_around(3, math.pi / 2), linear=(1, 2, -3), angular=(0.5, 0.25, -1))
+    seen = observe(env)
     assert [seen[f"to_target_{x}"] for x in "xyz"] == pytest.approx([-0.5, 1.0, 0.75])
     assert [seen[f"x_axis_{x}"] for x in "xyz"] == pytest.approx([0, 1, 0], abs=1e-6)
     assert [seen[f"y_axis_{x}"] for x in "xyz"] == pytest.approx([-1, 0, 0], abs=1e-6)
@@ -131,12 +132,12 @@ def test_the_state_is_observed(env):
 # --- targets ---
 
 
-def test_the_target_is_two_metres_up_and_the_ball_is_there(env):
+def test_first_target_is_two_metres_high(env):
     assert env.task.target.tolist() == [[0, 0, 2]] * 4
     assert env.entities["target"].data.root_pos_w.tolist() == [[0, 0, 2]] * 4
 
 
-def test_targets_are_drawn_anew_every_period_within_their_box():
+def test_targets_are_resampled_every_period():
     box = ("params.target_low=[-1,-1,1]", "params.target_high=[1,1,3]")
     env = build(
         "crazyflie", 100, *box, "params.target_period=5", "params.max_distance=100", "params.height_range=[-9,9]"
@@ -159,54 +160,54 @@ def test_targets_are_drawn_anew_every_period_within_their_box():
 # --- rewards and ends ---
 
 
-def test_level_and_still_at_the_target_pays_for_nearness_posture_and_stillness_less_low_effort(env):
+def test_reward_of_hovering_at_target(env):
     put(env, position=(0, 0, 2))
     env.task.actions.zero_()
-    assert pay(env) == (pytest.approx(1.0 + 1.0 + 0.01 - 0.05), False)
+    assert reward_and_done(env) == (pytest.approx(1.0 + 1.0 + 0.01 - 0.05), False)
 
 
 @pytest.mark.parametrize("distance", [0.25, 1.0, 2.0])
 def test_nearness_scales_posture_and_stillness(env, distance):
     put(env, position=(distance, 0, 2))
     env.task.actions.fill_(1.0)
-    assert pay(env)[0] == pytest.approx(2.01 / (1 + distance) - 0.05 * math.exp(-2.0), rel=1e-5)
+    assert reward_and_done(env)[0] == pytest.approx(2.01 / (1 + distance) - 0.05 * math.exp(-2.0), rel=1e-5)
 
 
 @pytest.mark.parametrize(("tilt", "share"), [(1.0, math.cos(1.0)), (2.0, 0.0)])
-def test_posture_is_the_cosine_of_the_lean_and_never_negative(env, tilt, share):
-    put(env, position=(0, 0, 2), quat=about(2, tilt))
+def test_posture_reward_is_cosine_of_tilt(env, tilt, share):
+    put(env, position=(0, 0, 2), quat=quat_around(2, tilt))
     env.task.actions.fill_(10.0)  # makes the cost vanish
-    assert pay(env)[0] == pytest.approx(1.01 + share, rel=1e-5)
+    assert reward_and_done(env)[0] == pytest.approx(1.01 + share, rel=1e-5)
 
 
-def test_turning_about_any_axis_forfeits_the_stillness(env):
+def test_rotation_removes_stillness_reward(env):
     put(env, position=(0, 0, 2), angular=(0.5, 1.0, -0.5))
     env.task.actions.fill_(10.0)
-    assert pay(env)[0] == pytest.approx(2.0 + 0.01 * math.exp(-1.5), rel=1e-6)
+    assert reward_and_done(env)[0] == pytest.approx(2.0 + 0.01 * math.exp(-1.5), rel=1e-6)
 
 
 @pytest.mark.parametrize(
     ("position", "quat", "ends"),
     [
-        ((0, 0, 0.49), about(1, 0.0), True),
-        ((0, 0, 0.51), about(1, 0.0), False),
-        ((0, 0, 4.99), about(1, 0.0), False),
-        ((0, 0, 5.01), about(1, 0.0), True),
-        ((4.99, 0, 2), about(1, 0.0), False),
-        ((0, 5.01, 2), about(1, 0.0), True),
-        ((0, 0, 2), about(1, 1.5), False),
-        ((0, 0, 2), about(2, 1.6), True),
+        ((0, 0, 0.49), quat_around(1, 0.0), True),
+        ((0, 0, 0.51), quat_around(1, 0.0), False),
+        ((0, 0, 4.99), quat_around(1, 0.0), False),
+        ((0, 0, 5.01), quat_around(1, 0.0), True),
+        ((4.99, 0, 2), quat_around(1, 0.0), False),
+        ((0, 5.01, 2), quat_around(1, 0.0), True),
+        ((0, 0, 2), quat_around(1, 1.5), False),
+        ((0, 0, 2), quat_around(2, 1.6), True),
     ],
 )
-def test_it_ends_too_far_too_low_too_high_or_upside_down(env, position, quat, ends):
+def test_terminates_too_far_low_high_or_upside_down(env, position, quat, ends):
     put(env, position=position, quat=quat)
-    assert pay(env)[1] is ends
+    assert reward_and_done(env)[1] is ends
 
 
 # --- starts ---
 
 
-def test_starts_fill_their_ranges_with_motors_off():
+def test_initial_states_fill_ranges_with_motors_off():
     env = build("crazyflie", 300)
     env.reset()
     qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")
@@ -219,7 +220,7 @@ def test_starts_fill_their_ranges_with_motors_off():
     assert not env.task.speeds.any()
 
 
-def test_a_new_episode_forgets_the_motors_and_the_action(env):
+def test_motors_and_action_are_reset(env):
     fly(env, 0.5, 3)
     env.episode_length_buf[1] = env.max_episode_length - 1
     fly(env, 0.5, 1, settled=False)
@@ -236,6 +237,6 @@ def test_a_new_episode_forgets_the_motors_and_the_action(env):
     ("offset", "velocity", "succeeds"),
     [((0.1, 0, 0), (0, 0, 0), True), ((0, 0.2, 0), (0, 0, 0), False), ((0, 0, 0), (0, 0, 0.6), False)],
 )
-def test_hovering_at_the_target_to_the_end_is_a_success(offset, velocity, succeeds):
+def test_success_requires_hovering_until_end(offset, velocity, succeeds):
     env = build("crazyflie", 2, "episode_length_s=1.0")
     assert hover_for_a_second(env, offset, velocity) == [succeeds] * 2

@@ -1,10 +1,11 @@
-"""The task `hand-reorient`: its model, what it observes, what it pays, when goals change, where it ends."""
+"""The task `hand-reorient`: model, observations, rewards, goals, terminations."""
 
 import math
 
 import mujoco
 import pytest
 import torch
+from support.direct_states import observe, quat_around
 from support.worlds import actions, build
 
 from rlcli.sim.rotations import multiply, turn_between
@@ -28,7 +29,7 @@ def env():
 
 
 def put(env, row=0, position=PLACE, quat=LEVEL, linear=(0, 0, 0), angular=(0, 0, 0), goal=FAR):
-    """Put the cube of one environment somewhere, angular in its own frame, and set the goal."""
+    """Set the cube and the goal of one environment; angular velocity is in the cube's frame."""
     qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")
     qpos[row, CUBE_POS], qpos[row, CUBE_QUAT] = torch.tensor(position).double(), torch.tensor(quat).double()
     qvel[row, 16:19], qvel[row, 19:22] = torch.tensor(linear).double(), torch.tensor(angular).double()
@@ -37,19 +38,8 @@ def put(env, row=0, position=PLACE, quat=LEVEL, linear=(0, 0, 0), angular=(0, 0,
     env.sim.refresh()
 
 
-def about(axis, angle):
-    """Quaternion of a turn about x, y or z."""
-    return tuple(math.cos(angle / 2) if i == 0 else math.sin(angle / 2) * (i == axis) for i in range(4))
-
-
-def look(env, row=0):
-    """Column name -> value of the observation."""
-    env.task.get_observations()
-    return dict(zip(env.task.observation_names, env.task.obs_buf[row].tolist(), strict=True))
-
-
-def judge(env):
-    """Let the task judge the state as it is; the rewards."""
+def compute_rewards(env):
+    """Compute the rewards of the current state."""
     env.task.get_observations()
     env.task.get_states()
     env.task.calculate_metrics()
@@ -60,7 +50,7 @@ def judge(env):
 # --- the model ---
 
 
-def test_the_cube_and_the_fingers_weigh_what_their_sources_say():
+def test_masses_equal_sources():
     model = build("hand-reorient", 1).engine.model
     assert float(model.body("object/cube").mass[0]) == pytest.approx(400 * 0.065**3)
     assert model.body("object/cube").inertia == pytest.approx([400 * 0.065**5 / 6] * 3)
@@ -69,7 +59,7 @@ def test_the_cube_and_the_fingers_weigh_what_their_sources_say():
         assert links == pytest.approx([0.0119, 0.065, 0.0355, 0.0306])
 
 
-def test_a_straight_finger_is_as_long_as_its_links():
+def test_finger_length_is_sum_of_links():
     model, data = build("hand-reorient", 1).world()
     data.qpos[HAND] = 0.0
     mujoco.mj_forward(model, data)
@@ -77,7 +67,7 @@ def test_a_straight_finger_is_as_long_as_its_links():
     assert tip - root == pytest.approx([0.0164 + 0.054 + 0.0384 + 0.029, 0, 0], abs=1e-9)
 
 
-def test_a_positive_angle_bends_every_finger_towards_the_palm():
+def test_positive_angles_bend_fingers_to_palm():
     model, data = build("hand-reorient", 1).world()
     for finger in FINGERS:
         heights = []
@@ -93,8 +83,8 @@ def test_a_positive_angle_bends_every_finger_towards_the_palm():
         assert inwards > 0.01, finger
 
 
-def test_what_touches_what(env):
-    """The cube touches palm and links, the ends of the fingers each other and the palm; nothing else collides."""
+def test_collision_pairs(env):
+    """Check that the cube touches palm and links, and fingertips touch each other and the palm; nothing else."""
     model = env.engine.model
     touching = set()
     for a in range(model.ngeom):
@@ -113,7 +103,7 @@ def test_what_touches_what(env):
     assert touching == expected
 
 
-def test_a_hand_that_stays_as_it_starts_holds_the_cube():
+def test_hand_in_initial_pose_holds_cube():
     """The fingers keep their start pose for two seconds: three cubes of four stay, and come to rest."""
     env = build("hand-reorient", 32)
     env.reset()
@@ -126,7 +116,7 @@ def test_a_hand_that_stays_as_it_starts_holds_the_cube():
     assert float(speed.median()) < 0.005
 
 
-def test_extreme_targets_neither_blow_the_simulation_up_nor_push_the_cube_through_the_palm():
+def test_extreme_targets_keep_simulation_stable():
     env = build("hand-reorient", 32)
     env.reset()
     qvel, cube = env.engine.field("qvel"), env.entities["object"].data
@@ -145,7 +135,7 @@ def test_extreme_targets_neither_blow_the_simulation_up_nor_push_the_cube_throug
 # --- actions ---
 
 
-def test_targets_follow_the_action_smoothly_and_stay_inside_the_limits(env):
+def test_targets_are_smoothed_and_within_limits(env):
     task, middle, half = env.task, env.task.middle, env.task.half
     before = task.targets.clone()
     env.step(torch.ones(N, 16))
@@ -161,14 +151,14 @@ def test_targets_follow_the_action_smoothly_and_stay_inside_the_limits(env):
 # --- observations ---
 
 
-def test_the_observation_is_that_of_the_state(env):
-    put(env, position=(0.01, -0.02, 0.56), quat=about(3, 0.5), linear=(0.1, 0.2, 0.3), angular=(1, 2, 3))
+def test_observation_of_state(env):
+    put(env, position=(0.01, -0.02, 0.56), quat=quat_around(3, 0.5), linear=(0.1, 0.2, 0.3), angular=(1, 2, 3))
     env.engine.field("qpos")[0, HAND] = env.task.high.double()
     env.engine.field("qvel")[0, HAND] = 2.0
     env.sim.refresh()
-    seen = look(env)
+    seen = observe(env)
     assert [seen[f"cube_{a}"] for a in "xyz"] == pytest.approx([0.01, -0.02, 0.56])
-    assert [seen[f"cube_quat_{a}"] for a in "wxyz"] == pytest.approx(about(3, 0.5))
+    assert [seen[f"cube_quat_{a}"] for a in "wxyz"] == pytest.approx(quat_around(3, 0.5))
     assert [seen[f"cube_vel_{a}"] for a in "xyz"] == pytest.approx([0.1, 0.2, 0.3])
     c, s = math.cos(0.5), math.sin(0.5)
     assert [seen[f"cube_rate_{a}"] for a in "xyz"] == pytest.approx([0.2 * (c - 2 * s), 0.2 * (s + 2 * c), 0.6])
@@ -177,26 +167,26 @@ def test_the_observation_is_that_of_the_state(env):
     assert [seen[f"goal_quat_{a}"] for a in "wxyz"] == pytest.approx(FAR)
 
 
-def test_a_rotation_is_observed_the_same_whichever_of_its_two_quaternions_the_engine_holds(env):
-    quat = about(1, 4.0)
-    put(env, 0, quat=quat, goal=about(2, 0.7))
-    put(env, 1, quat=[-part for part in quat], goal=about(2, 0.7))
-    left, right = look(env, 0), look(env, 1)
+def test_observation_is_equal_for_both_quaternion_signs(env):
+    quat = quat_around(1, 4.0)
+    put(env, 0, quat=quat, goal=quat_around(2, 0.7))
+    put(env, 1, quat=[-part for part in quat], goal=quat_around(2, 0.7))
+    left, right = observe(env, 0), observe(env, 1)
     for name in ("cube_quat", "turn_quat"):
         for axis in "wxyz":
             assert left[f"{name}_{axis}"] == pytest.approx(right[f"{name}_{axis}"], abs=1e-6)
         assert left[f"{name}_w"] >= 0
 
 
-def test_the_turn_takes_the_goal_to_the_cube(env):
-    put(env, quat=about(1, 0.9), goal=about(3, -0.4))
-    seen = look(env)
+def test_observed_rotation_is_from_goal_to_cube(env):
+    put(env, quat=quat_around(1, 0.9), goal=quat_around(3, -0.4))
+    seen = observe(env)
     turn = torch.tensor([[seen[f"turn_quat_{a}"] for a in "wxyz"]])
-    cube = multiply(turn, torch.tensor([about(3, -0.4)]))
-    assert float(turn_between(cube, torch.tensor([about(1, 0.9)]))) < 1e-3
+    cube = multiply(turn, torch.tensor([quat_around(3, -0.4)]))
+    assert float(turn_between(cube, torch.tensor([quat_around(1, 0.9)]))) < 1e-3
 
 
-def test_the_states_add_the_ends_of_the_fingers(env):
+def test_states_add_fingertips(env):
     for action in actions(3, N, 16):
         obs = env.step(action).obs
     assert torch.equal(obs["critic"][:, :69], obs["policy"])
@@ -206,7 +196,7 @@ def test_the_states_add_the_ends_of_the_fingers(env):
         assert place == pytest.approx(data.body(f"robot/{finger}_distal").xpos.tolist(), abs=1e-5)
 
 
-def test_the_load_of_a_fingers_end_is_its_weight_where_it_holds_still():
+def test_fingertip_load_at_rest_is_weight():
     env = build("hand-reorient", 2)
     env.reset()
     put(env, 0, position=(1.0, 0.0, 5.0))
@@ -224,25 +214,25 @@ def test_the_load_of_a_fingers_end_is_its_weight_where_it_holds_still():
 # --- rewards ---
 
 
-def test_the_reward_is_the_documented_sum(env):
-    put(env, position=(PLACE[0] + 0.03, PLACE[1], PLACE[2] + 0.04), quat=about(2, 1.2), goal=about(2, 0.2))
+def test_reward_is_documented_sum(env):
+    put(env, position=(PLACE[0] + 0.03, PLACE[1], PLACE[2] + 0.04), quat=quat_around(2, 1.2), goal=quat_around(2, 0.2))
     env.task.actions[0] = 0.5
-    assert float(judge(env)[0]) == pytest.approx(-10 * 0.05 + 1 / (1.0 + 0.1) - 0.0002 * 16 * 0.25, abs=1e-5)
+    assert float(compute_rewards(env)[0]) == pytest.approx(-10 * 0.05 + 1 / (1.0 + 0.1) - 0.0002 * 16 * 0.25, abs=1e-5)
 
 
 @pytest.mark.parametrize(("angle", "bonus"), [(0.39, 250.0), (0.41, 0.0)])
-def test_a_goal_within_the_tolerance_pays_and_counts(env, angle, bonus):
-    put(env, quat=about(1, angle), goal=LEVEL)
+def test_reached_goal_is_rewarded_and_counted(env, angle, bonus):
+    put(env, quat=quat_around(1, angle), goal=LEVEL)
     env.task.actions.zero_()
     before = env.task.goal_quat.clone()
-    assert float(judge(env)[0]) == pytest.approx(1 / (angle + 0.1) + bonus, abs=1e-2)
+    assert float(compute_rewards(env)[0]) == pytest.approx(1 / (angle + 0.1) + bonus, abs=1e-2)
     assert env.task.successes.tolist() == [float(bonus > 0), 0, 0, 0]
     assert (env.task.goal_quat != before).any(dim=1).tolist() == [bonus > 0, False, False, False]
 
 
-def test_the_policy_sees_the_next_goal_in_the_step_that_reached_one(env):
+def test_next_goal_is_observed_in_same_step(env):
     put(env, quat=LEVEL, goal=LEVEL)
-    judge(env)
+    compute_rewards(env)
     seen = env.task.obs_buf[0, GOAL]
     torch.testing.assert_close(seen[:4], env.task.goal_quat[0])
     assert torch.equal(env.task.states_buf[:, GOAL], env.task.obs_buf[:, GOAL])
@@ -251,19 +241,19 @@ def test_the_policy_sees_the_next_goal_in_the_step_that_reached_one(env):
     assert float(turn_between(shown.root_quat_w[:1].float(), torch.tensor([LEVEL]))) > 0.2
 
 
-def test_the_next_goals_of_an_environment_do_not_depend_on_the_others():
+def test_goals_do_not_depend_on_other_envs():
     drawn = []
     for reached in ([True, True, True, True], [False, True, False, False]):
         env = build("hand-reorient", N)
         env.reset()
         for row in range(N):
             put(env, row, goal=LEVEL if reached[row] else FAR)
-        judge(env)
+        compute_rewards(env)
         drawn.append(env.task.goal_quat[1].clone())
     assert torch.equal(*drawn)
 
 
-def test_goals_differ_between_steps_and_environments_and_fill_all_rotations(env):
+def test_goals_are_uniform_rotations(env):
     goals = []
     for step in range(250):
         env.episode_length_buf.fill_(step)
@@ -274,20 +264,20 @@ def test_goals_differ_between_steps_and_environments_and_fill_all_rotations(env)
     goals = torch.cat(goals)
     assert len(goals.unique(dim=0)) == 1000
     angle = turn_between(goals, torch.tensor([LEVEL]).expand_as(goals))
-    assert float(angle.mean()) == pytest.approx(math.pi / 2 + 2 / math.pi, abs=0.06)  # of the uniform distribution
+    assert float(angle.mean()) == pytest.approx(math.pi / 2 + 2 / math.pi, abs=0.06)  # mean of the uniform one
 
 
 # --- ends and starts ---
 
 
-def test_an_episode_ends_where_the_cube_is_lost(env):
+def test_lost_cube_terminates(env):
     put(env, 0, position=(PLACE[0], 0.23, PLACE[2]))
     put(env, 1, position=(PLACE[0], 0.25, PLACE[2]))
-    judge(env)
+    compute_rewards(env)
     assert env.task.reset_buf.tolist() == [0, 1, 0, 0]
 
 
-def test_start_states_stay_inside_their_ranges():
+def test_initial_states_are_within_ranges():
     env = build("hand-reorient", 256)
     env.reset()
     qpos = env.engine.field("qpos")
@@ -303,7 +293,7 @@ def test_start_states_stay_inside_their_ranges():
     assert not env.task.successes.any()
 
 
-def test_success_is_five_goals_and_a_cube_that_was_never_lost():
+def test_success_is_five_goals_without_lost_cube():
     env = build("hand-reorient", N, "episode_length_s=0.2")
     env.reset()
     env.task.successes.copy_(torch.tensor([0.0, 5.0, 4.0, 9.0]))
@@ -317,7 +307,7 @@ def test_success_is_five_goals_and_a_cube_that_was_never_lost():
     assert ended == {0: False, 1: True, 2: False, 3: False}
 
 
-def test_the_goals_reached_are_logged_of_every_episode(env):
+def test_reached_goals_are_logged_per_episode(env):
     env.task.successes[1] = 3.0
     put(env, 1, position=(0.0, 0.5, 0.5))
     result = env.step(torch.zeros(N, 16))

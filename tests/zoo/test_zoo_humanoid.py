@@ -1,18 +1,19 @@
-"""The tasks `humanoid` and `humanoid-direct`: the model, what is observed and paid, ends, starts, success."""
+"""The tasks `humanoid` and `humanoid-direct`: model, observations, rewards, initial states, success."""
 
 import math
 
 import mujoco
 import pytest
 import torch
-from support.worlds import actions, build
+from support.direct_states import observe, reward_and_done, set_floating_state
+from support.worlds import build
 
 from rlcli_tasks.humanoid.task import EFFORTS, JOINTS
 
 torch.set_num_threads(1)
 
 POS, RATE = slice(7, 28), slice(6, 27)
-"""Columns of qpos and of qvel that are the joints'."""
+"""Columns of the joints in qpos and in qvel."""
 
 
 @pytest.fixture
@@ -24,34 +25,17 @@ def env():
 
 def put(env, row=0, position=(0.0, 0.0, 1.3), quat=(1.0, 0.0, 0.0, 0.0), linear=(0, 0, 0), angular=(0, 0, 0),
         joints=None, rates=0.0):  # fmt: skip
-    """Put one environment into a state; angular is in the torso's frame, joints are name -> angle."""
-    qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")
-    qpos[row, :3], qpos[row, 3:7] = torch.tensor(position).double(), torch.tensor(quat).double()
-    qvel[row, :3], qvel[row, 3:6] = torch.tensor(linear).double(), torch.tensor(angular).double()
-    qpos[row, POS], qvel[row, RATE] = 0.0, rates
+    """Set the state of one environment; angular velocity is in the torso's frame, joints are name -> angle [rad]."""
+    angles = torch.zeros(len(JOINTS), dtype=torch.float64)
     for name, angle in (joints or {}).items():
-        qpos[row, 7 + JOINTS.index(name)] = angle
-    env.sim.refresh()
+        angles[JOINTS.index(name)] = angle
+    set_floating_state(env, row, position, quat, linear, angular, angles, rates)
     env.task.position_before[row] = torch.tensor(position[:2])
     env.task.distance_before[row] = math.hypot(1000.0 - position[0], position[1])
 
 
-def look(env, row=0):
-    """Column name -> value of the observation."""
-    env.task.get_observations()
-    return dict(zip(env.task.observation_names, env.task.obs_buf[row].tolist(), strict=True))
-
-
-def pay(env, row=0):
-    """Reward of the state as it is, and whether it ends the episode."""
-    env.task.get_observations()
-    env.task.calculate_metrics()
-    env.task.is_done()
-    return float(env.task.rew_buf[row]), bool(env.task.reset_buf[row])
-
-
 def posed(**joints):
-    """A world of the model alone with joints at some angles, in the air."""
+    """Return the compiled model and its data, in the air with joints at the given angles [rad]."""
     model, data = build("humanoid-direct", 1).world()
     data.qpos[:] = 0.0
     data.qpos[2:4] = 1.34, 1.0
@@ -64,7 +48,7 @@ def posed(**joints):
 # --- the model ---
 
 
-def test_the_model_has_the_mass_the_joints_and_the_motors_of_its_source():
+def test_model_has_mass_joints_and_motors_of_source():
     model, _ = posed()
     assert float(model.body_mass.sum()) == pytest.approx(40.844, abs=1e-3)
     names = [model.joint(i).name.removeprefix("robot/") for i in range(1, model.njnt)]
@@ -79,7 +63,7 @@ def test_the_model_has_the_mass_the_joints_and_the_motors_of_its_source():
 
 @pytest.mark.parametrize("joint", ["hip_roll", "hip_yaw", "hip_pitch", "knee", "ankle_pitch", "ankle_roll",
                                    "shoulder_1", "shoulder_2", "elbow"])  # fmt: skip
-def test_left_and_right_are_mirror_images_in_every_pose(joint):
+def test_left_and_right_are_mirrored(joint):
     _, left = posed(**{f"{joint}_l": 0.4})
     _, right = posed(**{f"{joint}_r": 0.4})
     moved = 0
@@ -90,7 +74,7 @@ def test_left_and_right_are_mirror_images_in_every_pose(joint):
     assert moved >= 1
 
 
-def test_positive_angles_bend_hips_and_knees_and_swing_legs_inwards():
+def test_direction_of_positive_joint_angles():
     _, rest = posed()
     for side, inwards in (("l", -1.0), ("r", 1.0)):
         foot = f"robot/foot_{side}"
@@ -102,7 +86,7 @@ def test_positive_angles_bend_hips_and_knees_and_swing_legs_inwards():
         assert (roll.body(foot).xpos[1] - rest.body(foot).xpos[1]) * inwards > 0.1
 
 
-def test_legs_touch_each_other_and_the_ground_and_arms_nothing():
+def test_legs_collide_and_arms_do_not():
     model, crossed = posed(hip_roll_l=0.24, hip_roll_r=0.24)
     pairs = {tuple(sorted(model.geom(g).name.removeprefix("robot/") for g in c.geom)) for c in crossed.contact}
     assert pairs
@@ -111,7 +95,7 @@ def test_legs_touch_each_other_and_the_ground_and_arms_nothing():
     assert folded.ncon == 0
 
 
-def test_no_start_pose_reaches_into_the_ground_or_one_leg_into_the_other():
+def test_initial_poses_have_no_penetration():
     env = build("humanoid-direct", 300)
     env.reset()
     model, data = env.world()
@@ -122,30 +106,13 @@ def test_no_start_pose_reaches_into_the_ground_or_one_leg_into_the_other():
         assert data.ncon == 0 or data.contact.dist.min() > -5e-3
 
 
-@pytest.mark.parametrize(("num_envs", "steps"), [(16, 150), pytest.param(100, 1000, marks=pytest.mark.slow)])
-def test_full_random_torques_never_blow_the_simulation_up(num_envs, steps):
-    env = build("humanoid-direct", num_envs, "params.termination_height=-10", "episode_length_s=1000")
-    env.reset()
-    qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")
-    generator = torch.Generator().manual_seed(0)
-    fastest = highest = 0.0
-    for _ in range(steps):
-        env.step((torch.rand(num_envs, 21, generator=generator) * 2 - 1).sign())
-        fastest = max(fastest, float(qvel[:, RATE].abs().max()))
-        highest = max(highest, float(qpos[:, 2].max()))
-    assert env.divergences == 0
-    assert 20.0 < fastest < 150.0
-    assert highest < 1.6
-    assert float(qpos[:, 2].min()) > 0.0, "the trunk lies on the ground"
-
-
 # --- observations ---
 
 
-def test_the_columns_are_those_of_the_state_scaled(env):
+def test_observation_is_scaled_state(env):
     joints = {"knee_l": math.radians(160), "hip_pitch_r": math.radians(-45), "waist_yaw": math.radians(22.5)}
     put(env, position=(3, 4, 1.2), linear=(3, -2, 1), angular=(0.5, -0.25, 2), joints=joints, rates=2.0)
-    seen = look(env)
+    seen = observe(env)
     assert [seen[n] for n in ("height", "vel_x", "vel_y", "vel_z")] == pytest.approx([1.2, 3, -2, 1])
     assert [seen[n] for n in ("rate_x", "rate_y", "rate_z")] == pytest.approx([0.125, -0.0625, 0.5])
     assert [seen["knee_l_pos"], seen["hip_pitch_r_pos"], seen["waist_yaw_pos"]] == pytest.approx([1, -1, 0.5])
@@ -154,8 +121,8 @@ def test_the_columns_are_those_of_the_state_scaled(env):
     assert len(seen) == 87
 
 
-def test_feet_carry_what_stands_on_them_when_they_do(env):
-    """Right after landing the ankles push up with about the weight; in free fall they push not at all."""
+def test_foot_forces_carry_weight_on_ground_only(env):
+    """Check the ankle forces: about the weight after landing, about 0 in free fall."""
     for row in range(4):
         put(env, row, position=(0.0, 0.0, 1.289))  # soles on the ground
     total, steps = 0.0, 12
@@ -169,65 +136,35 @@ def test_feet_carry_what_stands_on_them_when_they_do(env):
     assert abs(float(obs[54 + 2] + obs[60 + 2])) * 100.0 < 30.0
 
 
-def test_a_new_episode_has_felt_nothing_and_done_nothing_yet(env):
-    for action in actions(30, 4, 21):
-        result = env.step(action * 0.3)
-    env.episode_length_buf[2] = env.max_episode_length - 1
-    result = env.step(action * 0.3)
-    assert bool(result.truncated[2])
-    assert not result.obs["policy"][2, 54:].any()
-    assert result.final_obs["policy"][2, 54:].any()
+# --- rewards ---
 
 
-# --- rewards and ends ---
-
-
-def test_standing_still_pays_for_life_posture_and_heading(env):
-    put(env)
-    assert pay(env) == (pytest.approx(2.0 + 0.1 + 0.5), False)
-
-
-def test_progress_is_the_speed_towards_the_target(env):
-    put(env)
-    env.engine.field("qpos")[0, :2] = torch.tensor([0.05, 0.02], dtype=torch.float64)
-    env.sim.refresh()
-    assert pay(env)[0] == pytest.approx(2.6 + 0.05 * 60, abs=1e-4)
-    assert float(env.task.speed[0]) == pytest.approx(3.0, abs=1e-4)
-
-
-def test_actions_and_power_cost_and_power_counts_by_the_strength_of_the_motor(env):
+def test_action_and_power_costs_scale_with_motor(env):
     rates = torch.zeros(21, dtype=torch.float64)
     rates[JOINTS.index("hip_pitch_l")], rates[JOINTS.index("ankle_roll_r")] = 3.0, -6.0
     put(env, rates=rates)
     env.task.actions[0, JOINTS.index("hip_pitch_l")] = -0.5
     env.task.actions[0, JOINTS.index("ankle_roll_r")] = 0.8
     squares, power = 0.25 + 0.64, 0.5 * 0.3 * 1.0 + 0.8 * 0.6 * 22.5 / 135
-    assert pay(env)[0] == pytest.approx(2.6 - 0.01 * squares - 0.05 * power, abs=1e-5)
+    assert reward_and_done(env)[0] == pytest.approx(2.6 - 0.01 * squares - 0.05 * power, abs=1e-5)
 
 
-def test_a_joint_near_a_limit_costs_by_how_near_and_how_strong_it_is(env):
+def test_joint_limit_cost_scales_with_motor(env):
     half = math.radians(50)
     put(env, joints={"ankle_roll_l": 0.99 * half, "ankle_pitch_l": -0.97 * half, "hip_pitch_r": math.radians(120)})
-    assert pay(env)[0] == pytest.approx(2.6 - 0.25 * (0.5 * 22.5 / 135 + 1.0), abs=1e-4)
+    assert reward_and_done(env)[0] == pytest.approx(2.6 - 0.25 * (0.5 * 22.5 / 135 + 1.0), abs=1e-4)
 
 
-def test_who_is_below_the_height_has_fallen_and_gets_that_reward_alone(env):
-    put(env, position=(0.0, 0.0, 0.7999), linear=(5.0, 0.0, 0.0))
-    assert pay(env) == (-1.0, True)
-    put(env, position=(0.0, 0.0, 0.8001), linear=(5.0, 0.0, 0.0))
-    assert pay(env)[1] is False
-
-
-def test_torques_are_the_motors_times_the_action(env):
+def test_torque_is_motor_gear_times_action(env):
     env.step(torch.full((4, 21), -0.4))
     torque = env.engine.field("qfrc_actuator")[0, RATE]
     assert torque.tolist() == pytest.approx([-0.4 * effort for effort in EFFORTS.values()], rel=1e-5)
 
 
-# --- starts ---
+# --- initial states ---
 
 
-def test_starts_are_drawn_within_the_limits_and_nothing_else_differs():
+def test_initial_states_are_within_limits():
     env = build("humanoid-direct", 500)
     env.reset()
     qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")
@@ -251,7 +188,7 @@ def test_starts_are_drawn_within_the_limits_and_nothing_else_differs():
 
 @pytest.mark.parametrize("task", ["humanoid", "humanoid-direct"])
 @pytest.mark.parametrize(("speed", "pitch", "succeeds"), [(2.0, 0.0, True), (0.9, 0.0, False), (2.0, 1.0, False)])
-def test_an_episode_that_ends_upright_and_at_speed_is_a_success(task, speed, pitch, succeeds):
+def test_success_requires_upright_and_speed_at_end(task, speed, pitch, succeeds):
     env = build(task, 2, "episode_length_s=0.5", "success.hold_s=0.3")
     env.reset()
     tilted = torch.tensor([math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0]).double()

@@ -1,4 +1,4 @@
-"""The task `lift-cube`: a gripper that holds, what is paid for a cube in the air, where it starts and ends."""
+"""The task `lift-cube`: grasp, rewards, initial states, terminations."""
 
 import math
 
@@ -19,8 +19,8 @@ def env():
     return build("lift-cube", 4)
 
 
-def place(env, cube, row=None):
-    """Put the cube somewhere in one environment, or all."""
+def set_cube(env, cube, row=None):
+    """Set the cube in one environment, or in all."""
     rows = slice(None) if row is None else row
     env.engine.field("qpos")[rows, 9:12] = torch.tensor(cube, dtype=torch.float64)
     env.engine.field("qvel")[:] = 0.0
@@ -28,14 +28,14 @@ def place(env, cube, row=None):
     env.sim.refresh()
 
 
-def pay(env):
-    """What each term pays in the state as it is. (num_envs,) each"""
+def reward_terms(env):
+    """Return the value of each reward term in the current state. (num_envs,) each"""
     env.reward_manager.compute(torch.zeros(env.num_envs, dtype=torch.bool))
     return {name: value.clone() for name, value in env.reward_manager.values().items()}
 
 
 def reach_for(model, data, point):
-    """Joints that bring the gripper to a point, the hand pointing down."""
+    """Return joints that bring the gripper to a point with the hand pointing down."""
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "robot/grasp")
     hand = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "robot/hand")
     trial = mujoco.MjData(model)
@@ -57,7 +57,7 @@ def reach_for(model, data, point):
 
 
 def move(model, data, joints, grip, seconds):
-    """Targets go to `joints` in a straight line."""
+    """Move the targets to `joints` in a straight line."""
     begin, steps = data.ctrl[ARM].copy(), round(seconds / model.opt.timestep)
     for step in range(steps):
         data.ctrl[ARM] = begin + (joints - begin) * min(1.0, (step + 1) / (0.6 * steps))
@@ -68,7 +68,7 @@ def move(model, data, joints, grip, seconds):
 # --- the grasp ---
 
 
-def test_a_closed_gripper_carries_the_cube_up_and_does_not_let_it_creep(env):
+def test_closed_gripper_lifts_cube_without_slip(env):
     model, data = env.world()
     cube = np.array([0.5, 0.0, 0.024])
     data.qpos[CUBE] = [*cube, 1.0, 0.0, 0.0, 0.0]
@@ -89,7 +89,7 @@ def test_a_closed_gripper_carries_the_cube_up_and_does_not_let_it_creep(env):
     assert float(data.qpos[11]) < 0.1, "and an open one drops it"
 
 
-def test_a_cube_at_rest_on_the_table_stays_there(env):
+def test_cube_on_table_stays(env):
     model, data = env.world()
     data.qpos[ARM] = data.ctrl[ARM] = (0.0, -0.569, 0.0, -2.81, 0.0, 3.037, 0.741)
     data.qpos[CUBE] = [0.5, 0.1, 0.024, 1.0, 0.0, 0.0, 0.0]
@@ -98,24 +98,24 @@ def test_a_cube_at_rest_on_the_table_stays_there(env):
     assert data.qpos[9:12] == pytest.approx([0.5, 0.1, 0.024], abs=5e-4)
 
 
-# --- what is paid ---
+# --- rewards ---
 
 
-def test_a_lifted_cube_is_paid_and_one_on_the_table_is_not(env):
+def test_only_lifted_cube_is_rewarded(env):
     env.reset()
-    place(env, [0.5, 0.0, 0.039])
-    assert pay(env)["lifting"].tolist() == [0.0] * 4
-    assert pay(env)["goal"].tolist() == [0.0] * 4
-    place(env, [0.5, 0.0, 0.041])
-    assert pay(env)["lifting"].tolist() == pytest.approx([15.0 * 0.02] * 4)
+    set_cube(env, [0.5, 0.0, 0.039])
+    assert reward_terms(env)["lifting"].tolist() == [0.0] * 4
+    assert reward_terms(env)["goal"].tolist() == [0.0] * 4
+    set_cube(env, [0.5, 0.0, 0.041])
+    assert reward_terms(env)["lifting"].tolist() == pytest.approx([15.0 * 0.02] * 4)
 
 
-def test_nearness_to_the_goal_is_paid_by_its_distance(env):
+def test_goal_distance_reward(env):
     env.reset()
     goal = env.command_manager.get_term("object_pose").command[:, :3].double()
     for row, off in enumerate((0.0, 0.03, 0.1, 0.3)):
-        place(env, (goal[row] + torch.tensor([0.0, 0.0, off])).tolist(), row)
-    paid = pay(env)
+        set_cube(env, (goal[row] + torch.tensor([0.0, 0.0, off])).tolist(), row)
+    paid = reward_terms(env)
     wide = [16.0 * 0.02 * (1.0 - math.tanh(off / 0.3)) for off in (0.0, 0.03, 0.1, 0.3)]
     fine = [5.0 * 0.02 * (1.0 - math.tanh(off / 0.05)) for off in (0.0, 0.03, 0.1, 0.3)]
     assert paid["goal"].tolist() == pytest.approx(wide, abs=1e-5)
@@ -123,17 +123,17 @@ def test_nearness_to_the_goal_is_paid_by_its_distance(env):
     assert env.compute_success().tolist() == [True, True, False, False]
 
 
-def test_the_gripper_is_paid_for_coming_near_the_cube(env):
+def test_reaching_reward(env):
     env.reset()
     grasp = env.entities["robot"].data.site_pos_w[0, 0].double()
-    place(env, (grasp + torch.tensor([0.0, 0.1, 0.0])).tolist())
-    assert float(pay(env)["reaching"][0]) == pytest.approx(0.02 * (1.0 - math.tanh(1.0)), rel=1e-3)
+    set_cube(env, (grasp + torch.tensor([0.0, 0.1, 0.0])).tolist())
+    assert float(reward_terms(env)["reaching"][0]) == pytest.approx(0.02 * (1.0 - math.tanh(1.0)), rel=1e-3)
 
 
-# --- starts and ends ---
+# --- initial states and terminations ---
 
 
-def test_cubes_start_spread_over_the_table_in_front_of_the_arm():
+def test_initial_cubes_are_spread_over_table():
     env = build("lift-cube", 256)
     env.reset()
     at = env.entities["object"].data.root_pos_w
@@ -146,15 +146,15 @@ def test_cubes_start_spread_over_the_table_in_front_of_the_arm():
         assert float(goal[:, column].max()) <= high
 
 
-def test_an_episode_ends_where_the_cube_is_pushed_off_the_table(env):
+def test_cube_off_table_terminates(env):
     env.reset()
-    place(env, [0.5, 0.75, 0.024], 1)
-    place(env, [1.1, 0.0, 0.024], 2)
+    set_cube(env, [0.5, 0.75, 0.024], 1)
+    set_cube(env, [1.1, 0.0, 0.024], 2)
     result = env.step(torch.zeros(4, 8))
     assert result.terminated.tolist() == [False, True, True, False]
 
 
-def test_the_last_action_opens_and_closes_the_gripper(env):
+def test_last_action_controls_gripper(env):
     env.reset()
     action = torch.zeros(4, 8)
     action[:2, 7], action[2:, 7] = -0.1, 0.1
@@ -165,7 +165,7 @@ def test_the_last_action_opens_and_closes_the_gripper(env):
     assert float(fingers[2:].min()) > 0.035
 
 
-def test_wild_actions_never_blow_the_simulation_up():
+def test_random_actions_keep_simulation_stable():
     env = build("lift-cube", 16)
     env.reset()
     for action in actions(150, 16, 8):

@@ -1,4 +1,4 @@
-"""The task `open-drawer`: what it observes, what it pays, how targets move, and that the drawer can be pulled open."""
+"""The task `open-drawer`: observations, rewards, targets; the drawer can be pulled open."""
 
 import math
 
@@ -27,7 +27,7 @@ def env():
 
 
 def reach_for(model, data, point, start):
-    """Joints that bring the gripper to a point, turned as the handle wants it."""
+    """Return joints that bring the gripper to a point, oriented for the handle."""
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "robot/grasp")
     hand = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "robot/hand")
     trial, wanted = mujoco.MjData(model), np.zeros(4)
@@ -51,7 +51,7 @@ def reach_for(model, data, point, start):
 
 
 def put(env, joints=HOME, fingers=(0.035, 0.035), drawer=0.0, row=0):
-    """Put one environment into a state, at rest."""
+    """Set the state of one environment, at rest."""
     qpos = env.engine.field("qpos")
     qpos[row, ARM], qpos[row, FINGERS] = torch.tensor(joints).double(), torch.tensor(fingers).double()
     qpos[row, DRAWER] = drawer
@@ -61,7 +61,7 @@ def put(env, joints=HOME, fingers=(0.035, 0.035), drawer=0.0, row=0):
 
 
 def pay(env, row=0, action=None):
-    """Reward of the state as it is."""
+    """Return the reward of the current state."""
     env.task.actions[row] = 0.0 if action is None else torch.tensor(action)
     env.task.get_observations()
     env.task.calculate_metrics()
@@ -69,7 +69,7 @@ def pay(env, row=0, action=None):
 
 
 def at_handle(env):
-    """Joints with which the gripper is about the handle of the shut drawer."""
+    """Return joints with the gripper around the handle of the closed drawer."""
     model, data = env.world()
     return reach_for(model, data, np.array([0.35, 0.0, 0.72]), HOME)
 
@@ -77,7 +77,7 @@ def at_handle(env):
 # --- the task can be done ---
 
 
-def test_a_gripper_that_closes_about_the_handle_pulls_the_drawer_open(env):
+def test_closed_gripper_pulls_drawer_open(env):
     model, data = env.world()
     data.qpos[ARM], data.qpos[FINGERS] = at_handle(env), 0.04
     data.ctrl[ARM], data.ctrl[FINGERS] = data.qpos[ARM], 0.0
@@ -93,7 +93,7 @@ def test_a_gripper_that_closes_about_the_handle_pulls_the_drawer_open(env):
     assert data.qpos[DRAWER] > 0.39
 
 
-def test_a_drawer_that_is_let_go_of_falls_shut(env):
+def test_released_drawer_closes(env):
     """The spring of 10 N/m pulls 2.8 kg: a quarter of a period is pi / 2 sqrt(m / k) = 0.83 s, damping apart."""
     model, data = env.world()
     data.qpos[ARM] = data.ctrl[ARM] = HOME
@@ -108,7 +108,7 @@ def test_a_drawer_that_is_let_go_of_falls_shut(env):
 # --- observations ---
 
 
-def test_columns_are_those_of_the_state(env):
+def test_observation_of_state(env):
     put(env, drawer=0.12)
     env.engine.field("qvel")[0, :10] = torch.arange(10).double() / 10
     env.sim.refresh()
@@ -129,7 +129,7 @@ def test_columns_are_those_of_the_state(env):
 # --- rewards ---
 
 
-def test_a_gripper_about_the_handle_earns_every_share(env):
+def test_gripper_at_handle_has_full_reward(env):
     put(env, at_handle(env).tolist(), (0.03, 0.02))
     aligned, near, around = 1.0, 2.0, 0.5
     fingers = (0.04 - 0.03) + (0.04 - 0.02)
@@ -137,7 +137,7 @@ def test_a_gripper_about_the_handle_earns_every_share(env):
     assert pay(env) == pytest.approx(expected, abs=0.02)
 
 
-def test_an_open_drawer_is_paid_half_as_much_again_while_it_is_held(env):
+def test_held_open_drawer_has_bonus(env):
     model, data = env.world()
     for opening, bonus in [(0.005, 0.0), (0.1, 0.5), (0.25, 1.0), (0.395, 2.0)]:
         joints = reach_for(model, data, np.array([0.35 + opening, 0.0, 0.72]), at_handle(env))
@@ -146,7 +146,7 @@ def test_an_open_drawer_is_paid_half_as_much_again_while_it_is_held(env):
         assert pay(env) == pytest.approx(expected, abs=0.03), opening
 
 
-def test_far_from_the_handle_only_nearness_and_attitude_count(env):
+def test_reward_far_from_handle(env):
     put(env, drawer=0.3)
     robot = env.entities["robot"].data
     distance = math.dist(robot.site_pos_w[0, 0].tolist(), [0.65, 0.0, 0.72])
@@ -166,7 +166,7 @@ def test_far_from_the_handle_only_nearness_and_attitude_count(env):
 # --- actions, starts, ends ---
 
 
-def test_actions_move_the_targets_and_stop_at_the_limits(env):
+def test_actions_move_targets_within_limits(env):
     env.reset()
     before = env.task.targets.clone()
     action = torch.zeros(4, 9)
@@ -183,7 +183,7 @@ def test_actions_move_the_targets_and_stop_at_the_limits(env):
     torch.testing.assert_close(env.engine.field("ctrl")[:, :9].float(), high.expand(4, 9))
 
 
-def test_arms_start_about_their_pose_and_drawers_nearly_shut():
+def test_initial_states_fill_ranges():
     env = build("open-drawer", 256)
     env.reset()
     joints, default = env.entities["robot"].data.joint_pos, torch.tensor([*HOME, 0.035, 0.035])
@@ -197,7 +197,7 @@ def test_arms_start_about_their_pose_and_drawers_nearly_shut():
     assert 0.009 < float(drawer.max()) <= 0.01
 
 
-def test_an_open_drawer_succeeds_and_does_not_end_the_episode(env):
+def test_open_drawer_succeeds_without_termination(env):
     env.reset()
     put(env, drawer=0.36, row=0)
     put(env, drawer=0.34, row=1)
@@ -207,7 +207,7 @@ def test_an_open_drawer_succeeds_and_does_not_end_the_episode(env):
     assert not bool(result.terminated.any() | result.truncated.any())
 
 
-def test_wild_actions_never_blow_the_simulation_up():
+def test_random_actions_keep_simulation_stable():
     env = build("open-drawer", 16)
     env.reset()
     for action in actions(200, 16, 9):

@@ -1,10 +1,11 @@
-"""The task `quadcopter`: its model, what it observes, what it pays, where it ends, how it starts."""
+"""The task `quadcopter`: model, observations, rewards, terminations, initial states."""
 
 import math
 
 import pytest
 import torch
-from support.flight import about, hover_for_a_second, look, pay, put, weight
+from support.direct_states import observe, quat_around, reward_and_done
+from support.flight import hover_for_a_second, put, weight
 from support.worlds import build
 
 from rlcli_tasks.quadcopter.task import JOINTS
@@ -28,7 +29,7 @@ def act(env, thrust=0.0, tilts=0.0, steps=1):
 # --- the model ---
 
 
-def test_the_model_has_the_mass_and_the_ranges_of_its_source(env):
+def test_model_has_mass_and_ranges_of_source(env):
     chassis, gimbal, rotor = (
         50 * math.pi * 0.1**2 * 0.03,
         200 * 4 / 3 * math.pi * 0.01**3,
@@ -40,7 +41,7 @@ def test_the_model_has_the_mass_and_the_ranges_of_its_source(env):
     assert tuple(env.entities["robot"].joint_names) == JOINTS
 
 
-def test_four_quarters_of_the_weight_hold_it_in_the_air(env):
+def test_thrust_equal_to_weight_hovers(env):
     put(env)
     act(env, thrust=weight(env) / 4, steps=100)
     state = env.entities["robot"].data
@@ -49,21 +50,21 @@ def test_four_quarters_of_the_weight_hold_it_in_the_air(env):
     assert state.root_pos_w[0].tolist() == pytest.approx([0, 0, 1], abs=5e-3)
 
 
-def test_a_rotor_at_full_thrust_bends_its_gimbal_by_less_than_a_degree(env):
+def test_full_thrust_bends_gimbal_less_than_a_degree(env):
     put(env)
     act(env, thrust=[2.0, 0.0, 0.0, 0.0], steps=5)
     bent = env.entities["robot"].data.joint_pos[0].abs().max()
     assert 0.0 < bent < math.radians(1.0)
 
 
-def test_servos_reach_the_tilt_they_are_asked_for_within_a_tenth_of_a_second(env):
+def test_servos_reach_target_tilt_within_tenth_of_second(env):
     put(env)
     asked = torch.tensor([0.5, -0.5, 0.3, 0.2, -0.2, 0.1, 0.0, -0.4])
     act(env, thrust=weight(env) / 4, tilts=asked, steps=10)
     assert env.entities["robot"].data.joint_pos[0].tolist() == pytest.approx(asked.tolist(), abs=0.05)
 
 
-def test_rotors_rolled_the_same_way_turn_it_about_the_vertical_where_it_stands(env):
+def test_equal_rotor_tilts_yaw_without_drift(env):
     put(env)
     act(env, thrust=weight(env) / 4, tilts=[0.0, 0.3] * 4, steps=15)
     state = env.entities["robot"].data
@@ -71,7 +72,7 @@ def test_rotors_rolled_the_same_way_turn_it_about_the_vertical_where_it_stands(e
     assert state.root_lin_vel_w[0, :2].abs().max() < 1e-2
 
 
-def test_more_thrust_in_front_raises_the_nose_and_drives_it_back(env):
+def test_more_front_thrust_pitches_up_and_moves_back(env):
     put(env)
     quarter = weight(env) / 4
     act(env, thrust=[quarter * 1.1, quarter * 0.9, quarter * 0.9, quarter * 1.1], steps=20)
@@ -80,7 +81,7 @@ def test_more_thrust_in_front_raises_the_nose_and_drives_it_back(env):
     assert state.root_lin_vel_w[0, 0] < -0.01
 
 
-def test_random_actions_never_blow_the_simulation_up():
+def test_random_actions_keep_simulation_stable():
     env = build("quadcopter", 256)
     env.reset()
     generator = torch.Generator().manual_seed(0)
@@ -95,7 +96,7 @@ def test_random_actions_never_blow_the_simulation_up():
 # --- actions and observations ---
 
 
-def test_actions_are_speeds_of_thrusts_and_tilts_that_stop_at_their_limits(env):
+def test_actions_are_rates_with_limits(env):
     task = env.task
     task.tilts.zero_()
     action = torch.zeros(4, 12)
@@ -113,64 +114,71 @@ def test_actions_are_speeds_of_thrusts_and_tilts_that_stop_at_their_limits(env):
     assert env.engine.field("ctrl")[1].tolist() == pytest.approx([math.pi / 6] * 8 + [2.0] * 4)
 
 
-def test_the_state_is_observed_in_its_units(env):
+def test_observation_units(env):
     joints = torch.linspace(-0.4, 0.4, 8).double()
-    put(env, position=(0.3, -0.6, 1.9), quat=about(3, 0.5), linear=(1, 2, -3), angular=(0, 0, math.pi), joints=joints)
-    seen = look(env)
+    put(
+        env,
+        position=(0.3, -0.6, 1.9),
+        quat=quat_around(3, 0.5),
+        linear=(1, 2, -3),
+        angular=(0, 0, math.pi),
+        joints=joints,
+    )
+    seen = observe(env)
     assert [seen[f"to_target_{x}"] for x in "xyz"] == pytest.approx([-0.1, 0.2, -0.3])
-    assert [seen[f"quat_{x}"] for x in "wxyz"] == pytest.approx(list(about(3, 0.5)))
+    assert [seen[f"quat_{x}"] for x in "wxyz"] == pytest.approx(list(quat_around(3, 0.5)))
     assert [seen[f"vel_{x}"] for x in "xyz"] == pytest.approx([0.5, 1.0, -1.5])
     assert [seen[f"rate_{x}"] for x in "xyz"] == pytest.approx([0, 0, 1], abs=1e-6)
     assert [seen[f"{joint}_pos"] for joint in JOINTS] == pytest.approx(joints.tolist())
 
 
-def test_rates_are_those_of_the_world(env):
-    put(env, quat=about(1, math.pi / 2), angular=(0.0, 1.0, 0.0))  # its y axis points up
-    seen = look(env)
+def test_rates_are_in_world_frame(env):
+    put(env, quat=quat_around(1, math.pi / 2), angular=(0.0, 1.0, 0.0))  # its y axis points up
+    seen = observe(env)
     assert [seen[f"rate_{x}"] for x in "xyz"] == pytest.approx([0, 0, 1 / math.pi], abs=1e-6)
 
 
 # --- rewards and ends ---
 
 
-def test_level_and_still_at_the_target_pays_three(env):
+def test_hovering_at_target_is_rewarded_with_three(env):
     put(env)
-    assert pay(env) == (pytest.approx(3.0), False)
+    assert reward_and_done(env) == (pytest.approx(3.0), False)
 
 
 @pytest.mark.parametrize("distance", [0.1, 0.5, 1.0, 2.0])
-def test_nearness_scales_everything(env, distance):
+def test_nearness_scales_reward(env, distance):
     put(env, position=(distance, 0.0, 1.0))
-    assert pay(env)[0] == pytest.approx(3.0 / (1.0 + 3.0 * distance**2), rel=1e-5)
+    assert reward_and_done(env)[0] == pytest.approx(3.0 / (1.0 + 3.0 * distance**2), rel=1e-5)
 
 
 @pytest.mark.parametrize(("axis", "tilt"), [(1, 0.5), (2, -1.0), (1, 3.0)])
-def test_leaning_costs_whichever_way(env, axis, tilt):
-    put(env, quat=about(axis, tilt))
-    assert pay(env)[0] == pytest.approx(2.0 + 1.0 / (1.0 + 10.0 * (1.0 - math.cos(tilt)) ** 2), rel=1e-5)
+def test_tilt_reduces_reward_in_every_direction(env, axis, tilt):
+    put(env, quat=quat_around(axis, tilt))
+    assert reward_and_done(env)[0] == pytest.approx(2.0 + 1.0 / (1.0 + 10.0 * (1.0 - math.cos(tilt)) ** 2), rel=1e-5)
 
 
 @pytest.mark.parametrize("spin", [-2.0, 10.0])
-def test_spinning_costs_either_way(env, spin):
+def test_spin_reduces_reward_in_both_directions(env, spin):
     put(env, angular=(0, 0, spin))
-    assert pay(env)[0] == pytest.approx(2.0 + 1.0 / (1.0 + 0.001 * spin**2) - spin**2 / 400.0, rel=1e-5)
+    assert reward_and_done(env)[0] == pytest.approx(2.0 + 1.0 / (1.0 + 0.001 * spin**2) - spin**2 / 400.0, rel=1e-5)
 
 
-def test_no_reward_is_below_zero(env):
+def test_reward_is_never_negative(env):
     put(env, angular=(0, 0, 60.0))
-    assert pay(env)[0] == 0.0
+    assert reward_and_done(env)[0] == 0.0
 
 
 @pytest.mark.parametrize(
     ("position", "ends"),
     [((0, 0, 0.299), True), ((0, 0, 0.301), False), ((2.99, 0, 1), False), ((0, -3.01, 1), True), ((0, 0, 4.01), True)],
 )
-def test_it_ends_too_low_or_too_far_from_the_target(env, position, ends):
+def test_terminates_too_low_or_too_far(env, position, ends):
     put(env, position=position)
-    assert pay(env)[1] is ends
+    assert reward_and_done(env)[1] is ends
 
 
-def test_time_truncates_after_five_hundred_steps(env):
+def test_time_out_after_500_steps(env):
     assert env.max_episode_length == 500
     env.episode_length_buf[2] = 499
     result = env.step(torch.zeros(4, 12))
@@ -181,7 +189,7 @@ def test_time_truncates_after_five_hundred_steps(env):
 # --- starts ---
 
 
-def test_starts_fill_their_ranges_and_nothing_else_differs():
+def test_initial_states_fill_ranges():
     env = build("quadcopter", 500)
     env.reset()
     qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")
@@ -198,7 +206,7 @@ def test_starts_fill_their_ranges_and_nothing_else_differs():
     assert not qvel.any()
 
 
-def test_an_episode_starts_without_thrust_and_with_the_tilts_it_is_drawn(env):
+def test_initial_thrust_is_zero_and_tilts_are_sampled(env):
     env.task.thrusts.fill_(1.0)
     env.episode_length_buf[1] = 499
     env.step(torch.zeros(4, 12))
@@ -213,6 +221,6 @@ def test_an_episode_starts_without_thrust_and_with_the_tilts_it_is_drawn(env):
     ("offset", "velocity", "succeeds"),
     [((0.05, 0, 0), (0, 0, 0), True), ((0, 0, 0.15), (0, 0, 0), False), ((0, 0, 0), (0.8, 0, 0), False)],
 )
-def test_hovering_at_the_target_to_the_end_is_a_success(offset, velocity, succeeds):
+def test_success_requires_hovering_until_end(offset, velocity, succeeds):
     env = build("quadcopter", 2, "episode_length_s=1.0")
     assert hover_for_a_second(env, offset, velocity) == [succeeds] * 2

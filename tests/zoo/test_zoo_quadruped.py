@@ -1,4 +1,4 @@
-"""The quadruped: its model, what it observes and is paid for, where episodes end and start, its ground."""
+"""The quadruped tasks: model, observations, rewards, terminations, initial states, terrain."""
 
 import math
 
@@ -26,7 +26,7 @@ def quadruped(task="quadruped-flat", num_envs=2, *overrides):
 
 def put(env, row, *, position=(0.0, 0.0, 0.34), quat=(1.0, 0.0, 0.0, 0.0), linear=(0, 0, 0), angular=(0, 0, 0),
         joints=STAND, rates=0.0):  # fmt: skip
-    """Put one environment into a state; velocities are in the world's and in the trunk's frame."""
+    """Set the state of one environment; linear velocity in the world frame, angular in the trunk's frame."""
     qpos, qvel = env.engine.field("qpos"), env.engine.field("qvel")
     values = [*position, *quat, *joints]
     qpos[row] = torch.tensor(values, dtype=torch.float64)
@@ -36,13 +36,13 @@ def put(env, row, *, position=(0.0, 0.0, 0.34), quat=(1.0, 0.0, 0.0, 0.0), linea
     env.sim.forward_moved()
 
 
-def ask(env, *command):
-    """Ask this of all environments."""
+def set_command(env, *command):
+    """Set the command of all environments."""
     env.command_manager.get_command("velocity")[:] = torch.tensor(command)
 
 
-def paid(env, row=0):
-    """Reward terms of the state as it is, weights and the step's 0.02 s taken out."""
+def reward_terms(env, row=0):
+    """Return the reward terms of the current state, without weights and step time."""
     env.reward_manager.compute(torch.zeros(env.num_envs, dtype=torch.bool))
     weights = {term.name: term.config.weight for term in env.reward_manager.terms}
     values = dict(zip(weights, env.reward_manager.step_terms[:, row].tolist(), strict=True))
@@ -52,7 +52,7 @@ def paid(env, row=0):
 # --- the model ---
 
 
-def test_the_masses_limits_and_gains_are_those_of_a_go1():
+def test_masses_limits_and_gains_equal_go1():
     model = build("quadruped-flat", 1).engine.model
     mass = {
         name: float(model.body(f"robot/{name}").mass[0])
@@ -71,7 +71,7 @@ def test_the_masses_limits_and_gains_are_those_of_a_go1():
     assert model.dof_armature[6:].reshape(4, 3).tolist() == [[0.00403, 0.00403, 0.00906]] * 4
 
 
-def test_feet_are_where_the_angles_say():
+def test_foot_positions_follow_joint_angles():
     env = quadruped(num_envs=1)
     put(env, 0)
     sites = env.entities["robot"].data.site_pos_w[0]
@@ -85,7 +85,7 @@ def test_feet_are_where_the_angles_say():
         assert sites[number].tolist() == pytest.approx([x, y, z], abs=1e-5), leg
 
 
-def test_only_feet_knees_and_trunk_touch_and_only_the_ground():
+def test_only_feet_knees_and_trunk_touch_ground():
     model = build("quadruped-flat", 1).engine.model
     names = [model.geom(geom).name.removeprefix("robot/") for geom in range(model.ngeom)]
     solid = {name for name, bits in zip(names, model.geom_conaffinity, strict=True) if bits and name != "ground"}
@@ -96,7 +96,7 @@ def test_only_feet_knees_and_trunk_touch_and_only_the_ground():
     assert not any(bits for name, bits in zip(names, model.geom_contype, strict=True) if name != "ground")
 
 
-def test_its_feet_carry_its_weight():
+def test_feet_carry_weight():
     env = quadruped(num_envs=2)
     for _ in range(100):
         env.step(torch.zeros(2, 12))
@@ -107,7 +107,7 @@ def test_its_feet_carry_its_weight():
     assert (env.entities["robot"].data.root_pos_w[:, 2] > 0.26).all()
 
 
-def test_an_action_moves_the_targets_by_a_quarter_of_a_radian():
+def test_action_moves_targets_by_quarter_radian():
     env = quadruped(num_envs=1)
     action = torch.linspace(-1.0, 1.0, 12)
     env.step(action[None])
@@ -115,14 +115,14 @@ def test_an_action_moves_the_targets_by_a_quarter_of_a_radian():
     assert targets.tolist() == pytest.approx((torch.tensor(STAND) + 0.25 * action).tolist(), abs=1e-6)
 
 
-# --- what it observes and is paid for ---
+# --- observations and rewards ---
 
 
-def test_the_observation_of_a_state():
+def test_observation_of_state():
     env = quadruped()
     quat = (math.cos(0.3), math.sin(0.3), 0.0, 0.0)  # rolled by 0.6 rad
     put(env, 1, quat=quat, linear=(0.5, 0.0, 0.0), angular=(0.1, 0.2, 0.3), joints=[q + 0.1 for q in STAND], rates=2.0)
-    ask(env, 0.4, -0.3, 0.2)
+    set_command(env, 0.4, -0.3, 0.2)
     seen = env._compute_observations()["policy"][1].tolist()
     assert len(seen) == 48
     assert seen[0:3] == pytest.approx([0.5, 0.0, 0.0], abs=1e-5)
@@ -134,41 +134,41 @@ def test_the_observation_of_a_state():
     assert seen[36:48] == [0.0] * 12
 
 
-def test_rewards_of_a_state():
+def test_rewards_of_state():
     env = quadruped()
     quat = (math.cos(0.1), 0.0, math.sin(0.1), 0.0)  # pitched by 0.2 rad
     put(env, 0, position=(0.0, 0.0, 1.0), quat=quat, angular=(0.2, -0.3, 0.5))
-    ask(env, 0.3, -0.4, 0.0)
-    found = paid(env)
+    set_command(env, 0.3, -0.4, 0.0)
+    found = reward_terms(env)
     assert found["track_lin_vel"] == pytest.approx(math.exp(-0.25 / 0.25), rel=1e-4)
     assert found["track_ang_vel"] == pytest.approx(math.exp(-0.25 / 0.25), rel=1e-4)
     assert found["ang_vel_xy"] == pytest.approx(0.04 + 0.09, rel=1e-4)
     assert found["flat_orientation"] == pytest.approx(math.sin(0.2) ** 2, rel=1e-4)
-    assert found["stand_still"] == 0.0  # it is asked to go
+    assert found["stand_still"] == 0.0  # the command is to move
     put(env, 0, position=(0.0, 0.0, 1.0), linear=(0.0, 0.0, 0.5), joints=[q + 0.1 for q in STAND])
-    ask(env, 0.0, 0.0, 0.0)
-    found = paid(env)
+    set_command(env, 0.0, 0.0, 0.0)
+    found = reward_terms(env)
     assert found["lin_vel_z"] == pytest.approx(0.25, rel=1e-4)
     assert found["track_lin_vel"] == pytest.approx(1.0)
     assert found["stand_still"] == pytest.approx(1.2, rel=1e-4)
 
 
-def test_a_step_in_the_air_is_paid_by_how_long_it_was():
+def test_feet_air_time_reward():
     env = quadruped(num_envs=1)
     feet = env.sensors["feet"]
-    ask(env, 0.5, 0.0, 0.0)
+    set_command(env, 0.5, 0.0, 0.0)
     feet.last_air_time[:] = torch.tensor([[0.45, 0.15, 0.9, 0.9]])
     feet.first_contact[:] = torch.tensor([[True, True, False, False]])
     threshold = env.config.rewards["feet_air_time"].params["threshold"]
-    assert paid(env)["feet_air_time"] == pytest.approx(0.45 + 0.15 - 2 * threshold, abs=1e-5)
-    ask(env, 0.0, 0.0, 0.9)
-    assert paid(env)["feet_air_time"] == 0.0  # nothing is paid for steps on the spot
+    assert reward_terms(env)["feet_air_time"] == pytest.approx(0.45 + 0.15 - 2 * threshold, abs=1e-5)
+    set_command(env, 0.0, 0.0, 0.9)
+    assert reward_terms(env)["feet_air_time"] == 0.0  # no reward for steps without a command
 
 
 # --- episodes ---
 
 
-def test_it_starts_near_its_default_pose_anywhere_about_the_origin_and_any_way_round():
+def test_initial_states_fill_ranges():
     env = build("quadruped-flat", 200)
     env.reset()
     data = env.entities["robot"].data
@@ -180,7 +180,7 @@ def test_it_starts_near_its_default_pose_anywhere_about_the_origin_and_any_way_r
     assert data.heading_w.min() < -2.5 < 2.5 < data.heading_w.max()
 
 
-def test_an_episode_ends_where_the_trunk_touches_the_ground():
+def test_trunk_contact_terminates():
     env = quadruped(num_envs=3)
     put(env, 1, position=(0.0, 0.0, 0.05), joints=[0.1, 3.0, -0.9] * 4)  # its legs in the air
     put(env, 2, quat=(0.0, 1.0, 0.0, 0.0), position=(0.0, 0.0, 0.05))  # on its back
@@ -189,8 +189,8 @@ def test_an_episode_ends_where_the_trunk_touches_the_ground():
     assert not result.truncated.any()
 
 
-def test_it_succeeds_where_the_whole_episode_followed_its_commands():
-    """Nobody moves: who is asked to stand follows, who is asked to run does not."""
+def test_success_requires_tracking_whole_episode():
+    """Check that a robot at rest succeeds with a zero command and fails with a velocity command."""
     env = quadruped("quadruped-flat", 2, "episode_length_s=2.0", "success.hold_s=0.5")
     for _ in range(100):
         env.command_manager.get_command("velocity")[:] = torch.tensor([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0]])
@@ -201,10 +201,10 @@ def test_it_succeeds_where_the_whole_episode_followed_its_commands():
     assert ended.metrics["velocity/error_vel_xy"][1] == pytest.approx(0.8, abs=0.1)
 
 
-# --- rough ground ---
+# --- rough terrain ---
 
 
-def test_the_height_scan_sees_the_ground_about_the_trunk():
+def test_height_scan_of_terrain():
     env = quadruped("quadruped-rough", 1, "scene.terrain.max_start_level=0")
     position = env.origins[0] + torch.tensor([0.3, -0.2, 0.6])
     put(env, 0, position=position.tolist())
@@ -220,18 +220,18 @@ def test_the_height_scan_sees_the_ground_about_the_trunk():
     assert rows[:, 15:].flatten().tolist() == pytest.approx([0.13] * 22, abs=1e-3)
 
 
-def test_levels_rise_with_the_way_that_was_covered():
+def test_terrain_levels_rise_with_distance():
     env = quadruped("quadruped-rough", 3, "episode_length_s=0.02")
     env.terrain.levels.fill_(2)
     for row, way in enumerate((4.5, 0.1, 0.0)):
         place = env.origins[row] + torch.tensor([way, 0.0, 0.5])
         put(env, row, position=place.tolist())
-    ask(env, 1.0, 0.0, 0.0)  # half of the way that was asked for is 0.01 m, half a patch 4 m
+    set_command(env, 1.0, 0.0, 0.0)  # half of the way that was asked for is 0.01 m, half a patch 4 m
     env.step(torch.zeros(3, 12))
     assert env.terrain.levels.tolist() == [3, 2, 1]
 
 
-def test_played_episodes_begin_on_levels_of_their_own():
+def test_play_spreads_terrain_levels():
     resolved = resolve(find_task("quadruped-rough"), play=True)
     env = make_env(resolved, seed=1)
     env.reset()
@@ -247,7 +247,7 @@ def test_played_episodes_begin_on_levels_of_their_own():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["quadruped-flat", "quadruped-rough"])
-def test_on_the_gpus_engine_it_stands_as_on_the_cpus(task):
+def test_gpu_engine_stands_like_cpu(task):
     small = ["scene.terrain.rows=2", "scene.terrain.columns=2", "scene.terrain.max_start_level=1"]
     stood = []
     for engine in ("batch", "warp"):

@@ -1,4 +1,4 @@
-"""The tasks `reach` and `reach-ik`, and the arm that they share with others: joints, motors, commands, success."""
+"""The tasks `reach` and `reach-ik`, and the arm: joints, motors, commands, success."""
 
 import math
 
@@ -24,7 +24,7 @@ def env():
 
 @pytest.fixture
 def arm(env):
-    """The compiled arm, and a state of it."""
+    """Return the compiled arm and its data."""
     return env.world()
 
 
@@ -33,7 +33,7 @@ def body(model, name):
 
 
 def pose(model, data, joints):
-    """The hand's position and axes (columns) with the joints so."""
+    """Return position and axes (columns) of the hand for some joints."""
     data.qpos[ARM] = joints
     mujoco.mj_forward(model, data)
     hand = body(model, "hand")
@@ -41,7 +41,7 @@ def pose(model, data, joints):
 
 
 def put(env, joints):
-    """Every arm into one pose, at rest."""
+    """Set all arms to one pose, at rest."""
     env.engine.field("qpos")[:, ARM] = torch.tensor(joints, dtype=torch.float64)
     env.engine.field("qvel")[:] = 0.0
     env.engine.forward(env._select_all())
@@ -49,7 +49,7 @@ def put(env, joints):
 
 
 def pay(env):
-    """What each term pays in the state as it is, in environment 0."""
+    """Return the value of each reward term in environment 0."""
     env.reward_manager.compute(torch.zeros(env.num_envs, dtype=torch.bool))
     return {name: float(value[0]) for name, value in env.reward_manager.values().items()}
 
@@ -57,14 +57,14 @@ def pay(env):
 # --- the arm ---
 
 
-def test_stretched_up_the_hand_is_as_high_as_the_links_are_long(arm):
+def test_height_of_stretched_arm(arm):
     """0.333 + 0.316 + 0.384 m to the wrist; from there 0.088 m ahead and the flange's 0.107 m back down."""
     place, axes = pose(*arm, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert place == pytest.approx([0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107], abs=1e-6)
     assert axes[:, 2] == pytest.approx([0.0, 0.0, -1.0], abs=1e-6)
 
 
-def test_the_ready_pose_points_the_hand_down_and_its_fingers_sideways(arm):
+def test_default_pose_of_hand(arm):
     place, axes = pose(*arm, READY)
     # leaning back by 45 degrees, the elbow's 0.0825 m square to the upper arm; then ahead, 0.0825 m above that
     half = math.sqrt(0.5)
@@ -74,7 +74,7 @@ def test_the_ready_pose_points_the_hand_down_and_its_fingers_sideways(arm):
     assert axes == pytest.approx(np.diag([1.0, -1.0, -1.0]), abs=1e-5)
 
 
-def test_joints_turn_as_far_and_give_as_much_as_the_panda(arm):
+def test_joint_limits_and_torques_equal_panda(arm):
     model, _ = arm
     low, high = model.jnt_range[ARM].T
     assert low.tolist() == [-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973]
@@ -87,7 +87,7 @@ def test_joints_turn_as_far_and_give_as_much_as_the_panda(arm):
 
 
 @pytest.mark.parametrize(("joint", "fastest"), [(0, 2.175), (6, 12.0 / 4.6)])
-def test_no_command_turns_a_joint_faster_than_its_motor_can(arm, joint, fastest):
+def test_joint_speed_is_limited_by_damping(arm, joint, fastest):
     """Full torque against the joint's damping: 2.175 rad/s of the first four joints, 2.61 rad/s of the last three."""
     model, data = arm
     data.qpos[ARM], data.ctrl[ARM] = READY, READY
@@ -99,7 +99,7 @@ def test_no_command_turns_a_joint_faster_than_its_motor_can(arm, joint, fastest)
     assert 0.95 * fastest < max(speeds) < 1.02 * fastest
 
 
-def test_gravity_does_not_pull_the_arm_down(arm):
+def test_gravity_is_compensated(arm):
     model, data = arm
     data.qpos[ARM], data.ctrl[ARM] = READY, READY
     for _ in range(120):
@@ -107,7 +107,7 @@ def test_gravity_does_not_pull_the_arm_down(arm):
     assert np.abs(data.qpos[ARM] - READY).max() < 1e-4
 
 
-def test_the_gripper_meets_the_ground_and_the_links_pass_through_each_other(arm):
+def test_gripper_collides_with_ground_only(arm):
     model, data = arm
     pose(model, data, [0.0, 1.2, 0.0, -1.6, 0.0, 2.8, 0.785])
     bodies = {model.geom(int(g)).name for pair in data.contact.geom for g in pair}
@@ -118,11 +118,11 @@ def test_the_gripper_meets_the_ground_and_the_links_pass_through_each_other(arm)
     assert data.ncon == 0
 
 
-# --- what is asked ---
+# --- commands ---
 
 
 @pytest.mark.parametrize("task", ["reach", "reach-ik"])
-def test_commands_lie_in_their_box_and_point_the_hand_down(task):
+def test_commands_are_in_range(task):
     env = build(task, 256)
     env.reset()
     command = env.command_manager.get_term("ee_pose").command
@@ -135,7 +135,7 @@ def test_commands_lie_in_their_box_and_point_the_hand_down(task):
     torch.testing.assert_close(down, torch.full_like(down, -1.0))
 
 
-def test_a_command_lasts_four_seconds(env):
+def test_command_lasts_four_seconds(env):
     env.reset()
     command = env.command_manager.get_term("ee_pose").command
     before, changes = command.clone(), []
@@ -147,7 +147,7 @@ def test_a_command_lasts_four_seconds(env):
     assert changes == [120, 240]
 
 
-def test_success_takes_place_and_attitude(env):
+def test_success_requires_position_and_orientation(env):
     """Asked for exactly where the hand is, then 6 cm beside it, then turned by 0.25 rad."""
     env.reset()
     put(env, READY)
@@ -164,7 +164,7 @@ def test_success_takes_place_and_attitude(env):
     assert env.compute_success().tolist() == [True, False, False, True]
 
 
-def test_rewards_are_those_of_the_distance_and_the_angle(env):
+def test_rewards_of_distance_and_angle(env):
     env.reset()
     put(env, READY)
     term = env.command_manager.get_term("ee_pose")
@@ -194,7 +194,7 @@ def test_penalties_grow_after_4500_steps(env):
     env.curriculum_manager.advance(torch.tensor(0))
 
 
-def test_arms_start_at_half_to_one_and_a_half_of_their_pose():
+def test_initial_joints_are_scaled_default_pose():
     env = build("reach", 256)
     env.reset()
     joints, home = env.entities["robot"].data.joint_pos[:, ARM], torch.tensor(READY)
@@ -205,10 +205,10 @@ def test_arms_start_at_half_to_one_and_a_half_of_their_pose():
     assert float((joints.amax(0) - joints.amin(0))[1]) > 0.5
 
 
-# --- what is done ---
+# --- actions ---
 
 
-def test_an_action_moves_the_joints_half_a_radian_about_their_pose(env):
+def test_action_moves_joints_by_half_radian(env):
     env.reset()
     action = torch.zeros(4, 7)
     action[:, 0], action[:, 6] = 0.5, -1.0
@@ -219,7 +219,7 @@ def test_an_action_moves_the_joints_half_a_radian_about_their_pose(env):
     torch.testing.assert_close(reached, wanted, atol=0.01, rtol=0)
 
 
-def test_inverse_kinematics_moves_the_hand_along_the_asked_axis():
+def test_inverse_kinematics_follows_commanded_axis():
     env = build("reach-ik", 2)
     env.reset()
     put(env, READY)
@@ -239,7 +239,7 @@ def test_inverse_kinematics_moves_the_hand_along_the_asked_axis():
 
 
 @pytest.mark.parametrize("task", ["reach", "reach-ik"])
-def test_wild_actions_never_blow_the_simulation_up(task):
+def test_random_actions_keep_simulation_stable(task):
     env = build(task, 16)
     env.reset()
     fastest = 0.0

@@ -1,4 +1,4 @@
-"""The two forms of ant and of humanoid, stepped side by side: what they observe, pay and end is the same."""
+"""Both forms of ant and of humanoid, stepped together: equal observations, rewards and terminations."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ torch.set_num_threads(1)
 
 
 def same_states(managed, direct, rows):
-    """Put the direct form into the state of the manager-based one, in some environments."""
+    """Copy the state of the manager-based form to the direct form, in some environments."""
     for field in ("qpos", "qvel"):
         direct.engine.field(field)[rows] = managed.engine.field(field)[rows]
 
@@ -18,17 +18,17 @@ def close(left, right, what):
 
 
 @pytest.mark.parametrize(("name", "size", "low"), [("ant", 8, 0.2), ("humanoid", 21, 0.7)])
-def test_the_two_forms_agree_step_by_step(name, size, low):
+def test_both_forms_agree_step_by_step(name, size, low):
     n, steps = 24, 150
     short = "episode_length_s=1.0"
     managed, direct = build(name, n, short), build(f"{name}-direct", n, short)
     managed.reset(), direct.reset()
     same_states(managed, direct, torch.arange(n))
-    age = torch.arange(n) * 2  # so that time runs out at different steps
+    age = torch.arange(n) * 2  # so that time-outs happen at different steps
     managed.episode_length_buf[:], direct.episode_length_buf[:] = age, age
     for env in (managed, direct):
         env.engine.field("qvel")[:, 0] = torch.linspace(-3.0, 3.0, n).double()
-        env.engine.field("qpos")[::6, 2], env.engine.field("qvel")[::6, 2] = low, -3.0  # these have fallen
+        env.engine.field("qpos")[::6, 2], env.engine.field("qvel")[::6, 2] = low, -3.0  # these environments have fallen
     random = torch.Generator().manual_seed(1)
     falls = outs = 0
     for step in range(steps):
@@ -46,13 +46,13 @@ def test_the_two_forms_agree_step_by_step(name, size, low):
                 managed.engine.field("qpos")[rows][:, :7], direct.engine.field("qpos")[rows][:, :7], "where they start"
             )
         falls, outs = falls + int(a.terminated.sum()), outs + int(a.truncated.sum())
-        same_states(managed, direct, torch.arange(n))  # rounding would grow otherwise, and start states are drawn anew
+        same_states(managed, direct, torch.arange(n))  # initial states differ, and rounding errors would grow
     assert falls >= 3
     assert outs >= 5
 
 
 @pytest.mark.parametrize("name", ["ant", "humanoid"])
-def test_the_two_forms_start_from_the_same_distribution(name):
+def test_both_forms_have_same_initial_distribution(name):
     states = []
     for form in (name, f"{name}-direct"):
         env = build(form, 600)

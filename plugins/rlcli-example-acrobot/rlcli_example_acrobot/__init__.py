@@ -1,4 +1,4 @@
-"""An arm of two links that is driven at its elbow alone, and learns to balance upright."""
+"""An arm of two links with a motor only at its elbow, which must balance upright."""
 
 from rlcli.task import TaskSpec
 

@@ -1,4 +1,4 @@
-"""The terms that rlcli does not have: how high the tip of the arm is, and whether it is high enough."""
+"""Terms that rlcli does not have: height of the arm's tip, and thresholds of it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rlcli.task import Entity, Joints
 def tip_height(
     env, *, entity: Entity = "robot", joints: Joints = ("shoulder", "elbow"), lengths: tuple[float, float]
 ) -> Tensor:
-    """Height of the tip over the shoulder, as a share of the arm's length: -1 hanging, 1 upright. (num_envs,)"""
+    """Return the height of the tip above the shoulder, over the arm's length: -1 hanging, 1 upright. (num_envs,)"""
     shoulder, elbow = entity.data.joint_pos[:, joints].unbind(dim=1)
     upper, lower = lengths
     return (upper * torch.cos(shoulder) + lower * torch.cos(shoulder + elbow)) / (upper + lower)
@@ -25,7 +25,7 @@ def tip_below(
     lengths: tuple[float, float],
     height: float,
 ) -> Tensor:
-    """The tip is lower than `height`, a share of the arm's length. (num_envs,) bool"""
+    """Return whether the tip is lower than `height`, a fraction of the arm's length. (num_envs,) bool"""
     return tip_height(env, entity=entity, joints=joints, lengths=lengths) < height
 
 
@@ -37,5 +37,5 @@ def tip_above(
     lengths: tuple[float, float],
     height: float,
 ) -> Tensor:
-    """The tip is higher than `height`, a share of the arm's length. (num_envs,) bool"""
+    """Return whether the tip is higher than `height`, a fraction of the arm's length. (num_envs,) bool"""
     return tip_height(env, entity=entity, joints=joints, lengths=lengths) > height

@@ -1,4 +1,4 @@
-"""The task keeps rlcli's contract, and its own terms compute what they say."""
+"""Contract of the task, and values of its own terms."""
 
 import math
 from types import SimpleNamespace
@@ -9,11 +9,11 @@ from rlcli_example_acrobot.terms import tip_above, tip_below, tip_height
 
 
 def arm(*angles):
-    """An entity whose joints stand at these (shoulder, elbow) angles, one pair an environment."""
+    """Return an entity with these joint angles (shoulder, elbow), one pair per environment."""
     return SimpleNamespace(data=SimpleNamespace(joint_pos=torch.tensor(angles)))
 
 
-def test_the_contract(rlcli_check):
+def test_contract(rlcli_check):
     assert rlcli_check("acrobot") == []
 
 
@@ -21,12 +21,12 @@ def test_the_contract(rlcli_check):
     ("shoulder", "elbow", "expected"),
     [(0.0, 0.0, 1.0), (math.pi, 0.0, -1.0), (0.0, math.pi, 0.0), (math.pi / 2, -math.pi / 2, 0.5)],
 )
-def test_tip_height_is_a_share_of_the_arms_length(shoulder, elbow, expected):
+def test_tip_height_is_fraction_of_arm_length(shoulder, elbow, expected):
     height = tip_height(None, entity=arm((shoulder, elbow)), joints=slice(0, 2), lengths=(0.5, 0.5))
     assert height.tolist() == pytest.approx([expected], abs=1e-6)
 
 
-def test_above_and_below_part_the_environments():
+def test_tip_above_and_below_split_environments():
     entity = arm((0.0, 0.0), (math.pi / 2, 0.0))
     parameters = {"entity": entity, "joints": slice(0, 2), "lengths": (0.5, 0.5), "height": 0.5}
     assert tip_above(None, **parameters).tolist() == [True, False]

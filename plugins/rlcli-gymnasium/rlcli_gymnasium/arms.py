@@ -1,4 +1,4 @@
-"""Reacher and pusher: an arm reaches a point, and pushes a puck to one."""
+"""Reacher and pusher: an arm reaches a point, or pushes a puck to one."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from rlcli.sim.selection import Selection
 from .base import GymnasiumTask
 
 _CANDIDATES = 32
-"""Draws for the puck's place; 38% of the area is taken, so that all of them fail once in 10^13 episodes."""
+"""Samples of the puck's position. 38 % of the area is excluded, so all samples fail once in 10^13 episodes."""
 
 
 class _Arm(GymnasiumTask):
-    """Looks up bodies by name."""
+    """Base of both arms: finds bodies by name."""
 
     reads = ("xpos",)
 
-    def place(self, body: str) -> Tensor:
-        """Where a body is, a physics step late. (num_envs, 3) [m]"""
+    def body_position(self, body: str) -> Tensor:
+        """Return a body's position, one physics step late. (num_envs, 3) [m]"""
         return self.field.xpos[:, self.bodies[body]]
 
     def post_reset(self) -> None:
-        """Bodies by name."""
+        """Find the bodies."""
         model = self.env.engine.model
         self.bodies = {model.body(b).name.removeprefix("robot/"): b for b in range(model.nbody)}
         super().post_reset()
 
     def velocities(self, selection: Selection, still: int) -> Tensor:
-        """Small ones for the arm, none for the last joints, which are not driven. (rows, nv)"""
+        """Return small velocities for the arm, and 0 for the last joints, which have no actuator. (rows, nv)"""
         noise = self.noise(selection, 0.005, self.model.nv)
         noise[:, -still:] = 0.0
         return noise
@@ -60,21 +60,21 @@ class Reacher(_Arm):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """The arm, the target, and the way between."""
+        """Return the state of the arm, the target, and the vector between them."""
         qpos, angles = self.field.qpos, self.field.qpos[:, :2]
         return [angles.cos(), angles.sin(), qpos[:, 2:], self.field.qvel[:, :2], self.gap()[:, :2]]
 
     def gap(self) -> Tensor:
-        """From the target to the fingertip. (num_envs, 3) [m]"""
-        return self.place("fingertip") - self.place("target")
+        """Return the vector from the target to the fingertip. (num_envs, 3) [m]"""
+        return self.body_position("fingertip") - self.body_position("target")
 
     def score(self) -> Tensor:
-        """Distance and actions cost."""
+        """Return minus the distance and the cost of actions."""
         params = self.params
         return -length(self.gap()) * params.reward_dist_weight - self.action_cost(params.reward_control_weight)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """The arm near straight, the target anywhere within 0.2 m."""
+        """Sample a nearly straight arm, and a target within 0.2 m."""
         qpos = self.start_pos + self.noise(selection, 0.1, self.model.nq)
         radius, turn = 0.2 * selection.uniform(0.0, 1.0).sqrt(), selection.uniform(-math.pi, math.pi)
         qpos[:, -2:] = torch.stack([radius * turn.cos(), radius * turn.sin()], dim=1)
@@ -103,19 +103,19 @@ class Pusher(_Arm):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """The arm, its tip, the puck, the goal."""
-        places = [self.place(body) for body in ("tips_arm", "object", "goal")]
+        """Return the state of the arm, its tip, the puck and the goal."""
+        places = [self.body_position(body) for body in ("tips_arm", "object", "goal")]
         return [self.field.qpos[:, :7], self.field.qvel[:, :7], *places]
 
     def score(self) -> Tensor:
-        """Distances and actions cost."""
-        params, puck = self.params, self.place("object")
-        near = -length(puck - self.place("tips_arm")) * params.reward_near_weight
-        far = -length(puck - self.place("goal")) * params.reward_dist_weight
+        """Return minus the distances and the cost of actions."""
+        params, puck = self.params, self.body_position("object")
+        near = -length(puck - self.body_position("tips_arm")) * params.reward_near_weight
+        far = -length(puck - self.body_position("goal")) * params.reward_dist_weight
         return far - self.action_cost(params.reward_control_weight) + near
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """The puck anywhere in a box, but not on the goal: the first of some draws that is off it."""
+        """Sample the puck's position in a box: the first sample that is not too close to the goal."""
         x = selection.uniform(-0.3, 0.0, (_CANDIDATES,))
         y = selection.uniform(-0.2, 0.2, (_CANDIDATES,))
         off = (x * x + y * y).sqrt() > 0.17

@@ -1,4 +1,4 @@
-"""What Gymnasium's MuJoCo tasks have in common: read the engine in its own dtype, cast at the boundary alone.
+"""Base of Gymnasium's MuJoCo tasks. It reads the engine in its own dtype and converts only at the boundary.
 
 Two things are as in Gymnasium and as nowhere else in rlcli. What MuJoCo derives from the state (xpos, cinert, forces)
 is read one physics step late, as `mj_step` leaves it: `sim.derived_fields: substep` in the YAML is the switch. And the
@@ -22,23 +22,23 @@ class GymnasiumTask(DirectTask):
     """One of Gymnasium's MuJoCo tasks.
 
     `observation` (num_envs, k) and `reward` (num_envs,) are what the buffers hold, before the cast to float32. `ended`
-    (num_envs,) is where the task ends the episode: it is judged once a step, for the reward as well.
+    (num_envs,) is where the task terminates the episode; it is computed once per step, also for the reward.
     """
 
     motors = False
     reads: ClassVar[tuple[str, ...]] = ()
     """Derived fields of the engine that the task reads."""
     moves: ClassVar[bool] = False
-    """Whether `speed` counts."""
+    """Whether the reward uses `speed`."""
 
     def set_up_scene(self, scene) -> None:
-        """On MuJoCo Warp, which has no PGS solver, Newton stands in."""
+        """Replace the PGS solver by Newton on MuJoCo Warp, which has no PGS."""
         on_warp = self.cfg.sim.engine == "warp" or (self.cfg.sim.engine == "auto" and self.device.type == "cuda")
         if on_warp and scene.spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
             scene.spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
 
     def post_reset(self) -> None:
-        """Look up fields, and make the buffers that the hooks fill."""
+        """Find the fields, and create the buffers that the hooks fill."""
         engine = self.env.engine
         self.model = engine.model
         self.field = SimpleNamespace(**{name: engine.field(name) for name in ("qpos", "qvel", "ctrl", *self.reads)})
@@ -53,7 +53,7 @@ class GymnasiumTask(DirectTask):
         self.before = self.progress().clone()
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """The actions are the controls."""
+        """Write the actions to the controls."""
         self.actions.copy_(actions)
         self.field.ctrl.copy_(actions)
         if self.moves:
@@ -66,7 +66,7 @@ class GymnasiumTask(DirectTask):
 
     def calculate_metrics(self) -> None:
         """Fill rew_buf."""
-        self.judge()
+        self.check_termination()
         self.reward.copy_(self.score())
         self.rew_buf.copy_(self.reward)
 
@@ -75,61 +75,61 @@ class GymnasiumTask(DirectTask):
         self.reset_buf.copy_(self.ended)
 
     def reset(self, selection: Selection) -> None:
-        """Write the start state."""
+        """Write the initial state."""
         qpos, qvel = self.start(selection)
         selection.write(self.field.qpos, qpos)
         selection.write(self.field.qvel, qvel)
 
-    # --- what each task says ---
+    # --- implemented by each task ---
 
     def columns(self) -> list[Tensor]:
-        """The observation, in parts. (num_envs, k) each"""
+        """Return the parts of the observation. (num_envs, k) each"""
         raise NotImplementedError
 
     def score(self) -> Tensor:
-        """The reward. (num_envs,)"""
+        """Return the reward. (num_envs,)"""
         raise NotImplementedError
 
-    def judge(self) -> None:
-        """Fill `ended`, where the task ends the episode: nowhere, unless it says so."""
+    def check_termination(self) -> None:
+        """Fill `ended` where the task terminates the episode. By default it never does."""
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Joint positions and velocities of new episodes. (rows, nq), (rows, nv)"""
+        """Return initial joint positions and velocities. (rows, nq), (rows, nv)"""
         raise NotImplementedError
 
     def progress(self) -> Tensor:
-        """What has moved by how much the reward counts. (num_envs,) [m]"""
+        """Return the position whose change is rewarded. (num_envs,) [m]"""
         return self.field.qpos[:, 0]
 
-    # --- what several use ---
+    # --- shared by several tasks ---
 
     def speed(self) -> Tensor:
-        """Change of `progress` over the step, for a task that `moves`. (num_envs,) [m/s]"""
+        """Return the change of `progress` over the step, for a task that `moves`. (num_envs,) [m/s]"""
         assert self.moves
         return (self.progress() - self.before) / self.step_dt
 
     def action_cost(self, weight: float) -> Tensor:
-        """Sum of squared actions times weight, in their float32. (num_envs,)"""
+        """Return the weighted sum of squared actions, computed in float32. (num_envs,)"""
         return weight * float32_sum(self.actions.square())
 
     def uniform_start(self, selection: Selection, scale: float) -> tuple[Tensor, Tensor]:
-        """The model's positions and no velocities, uniform in +-scale of these. (rows, nq), (rows, nv)"""
+        """Sample positions around the model's, and velocities around 0, uniformly in +-scale. (rows, nq), (rows, nv)"""
         positions = self.model.nq
         noise = self.noise(selection, scale, positions + self.model.nv)
         return self.start_pos + noise[:, :positions], noise[:, positions:]
 
     def gaussian_start(self, selection: Selection, scale: float) -> tuple[Tensor, Tensor]:
-        """Likewise, but velocities that are Gaussian. (rows, nq), (rows, nv)"""
+        """Sample positions uniformly in +-scale, and Gaussian velocities. (rows, nq), (rows, nv)"""
         qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
         return qpos, selection.normal(0.0, scale, (self.model.nv,))
 
     def noise(self, selection: Selection, scale: float, size: int) -> Tensor:
-        """Uniform in +-scale. (rows, size)"""
+        """Sample uniformly in +-scale. (rows, size)"""
         return selection.uniform(-scale, scale, (size,))
 
 
 def float32_sum(values: Tensor) -> Tensor:
-    """Sum of up to eight columns, to the last bit as numpy sums as many numbers. (num_envs,)"""
+    """Sum up to eight columns in numpy's order, so that the bits are equal. (num_envs,)"""
     columns = list(values.unbind(dim=1))
     if len(columns) == 8:
         while len(columns) > 1:
@@ -141,12 +141,12 @@ def float32_sum(values: Tensor) -> Tensor:
 
 
 def square_sum(values: Tensor) -> Tensor:
-    """Sum of squares of each environment. values (num_envs, ...) -> (num_envs,)"""
+    """Return the sum of squares of each environment. values (num_envs, ...) -> (num_envs,)"""
     return values.square().flatten(1).sum(dim=1)
 
 
 def within(values: Tensor, low: float, high: float) -> Tensor:
-    """Whether values lie strictly between two bounds."""
+    """Return whether values are strictly between two bounds."""
     return (values > low) & (values < high)
 
 

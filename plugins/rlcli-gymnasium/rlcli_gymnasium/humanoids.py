@@ -23,7 +23,7 @@ _NAMES = (
 
 
 class _Humanoid(GymnasiumTask):
-    """What both see, and how both start."""
+    """Base of both tasks: observations and initial state."""
 
     num_observations = 348
     num_actions = 17
@@ -31,7 +31,7 @@ class _Humanoid(GymnasiumTask):
     reads = ("xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 
     def columns(self) -> list[Tensor]:
-        """Pose without x and y, velocity, inertias and velocities of bodies, actuator and contact forces."""
+        """Return pose without x and y, velocity, inertias and velocities of bodies, actuator and contact forces."""
         field = self.field
         return [
             field.qpos[:, 2:],
@@ -43,15 +43,15 @@ class _Humanoid(GymnasiumTask):
         ]
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Uniform."""
+        """Sample a uniform initial state."""
         return self.uniform_start(selection, self.params.reset_noise_scale)
 
     def control_cost(self) -> Tensor:
-        """Of the controls as the engine holds them. (num_envs,)"""
+        """Return the cost of the controls as stored in the engine. (num_envs,)"""
         return self.params.ctrl_cost_weight * square_sum(self.field.ctrl.contiguous())
 
     def force_cost(self, weight: float, bounds: tuple[float | None, float | None]) -> Tensor:
-        """Sum of squared contact forces times weight, within bounds. (num_envs,)"""
+        """Return the weighted sum of squared contact forces, clipped to bounds. (num_envs,)"""
         low, high = bounds
         return (weight * square_sum(self.field.cfrc_ext)).clamp(low, high)
 
@@ -73,34 +73,34 @@ class Humanoid(_Humanoid):
         )
         healthy_reward: float = Field(5.0, description="Reward of a step that does not end the episode.")
         healthy_z_range: tuple[float, float] = Field(
-            (1.0, 2.0), description="Height of a torso that has not failed [m]."
+            (1.0, 2.0), description="Range of the torso's height; outside it the episode terminates [m]."
         )
 
     params: Params
 
     def post_reset(self) -> None:
-        """The centre of mass is the progress."""
+        """Start to track the centre of mass."""
         mass = torch.tensor(self.env.engine.model.body_mass, dtype=torch.float64)
         self.share = (mass / mass.sum()).to(self.env.engine.field("qpos"))
         super().post_reset()
 
     def progress(self) -> Tensor:
-        """Where the centre of mass is, a physics step late. (num_envs,) [m]"""
+        """Return x of the centre of mass, one physics step late. (num_envs,) [m]"""
         return (self.field.xipos[:, :, 0] * self.share).sum(dim=1)
 
     def healthy(self) -> Tensor:
-        """The torso's height is in range. (num_envs,) bool"""
+        """Return whether the torso's height is in range. (num_envs,) bool"""
         return within(self.field.qpos[:, 2], *self.params.healthy_z_range)
 
     def score(self) -> Tensor:
-        """Speed and health, less the cost of controls and contacts."""
+        """Return speed and health, minus the cost of controls and contacts."""
         params = self.params
         gains = params.forward_reward_weight * self.speed() + ~self.ended * params.healthy_reward
         contact_cost = self.force_cost(params.contact_cost_weight, params.contact_cost_range)
         return gains - (self.control_cost() + contact_cost)
 
-    def judge(self) -> None:
-        """Not healthy."""
+    def check_termination(self) -> None:
+        """Terminate where the robot is not healthy."""
         torch.logical_not(self.healthy(), out=self.ended)
 
 
@@ -121,7 +121,7 @@ class HumanoidStandup(_Humanoid):
     params: Params
 
     def score(self) -> Tensor:
-        """Height, less the cost of controls and impacts, plus 1."""
+        """Return height, minus the cost of controls and impacts, plus 1."""
         params = self.params
         height = params.uph_cost_weight * self.field.qpos[:, 2] / self.env.physics_dt
         return height - self.control_cost() - self.force_cost(params.impact_cost_weight, params.impact_cost_range) + 1

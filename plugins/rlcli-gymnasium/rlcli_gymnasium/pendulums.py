@@ -28,19 +28,19 @@ class InvertedPendulum(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Joint positions and velocities."""
+        """Return joint positions and velocities."""
         return [self.field.qpos, self.field.qvel]
 
     def score(self) -> Tensor:
-        """1 unless it fell."""
+        """Return 1, or 0 if the pole fell."""
         return ~self.ended
 
-    def judge(self) -> None:
-        """The pole leans by more than 0.2 rad. A state that is not finite ends the episode before it gets here."""
+    def check_termination(self) -> None:
+        """Terminate where the pole leans by more than 0.2 rad. Non-finite states end the episode before this check."""
         torch.gt(self.observation[:, 1].abs(), 0.2, out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Uniform."""
+        """Sample a uniform initial state."""
         return self.uniform_start(selection, self.params.reset_noise_scale)
 
 
@@ -65,25 +65,25 @@ class InvertedDoublePendulum(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Cart, sines and cosines of the angles, clipped velocities and force on the cart."""
+        """Return the cart, sines and cosines of the angles, clipped velocities, and the force on the cart."""
         qpos, force = self.field.qpos, self.field.qfrc_constraint[:, :1]
         angles = qpos[:, 1:]
         return [qpos[:, :1], angles.sin(), angles.cos(), self.field.qvel.clamp(-10.0, 10.0), force.clamp(-10.0, 10.0)]
 
     def score(self) -> Tensor:
-        """Alive, less the distance of the tip from its place and the speed of the poles."""
+        """Return a bonus, minus the distance of the tip from its goal and the speed of the poles."""
         x, height = self.field.site_xpos[:, 0, 0], self.field.site_xpos[:, 0, 2]
         first, second = self.field.qvel[:, 1], self.field.qvel[:, 2]
         distance = 0.01 * x.square() + (height - 2).square()
         rates = 0.001 * first.square() + 0.005 * second.square()
         return self.params.healthy_reward * (~self.ended) - distance - rates
 
-    def judge(self) -> None:
-        """The tip is no higher than 1 m, a physics step late."""
+    def check_termination(self) -> None:
+        """Terminate where the tip is at or below 1 m, one physics step late."""
         torch.le(self.field.site_xpos[:, 0, 2], 1, out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Uniform positions, Gaussian velocities."""
+        """Sample uniform positions and Gaussian velocities."""
         return self.gaussian_start(selection, self.params.reset_noise_scale)
 
 

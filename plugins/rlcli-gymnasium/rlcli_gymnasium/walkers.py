@@ -13,7 +13,7 @@ from .base import GymnasiumTask, square_sum, within
 
 
 class Ant(GymnasiumTask):
-    """Ant-v5: a four-legged walker, which feels the forces of contacts."""
+    """Ant-v5: a four-legged walker that observes contact forces."""
 
     moves = True
     num_observations = 105
@@ -33,7 +33,7 @@ class Ant(GymnasiumTask):
         contact_cost_weight: float = Field(5e-4, ge=0, description="Penalty on the sum of squared contact forces.")
         healthy_reward: float = Field(1.0, description="Reward of a step that does not end the episode.")
         healthy_z_range: tuple[float, float] = Field(
-            (0.2, 1.0), description="Height of a torso that has not failed [m]."
+            (0.2, 1.0), description="Range of the torso's height; outside it the episode terminates [m]."
         )
         contact_force_range: tuple[float, float] = Field((-1.0, 1.0), description="Clip of contact forces [N, N m].")
         reset_noise_scale: float = Field(0.1, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
@@ -41,46 +41,46 @@ class Ant(GymnasiumTask):
     params: Params
 
     def post_reset(self) -> None:
-        """The torso's place is the progress."""
+        """Start to track the torso."""
         self.torso = 1
         super().post_reset()
 
     def progress(self) -> Tensor:
-        """Where the torso is, a physics step late. (num_envs,) [m]"""
+        """Return x of the torso, one physics step late. (num_envs,) [m]"""
         return self.field.xpos[:, self.torso, 0]
 
     def contact_forces(self) -> Tensor:
-        """Clipped. (num_envs, bodies, 6)"""
+        """Return clipped contact forces. (num_envs, bodies, 6)"""
         return self.field.cfrc_ext.clamp(*self.params.contact_force_range)
 
     def columns(self) -> list[Tensor]:
-        """Pose without x and y, velocity, contact forces."""
+        """Return pose without x and y, velocity, and contact forces."""
         return [self.field.qpos[:, 2:], self.field.qvel, self.contact_forces()[:, 1:].flatten(1)]
 
     def healthy(self) -> Tensor:
-        """The torso's height is in range. (num_envs,) bool"""
+        """Return whether the torso's height is in range. (num_envs,) bool"""
         low, high = self.params.healthy_z_range
         height = self.field.qpos[:, 2]
         return (height >= low) & (height <= high)
 
     def score(self) -> Tensor:
-        """Speed and health, less the cost of actions and contacts."""
+        """Return speed and health, minus the cost of actions and contacts."""
         params = self.params
         gains = self.speed() * params.forward_reward_weight + ~self.ended * params.healthy_reward
         contact_cost = params.contact_cost_weight * square_sum(self.contact_forces())
         return gains - (self.action_cost(params.ctrl_cost_weight) + contact_cost)
 
-    def judge(self) -> None:
-        """Not healthy."""
+    def check_termination(self) -> None:
+        """Terminate where the robot is not healthy."""
         torch.logical_not(self.healthy(), out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Uniform positions, Gaussian velocities."""
+        """Sample uniform positions and Gaussian velocities."""
         return self.gaussian_start(selection, self.params.reset_noise_scale)
 
 
 class HalfCheetah(GymnasiumTask):
-    """HalfCheetah-v5: a planar runner that cannot fail."""
+    """HalfCheetah-v5: a planar runner without termination."""
 
     moves = True
     num_observations = 17
@@ -97,21 +97,21 @@ class HalfCheetah(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Joint positions without x, velocities."""
+        """Return joint positions without x, and velocities."""
         return [self.field.qpos[:, 1:], self.field.qvel]
 
     def score(self) -> Tensor:
-        """Speed, less the cost of actions."""
+        """Return speed, minus the cost of actions."""
         params = self.params
         return params.forward_reward_weight * self.speed() - self.action_cost(params.ctrl_cost_weight)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Uniform positions, Gaussian velocities."""
+        """Sample uniform positions and Gaussian velocities."""
         return self.gaussian_start(selection, self.params.reset_noise_scale)
 
 
 class Swimmer(HalfCheetah):
-    """Swimmer-v5: three links in a thick fluid."""
+    """Swimmer-v5: three links in a viscous fluid."""
 
     num_observations = 8
     num_actions = 2
@@ -127,11 +127,11 @@ class Swimmer(HalfCheetah):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Joint positions without x and y, velocities."""
+        """Return joint positions without x and y, and velocities."""
         return [self.field.qpos[:, 2:], self.field.qvel]
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Uniform."""
+        """Sample a uniform initial state."""
         return self.uniform_start(selection, self.params.reset_noise_scale)
 
 
@@ -150,7 +150,7 @@ class Walker2d(GymnasiumTask):
         ctrl_cost_weight: float = Field(1e-3, ge=0, description="Penalty on the sum of squared actions.")
         healthy_reward: float = Field(1.0, description="Reward of a step that does not end the episode.")
         healthy_z_range: tuple[float, float] = Field(
-            (0.8, 2.0), description="Height of a torso that has not failed [m]."
+            (0.8, 2.0), description="Range of the torso's height; outside it the episode terminates [m]."
         )
         healthy_angle_range: tuple[float, float] = Field((-1.0, 1.0), description="Its pitch [rad].")
         reset_noise_scale: float = Field(5e-3, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
@@ -158,26 +158,26 @@ class Walker2d(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Joint positions without x, velocities clipped to +-10."""
+        """Return joint positions without x, and velocities clipped to +-10."""
         return [self.field.qpos[:, 1:], self.field.qvel.clamp(-10.0, 10.0)]
 
     def healthy(self) -> Tensor:
-        """Height and pitch are in range. (num_envs,) bool"""
+        """Return whether height and pitch are in range. (num_envs,) bool"""
         height, angle = self.field.qpos[:, 1], self.field.qpos[:, 2]
         return within(height, *self.params.healthy_z_range) & within(angle, *self.params.healthy_angle_range)
 
     def score(self) -> Tensor:
-        """Speed and health, less the cost of actions."""
+        """Return speed and health, minus the cost of actions."""
         params = self.params
         gains = params.forward_reward_weight * self.speed() + ~self.ended * params.healthy_reward
         return gains - self.action_cost(params.ctrl_cost_weight)
 
-    def judge(self) -> None:
-        """Not healthy."""
+    def check_termination(self) -> None:
+        """Terminate where the robot is not healthy."""
         torch.logical_not(self.healthy(), out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Uniform."""
+        """Sample a uniform initial state."""
         return self.uniform_start(selection, self.params.reset_noise_scale)
 
 
@@ -196,7 +196,8 @@ class Hopper(Walker2d):
         healthy_reward: float = Field(1.0, description="Reward of a step that does not end the episode.")
         healthy_state_range: tuple[float, float] = Field((-100.0, 100.0), description="All of the state but x and z.")
         healthy_z_range: tuple[float, float | None] = Field(
-            (0.7, None), description="Height of a torso that has not failed [m]; null: no upper end."
+            (0.7, None),
+            description="Range of the torso's height; outside it the episode terminates [m]; null: no upper end.",
         )
         healthy_angle_range: tuple[float, float] = Field((-0.2, 0.2), description="Its pitch [rad].")
         reset_noise_scale: float = Field(5e-3, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
@@ -204,7 +205,7 @@ class Hopper(Walker2d):
     params: Params
 
     def healthy(self) -> Tensor:
-        """Height, pitch and all else are in range. (num_envs,) bool"""
+        """Return whether height, pitch and all other state values are in range. (num_envs,) bool"""
         params, qpos = self.params, self.field.qpos
         low, high = params.healthy_z_range
         state = torch.cat([qpos[:, 2:], self.field.qvel], dim=1)

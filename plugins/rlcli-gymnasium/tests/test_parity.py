@@ -1,4 +1,4 @@
-"""Each task, step by step beside Gymnasium's own environment: the same before the cast to float32."""
+"""Each task step by step beside Gymnasium's environment: equal values before the conversion to float32."""
 
 import gymnasium
 import numpy as np
@@ -30,8 +30,8 @@ def ours(task, *overrides, seed=1):
     return make_env(resolve(find_task(task), overrides=[f"scene.num_envs={WORLDS}", *overrides]), seed=seed)
 
 
-def recorded(env):
-    """What the task observed before the cast, the last list entry being the latest look."""
+def record_observations(env):
+    """Record the task's observations before the conversion to float32; the last item is the latest."""
     looks, look = [], env.task.get_observations
 
     def get_observations():
@@ -43,7 +43,7 @@ def recorded(env):
 
 
 def begin(theirs, env, world):
-    """Begin an episode of Gymnasium's in the state that a world of ours begins one in."""
+    """Begin an episode of Gymnasium's environment in the initial state of one of rlcli's environments."""
     inner = theirs.unwrapped
     qpos, qvel = (env.engine.field(name)[world].numpy().copy() for name in ("qpos", "qvel"))
 
@@ -56,9 +56,9 @@ def begin(theirs, env, world):
 
 
 def compare(task, episodes, *overrides, max_episode_steps=None):
-    """Run both side by side until so many episodes have ended in each way that they end."""
+    """Run both environments until enough episodes have ended in each possible way."""
     env = ours(task, *overrides)
-    looks = recorded(env)
+    looks = record_observations(env)
     limit = {} if max_episode_steps is None else {"max_episode_steps": max_episode_steps}
     theirs = [gymnasium.make(TASKS[task], **limit) for _ in range(WORLDS)]
     env.reset()
@@ -69,7 +69,7 @@ def compare(task, episodes, *overrides, max_episode_steps=None):
     rng = np.random.default_rng(3)
     ended = {"terminated": 0, "truncated": 0}
     while sum(ended.values()) < episodes:
-        actions = rng.uniform(1.1 * low, 1.1 * high, (WORLDS, len(low))).astype(np.float32)  # beyond the limits, too
+        actions = rng.uniform(1.1 * low, 1.1 * high, (WORLDS, len(low))).astype(np.float32)  # also beyond the limits
         looks.clear()
         result = env.step(torch.from_numpy(actions))
         for world in range(WORLDS):
@@ -88,7 +88,7 @@ def compare(task, episodes, *overrides, max_episode_steps=None):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_short_episodes_are_gymnasiums_resets_in_mid_run_included(task):
+def test_short_episodes_with_resets_equal_gymnasium(task):
     step_s = ours(task).step_dt
     ended = compare(task, 12, f"episode_length_s={30 * step_s}", max_episode_steps=30)
     assert sum(ended.values()) >= 12
@@ -96,5 +96,5 @@ def test_short_episodes_are_gymnasiums_resets_in_mid_run_included(task):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
-def test_twenty_whole_episodes_are_gymnasiums(task):
+def test_twenty_episodes_equal_gymnasium(task):
     assert sum(compare(task, 20).values()) >= 20

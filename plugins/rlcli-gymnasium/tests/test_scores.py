@@ -1,4 +1,4 @@
-"""The comparison with rl-zoo3's scores: what v3 counts differently, and what the table says."""
+"""Comparison with the scores of rl-zoo3: the reward of v3, and the table."""
 
 import json
 import subprocess
@@ -23,12 +23,12 @@ V4 = {
     "gym-swimmer": "Swimmer-v4",
     "gym-walker2d": "Walker2d-v4",
 }
-"""Gymnasium has no v3 any more; v4 pays the same, on MuJoCo's own bindings."""
+"""Gymnasium no longer has v3; v4 has the same rewards with MuJoCo's own bindings."""
 
 
 @pytest.mark.filterwarnings("ignore:.*out of date")
 @pytest.mark.parametrize("task", V4)
-def test_counted_as_v3_an_episode_is_worth_what_gymnasiums_older_task_pays(task):
+def test_v3_return_equals_older_gymnasium_task(task):
     env = ours(task, *gym_scores.V3_OVERRIDES.get(task, []))
     theirs = gymnasium.make(V4[task])
     env.reset()
@@ -49,7 +49,7 @@ def test_counted_as_v3_an_episode_is_worth_what_gymnasiums_older_task_pays(task)
     assert failed or task not in ("gym-hopper", "gym-walker2d")
 
 
-def test_the_table_has_medians_and_says_what_is_reached():
+def test_table_has_medians_and_reached_goals():
     def row(seed, v3, v5):
         counts = {name: {"mean": mean, "std": 1.0, "low": 0.0, "high": 0.0} for name, mean in (("v3", v3), ("v5", v5))}
         return {"task": "gym-hopper", "seed": seed, "failed": 0.5, "length": 800.0, **counts}
@@ -62,7 +62,7 @@ def test_the_table_has_medians_and_says_what_is_reached():
     assert not entry["reached"]
 
 
-def test_scores_are_put_between_the_marks_of_a_page_and_nowhere_else(tmp_path):
+def test_scores_replace_only_marked_block_of_page(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("above\n<!-- scores -->\nold\n<!-- end scores -->\nbelow\n")
     gym_scores.put(page, "new")
@@ -74,7 +74,7 @@ def test_scores_are_put_between_the_marks_of_a_page_and_nowhere_else(tmp_path):
 
 
 @pytest.mark.slow
-def test_one_command_trains_evaluates_and_writes_the_scores(tmp_path):
+def test_one_command_trains_evaluates_and_writes_scores(tmp_path):
     output = tmp_path / "scores.json"
     command = [
         sys.executable,

@@ -1,4 +1,4 @@
-"""The tasks are ordinary ones: the contract, the switch, saved states, start states, both engines, training."""
+"""The tasks as rlcli tasks: contract, saved states, initial states, both engines, training."""
 
 import json
 import subprocess
@@ -20,7 +20,7 @@ torch.set_num_threads(1)
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_spaces_and_episode_lengths_are_gymnasiums(task):
+def test_spaces_and_episode_lengths_equal_gymnasium(task):
     env, spec = ours(task), gymnasium.spec(TASKS[task])
     theirs = gymnasium.make(spec)
     assert env.max_episode_length == spec.max_episode_steps
@@ -31,26 +31,26 @@ def test_spaces_and_episode_lengths_are_gymnasiums(task):
 
 
 @pytest.mark.parametrize("columns", [1, 2, 3, 6, 7, 8])
-def test_sums_of_float32_are_numpys_to_the_last_bit(columns):
+def test_float32_sum_equals_numpy_bit_for_bit(columns):
     values = np.random.default_rng(0).normal(size=(4000, columns)).astype(np.float32)
     expected = np.array([np.sum(row) for row in values])
     np.testing.assert_array_equal(float32_sum(torch.from_numpy(values)).numpy(), expected)
 
 
 @pytest.mark.parametrize("task", ["gym-inverted-pendulum", "gym-hopper"])
-def test_the_contract(task):
+def test_contract(task):
     assert [finding for finding in check_task(task) if finding.severity == "error"] == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", [task for task in TASKS if task not in ("gym-inverted-pendulum", "gym-hopper")])
-def test_the_contract_but_for_columns_that_gymnasium_keeps_constant(task):
+def test_contract_except_constant_columns(task):
     errors = [finding for finding in check_task(task) if finding.severity == "error"]
     assert [finding for finding in errors if finding.check != "constant-columns"] == []
 
 
 @pytest.mark.parametrize("task", ["gym-ant", "gym-humanoid", "gym-reacher", "gym-inverted-double-pendulum"])
-def test_what_is_read_late_is_read_in_time_at_the_turn_of_the_switch(task):
+def test_late_values_become_current_with_switch(task):
     late, current = ours(task), ours(task, "sim.derived_fields=current")
     for env in (late, current):
         env.reset()
@@ -62,7 +62,7 @@ def test_what_is_read_late_is_read_in_time_at_the_turn_of_the_switch(task):
 
 
 @pytest.mark.parametrize("task", ["gym-ant", "gym-humanoid", "gym-inverted-double-pendulum"])
-def test_a_saved_state_goes_on_bit_for_bit(task):
+def test_saved_state_continues_bit_for_bit(task):
     env, other = ours(task), ours(task)
     env.reset()
     action = torch.full((4, env.layout.action_size), 0.2)
@@ -77,7 +77,7 @@ def test_a_saved_state_goes_on_bit_for_bit(task):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_an_environment_lives_alike_however_many_there_are(task):
+def test_rollout_does_not_depend_on_num_envs(task):
     few, many = ours(task), ours(task, "scene.num_envs=7")
     few.reset()
     many.reset()
@@ -89,7 +89,7 @@ def test_an_environment_lives_alike_however_many_there_are(task):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_start_states_are_spread_as_gymnasiums(task):
+def test_initial_states_have_gymnasium_distribution(task):
     env = ours(task, "scene.num_envs=400")
     env.reset()
     theirs = gymnasium.make(TASKS[task]).unwrapped
@@ -104,14 +104,14 @@ def test_start_states_are_spread_as_gymnasiums(task):
     np.testing.assert_allclose(found.std(axis=0), spread, rtol=0.25, atol=1e-6)
 
 
-def test_a_target_and_a_puck_lie_where_gymnasium_would_put_them():
+def test_target_and_puck_positions_have_gymnasium_distribution():
     reacher, pusher = ours("gym-reacher", "scene.num_envs=2000"), ours("gym-pusher", "scene.num_envs=2000")
     reacher.reset()
     pusher.reset()
     target = torch.linalg.vector_norm(reacher.engine.field("qpos")[:, -2:], dim=1)
     puck = pusher.engine.field("qpos")[:, -4:-2]
     assert 0.19 < float(target.max()) < 0.2
-    assert float((target < 0.1).float().mean()) == pytest.approx(0.25, abs=0.04)  # even over the disc
+    assert float((target < 0.1).float().mean()) == pytest.approx(0.25, abs=0.04)  # uniform over the disc
     assert float(torch.linalg.vector_norm(puck, dim=1).min()) > 0.17
     assert -0.3 <= float(puck[:, 0].min()) < -0.29
     assert float(puck[:, 1].abs().max()) <= 0.2
@@ -127,7 +127,7 @@ def rlcli(folder, *arguments):
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("agent", ["sb3-ppo", "ppo"])
-def test_the_agents_train(task, agent, tmp_path):
+def test_agents_train(task, agent, tmp_path):
     sizes = {"sb3-ppo": ["agent.n_steps=8"], "ppo": ["agent.num_steps=8"]}[agent]
     rlcli(tmp_path, "train", task, "--agent", agent, "--max-iterations", "2", "--num-envs", "8", "--quiet", *sizes)
     report = json.loads(
@@ -138,7 +138,7 @@ def test_the_agents_train(task, agent, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["gym-ant", "gym-half-cheetah", "gym-hopper", "gym-swimmer", "gym-walker2d"])
-def test_the_agents_for_a_million_steps_train_for_a_million_steps(task, tmp_path):
+def test_million_step_agents_train_for_a_million_steps(task, tmp_path):
     agent = resolve(find_task(task), agent="ppo-1m")
     steps = agent.agent.max_iterations * agent.agent.num_steps * agent.task.scene.num_envs
     assert 0.99e6 < steps <= 1e6
@@ -146,7 +146,7 @@ def test_the_agents_for_a_million_steps_train_for_a_million_steps(task, tmp_path
 
 
 @pytest.mark.slow
-def test_the_pendulum_is_balanced_after_its_training(tmp_path):
+def test_pendulum_is_balanced_after_training(tmp_path):
     rlcli(tmp_path, "train", "gym-inverted-pendulum", "--quiet")
     report = json.loads(rlcli(tmp_path, "eval", "gym-inverted-pendulum", "--episodes", "20", "--json"))
     assert report["return"]["mean"] >= 950  # Gymnasium's own threshold
@@ -154,7 +154,7 @@ def test_the_pendulum_is_balanced_after_its_training(tmp_path):
 
 @pytest.mark.slow  # Warp compiles the kernels of each model
 @pytest.mark.parametrize("task", ["gym-hopper", "gym-ant", "gym-humanoid"])
-def test_the_gpu_engine_takes_the_same_first_steps(task):
+def test_gpu_engine_equals_cpu_in_first_steps(task):
     pytest.importorskip("mujoco_warp", reason="the GPU engine is an extra of rlcli")
     host, device = ours(task), ours(task, "sim.engine=warp")
     for env in (host, device):

@@ -1,7 +1,8 @@
-"""Isaac Lab's vocabulary: its configuration classes and the environment its terms see, as a front end to rlcli's tasks.
+"""Isaac Lab's vocabulary for rlcli: configuration classes, and the environment that Isaac Lab's terms expect.
 
-Every name is here, and in the submodule that has its name in Isaac Lab: `from rlcli_isaaclab import configclass` or
-`from rlcli_isaaclab.utils import configclass`. Nothing is imported before a name is used.
+Every name is available here and in the submodule that has its name in Isaac Lab:
+`from rlcli_isaaclab import configclass` or `from rlcli_isaaclab.utils import configclass`.
+A submodule is imported when one of its names is first used.
 """
 
 from __future__ import annotations

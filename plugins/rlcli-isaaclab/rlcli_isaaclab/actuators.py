@@ -1,15 +1,15 @@
-"""What drives joints. Names as in `isaaclab.actuators`."""
+"""Configuration classes of actuators. Names as in `isaaclab.actuators`."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from rlcli_isaaclab.config_class import MISSING, configclass
+from rlcli_isaaclab.config_class import MISSING, config_subclass, configclass
 
 
 @configclass
 class ActuatorBaseCfg:
-    """What all actuators have; a number is for all joints, a mapping for regexes."""
+    """Settings of all actuators. A number applies to all joints, a mapping to the joints that its regexes match."""
 
     class_type: Any = "ActuatorBase"
     joint_names_expr: Any = MISSING
@@ -25,32 +25,17 @@ class ActuatorBaseCfg:
     viscous_friction: Any = None
 
 
-@configclass
-class ImplicitActuatorCfg(ActuatorBaseCfg):
-    """A PD controller that the simulator integrates: MuJoCo's own actuators."""
-
-    class_type: Any = "ImplicitActuator"
-
-
-@configclass
-class IdealPDActuatorCfg(ActuatorBaseCfg):
-    """A PD controller, computed before every physics step."""
-
-    class_type: Any = "IdealPDActuator"
-
-
-@configclass
-class DCMotorCfg(IdealPDActuatorCfg):
-    """The same behind a motor with a torque-speed curve."""
-
-    class_type: Any = "DCMotor"
-    saturation_effort: float = MISSING
-
-
-@configclass
-class DelayedPDActuatorCfg(IdealPDActuatorCfg):
-    """The same with commands that arrive some physics steps late."""
-
-    class_type: Any = "DelayedPDActuator"
-    min_delay: int = 0
-    max_delay: int = 0
+ImplicitActuatorCfg = config_subclass(
+    "ImplicitActuator", "A PD controller inside the simulator: MuJoCo's own actuators.", ActuatorBaseCfg
+)
+IdealPDActuatorCfg = config_subclass(
+    "IdealPDActuator", "A PD controller, computed before every physics step.", ActuatorBaseCfg
+)
+DCMotorCfg = config_subclass(
+    "DCMotor", "A PD controller whose effort a torque-speed curve limits.", IdealPDActuatorCfg,
+    saturation_effort=MISSING,
+)  # fmt: skip
+DelayedPDActuatorCfg = config_subclass(
+    "DelayedPDActuator", "A PD controller whose commands arrive some physics steps late.", IdealPDActuatorCfg,
+    min_delay=0, max_delay=0,
+)  # fmt: skip

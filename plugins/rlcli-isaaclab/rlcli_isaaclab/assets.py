@@ -1,4 +1,7 @@
-"""Robots, objects, and which MJCF stands for which USD file. Names as in `isaaclab.assets` and `isaaclab_assets`."""
+"""Configuration classes of robots and objects, and the MJCF that replaces each USD file.
+
+Names as in `isaaclab.assets` and `isaaclab_assets`.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,8 @@ from typing import Any
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli_isaaclab.actuators import ImplicitActuatorCfg
 from rlcli_isaaclab.config_class import MISSING, configclass
-from rlcli_isaaclab.runtime import Asset as Articulation
-from rlcli_isaaclab.runtime import Asset as RigidObject
+from rlcli_isaaclab.scene_facade import Asset as Articulation
+from rlcli_isaaclab.scene_facade import Asset as RigidObject
 from rlcli_isaaclab.sim import UsdFileCfg
 from rlcli_isaaclab.utils.assets import ISAAC_NUCLEUS_DIR, ISAACLAB_NUCLEUS_DIR
 
@@ -22,15 +25,15 @@ USD_TO_MJCF: dict[str, str] = {
 
 
 def map_usd(usd: str, mjcf: str) -> None:
-    """Let an MJCF stand for a USD file; the end of its path is enough. Call it before the configuration is made."""
+    """Replace a USD file by an MJCF; the end of the USD's path is enough. Call it before creating the configuration."""
     USD_TO_MJCF[usd] = mjcf
 
 
 def mjcf_of(usd: str) -> str:
-    """The MJCF that stands for a USD file; an `.xml` stands for itself.
+    """Return the MJCF that replaces a USD file; an `.xml` file is returned unchanged.
 
     Raises:
-        TaskError: if none is known.
+        TaskError: if no MJCF is known for it.
     """
     if usd.endswith(".xml"):
         return usd
@@ -48,11 +51,11 @@ def mjcf_of(usd: str) -> str:
 
 @configclass
 class AssetBaseCfg:
-    """Something that stands in the scene."""
+    """An asset of the scene."""
 
     @configclass
     class InitialStateCfg:
-        """Where it starts: position [m] and quaternion (w, x, y, z)."""
+        """Initial position [m] and quaternion (w, x, y, z)."""
 
         pos: Any = (0.0, 0.0, 0.0)
         rot: Any = (1.0, 0.0, 0.0, 0.0)
@@ -71,7 +74,7 @@ class RigidObjectCfg(AssetBaseCfg):
 
     @configclass
     class InitialStateCfg(AssetBaseCfg.InitialStateCfg):
-        """Where and how fast it starts [m, m/s, rad/s]."""
+        """Initial pose and velocity [m, m/s, rad/s]."""
 
         lin_vel: Any = (0.0, 0.0, 0.0)
         ang_vel: Any = (0.0, 0.0, 0.0)
@@ -86,9 +89,9 @@ class ArticulationCfg(AssetBaseCfg):
 
     @configclass
     class InitialStateCfg(RigidObjectCfg.InitialStateCfg):
-        """Where and how fast it and its joints start."""
+        """Initial pose and velocity of the root and the joints."""
 
-        joint_pos: Any = {".*": 0.0}  # noqa: RUF012  (every object gets its own)
+        joint_pos: Any = {".*": 0.0}  # noqa: RUF012  (configclass copies it for each object)
         joint_vel: Any = {".*": 0.0}  # noqa: RUF012
 
     class_type: Any = "Articulation"
@@ -113,14 +116,14 @@ CARTPOLE_CFG = ArticulationCfg(
         ),
     },
 )
-"""A pole on a cart."""
+"""A cart with a pole."""
 
 ANT_CFG = ArticulationCfg(
     spawn=UsdFileCfg(usd_path=f"{ISAAC_NUCLEUS_DIR}/Robots/Ant/ant_instanceable.usd"),
     init_state=ArticulationCfg.InitialStateCfg(pos=(0.0, 0.0, 0.5)),
     actuators={"body": ImplicitActuatorCfg(joint_names_expr=[".*"], stiffness=0.0, damping=0.0)},
 )
-"""Four legs."""
+"""A robot with four legs."""
 
 __all__ = [
     "ANT_CFG",

@@ -33,8 +33,8 @@ def import_run(
     from rlcli.errors import UsageError
     from rlcli_isaaclab.importer import convert
 
-    models = dict(given.partition("=")[::2] for given in model or [])
+    models = dict(item.partition("=")[::2] for item in model or [])
     for name, file in models.items():
         if not file or not Path(file).is_file():
-            raise UsageError(f"--model {name}={file}: there is no such file", hint="--model robot=robot.xml")
+            raise UsageError(f"--model {name}={file}: file not found", hint="--model robot=robot.xml")
     return convert(env, agent, output or Path("imported"), models)

@@ -1,4 +1,4 @@
-"""`configclass`: a dataclass that also takes members without annotations, and gives every object its own defaults."""
+"""`configclass`: a dataclass that also takes members without annotations, and copies defaults for every object."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, dataclass_transform
 
 MISSING: Any = dataclasses.MISSING
-"""Stands for a value that must be given."""
+"""Marks a value that the user must set."""
 
 T = TypeVar("T")
 
 
 @dataclass_transform()
 def configclass(cls: type[T]) -> type[T]:
-    """Make a class of settings: a member is what is annotated or assigned, except methods and nested classes."""
+    """Turn a class into a class of settings: its members are all names except methods and nested classes."""
     own = inspect.get_annotations(cls)
     assigned = [name for name, value in vars(cls).items() if name in own or _is_setting(cls, name, value)]
     names = [*(name for name in own if name not in assigned), *assigned]
@@ -24,20 +24,31 @@ def configclass(cls: type[T]) -> type[T]:
     for name in names:
         value = vars(cls).get(name, MISSING)
         if not isinstance(value, dataclasses.Field):
-            setattr(cls, name, dataclasses.field(default_factory=_fresh(value)))
+            setattr(cls, name, dataclasses.field(default_factory=_copier(value)))
     for name, method in (("to_dict", to_dict), ("replace", _replace), ("copy", _copy), ("from_dict", _from_dict)):
         if name not in vars(cls):
             setattr(cls, name, method)
     return dataclasses.dataclass(cls)
 
 
+def make_config_class(name: str, doc: str, bases: tuple[type, ...] = (), **members: Any) -> Any:
+    """Return a new configuration class with default values, for tables of classes that differ only in their members."""
+    module = bases[0].__module__ if bases else __name__
+    return configclass(type(name, bases, {"__doc__": doc, "__module__": module, "__annotations__": {}, **members}))
+
+
+def config_subclass(class_type: str, doc: str, base: type, **members: Any) -> Any:
+    """Return a subclass of a configuration class: `{class_type}Cfg`."""
+    return make_config_class(f"{class_type}Cfg", doc, (base,), class_type=class_type, **members)
+
+
 def is_missing(value: Any) -> bool:
-    """Whether a value has not been given; a copy of MISSING says so too."""
+    """Return whether a value has not been set. Copies of MISSING count too."""
     return isinstance(value, type(MISSING))
 
 
 def to_dict(value: Any) -> Any:
-    """Settings as nested dicts; functions, numbers and text stay what they are."""
+    """Return settings as nested dicts; functions, numbers and text stay unchanged."""
     if isinstance(value, type):
         return value
     if dataclasses.is_dataclass(value) or hasattr(value, "__settings__"):
@@ -53,27 +64,28 @@ def _is_setting(cls: type, name: str, value: Any) -> bool:
     return not (isinstance(value, type) and value.__qualname__.startswith(f"{cls.__qualname__}."))
 
 
-def _fresh(value: Any) -> Callable[[], Any]:
+def _copier(value: Any) -> Callable[[], Any]:
+    """Return a function that copies a default, so that objects do not share it."""
     return lambda: value if is_missing(value) else copy.deepcopy(value)
 
 
 def _replace(self: Any, **changes: Any) -> Any:
-    """A copy with some members changed."""
-    made = copy.deepcopy(self)
+    """Return a copy with some members changed."""
+    changed = copy.deepcopy(self)
     for name, value in changes.items():
-        if name not in vars(made):
-            raise TypeError(f"{type(self).__name__} has no '{name}'; it has {', '.join(vars(made))}")
-        setattr(made, name, value)
-    return made
+        if name not in vars(changed):
+            raise TypeError(f"{type(self).__name__} has no '{name}'; it has {', '.join(vars(changed))}")
+        setattr(changed, name, value)
+    return changed
 
 
 def _copy(self: Any, **changes: Any) -> Any:
-    """A copy that shares nothing."""
+    """Return a deep copy with some members changed."""
     return _replace(self, **changes)
 
 
 def _from_dict(self: Any, data: Mapping[str, Any]) -> None:
-    """Set members from a mapping, nested ones within."""
+    """Set members from a mapping, and nested members from nested mappings."""
     for name, value in data.items():
         if name not in vars(self):
             raise KeyError(f"{type(self).__name__} has no '{name}'")

@@ -9,7 +9,7 @@ from rlcli_isaaclab.config_class import MISSING, configclass
 
 @configclass
 class DifferentialIKControllerCfg:
-    """Inverse kinematics by the Jacobian; here always damped least squares."""
+    """Differential inverse kinematics; rlcli always uses damped least squares."""
 
     class_type: Any = "DifferentialIKController"
     command_type: str = MISSING

@@ -1,4 +1,4 @@
-"""The format of Isaac Lab's manager-based tasks: how a folder of them is recognised."""
+"""Format of Isaac Lab's manager-based tasks: how rlcli recognizes a folder of them."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ SPEC = FormatSpec(
 
 
 def find(path: Path) -> TaskSource | None:
-    """Return the task of a folder whose Python files have one class of an environment; None for another one.
+    """Return the task of a folder whose Python files have one environment class; None if they have none.
 
     Raises:
-        TaskError: if there are several.
+        TaskError: if there are several environment classes.
     """
     from rlcli.errors import TaskError, listing
     from rlcli.registry import python_config, python_task
@@ -37,23 +37,24 @@ def find(path: Path) -> TaskSource | None:
     classes = _environments(path)
     if len(classes) > 1:
         names = listing(f"{path.name}/{found}" for found in classes)
-        raise TaskError(f"'{path}' holds several tasks", hint=f"name one: {names}")
+        raise TaskError(f"'{path}' contains several tasks", hint=f"choose one: {names}")
     return python_task(f"{path / classes[0]}", path.name) if classes else None
 
 
 def agents_beside(folder: Path) -> list[Path]:
-    """Return the Python files of a folder that hold a runner."""
+    """Return the Python files of a folder that contain a runner configuration."""
     return sorted(file for file in folder.glob("*.py") if _RUNNER in file.read_bytes())
 
 
 def _environments(root: Path) -> list[str]:
-    """Return `file.py:Class` of every environment in a folder, without the classes that its files build upon."""
+    """Return `file.py:Class` of every environment in a folder, without the base classes that its files subclass."""
     classes = [
         (file.name, node.name, {ast.unparse(base).rpartition(".")[2] for base in node.bases})
         for file in sorted(root.glob("*.py"))
         for node in _body(file)
         if isinstance(node, ast.ClassDef)
     ]
+    # Subclasses may come before their base class: repeat until no class is added.
     kinds, before = {"ManagerBasedRLEnvCfg"}, 0
     while len(kinds) > before:
         before = len(kinds)

@@ -1,4 +1,4 @@
-"""The YAML files that Isaac Lab writes into a run's `params/`, as a task of rlcli's own."""
+"""Import of the YAML files that Isaac Lab writes into a run's `params/`, as a task of rlcli."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _PYTHON = "tag:yaml.org,2002:python/"
 
 
 def read(file: Path) -> dict[str, Any]:
-    """A dump: plain YAML, Python's tuples and slices; other Python objects are text, nothing is ever constructed.
+    """Read a YAML dump with Python's tuples and slices. Other Python objects become text; none is constructed.
 
     Raises:
-        ConfigError: if it is not such a file.
+        ConfigError: if the file cannot be read or is not such a dump.
     """
     try:
-        text = read_plain(file, MAX_BYTES)  # a pipe is not waited for
+        text = read_plain(file, MAX_BYTES)  # refuses pipes, which would block
     except OSError as error:
         raise ConfigError([Problem(str(file), "", f"cannot be read: {error.strerror or error}")]) from None
     try:
@@ -41,8 +41,8 @@ def read(file: Path) -> dict[str, Any]:
         _count(data)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
-        place = f"{file}:{mark.line + 1}:{mark.column + 1}" if mark else str(file)
-        raise ConfigError([Problem(place, "", error.problem or "not YAML")]) from None
+        position = f"{file}:{mark.line + 1}:{mark.column + 1}" if mark else str(file)
+        raise ConfigError([Problem(position, "", error.problem or "not YAML")]) from None
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise ConfigError([Problem(str(file), "", str(error) or "nested too deeply")]) from None
     if not isinstance(data, dict):
@@ -51,21 +51,27 @@ def read(file: Path) -> dict[str, Any]:
 
 
 def convert(env: Path, agent_file: Path | None, folder: Path, models: Mapping[str, str]) -> Imported:
-    """Write a task folder. `models` name an MJCF for entities whose USD file the table does not know.
+    """Write a task folder.
+
+    Args:
+        env: env.yaml of the run.
+        agent_file: RSL-RL's agent.yaml of the run.
+        folder: folder to write.
+        models: entity -> MJCF, for entities whose USD file is not in `assets.USD_TO_MJCF`.
 
     Raises:
-        ConfigError: if the files do not make a valid task; nothing is written then.
-        UsageError: if there is a task in the folder already.
+        ConfigError: if the files do not describe a valid task; then nothing is written.
+        UsageError: if the folder contains a task already.
     """
     if (folder / "task.yaml").exists():
-        raise UsageError(f"{folder / 'task.yaml'} exists", hint="name another folder with -o")
+        raise UsageError(f"{folder / 'task.yaml'} exists", hint="choose another folder with -o")
     report, agent_report = Report(), None
-    here = {name: str(Path(model).resolve()) for name, model in models.items()}
+    model_files = {name: str(Path(model).resolve()) for name, model in models.items()}
     data: dict[str, Any] = {"summary": f"Imported from {env.name} of Isaac Lab."}
     source = read(env)
     problems: list[Problem] = []
     try:
-        data |= task(source, report, Path.cwd(), to_dict(ManagerBasedRLEnvCfg()), here)
+        data |= task(source, report, Path.cwd(), to_dict(ManagerBasedRLEnvCfg()), model_files)
     except ConfigError as error:
         problems += [Problem(str(env), p.path, p.message, p.hint) for p in error.problems]
     if agent_file is not None:
@@ -77,8 +83,8 @@ def convert(env: Path, agent_file: Path | None, folder: Path, models: Mapping[st
     if problems:
         raise ConfigError(problems)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".import-") as place:
-        draft = Path(place) / folder.name
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".import-") as parent:
+        draft = Path(parent) / folder.name
         draft.mkdir()
         names = _write(draft, data, report)
         check_all(folder_task(draft))
@@ -92,11 +98,11 @@ def convert(env: Path, agent_file: Path | None, folder: Path, models: Mapping[st
 
 
 def _write(folder: Path, data: dict[str, Any], report: Report) -> list[str]:
-    """The files of the task, models that stand alone among them."""
+    """Write the files of the task, with the models that need no other files. Return the names of the files."""
     files = ["task.yaml"]
     for entity in data["scene"]["entities"].values():
         model = model_file(Path.cwd(), entity["model"])
-        if _stands_alone(model, folder):
+        if _compiles_alone(model, folder):
             entity["model"] = model.name
             files += [model.name] if model.name not in files else []
     (folder / "task.yaml").write_text(to_yaml(data), encoding="utf-8")
@@ -106,8 +112,8 @@ def _write(folder: Path, data: dict[str, Any], report: Report) -> list[str]:
     return files
 
 
-def _stands_alone(model: Path, folder: Path) -> bool:
-    """Whether a copy of an MJCF compiles; one with meshes beside it does not."""
+def _compiles_alone(model: Path, folder: Path) -> bool:
+    """Copy an MJCF into a folder, and remove it again if it does not compile there (models with meshes do not)."""
     from rlcli.scene.untrusted_mjcf import read_mjcf
 
     copy = folder / model.name
@@ -123,24 +129,28 @@ def _stands_alone(model: Path, folder: Path) -> bool:
 
 
 def _stubs(report: Report) -> str:
-    """Terms to be written: their names and parameters, as the files say."""
-    lines = ['"""Terms to write: their code is not in the files that were imported."""', ""]
+    """Return a Python module with a stub for each term whose code is not in the imported files."""
+    lines = ['"""Terms to write. Their code is not in the imported files."""', ""]
     lines += ["from rlcli.task import Bodies, Entity, Joints"]
     for name, (section, params) in report.stubs.items():
-        given = "".join(f", {key}: {_annotation(key, value)}" for key, value in params.items())
-        star = ", *" if given else ""
-        to_do = [f'    """A term of {section}, to be written."""', f'    raise NotImplementedError("{name}")']
+        parameters = "".join(f", {key}: {_annotation(key, value)}" for key, value in params.items())
+        star = ", *" if parameters else ""
+        to_do = [f'    """To do: write this term of {section}."""', f'    raise NotImplementedError("{name}")']
         if section == "commands":
-            lines += ["", "", f"class {name}:", to_do[0], "", f"    def __init__(self, env{star}{given}):"]
-            lines += ["        # self.command is a tensor (num_envs, k) that stays the same", f"    {to_do[1]}", ""]
+            lines += ["", "", f"class {name}:", to_do[0], "", f"    def __init__(self, env{star}{parameters}):"]
+            lines += [
+                "        # self.command is a tensor (num_envs, k); change it only in place",
+                f"    {to_do[1]}",
+                "",
+            ]
             lines += [
                 "    def resample(self, selection):",
-                '        """selection.write(self.command, selection.uniform(...))"""',
+                '        """Sample new commands: selection.write(self.command, selection.uniform(...))"""',
             ]
-            lines += ["", "    def update(self):", '        """Once a step."""']
+            lines += ["", "    def update(self):", '        """Update the command, once per step."""']
             continue
         selection = ", selection" if section in ("events", "curriculum") else ""
-        lines += ["", "", f"def {name}(env{selection}{star}{given}):", *to_do]
+        lines += ["", "", f"def {name}(env{selection}{star}{parameters}):", *to_do]
     return "\n".join(lines) + "\n"
 
 
@@ -162,31 +172,31 @@ def _annotation(key: str, value: Any) -> str:
 def _agent(file: Path, report: Report) -> dict[str, Any]:
     data = read(file)
     if "algorithm" not in data or "num_steps_per_env" not in data:
-        hint = "rl_games, skrl and Stable-Baselines3 have files of their own form: write an agent by hand"
+        hint = "agents of rl_games, skrl and Stable-Baselines3 cannot be imported: write the agent by hand"
         raise ConfigError([Problem(str(file), "", "is not RSL-RL's agent.yaml", hint)])
     return agent(data, report)
 
 
 def _count(value: Any) -> None:
-    """Refuse what aliases make larger than it looks.
+    """Check the number of values. YAML aliases let a small file expand to a huge structure.
 
     Raises:
-        ValueError: beyond MAX_VALUES.
+        ValueError: if there are more than MAX_VALUES.
     """
-    left, waiting = MAX_VALUES, [value]
-    while waiting:
-        item = waiting.pop()
+    left, stack = MAX_VALUES, [value]
+    while stack:
+        item = stack.pop()
         left -= 1
         if left < 0:
             raise ValueError(f"more than {MAX_VALUES} values")
         if isinstance(item, Mapping):
-            waiting += item.values()
+            stack += item.values()
         elif isinstance(item, list | tuple):
-            waiting += item
+            stack += item
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader that knows tuples and slices."""
+    """PyYAML's safe loader, extended by tuples and slices."""
 
 
 def _tuple(loader: _Loader, node: yaml.SequenceNode) -> tuple[Any, ...]:
@@ -198,7 +208,7 @@ def _slice(loader: _Loader, node: yaml.SequenceNode) -> slice:
 
 
 def _opaque(loader: _Loader, suffix: str, node: yaml.Node) -> Any:
-    """Any other Python object as text: of a name its reference, of anything else nothing."""
+    """Return any other Python object as text: a name as its reference, anything else as None."""
     kind, _, name = suffix.partition(":")
     return ":".join(name.rsplit(".", 1)) if kind == "name" else None
 

@@ -1,4 +1,4 @@
-"""Configurations of terms, and what a term's own code is written with. Names as in `isaaclab.managers`."""
+"""Configuration classes of terms, and base classes for the user's own terms. Names as in `isaaclab.managers`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rlcli_isaaclab.config_class import MISSING, configclass
 
 @configclass
 class SceneEntityCfg:
-    """Elements of one entity; when a term is bound, `joint_ids` and `body_ids` are what the names resolve to."""
+    """Selected elements of one entity. Binding the term resolves the names to `joint_ids` and `body_ids`."""
 
     name: str = MISSING
     joint_names: Any = None
@@ -30,16 +30,16 @@ class SceneEntityCfg:
     preserve_order: bool = False
 
     def resolve(self, scene: Any) -> None:
-        """Look the names up in a scene."""
+        """Resolve the names in a scene."""
         scene.resolve(self)
 
 
 @configclass
 class ManagerTermBaseCfg:
-    """What all terms have."""
+    """Settings of all terms."""
 
     func: Any = MISSING
-    params: dict[str, Any] = {}  # noqa: RUF012  (every object gets its own)
+    params: dict[str, Any] = {}  # noqa: RUF012  (configclass copies it for each object)
 
 
 @configclass
@@ -56,7 +56,7 @@ class ObservationTermCfg(ManagerTermBaseCfg):
 
 @configclass
 class ObservationGroupCfg:
-    """A group of observations; its further members are terms."""
+    """A group of observations; its other members are terms."""
 
     concatenate_terms: bool = True
     concatenate_dim: int = -1
@@ -96,14 +96,14 @@ class CurriculumTermCfg(ManagerTermBaseCfg):
 
 @configclass
 class RecorderTermCfg:
-    """A recorder; `rlcli eval --record` takes its place."""
+    """A recorder; use `rlcli eval --record` instead."""
 
     class_type: Any = MISSING
 
 
 @configclass
 class ActionTermCfg:
-    """An action; the ones there are stand in `mdp`."""
+    """An action; `mdp` has its subclasses."""
 
     class_type: Any = MISSING
     asset_name: str = MISSING
@@ -113,7 +113,7 @@ class ActionTermCfg:
 
 @configclass
 class CommandTermCfg:
-    """A command; the ones there are stand in `mdp`."""
+    """A command; `mdp` has its subclasses."""
 
     class_type: Any = MISSING
     resampling_time_range: Any = MISSING
@@ -121,7 +121,7 @@ class CommandTermCfg:
 
 
 class ManagerTermBase:
-    """A term with a memory: made once with its configuration, then called with the environment and its parameters."""
+    """A term with a state: constructed with its configuration, then called with the environment and its parameters."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         self.cfg = cfg
@@ -129,24 +129,24 @@ class ManagerTermBase:
 
     @property
     def num_envs(self) -> int:
-        """Environments."""
+        """Number of environments."""
         return self._env.num_envs
 
     @property
     def device(self) -> Any:
-        """Where tensors live."""
+        """Device of the tensors."""
         return self._env.device
 
     def reset(self, env_ids: Any = None) -> Any:
-        """Called when episodes begin."""
+        """Reset the state of environments (None: all) at the start of their episodes."""
 
     def __call__(self, env: Any, *args: Any, **params: Any) -> Any:
-        """The term's value."""
+        """Return the term's value."""
         raise NotImplementedError
 
 
 class CommandTerm(ManagerTermBase):
-    """A command of the user's own; when to draw anew is kept by the environment."""
+    """A command of the user's own. The environment decides when to resample it."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -155,11 +155,11 @@ class CommandTerm(ManagerTermBase):
 
     @property
     def command(self) -> Tensor:
-        """What is asked. (num_envs, k)"""
+        """Current command. (num_envs, k)"""
         raise NotImplementedError
 
     def reset(self, env_ids: Any = None) -> dict[str, float]:
-        """Episodes begin; the environment draws their first command after this."""
+        """Reset the counter and the metrics. The environment samples the first command of an episode afterwards."""
         rows = slice(None) if env_ids is None else env_ids
         self.command_counter[rows] = 0
         for metric in self.metrics.values():
@@ -167,18 +167,18 @@ class CommandTerm(ManagerTermBase):
         return {}
 
     def set_debug_vis(self, debug_vis: bool) -> bool:
-        """Nothing is drawn."""
+        """Do nothing: commands are not drawn. Returns False."""
         return False
 
     def _update_metrics(self) -> None:
-        """Called once a step, before anything is drawn anew."""
+        """Update the metrics, once per step, before commands are resampled."""
 
     def _resample_command(self, env_ids: Any) -> None:
-        """Draw new commands for some environments."""
+        """Sample new commands for some environments."""
         raise NotImplementedError
 
     def _update_command(self) -> None:
-        """Called once a step, after the drawing."""
+        """Update the commands, once per step, after they are resampled."""
 
 
 ObsTerm, ObsGroup, RewTerm, DoneTerm, EventTerm, CurrTerm = (

@@ -1,7 +1,7 @@
 """Terms and actions under Isaac Lab's names: every term of `rlcli.mdp` that has a counterpart there.
 
-In a configuration such a function stands for the built-in term. Called from a term of your own it gives that term's
-value: `mdp.joint_pos_rel(env, asset_cfg)`.
+In a configuration such a function selects the built-in term. Called from the user's own term, it returns the value of
+the built-in term: `mdp.joint_pos_rel(env, asset_cfg)`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import functools
 import importlib
 from typing import Any
 
-from rlcli.config.term_signatures import SECTIONS, builtin_terms
+from rlcli.config.term_signatures import SECTIONS, Parameter, builtin_terms
 from rlcli.errors import did_you_mean
-from rlcli_isaaclab.config_class import MISSING, configclass
+from rlcli_isaaclab.config_class import MISSING, config_subclass, configclass
 from rlcli_isaaclab.managers import ActionTermCfg, CommandTermCfg, SceneEntityCfg
 from rlcli_isaaclab.table import TERMS, Entry
 
@@ -30,58 +30,63 @@ class MdpFunction:
         return f"mdp.{self.__name__}"
 
     def __call__(self, env: Any, *args: Any, **params: Any) -> Any:
-        """The term's value."""
-        section, ours = found(self.__name__)
-        signature = builtin_terms(section)[ours]
+        """Return the term's value."""
+        section, builtin_name = find_term(self.__name__)
+        signature = builtin_terms(section)[builtin_name]
         if signature.is_class or section == "events":
-            raise TypeError(f"mdp.{self.__name__} has a memory or changes the simulation: name it in the configuration")
+            name = f"mdp.{self.__name__}"
+            raise TypeError(f"{name} has a state or changes the simulation: use it only in the configuration")
         module = importlib.import_module(signature.module)
         entry = TERMS.get(section, {}).get(self.__name__, Entry())
-        known = {p.name: p for p in signature.parameters}
-        first: dict[str, str] = {}
+        by_name = {p.name: p for p in signature.parameters}
+        by_alias: dict[str, str] = {}
+        """Kind of parameter (Entity, Joints, ...) -> name of the first parameter of that kind."""
         for p in signature.parameters:
-            first.setdefault(p.alias or "", p.name)
-        plain = iter([p.name for p in signature.parameters if p.alias is None])
-        named = [("", value) for value in args] + list(params.items())
-        given: dict[str, Any] = {}
-        for name, value in named:
+            by_alias.setdefault(p.alias or "", p.name)
+        positional = iter([p.name for p in signature.parameters if p.alias is None])
+        values: dict[str, Any] = {}
+        for name, value in [*(("", value) for value in args), *params.items()]:
             if isinstance(value, SceneEntityCfg):
-                given |= _elements(env, name, value, known, first)
-            elif name == "command_name" or (not name and isinstance(value, str) and "Command" in first):
-                given[first["Command"]] = env.command_manager.get_term(value)
+                values |= _elements(env, name, value, by_name, by_alias)
+            elif name == "command_name" or (not name and isinstance(value, str) and "Command" in by_alias):
+                values[by_alias["Command"]] = env.command_manager.get_term(value)
             elif name:
-                to = entry.params.get(name, name)
-                given |= to(value) if callable(to) else {to: value}
+                target = entry.params.get(name, name)
+                values |= target(value) if callable(target) else {target: value}
             else:
-                given[next(plain)] = value
+                values[next(positional)] = value
         for p in signature.parameters:
-            if p.name not in given and not p.required:
-                whole = {"Entity": lambda default: env.entities[default]}.get(p.alias or "")
-                every = slice(None) if p.alias in ("Joints", "Bodies", "Sites", "Actuators") else p.default
-                given[p.name] = whole(p.default) if whole else every
-        return getattr(module, signature.attribute)(env.managed, **given)
+            if p.name not in values and not p.required:
+                values[p.name] = _default(env, p)
+        return getattr(module, signature.attribute)(env.managed, **values)
+
+
+def _default(env: Any, parameter: Parameter) -> Any:
+    """Return the default of a parameter as a bound term receives it: an entity, or a slice for "all elements"."""
+    if parameter.alias == "Entity":
+        return env.entities[parameter.default]
+    return slice(None) if parameter.alias in ("Joints", "Bodies", "Sites", "Actuators") else parameter.default
 
 
 def _elements(
-    env: Any, name: str, value: SceneEntityCfg, known: dict[str, Any], first: dict[str, str]
+    env: Any, name: str, value: SceneEntityCfg, by_name: dict[str, Any], by_alias: dict[str, str]
 ) -> dict[str, Any]:
-    """What a `SceneEntityCfg` picks, as a built-in term takes it."""
-    sensor = next((first[kind] for kind in ("ContactSensor", "RaySensor") if kind in first), None)
+    """Return the parameters of a built-in term for the elements that a `SceneEntityCfg` selects."""
+    sensor = next((by_alias[kind] for kind in ("ContactSensor", "RaySensor") if kind in by_alias), None)
     if sensor is not None and value.name not in env.entities:
         whole = env.managed.sensors[value.name]
-        every = isinstance(value.body_ids, slice)
-        return {sensor: whole if every else SensorPart(whole, value.body_ids)}
+        return {sensor: whole if isinstance(value.body_ids, slice) else SensorPart(whole, value.body_ids)}
     stem = name.removesuffix("_cfg")
-    entity = stem if stem in known and known[stem].alias == "Entity" else first.get("Entity")
-    made = {} if entity is None else {entity: env.entities[value.name]}
+    entity = stem if stem in by_name and by_name[stem].alias == "Entity" else by_alias.get("Entity")
+    selected = {} if entity is None else {entity: env.entities[value.name]}
     for kind, index in (("Joints", value.joint_ids), ("Bodies", value.body_ids)):
-        if kind in first:
-            made[first[kind]] = index
-    return made
+        if kind in by_alias:
+            selected[by_alias[kind]] = index
+    return selected
 
 
 class SensorPart:
-    """Some bodies of a contact sensor."""
+    """View of some bodies of a contact sensor."""
 
     def __init__(self, whole: Any, ids: Any) -> None:
         self._whole, self._ids = whole, ids
@@ -92,11 +97,11 @@ class SensorPart:
         return value[:, :, self._ids] if name == "force_history" else value[:, self._ids]
 
 
-def found(name: str) -> tuple[str, str]:
-    """The section and the name here of one of Isaac Lab's terms.
+def find_term(name: str) -> tuple[str, str]:
+    """Return the section and rlcli's name of one of Isaac Lab's terms.
 
     Raises:
-        KeyError: if rlcli has none.
+        KeyError: if rlcli has no counterpart.
     """
     for section in SECTIONS:
         entry = TERMS.get(section, {}).get(name)
@@ -116,12 +121,12 @@ def _names() -> list[str]:
     for section in SECTIONS:
         if section not in ("actions", "commands", "success"):
             names |= set(builtin_terms(section))
-    return sorted(name for name in names if _known(name))
+    return sorted(name for name in names if _has_counterpart(name))
 
 
-def _known(name: str) -> bool:
+def _has_counterpart(name: str) -> bool:
     try:
-        return bool(found(name))
+        return bool(find_term(name))
     except KeyError:
         return False
 
@@ -129,17 +134,17 @@ def _known(name: str) -> bool:
 def __getattr__(name: str) -> Any:
     if name.startswith("_"):
         raise AttributeError(name)
-    if not _known(name):
+    if not _has_counterpart(name):
         near = did_you_mean(name, _names())
         raise AttributeError(
-            f"rlcli_isaaclab.mdp has no '{name}'; {near or 'docs/reference/isaac-lab-terms.md says which there are'}"
+            f"rlcli_isaaclab.mdp has no '{name}'; {near or 'docs/reference/isaac-lab-terms.md lists the terms'}"
         )
     return _function(name)
 
 
 @configclass
 class JointActionCfg(ActionTermCfg):
-    """What all joint actions have; a number is for all joints, a mapping for regexes."""
+    """Settings of all joint actions. A number applies to all joints, a mapping to the joints that its regexes match."""
 
     joint_names: Any = MISSING
     scale: Any = 1.0
@@ -147,40 +152,22 @@ class JointActionCfg(ActionTermCfg):
     preserve_order: bool = False
 
 
-@configclass
-class JointEffortActionCfg(JointActionCfg):
-    """Efforts [N or N m]."""
-
-    class_type: Any = "JointEffortAction"
-
-
-@configclass
-class JointPositionActionCfg(JointActionCfg):
-    """Position targets [m or rad]."""
-
-    class_type: Any = "JointPositionAction"
-    use_default_offset: bool = True
-
-
-@configclass
-class RelativeJointPositionActionCfg(JointActionCfg):
-    """Position targets relative to where the joints are [m or rad]."""
-
-    class_type: Any = "RelativeJointPositionAction"
-    use_zero_offset: bool = True
-
-
-@configclass
-class JointVelocityActionCfg(JointActionCfg):
-    """Velocity targets [m/s or rad/s]."""
-
-    class_type: Any = "JointVelocityAction"
-    use_default_offset: bool = True
+JointEffortActionCfg = config_subclass("JointEffortAction", "Efforts [N or N m].", JointActionCfg)
+JointPositionActionCfg = config_subclass(
+    "JointPositionAction", "Position targets [m or rad].", JointActionCfg, use_default_offset=True
+)
+RelativeJointPositionActionCfg = config_subclass(
+    "RelativeJointPositionAction", "Position targets relative to the current joint positions [m or rad].",
+    JointActionCfg, use_zero_offset=True,
+)  # fmt: skip
+JointVelocityActionCfg = config_subclass(
+    "JointVelocityAction", "Velocity targets [m/s or rad/s].", JointActionCfg, use_default_offset=True
+)
 
 
 @configclass
 class JointPositionToLimitsActionCfg(ActionTermCfg):
-    """Position targets, [-1, 1] being the soft limits."""
+    """Position targets; [-1, 1] is mapped to the soft limits."""
 
     class_type: Any = "JointPositionToLimitsAction"
     joint_names: Any = MISSING
@@ -189,12 +176,10 @@ class JointPositionToLimitsActionCfg(ActionTermCfg):
     preserve_order: bool = False
 
 
-@configclass
-class EMAJointPositionToLimitsActionCfg(JointPositionToLimitsActionCfg):
-    """The same as a moving average."""
-
-    class_type: Any = "EMAJointPositionToLimitsAction"
-    alpha: Any = 1.0
+EMAJointPositionToLimitsActionCfg = config_subclass(
+    "EMAJointPositionToLimitsAction", "Position targets, smoothed by an exponential moving average.",
+    JointPositionToLimitsActionCfg, alpha=1.0,
+)  # fmt: skip
 
 
 @configclass
@@ -206,27 +191,17 @@ class BinaryJointActionCfg(ActionTermCfg):
     close_command_expr: Any = MISSING
 
 
-@configclass
-class BinaryJointPositionActionCfg(BinaryJointActionCfg):
-    """Open or closed positions [m or rad]."""
-
-    class_type: Any = "BinaryJointPositionAction"
-
-
-@configclass
-class AbsBinaryJointPositionActionCfg(BinaryJointActionCfg):
-    """Open or closed positions [m or rad], by the action's value against a threshold."""
-
-    class_type: Any = "AbsBinaryJointPositionAction"
-    threshold: float = 0.5
-    positive_threshold: bool = True
-
-
-@configclass
-class BinaryJointVelocityActionCfg(BinaryJointActionCfg):
-    """Opening or closing velocities [m/s or rad/s]."""
-
-    class_type: Any = "BinaryJointVelocityAction"
+BinaryJointPositionActionCfg = config_subclass(
+    "BinaryJointPositionAction", "Open or closed positions [m or rad].", BinaryJointActionCfg
+)
+AbsBinaryJointPositionActionCfg = config_subclass(
+    "AbsBinaryJointPositionAction",
+    "Open or closed positions [m or rad]; the action is compared with a threshold.",
+    BinaryJointActionCfg, threshold=0.5, positive_threshold=True,
+)  # fmt: skip
+BinaryJointVelocityActionCfg = config_subclass(
+    "BinaryJointVelocityAction", "Opening or closing velocities [m/s or rad/s].", BinaryJointActionCfg
+)
 
 
 @configclass
@@ -235,7 +210,7 @@ class DifferentialInverseKinematicsActionCfg(ActionTermCfg):
 
     @configclass
     class OffsetCfg:
-        """Where the moved frame sits in the body's."""
+        """Pose of the controlled frame in the frame of the body."""
 
         pos: Any = (0.0, 0.0, 0.0)
         rot: Any = (1.0, 0.0, 0.0, 0.0)
@@ -248,21 +223,18 @@ class DifferentialInverseKinematicsActionCfg(ActionTermCfg):
     controller: Any = MISSING
 
 
-@configclass
-class NullCommandCfg(CommandTermCfg):
-    """Nothing is asked."""
-
-    class_type: Any = "NullCommand"
-    resampling_time_range: Any = (float("inf"), float("inf"))
+NullCommandCfg = config_subclass(
+    "NullCommand", "A command without values.", CommandTermCfg, resampling_time_range=(float("inf"), float("inf"))
+)
 
 
 @configclass
 class UniformVelocityCommandCfg(CommandTermCfg):
-    """A velocity of the root."""
+    """A velocity of the root, sampled from uniform distributions."""
 
     @configclass
     class Ranges:
-        """[low, high] each [m/s, rad/s, rad]."""
+        """[low, high] of each [m/s, rad/s, rad]."""
 
         lin_vel_x: Any = MISSING
         lin_vel_y: Any = MISSING
@@ -280,11 +252,11 @@ class UniformVelocityCommandCfg(CommandTermCfg):
 
 @configclass
 class NormalVelocityCommandCfg(UniformVelocityCommandCfg):
-    """The same drawn from normal distributions."""
+    """A velocity of the root, sampled from normal distributions."""
 
     @configclass
     class Ranges:
-        """Means, deviations and chances of zero of x, y [m/s] and yaw [rad/s]."""
+        """Mean, standard deviation and probability of zero for x, y [m/s] and yaw [rad/s]."""
 
         mean_vel: Any = MISSING
         std_vel: Any = MISSING
@@ -299,7 +271,7 @@ class UniformPoseCommandCfg(CommandTermCfg):
 
     @configclass
     class Ranges:
-        """[low, high] each [m, rad]."""
+        """[low, high] of each [m, rad]."""
 
         pos_x: Any = MISSING
         pos_y: Any = MISSING
@@ -317,11 +289,11 @@ class UniformPoseCommandCfg(CommandTermCfg):
 
 @configclass
 class UniformPose2dCommandCfg(CommandTermCfg):
-    """A place on the ground."""
+    """A position and heading on the ground."""
 
     @configclass
     class Ranges:
-        """[low, high] each [m, rad]."""
+        """[low, high] of each [m, rad]."""
 
         pos_x: Any = MISSING
         pos_y: Any = MISSING

@@ -1,4 +1,4 @@
-"""RSL-RL's settings, read as those of the `ppo` trainer in RSL-RL's dialect. Names as in `isaaclab_rl.rsl_rl`."""
+"""Settings of RSL-RL, which the `ppo` trainer reads with `dialect: rsl_rl`. Names as in `isaaclab_rl.rsl_rl`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rlcli_isaaclab.config_class import MISSING, configclass, to_dict
 
 @configclass
 class RslRlPpoActorCriticCfg:
-    """The networks."""
+    """Actor and critic networks."""
 
     class_name: str = "ActorCritic"
     init_noise_std: float = MISSING
@@ -25,7 +25,7 @@ class RslRlPpoActorCriticCfg:
 
 @configclass
 class RslRlPpoActorCriticRecurrentCfg(RslRlPpoActorCriticCfg):
-    """The networks with a memory."""
+    """Recurrent actor and critic networks."""
 
     class_name: str = "ActorCriticRecurrent"
     rnn_type: str = MISSING
@@ -35,7 +35,7 @@ class RslRlPpoActorCriticRecurrentCfg(RslRlPpoActorCriticCfg):
 
 @configclass
 class RslRlPpoAlgorithmCfg:
-    """The update."""
+    """Settings of the PPO update."""
 
     class_name: str = "PPO"
     num_learning_epochs: int = MISSING
@@ -57,7 +57,7 @@ class RslRlPpoAlgorithmCfg:
 
 @configclass
 class RslRlBaseRunnerCfg:
-    """What all runners have."""
+    """Settings of all runners."""
 
     seed: int = 42
     device: str = "cuda:0"
@@ -79,7 +79,7 @@ class RslRlBaseRunnerCfg:
 
 @configclass
 class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
-    """A whole training run."""
+    """Settings of a training."""
 
     __rlcli_library__ = "rsl-rl"
 
@@ -88,12 +88,12 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
     algorithm: Any = MISSING
 
     def __rlcli_agent__(self, notes: list[Note] | None = None) -> dict[str, Any]:
-        """The settings of the agent that this is here."""
+        """Return the settings of the agent; append the translation notes to `notes`."""
         from rlcli_isaaclab.convert import agent
         from rlcli_isaaclab.settings import Report
 
         report = Report()
         data = agent(to_dict(self), report)
         if notes is not None:
-            notes += report.news("agent")
+            notes += report.user_notes("agent")
         return data

@@ -1,4 +1,4 @@
-"""The scene. Names as in `isaaclab.scene`."""
+"""Configuration class of the scene. Names as in `isaaclab.scene`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from rlcli_isaaclab.config_class import MISSING, configclass
 
 @configclass
 class InteractiveSceneCfg:
-    """What stands in each environment; its further members are assets, sensors and lights."""
+    """Scene of each environment; its other members are assets, sensors and lights."""
 
     num_envs: int = MISSING
     env_spacing: float = MISSING

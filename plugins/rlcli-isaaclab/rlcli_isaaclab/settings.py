@@ -1,4 +1,4 @@
-"""Isaac Lab's settings as nested dicts, read key by key: what nobody asks for is reported."""
+"""Reader of Isaac Lab's settings, which are nested dicts. Keys that are never read are reported as ignored."""
 
 from __future__ import annotations
 
@@ -16,47 +16,51 @@ Key = tuple[str, ...]
 
 @dataclass(slots=True)
 class Report:
-    """What became of each key."""
+    """Record of how each key was translated, and of the mistakes found."""
 
     entries: dict[Key, tuple[Status, str]] = field(default_factory=dict)
-    """Key -> mapped, approximated or ignored, and why."""
+    """Key -> (mapped, approximated, ignored, default or to do; the reason)."""
     problems: list[Problem] = field(default_factory=list)
     stubs: dict[str, tuple[str, dict[str, Any]]] = field(default_factory=dict)
-    """Functions that only their author has: name -> section and parameters."""
+    """Functions whose code is not in the imported files: name -> (section, parameters)."""
 
     def notes(self, prefix: str = "", where: str = "") -> list[Note]:
-        """What became of each key."""
+        """Return how each key was translated, as notes."""
         start = f"{prefix}." if prefix else ""
-        return [Note(where, start + ".".join(key), *what) for key, what in self.entries.items()]
+        return [Note(where, start + ".".join(key), *entry) for key, entry in self.entries.items()]
 
-    def news(self, prefix: str = "") -> list[Note]:
-        """What a user should know: everything that is not simply mapped."""
+    def user_notes(self, prefix: str = "") -> list[Note]:
+        """Return the notes that matter to the user: those of keys that are neither mapped nor defaults."""
         return [note for note in self.notes(prefix) if note.status not in ("mapped", "default")]
 
     def problem(self, key: Key, message: str, hint: str | None = None) -> None:
-        """Note a mistake."""
+        """Add a mistake."""
         self.problems.append(Problem("configuration", ".".join(key), message, hint))
 
     def finish(self, data: Any, defaults: Any = None) -> None:
-        """Whatever nobody asked for is ignored; what is not set, or as it always is, is a default."""
-        self._finish(data, (), defaults)
+        """Mark the keys that were never read as ignored, or as default if they have their default value.
+
+        Raises:
+            ConfigError: with all mistakes that were recorded.
+        """
+        self._mark_unread(data, (), defaults)
         if self.problems:
             raise ConfigError(self.problems)
 
-    def _finish(self, value: Any, key: Key, default: Any) -> None:
+    def _mark_unread(self, value: Any, key: Key, default: Any) -> None:
         if key in self.entries:
             return
-        if isinstance(value, Mapping) and value and any(known[: len(key)] == key for known in self.entries):
+        if isinstance(value, Mapping) and value and any(read[: len(key)] == key for read in self.entries):
             for name, item in value.items():
-                self._finish(item, (*key, str(name)), default.get(name) if isinstance(default, Mapping) else None)
-        elif is_empty(value) or (default is not None and alike(value, default)):
+                self._mark_unread(item, (*key, str(name)), default.get(name) if isinstance(default, Mapping) else None)
+        elif is_empty(value) or (default is not None and equals_default(value, default)):
             self.entries[key] = ("default", "")
         else:
             self.entries[key] = ("ignored", "")
 
 
 class Node:
-    """A mapping of settings; what is asked for counts as mapped."""
+    """Mapping of settings. Reading a key marks it as mapped in the report."""
 
     def __init__(self, data: Mapping[str, Any], key: Key, report: Report) -> None:
         self.data, self.key, self.report = data, key, report
@@ -66,21 +70,21 @@ class Node:
         return value is not None and not is_missing(value)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """A value, taken over."""
+        """Return a value, or the default if it is null or missing."""
         if name in self.data:
             self.report.entries.setdefault((*self.key, name), ("mapped", ""))
         value = self.data.get(name)
         return default if value is None or is_missing(value) else value
 
-    def need(self, name: str) -> Any:
-        """A value that must be there."""
+    def require(self, name: str) -> Any:
+        """Return a value; report a mistake if it is null or missing."""
         value = self.get(name)
         if value is None:
             self.report.problem(self.key, f"missing '{name}'")
         return value
 
     def node(self, name: str) -> Node:
-        """What stands under a name; empty if nothing does."""
+        """Return the settings under a name; empty if there are none."""
         value = self.data.get(name)
         if value is None or is_missing(value):
             self.get(name)
@@ -93,49 +97,49 @@ class Node:
         return Node(value, (*self.key, name), self.report)
 
     def nodes(self) -> Iterator[tuple[str, Node]]:
-        """Every member that has settings."""
+        """Yield every member that has settings of its own."""
         for name, value in self.data.items():
             if isinstance(value, Mapping):
                 yield name, Node(value, (*self.key, name), self.report)
 
-    def say(self, status: Status, name: str, why: str = "") -> None:
-        """Report a member, if it is set to something."""
+    def note(self, status: Status, name: str, why: str = "") -> None:
+        """Record a status for a member, unless it is empty."""
         if name in self and not is_empty(self.data[name]):
             self.report.entries[(*self.key, name)] = (status, why)
 
     def skip(self, *names: str) -> None:
-        """Members that mean nothing outside Isaac Sim, and change nothing that matters here."""
+        """Mark members as mapped that have no effect outside Isaac Sim."""
         for name in names:
             if name in self.data:
                 self.report.entries[(*self.key, name)] = ("mapped", "")
 
 
 def kind_of(value: Any) -> str:
-    """The last word of a class or function, given as such or as `module:Name`."""
+    """Return the last part of the name of a class or function, which may be written as `module:Name`."""
     if value is None or is_missing(value):
         return ""
     name = value if isinstance(value, str) else getattr(value, "__name__", type(value).__name__)
     return name.rpartition(":")[2].rpartition(".")[2] or name.rpartition(":")[2]
 
 
-def numbers(value: Any) -> Any:
-    """Tuples as lists, without infinities."""
+def to_plain(value: Any) -> Any:
+    """Return tuples as lists, and infinities as +-1e9, because a YAML task has neither."""
     if isinstance(value, Mapping):
-        return {str(key): numbers(item) for key, item in value.items()}
+        return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [numbers(item) for item in value]
+        return [to_plain(item) for item in value]
     if isinstance(value, float) and math.isinf(value):
         return math.copysign(1e9, value)
     return value
 
 
 def as_float(value: Any) -> Any:
-    """A whole number as a float; anything else as it is."""
+    """Return an integer as a float, and any other value unchanged."""
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
 def is_empty(value: Any) -> bool:
-    """Whether a setting, with all below it, says nothing."""
+    """Return whether a setting and all settings below it have no value."""
     if isinstance(value, Mapping):
         return all(is_empty(item) for item in value.values())
     return (
@@ -143,8 +147,8 @@ def is_empty(value: Any) -> bool:
     )
 
 
-def alike(value: Any, default: Any) -> bool:
-    """Whether a setting says what its default says, be it a list or a tuple."""
+def equals_default(value: Any, default: Any) -> bool:
+    """Return whether a setting equals its default. A list and a tuple with equal items are equal."""
     if isinstance(value, list | tuple) and isinstance(default, list | tuple):
-        return len(value) == len(default) and all(alike(a, b) for a, b in zip(value, default, strict=True))
+        return len(value) == len(default) and all(equals_default(a, b) for a, b in zip(value, default, strict=True))
     return bool(value == default)

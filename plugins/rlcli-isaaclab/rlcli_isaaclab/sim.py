@@ -1,6 +1,6 @@
-"""What stands in a scene and how it is simulated. Names as in `isaaclab.sim`, usually imported as `sim_utils`.
+"""Configuration classes of the simulation and of what is spawned. Names as in `isaaclab.sim`, often `sim_utils`.
 
-Settings that only Isaac Sim knows are accepted and reported; those in use are in docs/guides/isaac-lab.md.
+Settings of Isaac Sim without a counterpart are accepted and reported; docs/guides/isaac-lab.md lists those with one.
 """
 
 from __future__ import annotations
@@ -10,56 +10,58 @@ from typing import Any
 from rlcli_isaaclab.config_class import configclass
 
 
-class _Open:
-    """Settings of which any may be given; which of them mean something here is said when they are read."""
+class _OpenSettings:
+    """Settings with any names. `scene_reader.py` reports which of them have no effect."""
 
     __settings__ = True
     _fixed: dict[str, Any]
 
-    def __init__(self, *values: Any, **given: Any) -> None:
+    def __init__(self, *values: Any, **settings: Any) -> None:
         positional = dict(zip(getattr(self, "_order", ()), values, strict=False))
-        vars(self).update({**self._fixed, **positional, **given})
+        vars(self).update({**self._fixed, **positional, **settings})
 
     def replace(self, **changes: Any) -> Any:
-        """A copy with some members changed."""
-        made = type(self)()
-        vars(made).update({**vars(self), **changes})
-        return made
+        """Return a copy with some members changed."""
+        copy = type(self)()
+        vars(copy).update({**vars(self), **changes})
+        return copy
 
 
-def _open(name: str, doc: str, **fixed: Any) -> Any:
-    return type(name, (_Open,), {"__doc__": doc, "_fixed": fixed, "__module__": __name__})
+def _settings_class(name: str, doc: str, **fixed: Any) -> Any:
+    return type(name, (_OpenSettings,), {"__doc__": doc, "_fixed": fixed, "__module__": __name__})
 
 
-RigidBodyPropertiesCfg = _open("RigidBodyPropertiesCfg", "PhysX settings of rigid bodies.")
-ArticulationRootPropertiesCfg = _open("ArticulationRootPropertiesCfg", "PhysX settings of an articulation.")
-CollisionPropertiesCfg = _open("CollisionPropertiesCfg", "PhysX settings of collisions.")
-MassPropertiesCfg = _open("MassPropertiesCfg", "Mass [kg] or density [kg/m^3].")
-JointDrivePropertiesCfg = _open("JointDrivePropertiesCfg", "PhysX settings of drives.")
-FixedTendonPropertiesCfg = _open("FixedTendonPropertiesCfg", "PhysX settings of tendons.")
-DeformableBodyPropertiesCfg = _open("DeformableBodyPropertiesCfg", "PhysX settings of soft bodies.")
-RigidBodyMaterialCfg = _open(
+RigidBodyPropertiesCfg = _settings_class("RigidBodyPropertiesCfg", "PhysX settings of rigid bodies.")
+ArticulationRootPropertiesCfg = _settings_class("ArticulationRootPropertiesCfg", "PhysX settings of an articulation.")
+CollisionPropertiesCfg = _settings_class("CollisionPropertiesCfg", "PhysX settings of collisions.")
+MassPropertiesCfg = _settings_class("MassPropertiesCfg", "Mass [kg] or density [kg/m^3].")
+JointDrivePropertiesCfg = _settings_class("JointDrivePropertiesCfg", "PhysX settings of drives.")
+FixedTendonPropertiesCfg = _settings_class("FixedTendonPropertiesCfg", "PhysX settings of tendons.")
+DeformableBodyPropertiesCfg = _settings_class("DeformableBodyPropertiesCfg", "PhysX settings of soft bodies.")
+RigidBodyMaterialCfg = _settings_class(
     "RigidBodyMaterialCfg", "Friction and restitution.", func="spawn_rigid_body_material", static_friction=0.5,
     dynamic_friction=0.5, restitution=0.0,
 )  # fmt: skip
-PreviewSurfaceCfg = _open("PreviewSurfaceCfg", "A colour.", func="spawn_preview_surface")
-MdlFileCfg = _open("MdlFileCfg", "A material of Isaac Sim.", func="spawn_from_mdl_file")
-PhysxCfg = _open("PhysxCfg", "The PhysX solver.")
-RenderCfg = _open("RenderCfg", "The renderer.")
+PreviewSurfaceCfg = _settings_class("PreviewSurfaceCfg", "A colour.", func="spawn_preview_surface")
+MdlFileCfg = _settings_class("MdlFileCfg", "A material of Isaac Sim.", func="spawn_from_mdl_file")
+PhysxCfg = _settings_class("PhysxCfg", "The PhysX solver.")
+RenderCfg = _settings_class("RenderCfg", "The renderer.")
 
-GroundPlaneCfg = _open("GroundPlaneCfg", "A ground plane.", func="spawn_ground_plane", size=(100.0, 100.0))
-DomeLightCfg = _open("DomeLightCfg", "Light from everywhere.", func="spawn_light", prim_type="DomeLight")
-DistantLightCfg = _open("DistantLightCfg", "Parallel light.", func="spawn_light", prim_type="DistantLight")
-SphereLightCfg = _open("SphereLightCfg", "A lamp.", func="spawn_light", prim_type="SphereLight")
-DiskLightCfg = _open("DiskLightCfg", "A lamp.", func="spawn_light", prim_type="DiskLight")
-CylinderLightCfg = _open("CylinderLightCfg", "A lamp.", func="spawn_light", prim_type="CylinderLight")
-UsdFileCfg = _open("UsdFileCfg", "A model by its USD path; assets.py maps it to an MJCF.", func="spawn_from_usd")
-UrdfFileCfg = _open("UrdfFileCfg", "A model by its URDF path; assets.py maps it.", func="spawn_from_urdf")
-CuboidCfg = _open("CuboidCfg", "A box; `size` are its edges [m].", func="spawn_cuboid")
-SphereCfg = _open("SphereCfg", "A sphere.", func="spawn_sphere")
-CapsuleCfg = _open("CapsuleCfg", "A capsule.", func="spawn_capsule")
-CylinderCfg = _open("CylinderCfg", "A cylinder.", func="spawn_cylinder")
-ConeCfg = _open("ConeCfg", "A cone.", func="spawn_cone")
+GroundPlaneCfg = _settings_class("GroundPlaneCfg", "A ground plane.", func="spawn_ground_plane", size=(100.0, 100.0))
+DomeLightCfg = _settings_class("DomeLightCfg", "Light from everywhere.", func="spawn_light", prim_type="DomeLight")
+DistantLightCfg = _settings_class("DistantLightCfg", "Parallel light.", func="spawn_light", prim_type="DistantLight")
+SphereLightCfg = _settings_class("SphereLightCfg", "A lamp.", func="spawn_light", prim_type="SphereLight")
+DiskLightCfg = _settings_class("DiskLightCfg", "A lamp.", func="spawn_light", prim_type="DiskLight")
+CylinderLightCfg = _settings_class("CylinderLightCfg", "A lamp.", func="spawn_light", prim_type="CylinderLight")
+UsdFileCfg = _settings_class(
+    "UsdFileCfg", "A model by its USD path; assets.py maps it to an MJCF.", func="spawn_from_usd"
+)
+UrdfFileCfg = _settings_class("UrdfFileCfg", "A model by its URDF path; assets.py maps it.", func="spawn_from_urdf")
+CuboidCfg = _settings_class("CuboidCfg", "A box; `size` are its edges [m].", func="spawn_cuboid")
+SphereCfg = _settings_class("SphereCfg", "A sphere.", func="spawn_sphere")
+CapsuleCfg = _settings_class("CapsuleCfg", "A capsule.", func="spawn_capsule")
+CylinderCfg = _settings_class("CylinderCfg", "A cylinder.", func="spawn_cylinder")
+ConeCfg = _settings_class("ConeCfg", "A cone.", func="spawn_cone")
 
 
 @configclass

@@ -1,4 +1,4 @@
-"""Isaac Lab's terms and which of rlcli's each is; a term that is not named here has the same name in both."""
+"""Table of Isaac Lab's terms and rlcli's counterparts. A term without a row has the same name in both."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ Translate = Callable[[Any], dict[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A term under another name, or with parameters under other names (or computed from theirs)."""
+    """Counterpart of a term: its name in rlcli, and parameters with another name or another form."""
 
     name: str | None = None
     params: Mapping[str, str | Translate] = field(default_factory=dict)
     note: str | None = None
-    """What is not quite the same."""
+    """How the counterpart differs."""
     fixed: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters that theirs does not have because it knows them."""
+    """Parameters that Isaac Lab's term has as constants in its code."""
 
 
 def _pose(value: Mapping[str, Any]) -> dict[str, Any]:
@@ -28,14 +28,14 @@ def _pose(value: Mapping[str, Any]) -> dict[str, Any]:
 
 def _velocity(value: Mapping[str, Any]) -> dict[str, Any]:
     still = (0.0, 0.0)
-    made = {
+    ranges_by_key = {
         "linear_velocity": [value.get(axis, still) for axis in ("x", "y", "z")],
         "angular_velocity": [value.get(axis, still) for axis in ("roll", "pitch", "yaw")],
     }
-    return {key: ranges for key, ranges in made.items() if any(tuple(r) != still for r in ranges)}
+    return {key: ranges for key, ranges in ranges_by_key.items() if any(tuple(r) != still for r in ranges)}
 
 
-def _position(value: Mapping[str, Any]) -> dict[str, Any]:
+def _xyz(value: Mapping[str, Any]) -> dict[str, Any]:
     return {axis: value[axis] for axis in ("x", "y", "z") if axis in value}
 
 
@@ -43,13 +43,9 @@ def _names(value: Any) -> dict[str, Any]:
     return {"terms": [value] if isinstance(value, str) else list(value)}
 
 
-def _only(value: Any) -> dict[str, Any]:
-    """Of a list of one the one; what is wrong with several is said where the term is checked."""
+def _unwrap_single(value: Any) -> dict[str, Any]:
+    """Unwrap a single-element list. The check of the term rejects longer lists."""
     return {"sensor": value[0] if len(value) == 1 else list(value)}
-
-
-def _bounds(value: Mapping[str, Any]) -> dict[str, Any]:
-    return {axis: value[axis] for axis in ("x", "y", "z") if axis in value}
 
 
 _JOINTS: dict[str, str | Translate] = {"position_range": "position", "velocity_range": "velocity"}
@@ -66,7 +62,7 @@ TERMS: dict[str, dict[str, Entry]] = {
         "object_pos_b": Entry("object_position_in_robot_root_frame"),
         "object_obs": Entry("rel_ee_object_distance"),
         "gripper_pos": Entry("joint_pos"),
-        "fingers_contact_force_b": Entry(params={"contact_sensor_names": _only}),
+        "fingers_contact_force_b": Entry(params={"contact_sensor_names": _unwrap_single}),
         "cube_positions_in_world_frame": Entry("root_pos_w"),
         "cube_orientations_in_world_frame": Entry("root_quat_w"),
     },
@@ -79,9 +75,9 @@ TERMS: dict[str, dict[str, Entry]] = {
         "action_rate_l2_clamped": Entry("action_rate_l2"),
     },
     "terminations": {
-        "out_of_bound": Entry(params={"in_bound_range": _bounds}),
+        "out_of_bound": Entry(params={"in_bound_range": _xyz}),
         "terrain_out_of_bounds": Entry(
-            "out_of_bound", {"distance_buffer": lambda value: {}}, "without bounds: give out_of_bound its x and y"
+            "out_of_bound", {"distance_buffer": lambda value: {}}, "without bounds: set x and y of out_of_bound"
         ),
     },
     "events": {
@@ -90,7 +86,7 @@ TERMS: dict[str, dict[str, Entry]] = {
         "reset_joints_within_limits_range": Entry("reset_joints_within_limits", _JOINTS),
         "reset_joints_by_scale": Entry(params=_JOINTS),
         "reset_root_state_uniform": Entry(params=_ROOT),
-        "reset_root_state_with_random_orientation": Entry(params=_ROOT | {"pose_range": _position}),
+        "reset_root_state_with_random_orientation": Entry(params=_ROOT | {"pose_range": _xyz}),
         "push_by_setting_velocity": Entry(params={"velocity_range": _velocity}),
         "apply_external_force_torque": Entry(params={"force_range": "force", "torque_range": "torque"}),
         "reset_scene_to_default": Entry(params={"reset_joint_targets": lambda value: {}}),
@@ -113,7 +109,7 @@ TERMS: dict[str, dict[str, Entry]] = {
         "terrain_levels_vel": Entry("terrain_levels", fixed={"command": "base_velocity"}),
     },
 }
-"""Section -> Isaac Lab's name -> what it is here; `rlcli_isaaclab.randomization` translates the parameters of some."""
+"""Section -> Isaac Lab's name -> counterpart. `randomization.py` translates the parameters of randomization events."""
 
 ACTIONS: dict[str, str] = {
     "JointEffortAction": "joint_effort",
@@ -127,7 +123,7 @@ ACTIONS: dict[str, str] = {
     "AbsBinaryJointPositionAction": "binary_joint_position",
     "DifferentialInverseKinematicsAction": "differential_inverse_kinematics",
 }
-"""Isaac Lab's class -> the action term."""
+"""Isaac Lab's class -> action term."""
 
 COMMANDS: dict[str, Entry] = {
     "NullCommand": Entry("null_command"),
@@ -143,12 +139,12 @@ COMMANDS: dict[str, Entry] = {
     "UniformPoseCommand": Entry("uniform_pose", {"body_name": "bodies", "pos_x": "x", "pos_y": "y", "pos_z": "z"}),
     "UniformPose2dCommand": Entry("uniform_pose2d", {"pos_x": "x", "pos_y": "y"}),
 }
-"""Isaac Lab's class -> the command term; its `ranges` are parameters like the others."""
+"""Isaac Lab's class -> command term. Its `ranges` become parameters of the term."""
 
 NEVER = 1.0e9
-"""An interval that no episode lasts [s], for an infinite one."""
+"""A time that no episode reaches [s]; replaces infinity, which a YAML task cannot hold."""
 
 
-def seconds(value: Any) -> Any:
-    """A range of times without infinities."""
+def finite_times(value: Any) -> Any:
+    """Return a range of times [s] with infinite ends replaced by NEVER."""
     return [NEVER if math.isinf(end) else end for end in value]

@@ -1,16 +1,16 @@
-"""The ground. Names as in `isaaclab.terrains`; the terrains of a generator keep their own settings' names."""
+"""Configuration classes of the terrain. Names as in `isaaclab.terrains`."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from rlcli_isaaclab.config_class import MISSING, configclass
+from rlcli_isaaclab.config_class import MISSING, configclass, make_config_class
 from rlcli_isaaclab.sim import RigidBodyMaterialCfg
 
 
 @configclass
 class TerrainGeneratorCfg:
-    """Rows of patches of rising difficulty."""
+    """A grid of sub-terrains; the difficulty rises from row to row."""
 
     class_type: Any = "TerrainGenerator"
     seed: Any = None
@@ -32,7 +32,7 @@ class TerrainGeneratorCfg:
 
 @configclass
 class TerrainImporterCfg:
-    """A plane, or what a generator makes."""
+    """A plane, or the terrain of a generator."""
 
     class_type: Any = "TerrainImporter"
     collision_group: int = -1
@@ -49,44 +49,45 @@ class TerrainImporterCfg:
     debug_vis: bool = False
 
 
-def _patch(name: str, function: str, **settings: Any) -> Any:
-    """A kind of ground with its settings."""
-    members = {"function": function, "proportion": 1.0, "size": None, "flat_patch_sampling": None, **settings}
-    made = type(name, (), {"__doc__": f"{function}.", "__module__": __name__, "__annotations__": {}, **members})
-    return configclass(made)
+def _sub_terrain(name: str, function: str, **settings: Any) -> Any:
+    """Return the class of a sub-terrain. Its settings keep Isaac Lab's names."""
+    common: dict[str, Any] = {"function": function, "proportion": 1.0, "size": None, "flat_patch_sampling": None}
+    return make_config_class(name, f"Sub-terrain `{function}`.", **common, **settings)
 
 
-HfRandomUniformTerrainCfg = _patch(
+HfRandomUniformTerrainCfg = _sub_terrain(
     "HfRandomUniformTerrainCfg", "random_uniform_terrain", noise_range=MISSING, noise_step=MISSING,
     downsampled_scale=None, border_width=0.0,
 )  # fmt: skip
-HfPyramidSlopedTerrainCfg = _patch(
+HfPyramidSlopedTerrainCfg = _sub_terrain(
     "HfPyramidSlopedTerrainCfg", "pyramid_sloped_terrain", slope_range=MISSING, platform_width=1.0, inverted=False,
     border_width=0.0,
 )  # fmt: skip
-HfInvertedPyramidSlopedTerrainCfg = _patch(
+HfInvertedPyramidSlopedTerrainCfg = _sub_terrain(
     "HfInvertedPyramidSlopedTerrainCfg", "pyramid_sloped_terrain", slope_range=MISSING, platform_width=1.0,
     inverted=True, border_width=0.0,
 )  # fmt: skip
-HfWaveTerrainCfg = _patch("HfWaveTerrainCfg", "wave_terrain", amplitude_range=MISSING, num_waves=1, border_width=0.0)
-HfDiscreteObstaclesTerrainCfg = _patch(
+HfWaveTerrainCfg = _sub_terrain(
+    "HfWaveTerrainCfg", "wave_terrain", amplitude_range=MISSING, num_waves=1, border_width=0.0
+)
+HfDiscreteObstaclesTerrainCfg = _sub_terrain(
     "HfDiscreteObstaclesTerrainCfg", "discrete_obstacles_terrain", obstacle_height_mode="choice",
     obstacle_width_range=MISSING, obstacle_height_range=MISSING, num_obstacles=MISSING, platform_width=1.0,
 )  # fmt: skip
-HfSteppingStonesTerrainCfg = _patch(
+HfSteppingStonesTerrainCfg = _sub_terrain(
     "HfSteppingStonesTerrainCfg", "stepping_stones_terrain", stone_height_max=MISSING, stone_width_range=MISSING,
     stone_distance_range=MISSING, holes_depth=-10.0, platform_width=1.0,
 )  # fmt: skip
-MeshPlaneTerrainCfg = _patch("MeshPlaneTerrainCfg", "flat_terrain")
-MeshPyramidStairsTerrainCfg = _patch(
+MeshPlaneTerrainCfg = _sub_terrain("MeshPlaneTerrainCfg", "flat_terrain")
+MeshPyramidStairsTerrainCfg = _sub_terrain(
     "MeshPyramidStairsTerrainCfg", "pyramid_stairs_terrain", border_width=0.0, step_height_range=MISSING,
     step_width=MISSING, platform_width=1.0, holes=False,
 )  # fmt: skip
-MeshInvertedPyramidStairsTerrainCfg = _patch(
+MeshInvertedPyramidStairsTerrainCfg = _sub_terrain(
     "MeshInvertedPyramidStairsTerrainCfg", "inverted_pyramid_stairs_terrain", border_width=0.0,
     step_height_range=MISSING, step_width=MISSING, platform_width=1.0, holes=False,
 )  # fmt: skip
-MeshRandomGridTerrainCfg = _patch(
+MeshRandomGridTerrainCfg = _sub_terrain(
     "MeshRandomGridTerrainCfg", "random_grid_terrain", grid_width=MISSING, grid_height_range=MISSING,
     platform_width=1.0, holes=False,
 )  # fmt: skip

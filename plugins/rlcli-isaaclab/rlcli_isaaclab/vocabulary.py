@@ -1,5 +1,5 @@
 # ruff: noqa: F401
-"""Every name of Isaac Lab's vocabulary, in one module."""
+"""All names of Isaac Lab's vocabulary in one module."""
 
 from rlcli_isaaclab import actuators, assets, envs, managers, mdp, rsl_rl, scene, sensors, sim, terrains, utils
 from rlcli_isaaclab import sim as sim_utils
@@ -40,12 +40,12 @@ from rlcli_isaaclab.rsl_rl import (
     RslRlPpoActorCriticRecurrentCfg,
     RslRlPpoAlgorithmCfg,
 )
-from rlcli_isaaclab.runtime import Asset as Articulation
-from rlcli_isaaclab.runtime import Asset as RigidObject
 from rlcli_isaaclab.runtime import ManagerBasedRLEnv
-from rlcli_isaaclab.runtime import Sensor as ContactSensor
-from rlcli_isaaclab.runtime import Sensor as RayCaster
 from rlcli_isaaclab.scene import InteractiveSceneCfg
+from rlcli_isaaclab.scene_facade import Asset as Articulation
+from rlcli_isaaclab.scene_facade import Asset as RigidObject
+from rlcli_isaaclab.scene_facade import Sensor as ContactSensor
+from rlcli_isaaclab.scene_facade import Sensor as RayCaster
 from rlcli_isaaclab.sensors import ContactSensorCfg, RayCasterCfg, patterns
 from rlcli_isaaclab.sim import *  # noqa: F403
 from rlcli_isaaclab.sim import __all__ as _sim

@@ -1,4 +1,4 @@
-"""A manager-based cartpole as its author wrote it for Isaac Lab: only the lines that import are other ones."""
+"""A manager-based cartpole task as written for Isaac Lab; only the import lines are changed."""
 
 ENV = '''
 import math
@@ -203,7 +203,7 @@ FILES = {
 
 
 def write(folder):
-    """The package, in a folder."""
+    """Write the package into a folder."""
     for name, content in FILES.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)

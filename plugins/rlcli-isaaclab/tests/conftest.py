@@ -1,4 +1,4 @@
-"""The files of a cartpole written for Isaac Lab."""
+"""Fixture with the files of a cartpole task written for Isaac Lab."""
 
 import sys
 
@@ -11,7 +11,7 @@ __all__ = ["own_console", "own_state"]
 
 @pytest.fixture
 def package(tmp_path):
-    """package(name, **files) -> the folder; other content replaces a file, a new name adds one."""
+    """Return package(name, **files) -> folder. Content for an existing name replaces a file; a new name adds one."""
     known = set(sys.modules)
 
     def make(name="balance", **files):

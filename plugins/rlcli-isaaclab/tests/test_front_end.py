@@ -1,4 +1,4 @@
-"""Configuration written for Isaac Lab is a task here: the same numbers, the same steps, and its own terms run."""
+"""Tasks written for Isaac Lab in rlcli: equal numbers, equal steps, and their own terms."""
 
 import itertools
 import json
@@ -19,7 +19,7 @@ from rlcli.scene.names import NameProblem
 torch.set_num_threads(1)
 
 
-def same_state(ours, other):
+def assert_equal_state(ours, other):
     for field in ("qpos", "qvel"):
         ours.engine.field(field).copy_(other.engine.field(field))
     everyone = ours._select_all()
@@ -28,14 +28,14 @@ def same_state(ours, other):
     ours.episode_length_buf.copy_(other.episode_length_buf)
 
 
-def test_the_environment_equals_cartpole_step_by_step(package):
+def test_env_equals_builtin_cartpole_step_by_step(package):
     ours = make_env(resolve(find_task(str(package())), flags={"scene.num_envs": 16}))
     other = make_env(resolve(find_task("cartpole"), flags={"scene.num_envs": 16}))
     ours.reset(seed=1), other.reset(seed=1)
     ended, timed_out = 0, 0
     generator = torch.Generator().manual_seed(3)
     for step in range(700):
-        same_state(ours, other)
+        assert_equal_state(ours, other)
         action = (6.0 if step < 350 else 0.5) * torch.randn(16, 1, generator=generator)
         a, b = ours.step(action), other.step(action)
         assert torch.equal(a.reward, b.reward)
@@ -50,7 +50,7 @@ def test_the_environment_equals_cartpole_step_by_step(package):
     assert timed_out > 0
 
 
-def test_the_configuration_equals_that_of_cartpole(package):
+def test_config_equals_builtin_cartpole(package):
     ours = to_data(resolve(find_task(str(package()))))
     theirs = to_data(resolve(find_task("cartpole"), flags={"scene.num_envs": 4096}))
     assert ours["scene"]["entities"]["robot"].pop("model") == "cartpole:cartpole.xml"
@@ -78,7 +78,7 @@ def test_the_configuration_equals_that_of_cartpole(package):
         assert a == b
 
 
-def test_the_runner_is_the_ppo_agent_in_rsl_rls_dialect(package):
+def test_runner_becomes_ppo_agent_with_rsl_rl_dialect(package):
     agent = to_data(resolve(find_task(str(package()))))["agents"]
     assert agent["default"] == "rsl-rl"
     wanted = {
@@ -92,7 +92,7 @@ def test_the_runner_is_the_ppo_agent_in_rsl_rls_dialect(package):
     assert {key: agent["rsl-rl"][key] for key in wanted} == wanted
 
 
-def test_files_without_a_package_find_each_other_and_the_agents_folder(package):
+def test_files_without_package_import_each_other_and_agents_folder(package):
     folder = package("other")
     (folder / "__init__.py").unlink()
     resolved = resolve(find_task(f"{folder / 'cartpole_env_cfg.py'}:CartpoleEnvCfg"))
@@ -101,7 +101,7 @@ def test_files_without_a_package_find_each_other_and_the_agents_folder(package):
     assert resolved.task.rewards["pole_pos"].params["asset_cfg"].joint_names == ["cart_to_pole"]
 
 
-def test_a_folder_with_one_environment_is_a_task_and_a_runner_beside_it_its_agent(package):
+def test_folder_with_one_env_is_task_and_runner_beside_it_is_agent(package):
     folder = package("other")
     (folder / "__init__.py").unlink()
     (folder / "agents" / "rsl_rl_ppo_cfg.py").rename(folder / "rsl_rl_ppo_cfg.py")
@@ -110,12 +110,12 @@ def test_a_folder_with_one_environment_is_a_task_and_a_runner_beside_it_its_agen
     resolved = resolve(find_task(str(folder)))
     assert (resolved.source.name, resolved.agent_name, resolved.agent.num_steps) == ("other", "rsl-rl", 16)
     (folder / "a_env_cfg.py").write_text(f"{play.replace('Cfg_PLAY', 'Tilted')}CartpoleEnvCfg):\n    pass\n")
-    with pytest.raises(TaskError, match="holds several tasks") as caught:
+    with pytest.raises(TaskError, match="contains several tasks") as caught:
         find_task(str(folder))
     assert "other/a_env_cfg.py:Tilted, other/cartpole_env_cfg.py:CartpoleEnvCfg" in caught.value.hint
 
 
-def test_the_environment_is_made_from_the_class_and_by_gymnasium(package):
+def test_env_from_class_and_from_gymnasium_make(package):
     import gymnasium
 
     from rlcli_isaaclab import ManagerBasedRLEnv
@@ -146,7 +146,7 @@ from rlcli_isaaclab import (
 )
 
 
-def seen(env, asset_cfg: SceneEntityCfg = SceneEntityCfg("robot", joint_names=["cart_to_pole", "slider_to_cart"])):
+def positions(env, asset_cfg: SceneEntityCfg = SceneEntityCfg("robot", joint_names=["cart_to_pole", "slider_to_cart"])):
     return env.scene[asset_cfg.name].data.joint_pos[:, asset_cfg.joint_ids] - env.scene.env_origins[:, :1]
 
 
@@ -204,8 +204,8 @@ class Actions:
 class Observations:
     @configclass
     class Policy(ObsGroup):
-        joints = ObsTerm(func=seen)
-        chosen = ObsTerm(func=seen, params={"asset_cfg": SceneEntityCfg(
+        joints = ObsTerm(func=positions)
+        chosen = ObsTerm(func=positions, params={"asset_cfg": SceneEntityCfg(
             "robot", joint_names=["cart_to_pole", "slider_to_cart"], preserve_order=True)})
         left = ObsTerm(func=time_left, params={"scale": 2})
         actions = ObsTerm(func=acted)
@@ -247,7 +247,7 @@ class Cfg(ManagerBasedRLEnvCfg):
 
 @pytest.fixture
 def cfg(package):
-    """cfg(changes to the text...) -> the source of a task that is one file."""
+    """Return cfg(*changes) -> source of a one-file task; each change is a pair (old text, new text)."""
     count = iter(range(100))
 
     def make(*changes):
@@ -261,11 +261,11 @@ def cfg(package):
     return make
 
 
-def test_terms_of_isaac_labs_signature_run_as_they_stand(cfg):
+def test_terms_with_isaac_lab_signature_run_unchanged(cfg):
     env = make_env(resolve(cfg()))
     obs = env.reset(seed=0)["policy"]
     joints = env.entities["robot"].data.joint_pos.clone()
-    assert torch.equal(obs[:, :2], joints)  # without preserve_order in the model's order
+    assert torch.equal(obs[:, :2], joints)  # without preserve_order: the model's order
     assert torch.equal(obs[:, 2:4], joints[:, [1, 0]])
     assert torch.equal(obs[:, 4], torch.full((3,), 500.0))  # 250 steps of 0.02 s, each counted as 2
     assert torch.allclose(env.entities["robot"].data.joint_vel, torch.tensor(0.25))
@@ -279,10 +279,10 @@ def test_terms_of_isaac_labs_signature_run_as_they_stand(cfg):
         assert bool(step.terminated.all()) == (number == 6)
     step = env.step(torch.zeros(3, 1))
     pole = env.entities["robot"].data.joint_pos[:, 1]
-    assert torch.allclose(step.reward, 0.02 * (2.0 * pole.square() + 3.0))  # the counter began anew
+    assert torch.allclose(step.reward, 0.02 * (2.0 * pole.square() + 3.0))  # the counter was reset
 
 
-def test_what_a_class_term_carries_is_part_of_the_state(cfg):
+def test_tensors_of_class_term_are_part_of_state(cfg):
     env = make_env(resolve(cfg()))
     env.reset(seed=0)
     for _ in range(3):
@@ -296,7 +296,7 @@ def test_what_a_class_term_carries_is_part_of_the_state(cfg):
 
 COMMANDED = (
     ("    RewTerm, SceneEntityCfg,", "    CommandTerm, CommandTermCfg, CurrTerm, MISSING, RewTerm, SceneEntityCfg,"),
-    ("\n\n\ndef seen", """
+    ("\n\n\ndef positions", """
 
 
 class Place(CommandTerm):
@@ -356,9 +356,9 @@ class Curriculum:
     heavier = CurrTerm(func=heavier, params={"term_name": "place", "weight": -3.0})
 
 
-def seen"""),
+def positions"""),
     ("        actions = ObsTerm(func=acted)", """        actions = ObsTerm(func=acted)
-        asked = ObsTerm(func=mdp.generated_commands, params={"command_name": "place"})"""),
+        commands = ObsTerm(func=mdp.generated_commands, params={"command_name": "place"})"""),
     ("    counter = RewTerm(func=Counter, weight=1.0", """    place = RewTerm(
         func=off, weight=1.0, params={"command_name": "place"})
     counter = RewTerm(func=Counter, weight=0.0"""),
@@ -369,13 +369,13 @@ def seen"""),
 )  # fmt: skip
 
 
-def test_a_command_of_the_users_own_is_drawn_measured_and_kept(cfg):
+def test_user_command_is_resampled_measured_and_saved(cfg):
     env = make_env(resolve(cfg(*COMMANDED), flags={"commands.place.ranges.x": [3.0, 4.0]}))
     torch.manual_seed(0)
-    asked = [env.reset(seed=0)["policy"][:, -1].clone()]
-    assert bool(((asked[0] >= 3.0) & (asked[0] <= 4.0)).all())
-    asked += [env.step(torch.zeros(3, 1)).obs["policy"][:, -1].clone() for _ in range(4)]
-    changed = [bool((a != b).all()) for a, b in itertools.pairwise(asked)]
+    commands = [env.reset(seed=0)["policy"][:, -1].clone()]
+    assert bool(((commands[0] >= 3.0) & (commands[0] <= 4.0)).all())
+    commands += [env.step(torch.zeros(3, 1)).obs["policy"][:, -1].clone() for _ in range(4)]
+    changed = [bool((a != b).all()) for a, b in itertools.pairwise(commands)]
     assert changed == [False, False, True, False]  # 0.06 s are three steps
     state = env.state_dict()
     first = env.step(torch.ones(3, 1))
@@ -389,19 +389,19 @@ def test_a_command_of_the_users_own_is_drawn_measured_and_kept(cfg):
     assert bool((ended.metrics["place/error"] > 2.5).all())
 
 
-def test_a_curriculum_of_the_users_own_changes_the_weight_of_a_reward(cfg):
+def test_user_curriculum_changes_reward_weight(cfg):
     env = make_env(resolve(cfg(*COMMANDED)))
     env.reset(seed=0)
     for number in range(1, 9):
-        asked = env.command_manager.get_command("place")[:, 0].clone()
+        commands = env.command_manager.get_command("place")[:, 0].clone()
         step = env.step(torch.zeros(3, 1))
         weight = 1.0 if number <= 6 else -3.0  # the first episodes end after six steps
-        assert torch.allclose(step.reward, 0.02 * weight * asked)
+        assert torch.allclose(step.reward, 0.02 * weight * commands)
     assert env.curriculum_manager.values() == {"Curriculum/heavier": -3.0}
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (('place = PlaceCfg(asset_name="robot", ', "place = PlaceCfg("), "commands.place: missing 'asset_name'"),
         (("x=(1.0, 2.0)", ""), r"commands\.place\.ranges: missing 'x'"),
@@ -409,19 +409,19 @@ def test_a_curriculum_of_the_users_own_changes_the_weight_of_a_reward(cfg):
         (('"term_name": "place"', '"term_name": "plaice"'), "no reward 'plaice'"),
     ],
 )
-def test_mistakes_in_own_commands_are_said_with_what_there_is(cfg, change, said):
+def test_error_in_user_command_lists_valid_names(cfg, change, message):
     def live():
         env = make_env(resolve(cfg(*COMMANDED, change)))
         env.reset(seed=0)
         for _ in range(7):
             env.step(torch.zeros(3, 1))
 
-    with pytest.raises((ConfigError, NameProblem), match=said):
+    with pytest.raises((ConfigError, NameProblem), match=message):
         live()
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (('"robot", joint_names=".*pole"', '"robot", joint_names="pol"'), "no joint matches 'pol'"),
         (('"robot", joint_names=".*pole"', '"robot", joint_names=[".*pole", "cart.*"]'), "matched twice"),
@@ -445,40 +445,40 @@ def test_mistakes_in_own_commands_are_said_with_what_there_is(cfg, change, said)
         (("mdp.JointEffortActionCfg(", "mdp.JointPositionToLimitsActionCfg("), "no position actuator drives"),
     ],
 )  # fmt: skip
-def test_mistakes_are_said_with_what_there_is(cfg, change, said):
-    with pytest.raises((ConfigError, TaskError), match=said):
+def test_error_in_config_lists_valid_names(cfg, change, message):
+    with pytest.raises((ConfigError, TaskError), match=message):
         make_env(resolve(cfg(change)))
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("import isaaclab.sim as sim_utils", "import it from rlcli_isaaclab:"),
         ("from isaaclab_tasks.utils import parse_env_cfg", "import it from rlcli_isaaclab:"),
-        ("import omni.usd", "'omni' is Isaac Sim's"),
-        ("from rlcli_isaaclab.envs import DirectRLEnvCfg", "becomes a direct task"),
+        ("import omni.usd", "'omni' belongs to Isaac Sim"),
+        ("from rlcli_isaaclab.envs import DirectRLEnvCfg", "write a DirectRLEnv as a direct task"),
         ("from rlcli_isaaclab.managers import RewardTermConfig", "did you mean 'RewardTermCfg'"),
         ("from rlcli_isaaclab import sim\nsim.CubeCfg", "did you mean 'CuboidCfg'"),
         ("import no_such_module", None),
     ],
 )
-def test_an_import_that_is_not_there_is_answered_with_the_line_and_what_to_write(cfg, line, said):
+def test_missing_import_gives_replacement_line(cfg, line, message):
     with pytest.raises(TaskError, match=r"own_0\.py:[23]\)") as caught:
         resolve(cfg(("\nimport torch\n", f"\n{line}\nimport torch\n")))
-    assert caught.value.hint is None if said is None else said in caught.value.hint
+    assert caught.value.hint is None if message is None else message in caught.value.hint
 
 
-def test_a_usd_file_is_mapped_by_the_table_or_refused_with_it(cfg):
+def test_usd_file_is_mapped_or_error_lists_table(cfg):
     own = 'CARTPOLE_CFG.replace(spawn=UsdFileCfg(usd_path="/models/thing.usd"), '
     first = ("from rlcli_isaaclab import (", "from rlcli_isaaclab import (UsdFileCfg, map_usd,")
     with pytest.raises(ConfigError, match=r"scene\.robot\.spawn\.usd_path: no MJCF is known for '/models/thing\.usd'"):
         resolve(cfg(first, ("CARTPOLE_CFG.replace(", own)))
-    known = ("\n\n\ndef seen", '\n\nmap_usd("models/thing.usd", "cartpole:cartpole.xml")\n\n\ndef seen')
+    known = ("\n\n\ndef positions", '\n\nmap_usd("models/thing.usd", "cartpole:cartpole.xml")\n\n\ndef positions')
     source = cfg(first, known, ("CARTPOLE_CFG.replace(", own))
     assert resolve(source).task.scene.entities["robot"].model == "cartpole:cartpole.xml"
 
 
-def test_settings_without_a_counterpart_are_named(cfg):
+def test_settings_without_counterpart_are_reported(cfg):
     spawn = (
         'CARTPOLE_CFG.replace(spawn=sim_utils.UsdFileCfg(usd_path="Robots/Cartpole/cartpole.usd",'
         " rigid_props=sim_utils.RigidBodyPropertiesCfg(max_depenetration_velocity=100.0)), "
@@ -494,7 +494,7 @@ def test_settings_without_a_counterpart_are_named(cfg):
     assert [note for note in resolve(cfg()).notes if not note.key.startswith("agent.")] == []
 
 
-def test_a_package_with_several_tasks_asks_which(package):
+def test_package_with_several_tasks_requires_choice(package):
     start = (package() / "__init__.py").read_text()
     more = start + start[start.index("gym.register") :].replace("Template-Cartpole-v0", "Other-v0")
     folder = package("other", __init__=more)
@@ -506,7 +506,7 @@ def test_a_package_with_several_tasks_asks_which(package):
         resolve(find_task(f"{folder}:No-v0"))
 
 
-def test_a_configclass_gives_each_object_its_own_defaults():
+def test_configclass_copies_defaults_for_each_object():
     from rlcli_isaaclab import MISSING, configclass
 
     @configclass
@@ -532,7 +532,7 @@ def test_a_configclass_gives_each_object_its_own_defaults():
 
 
 @pytest.mark.slow
-def test_such_a_package_trains_resumes_and_is_evaluated(package, tmp_path):
+def test_package_trains_resumes_and_evaluates(package, tmp_path):
     folder = package(cartpole_env_cfg=ENV.replace("num_envs=4096", "num_envs=64"))
 
     def rlcli(*words):

@@ -1,4 +1,4 @@
-"""The front end as a plugin: nothing heavy before it is needed, former module names, what a run records."""
+"""The front end as a plugin: lazy imports, former module names, and the plugin's entry in a run's record."""
 
 import json
 import subprocess
@@ -13,21 +13,21 @@ from rlcli.registry import load_object
 torch.set_num_threads(1)
 
 
-def test_importing_the_package_and_listing_its_importer_imports_nothing_heavy():
+def test_import_and_help_load_nothing_heavy():
     program = "import sys, rlcli_isaaclab, rlcli_isaaclab.format; from rlcli.cli.app import main\n"
     program += "main(['import', 'isaaclab', '--help']); print('torch' in sys.modules, 'mujoco' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1].split() == ["False", "False"]
 
 
-def test_every_name_is_offered_by_the_package_itself():
+def test_package_exports_every_name():
     import rlcli_isaaclab
 
     assert all(hasattr(rlcli_isaaclab, name) for name in dir(rlcli_isaaclab))
     assert {"configclass", "sim_utils", "mdp", "ManagerBasedRLEnvCfg"} <= set(dir(rlcli_isaaclab))
 
 
-def test_files_with_the_former_module_names_train_and_the_run_records_the_plugin(package, tmp_path, capsys):
+def test_former_module_names_train_and_run_records_plugin(package, tmp_path, capsys):
     old = {name: text.replace("rlcli_isaaclab", "rlcli.isaaclab") for name, text in FILES.items()}
     folder = package()
     for name, text in old.items():
@@ -44,7 +44,7 @@ def test_files_with_the_former_module_names_train_and_the_run_records_the_plugin
     assert json.loads(capsys.readouterr().out)["episodes"] == 4
 
 
-def test_a_former_reference_gives_the_same_object_and_no_second_module():
+def test_former_reference_resolves_to_same_module():
     from rlcli_isaaclab import managers, mdp
 
     assert load_object("rlcli.isaaclab.mdp:joint_pos_rel") is mdp.joint_pos_rel

@@ -1,4 +1,4 @@
-"""`rlcli import isaaclab`: the files of a run become a task of rlcli's own, every key accounted for."""
+"""`rlcli import isaaclab`: the files of a run become a task of rlcli, and every key is reported."""
 
 import json
 import os
@@ -21,7 +21,7 @@ ENV, AGENT = HERE / "env.yaml", HERE / "agent.yaml"
 
 @pytest.fixture
 def imported(tmp_path, capsys):
-    """imported(env text, ...) -> exit code, the JSON document, stderr, the folder."""
+    """Return imported(env_text, ...) -> exit code, JSON document, stderr, folder."""
 
     def run(text=None, *words, agent=True):
         env = tmp_path / "env.yaml"
@@ -35,7 +35,7 @@ def imported(tmp_path, capsys):
     return run
 
 
-def test_a_cartpole_run_gives_our_cartpole_field_by_field(imported):
+def test_cartpole_run_equals_builtin_cartpole_config(imported):
     code, _, _, folder = imported()
     assert code == 0
     ours = to_data(resolve(folder_task(folder)))
@@ -55,7 +55,7 @@ def test_a_cartpole_run_gives_our_cartpole_field_by_field(imported):
     assert agent["actor"] == {"hidden": [32, 32], "activation": "elu"}
 
 
-def test_the_imported_task_takes_the_steps_of_cartpole(imported):
+def test_imported_task_equals_builtin_cartpole_steps(imported):
     _, _, _, folder = imported()
     ours = make_env(resolve(folder_task(folder), flags={"scene.num_envs": 4}))
     other = make_env(resolve(find_task("cartpole"), flags={"scene.num_envs": 4}))
@@ -78,15 +78,15 @@ def leaves(value, key=()):
         yield key
 
 
-def test_every_key_is_accounted_for(imported):
+def test_every_key_is_reported(imported):
     _, document, _, _ = imported()
-    told = {tuple(row["key"].split(".")): row for row in document["keys"]}
+    reported = {tuple(row["key"].split(".")): row for row in document["keys"]}
     text = ENV.read_text().replace("!!python/tuple", "").replace("!!python/object/apply:builtins.slice", "")
     text = text.replace("!!python/object/apply:isaaclab.managers.recorder_manager.DatasetExportMode", "")
     missing = []
     for key in leaves(yaml.safe_load(text)):
         above = [".".join(key[:length]) for length in range(1, len(key) + 1)]
-        if not any(".".join(known) in above for known in told):
+        if not any(".".join(known) in above for known in reported):
             missing.append(key)
     assert missing == []
     status = {row["key"]: row["status"] for row in document["keys"]}
@@ -95,7 +95,7 @@ def test_every_key_is_accounted_for(imported):
     assert status["scene.robot.spawn.collision_props"] == "default"
 
 
-def test_a_function_that_only_its_author_has_becomes_a_stub(imported):
+def test_unknown_function_becomes_stub(imported):
     own = "func: my_robots.mdp:wobble\n    params:\n      strength: 2.0"
     text = ENV.read_text().replace("func: isaaclab.envs.mdp.rewards:is_alive\n    params: {}", own)
     code, _, err, folder = imported(text)
@@ -105,7 +105,7 @@ def test_a_function_that_only_its_author_has_becomes_a_stub(imported):
     assert resolve(folder_task(folder)).task.rewards["alive"].params == {"strength": 2.0}
 
 
-def test_a_command_and_a_curriculum_that_only_their_author_has_become_stubs_that_load(imported):
+def test_unknown_command_and_curriculum_become_loadable_stubs(imported):
     own = """commands:
   place:
     class_type: my_robots.mdp:PlaceCommand
@@ -127,7 +127,7 @@ curriculum:
     assert task.commands["place"].params == {"entity": "robot", "ranges": {"x": [-1.0, 1.0]}}
 
 
-def test_an_own_model_stands_for_a_usd_file_that_is_not_known(imported, tmp_path):
+def test_model_option_replaces_unknown_usd_file(imported, tmp_path):
     text = ENV.read_text().replace("Classic/Cartpole/cartpole.usd", "Own/wobbly.usd")
     code, document, _, folder = imported(text)
     assert code == 3
@@ -141,7 +141,7 @@ def test_an_own_model_stands_for_a_usd_file_that_is_not_known(imported, tmp_path
     assert make_env(resolve(folder_task(folder), flags={"scene.num_envs": 2})).num_envs == 2
 
 
-def test_nothing_of_a_file_is_run_or_constructed(imported, tmp_path):
+def test_import_executes_and_constructs_nothing(imported, tmp_path):
     mark = tmp_path / "ran"
     evil = f"evil: !!python/object/apply:os.system ['touch {mark}']\n"
     code, _, _, _ = imported(evil + ENV.read_text())
@@ -155,7 +155,7 @@ BOMB = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + "".join(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("a: [", "env.yaml:"),
         ("- 1", "the top level must be a mapping"),
@@ -164,21 +164,21 @@ BOMB = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + "".join(
         ("[" * 3000, "env.yaml"),
     ],
 )  # fmt: skip
-def test_what_is_not_such_a_file_is_refused(imported, text, said):
+def test_invalid_file_is_refused(imported, text, message):
     code, document, _, folder = imported(text)
     assert code == 3
-    assert said in json.dumps(document)
+    assert message in json.dumps(document)
     assert not folder.exists()
 
 
-def test_a_task_that_is_there_is_not_overwritten(imported):
+def test_existing_task_is_not_overwritten(imported):
     assert imported()[0] == 0
     code, document, _, _ = imported()
     assert code == 2
     assert "exists" in json.dumps(document)
 
 
-def test_a_file_of_another_library_is_refused(imported, tmp_path):
+def test_agent_file_of_other_library_is_refused(imported, tmp_path):
     other = tmp_path / "agent.yaml"
     other.write_text("params:\n  seed: 42\n")
     code, document, _, _ = imported(None, str(other), agent=False)
@@ -186,7 +186,7 @@ def test_a_file_of_another_library_is_refused(imported, tmp_path):
     assert "is not RSL-RL's agent.yaml" in json.dumps(document)
 
 
-def test_settings_beyond_cartpoles_are_translated(imported):
+def test_settings_that_cartpole_lacks_are_translated(imported):
     noise = "noise: {func: isaaclab.utils.noise.noise_model:uniform_noise, operation: add, n_min: -0.1, n_max: 0.1}"
     softer = "func: isaaclab.envs.mdp.curriculums:modify_reward_weight"
     softer += ", params: {term_name: alive, weight: 0.5, num_steps: 100}"
@@ -215,7 +215,7 @@ def test_settings_beyond_cartpoles_are_translated(imported):
     assert data["scene"]["ground"]["size"] == 60.0
 
 
-def test_a_pipe_and_a_file_without_end_are_not_read(tmp_path, capsys):
+def test_pipe_and_endless_file_are_not_read(tmp_path, capsys):
     pipe, sparse = tmp_path / "pipe.yaml", tmp_path / "sparse.yaml"
     os.mkfifo(pipe)
     with sparse.open("wb") as file:

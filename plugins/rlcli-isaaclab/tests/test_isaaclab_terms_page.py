@@ -1,4 +1,4 @@
-"""The page of Isaac Lab's terms tells the truth: what it says is here, is here."""
+"""The page docs/reference/isaac-lab-terms.md: every term that it lists exists."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,7 @@ ROW = re.compile(r"^\| `([^`]+)` \| (same|not possible|not offered|`[a-z0-9_]+`)
 
 
 def tables():
-    """Section -> (Isaac Lab's name, what is said to stand for it, remark)."""
+    """Return section -> [(Isaac Lab's name, counterpart, remark)]."""
     found, section = {}, None
     for line in PAGE.read_text().splitlines():
         if line.startswith("## "):
@@ -28,18 +28,18 @@ def tables():
     return found
 
 
-def test_the_page_has_every_section_of_terms():
+def test_page_has_every_section():
     assert set(tables()) == set(SECTIONS) - {"success"}
     assert sum(map(len, tables().values())) > 180
 
 
 RANDOMIZATION = Path(rlcli.__path__[0]) / "mdp" / "randomization"
-"""Half of the events; without it their table promises what is to come."""
+"""Package of about half of the events."""
 HERE = sorted(set(SECTIONS) - {"success"} - (set() if RANDOMIZATION.exists() else {"events"}))
 
 
 @pytest.mark.parametrize("section", HERE)
-def test_what_is_said_to_be_here_is_here(section):
+def test_listed_counterparts_exist(section):
     terms, rows = builtin_terms(section), tables()[section]
     names = [name for name, _, _ in rows]
     assert len(set(names)) == len(names)

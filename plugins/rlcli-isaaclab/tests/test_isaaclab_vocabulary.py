@@ -1,4 +1,4 @@
-"""Isaac Lab's terms with Isaac Lab's own parameters: each is the built-in one, and all run in one environment."""
+"""Isaac Lab's terms with Isaac Lab's parameters: each maps to its built-in term, and all run in one environment."""
 
 import re
 from pathlib import Path
@@ -50,7 +50,7 @@ GOAL = {"command_name": "hand", "object_cfg": Pick("object")}
 VELOCITY = {"command_name": "base_velocity"}
 LEVER = {"asset_cfg": Pick("cabinet", joint_names=["slide"])}
 OURS = {"handle": "handle"}
-"""What Isaac Lab's terms know of the one scene that they are for."""
+"""Constants in the code of Isaac Lab's terms, which are written for one scene."""
 
 OBSERVATIONS = {
     "base_pos_z": {}, "base_lin_vel": {}, "base_ang_vel": {}, "projected_gravity": {}, "root_pos_w": {},
@@ -169,12 +169,12 @@ EVENT_TERMS = {
     "randomize_joint_by_gaussian_offset": {"asset_cfg": Pick("arm", joint_names=["elbow"]), "mean": 0.0, "std": 0.02},
 }  # fmt: skip
 ELSEWHERE = {
-    "contacts", "success_reward",  # of one hand's own sensors and assets
-    "reset_joints_within_limits_range", "randomize_object_pose",  # ranges a joint, lists of assets
-    "image",  # of a camera, which needs OpenGL: tests/mdp/test_pictures.py
+    "contacts", "success_reward",  # needs the sensors and assets of one hand
+    "reset_joints_within_limits_range", "randomize_object_pose",  # ranges per joint, lists of assets
+    "image",  # needs a camera, and so OpenGL: tests/mdp/test_pictures.py
     "randomize_fixed_tendon_parameters",  # no robot here has tendons
 }  # fmt: skip
-"""On the page, with parameters of another shape."""
+"""Terms of the page that are not tried here."""
 
 
 def articulation(name, **more):
@@ -258,7 +258,7 @@ def source(tmp_path_factory):
 
 
 def rows(section):
-    """Isaac Lab's name -> the built-in one, as the page says."""
+    """Return Isaac Lab's name -> name of the built-in term, from the page."""
     text = PAGE.read_text().split(f"`{section}:`\n")[1].split("\n## ")[0]
     found = re.findall(r"^\| `([^`]+)` \| (same|`[a-z0-9_]+`) \|", text, re.MULTILINE)
     return {name: name if here == "same" else here.strip("`") for name, here in found}
@@ -273,18 +273,18 @@ def rows(section):
         ("events", EVENT_TERMS),
     ],
 )
-def test_each_term_of_the_page_is_tried_and_is_what_the_page_says(source, section, tried):
-    said = rows(section)
-    assert set(said) - ELSEWHERE == set(tried)
+def test_every_listed_term_maps_to_listed_counterpart(source, section, tried):
+    listed = rows(section)
+    assert set(listed) - ELSEWHERE == set(tried)
     made = to_data(resolve(source()))[section]
     made = made["policy"] if section == "observations" else made
     for name in tried:
         found = {term["func"] for key, term in made.items() if key == name or key.startswith(f"{name}_")}
-        assert said[name] in found, name
+        assert listed[name] in found, name
     assert set(EVENTS) - ELSEWHERE <= set(EVENT_TERMS)
 
 
-def test_all_of_them_run_in_one_environment(source):
+def test_all_terms_run_in_one_env(source):
     env = make_env(resolve(source()), seed=1)
     assert env.reset()["policy"].isfinite().all()
     generator = torch.Generator().manual_seed(0)
@@ -296,13 +296,13 @@ def test_all_of_them_run_in_one_environment(source):
     assert env.extras()["Curriculum/ramp"] == -0.5
 
 
-def test_an_object_starts_with_the_velocity_that_it_is_given(source):
+def test_object_starts_with_configured_velocity(source):
     env = make_env(resolve(source(), overrides=["events.reset_root_state_with_random_orientation=null"]), seed=1)
     env.reset()
     assert env.entities["object"].data.root_lin_vel_w.tolist() == [[0.5, 0.0, 0.0]] * 3
 
 
-def test_a_term_with_some_bodies_of_a_contact_sensor_sees_those_alone(source):
+def test_term_with_sensor_bodies_reads_only_these(source):
     env = make_env(resolve(source()), seed=1)
     env.reset()
     for _ in range(15):
@@ -311,7 +311,7 @@ def test_a_term_with_some_bodies_of_a_contact_sensor_sees_those_alone(source):
     assert sensors["contact_forces_leg"].names == ["leg_fl", "leg_fr", "leg_bl", "leg_br"]
     assert sensors["contact_forces_torso"].names == ["torso"]
     whole = sensors["contact_forces"].force_history
-    assert whole.norm(dim=-1).max() > 1.0  # it stands
+    assert whole.norm(dim=-1).max() > 1.0  # the robot stands on its feet
     for name in ("contact_forces_leg", "contact_forces_torso", "contact_forces_leg_f"):
         places = [sensors["contact_forces"].names.index(body) for body in sensors[name].names]
         assert torch.equal(sensors[name].force_history, whole[:, :, places])
@@ -345,10 +345,10 @@ MASS = {"asset_cfg": Pick("robot"), "mass_distribution_params": (0.0, 1.0), "ope
         ("curriculum", "modify_reward_weight", {"term_name": "acton_l2", "weight": 1.0, "num_steps": 3},
          "'rewards.acton_l2.weight' does not exist.*did you mean 'action_l2'"),
         ("curriculum", "modify_term_cfg", {"address": "rewards.action_l2.weight", "modify_fn": max},
-         "calls a function of its own.*|'stages' and 'interpolate'"),
+         "calls a function that edits.*|'stages' and 'interpolate'"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_is_refused_with_what_there_is(source, section, name, params, message):
+def test_invalid_params_error_lists_valid_names(source, section, name, params, message):
     class Wrong(Cfg):
         def __post_init__(self):
             super().__post_init__()

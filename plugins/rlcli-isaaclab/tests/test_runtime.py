@@ -1,4 +1,4 @@
-"""What a term of Isaac Lab's signature reads and writes: against the engine, and rotations against MuJoCo's."""
+"""Data that Isaac Lab's terms read and write, compared with the engine; rotations compared with MuJoCo."""
 
 import math
 
@@ -8,7 +8,8 @@ import pytest
 import torch
 from support.worlds import build, critter
 
-from rlcli_isaaclab import runtime
+from rlcli.scene.names import NameProblem
+from rlcli_isaaclab.runtime import facade_of
 from rlcli_isaaclab.utils import math as lab
 
 torch.set_num_threads(1)
@@ -16,9 +17,9 @@ torch.set_num_threads(1)
 
 @pytest.fixture(scope="module")
 def env(tmp_path_factory):
-    """Four critters in motion, as Isaac Lab's terms see them."""
+    """Yield four moving critters behind Isaac Lab's environment class."""
     built = build(critter(tmp_path_factory.mktemp("critter")))
-    yield runtime.facade_of(built)
+    yield facade_of(built)
     built.close()
 
 
@@ -30,17 +31,17 @@ def robot(env):
     return env.scene["robot"]
 
 
-def some_pose(rows):
-    drawn = torch.Generator().manual_seed(5)
-    place = torch.rand(rows, 3, generator=drawn) + torch.tensor([0.0, 0.0, 1.0])
-    return torch.cat([place, lab.normalize(torch.randn(rows, 4, generator=drawn))], dim=1)
+def random_pose(rows):
+    generator = torch.Generator().manual_seed(5)
+    position = torch.rand(rows, 3, generator=generator) + torch.tensor([0.0, 0.0, 1.0])
+    return torch.cat([position, lab.normalize(torch.randn(rows, 4, generator=generator))], dim=1)
 
 
-def test_a_root_state_that_is_written_is_what_is_read_in_the_rows_that_were_meant(robot):
+def test_written_root_state_is_read_back_in_selected_rows(robot):
     before = robot.data.root_state_w.clone()
     rows = torch.tensor([3, 1])
     written = torch.cat(
-        [some_pose(2), torch.tensor([[1.0, -2.0, 0.5, 0.3, -0.7, 2.0], [0.0, 1.0, 0.0, -1.0, 0.2, 0.1]])], 1
+        [random_pose(2), torch.tensor([[1.0, -2.0, 0.5, 0.3, -0.7, 2.0], [0.0, 1.0, 0.0, -1.0, 0.2, 0.1]])], 1
     )
     robot.write_root_state_to_sim(written, env_ids=rows)
     assert torch.allclose(robot.data.root_state_w[rows], written, atol=1e-6)
@@ -49,14 +50,14 @@ def test_a_root_state_that_is_written_is_what_is_read_in_the_rows_that_were_mean
     assert torch.allclose(robot.data.root_vel_w[rows], written[:, 7:], atol=1e-6)
 
 
-def test_a_joint_that_is_written_is_what_is_read_and_the_others_stay(robot):
+def test_written_joint_is_read_back_and_others_keep(robot):
     position, velocity = robot.data.joint_pos.clone(), robot.data.joint_vel.clone()
     ids, names = robot.find_joints(["hip_br", "hip_fl"])
     assert names == [robot.joint_names[i] for i in ids]
-    asked = torch.tensor([[0.3, -0.2]])
-    robot.write_joint_position_to_sim(asked, joint_ids=torch.tensor(ids), env_ids=[2])
-    robot.write_joint_velocity_to_sim(10 * asked, joint_ids=torch.tensor(ids), env_ids=[2])
-    position[2, ids], velocity[2, ids] = asked[0], 10 * asked[0]
+    target = torch.tensor([[0.3, -0.2]])
+    robot.write_joint_position_to_sim(target, joint_ids=torch.tensor(ids), env_ids=[2])
+    robot.write_joint_velocity_to_sim(10 * target, joint_ids=torch.tensor(ids), env_ids=[2])
+    position[2, ids], velocity[2, ids] = target[0], 10 * target[0]
     assert torch.allclose(robot.data.joint_pos, position)
     assert torch.allclose(robot.data.joint_vel, velocity)
     robot.write_joint_state_to_sim(torch.full((4, 4), 0.1), torch.full((4, 4), -1.0))
@@ -64,7 +65,7 @@ def test_a_joint_that_is_written_is_what_is_read_and_the_others_stay(robot):
     assert torch.allclose(robot.data.joint_vel, torch.tensor(-1.0))
 
 
-def test_joints_come_in_the_models_order_unless_the_callers_is_kept(robot):
+def test_find_joints_uses_model_order_unless_preserve_order(robot):
     model = robot.joint_names
     assert robot.find_joints(["hip_f.*", "hip_br"])[1] == [n for n in model if n in ("hip_fl", "hip_fr", "hip_br")]
     assert robot.find_joints(["hip_br", "hip_fl"], preserve_order=True)[1] == ["hip_br", "hip_fl"]
@@ -72,7 +73,7 @@ def test_joints_come_in_the_models_order_unless_the_callers_is_kept(robot):
     assert robot.find_bodies("leg_f.")[1] == ["leg_fl", "leg_fr"]
 
 
-def test_bodies_limits_and_directions_are_those_of_the_engine(env, robot):
+def test_bodies_limits_and_directions_equal_engine(env, robot):
     states = robot.data.body_state_w
     assert states.shape == (4, robot.num_bodies, 13)
     torso = robot.body_names.index("torso")
@@ -86,7 +87,7 @@ def test_bodies_limits_and_directions_are_those_of_the_engine(env, robot):
     assert robot.num_instances == env.scene.num_envs == 4
 
 
-def test_the_scene_is_a_mapping_that_names_what_it_has(env):
+def test_scene_is_mapping_and_errors_list_names(env):
     assert list(env.scene) == ["robot"]
     assert len(env.scene) == 1
     assert env.scene.articulations["robot"] is env.scene["robot"]
@@ -103,7 +104,7 @@ def test_the_scene_is_a_mapping_that_names_what_it_has(env):
     assert not hasattr(env.scene["robot"], "actuators")
 
 
-def test_managers_say_what_they_did_in_the_step(env):
+def test_managers_report_results_of_step(env):
     env.reset(seed=0)
     env.scene["robot"].write_root_pose_to_sim(torch.tensor([[0.0, 0.0, 1.0, 0.7, 0.7, 0.0, 0.0]]), env_ids=[1])
     before = env.common_step_counter.clone()
@@ -119,13 +120,13 @@ def test_managers_say_what_they_did_in_the_step(env):
     assert env.termination_manager.active_terms == ["time_out", "tilt", "low"]
     assert env.reward_manager.active_terms[:2] == ["alive", "fell"]
     assert env.max_episode_length_s == 0.6
-    with pytest.raises(runtime.NameProblem, match="no action 'arms'; there are legs"):
+    with pytest.raises(NameProblem, match="no action 'arms'; there are legs"):
         env.action_manager.get_term("arms")
-    with pytest.raises(runtime.NameProblem, match="no termination 'tlit'; there are time_out"):
+    with pytest.raises(NameProblem, match="no termination 'tlit'; there are time_out"):
         env.termination_manager.get_term("tlit")
 
 
-def test_the_spaces_are_those_of_the_batch(env):
+def test_spaces_are_batched(env):
     obs, _ = env.reset()
     assert env.single_action_space.shape == (4,)
     assert env.action_space.shape == (4, 4)
@@ -145,8 +146,8 @@ def vectors(rows=16, seed=1):
     return torch.randn(rows, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-def mujocos(function, size, *arguments):
-    """The same of MuJoCo, row by row."""
+def with_mujoco(function, size, *arguments):
+    """Apply a function of MuJoCo row by row."""
     rows = []
     for row in zip(*(a.numpy() for a in arguments), strict=True):
         result = np.zeros(size)
@@ -155,9 +156,9 @@ def mujocos(function, size, *arguments):
     return torch.from_numpy(np.stack(rows))
 
 
-def test_vectors_turn_as_mujoco_turns_them():
+def test_rotated_vectors_equal_mujoco():
     q, v = quats(), vectors()
-    turned = mujocos(lambda out, quat, vec: mujoco.mju_rotVecQuat(out, vec, quat), 3, q, v)
+    turned = with_mujoco(lambda out, quat, vec: mujoco.mju_rotVecQuat(out, vec, quat), 3, q, v)
     assert torch.allclose(lab.quat_apply(q, v), turned)
     assert torch.allclose(lab.quat_apply_inverse(q, turned), v)
     assert torch.allclose(lab.quat_apply(q[:1], v[:5]), lab.quat_apply(q[:1].expand(5, 4), v[:5]))
@@ -165,10 +166,10 @@ def test_vectors_turn_as_mujoco_turns_them():
     assert torch.allclose(many.reshape(16, 3), turned)
 
 
-def test_the_opposite_rotation_and_the_shortest_way_are_mujocos():
+def test_inverse_and_error_magnitude_equal_mujoco():
     a, b = quats(), quats(seed=7)
-    assert torch.allclose(lab.quat_inv(a), mujocos(mujoco.mju_negQuat, 4, a))
-    way = mujocos(mujoco.mju_subQuat, 3, a, b).norm(dim=1)
+    assert torch.allclose(lab.quat_inv(a), with_mujoco(mujoco.mju_negQuat, 4, a))
+    way = with_mujoco(mujoco.mju_subQuat, 3, a, b).norm(dim=1)
     angle = lab.quat_error_magnitude(a, b)
     assert torch.allclose(angle, torch.minimum(way, 2 * torch.pi - way))
     assert torch.allclose(lab.quat_error_magnitude(a, -a), torch.zeros(16, dtype=torch.float64), atol=1e-7)
@@ -176,7 +177,7 @@ def test_the_opposite_rotation_and_the_shortest_way_are_mujocos():
     assert torch.equal(lab.quat_unique(a), lab.quat_unique(-a))
 
 
-def test_angles_of_euler_and_back_are_the_same_rotation():
+def test_euler_angles_round_trip():
     q = quats()
     angles = lab.euler_xyz_from_quat(q)
     assert all(bool(((a >= 0) & (a < 2 * torch.pi)).all()) for a in angles)
@@ -188,7 +189,7 @@ def test_angles_of_euler_and_back_are_the_same_rotation():
     assert turned[0].tolist() == pytest.approx(expected)
 
 
-def test_a_turn_about_z_alone_keeps_heights_and_the_heading():
+def test_yaw_rotation_keeps_height_and_heading():
     q, v = quats(), vectors()
     level = lab.yaw_quat(q)
     assert torch.equal(level[:, 1:3], torch.zeros(16, 2, dtype=torch.float64))
@@ -198,7 +199,7 @@ def test_a_turn_about_z_alone_keeps_heights_and_the_heading():
     assert torch.allclose(lab.quat_apply_yaw(q, v)[:, 2], v[:, 2])
 
 
-def test_frames_combined_and_subtracted_are_what_they_were():
+def test_combine_and_subtract_frames_are_inverse():
     t01, q01, t12, q12 = vectors(), quats(), vectors(seed=8), quats(seed=9)
     t02, q02 = lab.combine_frame_transforms(t01, q01, t12, q12)
     points = vectors(seed=11)
@@ -215,7 +216,7 @@ def test_frames_combined_and_subtracted_are_what_they_were():
     assert torch.equal(turn, lab.quat_conjugate(q01))
 
 
-def test_scales_and_bounds_are_each_others_opposite():
+def test_scale_and_unscale_are_inverse():
     lower, upper = torch.tensor([-1.0, 0.0]), torch.tensor([3.0, 10.0])
     ends = torch.stack([lower, upper, 0.5 * (lower + upper)])
     assert torch.equal(lab.scale_transform(ends, lower, upper), torch.tensor([[-1.0, -1.0], [1.0, 1.0], [0.0, 0.0]]))
@@ -227,7 +228,7 @@ def test_scales_and_bounds_are_each_others_opposite():
     assert torch.equal(lab.copysign(-2.0, torch.tensor([-0.5, 3.0])), torch.tensor([-2.0, 2.0]))
 
 
-def test_draws_lie_where_they_should_and_spread():
+def test_samples_are_in_range_and_spread():
     torch.manual_seed(0)
     even = lab.sample_uniform(-1.0, 3.0, (4000,), "cpu")
     assert -1.0 <= float(even.min()) < -0.9 < 2.9 < float(even.max()) < 3.0
@@ -238,7 +239,7 @@ def test_draws_lie_where_they_should_and_spread():
     wide = lab.sample_log_uniform(0.01, 100.0, (4000,), "cpu")
     assert float(wide.min()) >= 0.01
     assert float(wide.max()) <= 100.0
-    assert float(wide.median()) == pytest.approx(1.0, rel=0.3)  # half of the decades lie below 1
+    assert float(wide.median()) == pytest.approx(1.0, rel=0.3)  # half of the sampled decades are below 1
     turns = lab.random_orientation(4000, "cpu")
     assert torch.allclose(turns.norm(dim=1), torch.ones(4000))
     up = lab.quat_apply(turns, torch.tensor([0.0, 0.0, 1.0]).expand(4000, 3))

@@ -1,4 +1,4 @@
-"""A task with legs, commands, noise, pushes and a curriculum, as its author wrote it for Isaac Lab."""
+"""A task with legs, commands, noise, pushes and a curriculum as written for Isaac Lab."""
 
 import pytest
 import torch
@@ -36,7 +36,7 @@ CRITTER_CFG = ArticulationCfg(
 )
 
 
-def asked(env, command_name: str):
+def command_of(env, command_name: str):
     return env.command_manager.get_command(command_name)
 
 
@@ -79,7 +79,7 @@ class ObservationsCfg:
     class PolicyCfg(ObsGroup):
         ang_vel = ObsTerm(func=mdp.base_ang_vel, noise=Unoise(n_min=-0.2, n_max=0.2), clip=(-10, 10))
         gravity = ObsTerm(func=mdp.projected_gravity)
-        command = ObsTerm(func=asked, params={"command_name": "base_velocity"})
+        command = ObsTerm(func=command_of, params={"command_name": "base_velocity"})
         joint_pos = ObsTerm(func=mdp.joint_pos_rel, noise=Unoise(n_min=-0.01, n_max=0.01), scale=2.0)
         actions = ObsTerm(func=mdp.last_action, history_length=2)
 
@@ -155,7 +155,7 @@ class Cfg(ManagerBasedRLEnvCfg):
 
 @pytest.fixture
 def velocity(tmp_path):
-    """velocity(changes...) -> the source of the task."""
+    """Return velocity(*changes) -> source of the task; each change is a pair (old text, new text)."""
     number = iter(range(10))
 
     def make(*changes, corrupt=True):
@@ -195,7 +195,7 @@ def test_every_section_is_translated(velocity):
     assert data["curriculum"]["flat"]["address"] == "rewards.rate.weight"
 
 
-def test_it_runs_and_its_curriculum_acts(velocity):
+def test_task_runs_and_curriculum_acts(velocity):
     env = make_env(resolve(velocity(("self.episode_length_s = 20.0", "self.episode_length_s = 1.0"))))
     obs = env.reset(seed=0)
     assert obs["policy"].shape == (4, 3 + 3 + 3 + 4 + 2 * 4)
@@ -205,16 +205,16 @@ def test_it_runs_and_its_curriculum_acts(velocity):
         step = env.step(torch.randn(4, 4, generator=generator))
         assert step.obs["critic"].isfinite().all()
     assert env.extras()["Curriculum/flat"] == pytest.approx(-0.05)
-    assert env.extras()["Curriculum/level"] in (2.0, 4.0, 6.0, 8.0)  # of the environments that ended last, twice each
+    assert env.extras()["Curriculum/level"] in (2.0, 4.0, 6.0, 8.0)  # 2 for each environment that ended last
 
 
-def test_preserve_order_keeps_the_order_written(velocity):
+def test_preserve_order_keeps_written_order(velocity):
     change = ("use_default_offset=True,", "use_default_offset=True, preserve_order=True,")
     env = make_env(resolve(velocity(change)))
     assert list(env.action_manager.terms[0].instance.elements) == ["hip_bl", "hip_br", "hip_fl", "hip_fr"]
 
 
-def test_without_corruption_observations_are_exact(velocity):
+def test_observations_without_corruption_are_exact(velocity):
     env = make_env(resolve(velocity(corrupt=False)))
     obs = env.reset(seed=0)["policy"]
     data = env.entities["robot"].data
@@ -222,7 +222,7 @@ def test_without_corruption_observations_are_exact(velocity):
     assert torch.equal(obs[:, 9:13], 2.0 * (data.joint_pos - data.default_joint_pos))
 
 
-def test_a_dc_motor_is_an_actuator_model(velocity):
+def test_dc_motor_becomes_actuator_model(velocity):
     motor = ("ImplicitActuatorCfg(\n", "DCMotorCfg(saturation_effort=12.0, velocity_limit=20.0,\n")
     limit = ("effort_limit_sim=8.0", "effort_limit=8.0")
     env = make_env(resolve(velocity(motor, limit)))
@@ -232,7 +232,7 @@ def test_a_dc_motor_is_an_actuator_model(velocity):
     assert env.step(torch.zeros(4, 4)).reward.isfinite().all()
 
 
-def test_a_command_or_reward_that_is_not_there_is_named(velocity):
+def test_unknown_command_or_reward_is_named(velocity):
     with pytest.raises(ConfigError, match="base_veloc"):
         make_env(resolve(velocity(('{"command_name": "base_velocity"}', '{"command_name": "base_veloc"}'))))
     with pytest.raises(ConfigError, match=r"rewards\.rat"):
@@ -293,7 +293,7 @@ FINE = (
 )
 
 
-def test_sensors_and_objects_are_seen_as_in_isaac_lab(velocity):
+def test_terms_read_sensors_and_objects(velocity):
     env = make_env(resolve(velocity(*FINE)))
     obs = env.reset(seed=0)["policy"]
     assert torch.equal(obs[:, 3:4], torch.full((4, 1), 2.0))  # the ball, before it falls
@@ -307,7 +307,7 @@ def test_sensors_and_objects_are_seen_as_in_isaac_lab(velocity):
     assert float(torch.stack(rewards).max()) == pytest.approx(2.0 * env.step_dt)  # both front feet on the ground
 
 
-def test_a_generated_terrain_keeps_its_patches(velocity):
+def test_terrain_generator_keeps_sub_terrains(velocity):
     generator = (
         'terrain_type="generator", max_init_terrain_level=1, terrain_generator=TerrainGeneratorCfg(size=(4.0, 4.0),'
         ' border_width=2.0, num_rows=3, num_cols=2, curriculum=True, sub_terrains={"slope":'

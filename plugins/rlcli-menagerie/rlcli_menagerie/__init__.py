@@ -1,4 +1,4 @@
-"""Velocity tracking on Unitree's Go1 and G1, whose models the user has. Nothing heavy is imported here."""
+"""Velocity tracking on Unitree's Go1 and G1. The user provides the models. This module imports nothing heavy."""
 
 from rlcli.task import TaskSpec
 

@@ -1,4 +1,4 @@
-"""Stand-ins with the names of the real robots' bodies and joints, and nothing else of theirs."""
+"""Stand-in models with the body and joint names of the real robots."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ LEG = """
 
 
 def go1(driven: bool) -> str:
-    """A four-legged robot, with the position actuators that Menagerie's file has or without any, as mjlab's."""
+    """Return a four-legged robot, with position actuators as in Menagerie's file, or without any as in mjlab's."""
     places = {"FR": (1, -1), "FL": (1, 1), "RR": (-1, -1), "RL": (-1, 1)}
     legs = "".join(LEG.format(n=n, x=0.19 * x, y=0.047 * y, side=0.08 * y) for n, (x, y) in places.items())
     joints = [f"{name}_{part}_joint" for name in places for part in ("hip", "thigh", "calf")]
@@ -41,7 +41,7 @@ def _chain(names: list[tuple[str, str, str, str]], inside: str) -> str:
 
 
 def g1() -> str:
-    """A humanoid of 29 joints."""
+    """Return a humanoid with 29 joints."""
     x, y, z = "1 0 0", "0 1 0", "0 0 1"
     limbs = ""
     for side, sign in (("left", 1), ("right", -1)):
@@ -66,7 +66,7 @@ def g1() -> str:
 
 @pytest.fixture
 def models(tmp_path, monkeypatch):
-    """A folder laid out as MuJoCo Menagerie is, with the stand-ins."""
+    """Return a folder with the layout of MuJoCo Menagerie and the stand-in models."""
     folder = tmp_path / "models"
     for robot, text in (("unitree_go1/go1", go1(driven=True)), ("unitree_g1/g1", g1())):
         file = folder / f"{robot}.xml"

@@ -1,4 +1,4 @@
-"""The tasks on stand-ins, on the real models where they are, and without any model."""
+"""Tasks on stand-in models, on the real models if installed, and without any model."""
 
 import json
 import os
@@ -38,7 +38,7 @@ def rlcli(*arguments, **environment):
 
 
 @pytest.mark.parametrize(("task", "joints"), TASKS.items())
-def test_a_stand_in_has_the_tasks_spaces_and_lives(models, task, joints):
+def test_stand_in_has_task_spaces_and_runs(models, task, joints):
     env = make(task)
     assert env.layout.action_size == joints
     assert env.layout.size() == 12 + 3 * joints
@@ -48,7 +48,7 @@ def test_a_stand_in_has_the_tasks_spaces_and_lives(models, task, joints):
     assert env.divergences == 0
 
 
-def test_gains_and_limits_are_the_tasks_whether_the_file_has_actuators_or_not(models):
+def test_gains_and_limits_come_from_task_with_and_without_actuators(models):
     values = []
     for driven in (True, False):
         (models / "unitree_go1" / "go1.xml").write_text(go1(driven))
@@ -69,7 +69,7 @@ def test_gains_and_limits_are_the_tasks_whether_the_file_has_actuators_or_not(mo
     assert armature == [0.00403, 0.00403, 0.00906] * 4
 
 
-def test_a_go1_stands_on_its_feet(models):
+def test_go1_stands_on_feet(models):
     env = make("go1-velocity", 2, "events.push=null", "events.payload=null")
     for _ in range(60):
         assert not env.step(torch.zeros(2, 12)).terminated.any()
@@ -77,7 +77,7 @@ def test_a_go1_stands_on_its_feet(models):
     assert env.sensors["feet"].force[..., 2].sum(dim=1).tolist() == pytest.approx([weight] * 2, rel=0.1)
 
 
-def test_a_g1_that_lies_down_has_fallen(models):
+def test_g1_lying_down_terminates(models):
     env = make("g1-velocity", 2, "events.push=null")
     qpos = env.engine.field("qpos")
     qpos[1, 2:7] = torch.tensor([0.3, 0.7071068, 0.0, 0.7071068, 0.0])
@@ -87,7 +87,7 @@ def test_a_g1_that_lies_down_has_fallen(models):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_without_a_model_one_message_says_what_to_set_or_to_install(task, tmp_path):
+def test_missing_model_error_says_what_to_install(task, tmp_path):
     done = rlcli("eval", task, "--policy", "zero", "--json", PYTHONPATH=_without_mjlab())
     assert done.returncode == 4, done.stderr
     error = json.loads(done.stdout)["error"]
@@ -105,14 +105,14 @@ def test_without_a_model_one_message_says_what_to_set_or_to_install(task, tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
-def test_the_contract_holds_on_a_stand_in(models, task):
+def test_contract_on_stand_in(models, task):
     assert [finding for finding in check_task(task) if finding.severity == "error"] == []
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL, reason="no real model: set RLCLI_MODELS, or install mjlab")
 @pytest.mark.parametrize("task", REAL)
-def test_the_real_model_lives_under_its_task(task):
+def test_real_model_runs_in_task(task):
     env = make(task, 4)
     for _ in range(25):
         result = env.step(torch.zeros(4, TASKS[task]))

@@ -1,8 +1,8 @@
-"""OmniIsaacGymEnvs' vocabulary, flat: change a task's import lines to `from rlcli_oige import ...`, and it runs here.
+"""OmniIsaacGymEnvs' vocabulary in one flat package: change a task's import lines to `from rlcli_oige import ...`.
 
-A name that is not one of these is looked for in the Python files beside the file that imports it, and below the folder
-of the task's YAML: a task's shared modules and view classes are imported from here too. Nothing is imported before a
-name is used: a task's YAML is read without torch.
+A name that this package does not have is searched in the Python files beside the importing file, and below the folder
+of the task's YAML. So a task's shared modules and view classes are imported from here too. Nothing is imported before
+a name is used: the check of a task's YAML does not import torch.
 """
 
 from __future__ import annotations
@@ -27,6 +27,6 @@ def __getattr__(name: str) -> Any:
     if name in vocabulary.NAMES:
         return getattr(vocabulary, name)
     neighbours = importlib.import_module(f"{__name__}.neighbours")
-    if name == "__all__":  # `import *` gives a task's file what it uses of its neighbours, too
-        return [*vocabulary.NAMES, *neighbours.used(vocabulary.NAMES)]
+    if name == "__all__":  # `import *` also exports the names of neighbour files that the importing file uses
+        return [*vocabulary.NAMES, *neighbours.used_names(vocabulary.NAMES)]
     return neighbours.find(name, vocabulary.NAMES)

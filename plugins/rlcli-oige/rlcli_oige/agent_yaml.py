@@ -1,17 +1,18 @@
-"""An rl_games train YAML, as OmniIsaacGymEnvs has them, as settings of the trainer `ppo`."""
+"""Translation of an rl_games train YAML, as in OmniIsaacGymEnvs, to settings of the trainer `ppo`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from rlcli.config.layers import Origin, document_origins
 from rlcli.config.strict_yaml import Document, Path
-from rlcli.errors import ConfigError, Problem, did_you_mean, listing
+from rlcli.errors import ConfigError, did_you_mean, listing
 from rlcli.formats import Note, Status
 from rlcli_oige.hydra import evaluate
+from rlcli_oige.yaml_translator import YamlTranslator
 
 _DIRECT = {
     "gamma": "gamma",
@@ -29,25 +30,25 @@ _DIRECT = {
     "save_frequency": "save_interval",
 }
 _IGNORED = {
-    "name": "a run is named by its task",
-    "full_experiment_name": "--name",
-    "env_name": "there is one environment loop",
-    "device": "--device decides",
-    "device_name": "--device decides",
-    "multi_gpu": "--gpus decides",
+    "name": "the task names the run",
+    "full_experiment_name": "use --name",
+    "env_name": "rlcli has one environment loop",
+    "device": "use --device",
+    "device_name": "use --device",
+    "multi_gpu": "use --gpus",
     "ppo": "",
-    "mixed_precision": "updates are float32",
-    "num_actors": "scene.num_envs",
-    "score_to_win": "training runs to its budget",
+    "mixed_precision": "updates use float32",
+    "num_actors": "use scene.num_envs",
+    "score_to_win": "training runs until its budget is used",
     "save_best_after": "the best checkpoint is always kept",
     "print_stats": "",
-    "player": "rlcli play",
-    "seq_length": "sequences are whole rollouts",
+    "player": "use rlcli play",
+    "seq_length": "sequences are always whole rollouts",
     "games_to_track": "",
     "max_frames": "",
     "minibatch_size_per_env": "",
 }
-_GRAINS = {"legacy": "minibatch", "standard": "epoch", "standard_epoch": "iteration"}
+_KL_GRAINS = {"legacy": "minibatch", "standard": "epoch", "standard_epoch": "iteration"}
 _SCHEDULES = {"adaptive": "adaptive", "linear": "linear", "constant": "constant", "identity": "constant"}
 _HANDLED = (
     "reward_shaper", "normalize_advantage", "lr_schedule", "kl_threshold", "grad_norm", "truncate_grads",
@@ -55,55 +56,47 @@ _HANDLED = (
     "minibatch_size",
 )  # fmt: skip
 _ACTIVATIONS = ("elu", "relu", "tanh", "silu")
-_MOST_LOG_STD = 20
+_MAX_ABS_LOG_STD = 20
 
 
 @dataclass(slots=True)
 class Agent:
-    """Settings of the trainer `ppo`, and where each was written."""
+    """Settings of the trainer `ppo`, and the position of each in the YAML."""
 
     data: dict[str, Any]
     origin: Callable[[Path], Origin]
     notes: list[Note]
 
     def origin_at(self, at: Path) -> Callable[[Path], Origin]:
-        """The same for a document in which the settings stand at `at`."""
+        """Return the origins for a document that has the settings under the key `at`."""
         return lambda path: self.origin(path[len(at) :])
 
 
 def translate(document: Document, label: str, root: Mapping[str, Any]) -> Agent:
-    """Settings of the trainer `ppo` that learn as rl_games does with this file.
+    """Return settings of the trainer `ppo` that train as rl_games does with this file.
 
     Args:
         document: the train YAML.
-        label: how messages name it.
-        root: what its interpolations find above it, the evaluated task among it.
+        label: name of the file in messages.
+        root: settings that its interpolations may refer to, with the evaluated task.
 
     Raises:
-        ConfigError: with every key that is not known or cannot be.
+        ConfigError: with every unknown key and every wrong value.
     """
     return _Translator(document, label).run(root)
 
 
-@dataclass(slots=True)
-class _Translator:
-    document: Document
-    label: str
-    data: dict[str, Any] = field(default_factory=dict)
-    sources: dict[Path, Path] = field(default_factory=dict)
-    notes: list[Note] = field(default_factory=list)
-    problems: list[Problem] = field(default_factory=list)
-
+class _Translator(YamlTranslator):
     def run(self, root: Mapping[str, Any]) -> Agent:
         train, errors = evaluate({**root, "train": self.document.data}, ("train",))
         for error in errors:
-            self._problem(error.path[1:], str(error), error.hint)
+            self.problem(error.path[1:], str(error), error.hint)
         for key in train:
             if key != "params":
-                self._problem((key,), f"unknown key '{key}'", "keys: params")
+                self.problem((key,), f"unknown key '{key}'", "keys: params")
         params = train.get("params")
         if not isinstance(params, dict) or not isinstance(params.get("config"), dict):
-            self._problem(("params",), "an rl_games YAML has params: {algo, model, network, config}")
+            self.problem(("params",), "an rl_games YAML has params: {algo, model, network, config}")
             raise ConfigError(self.problems)
         self.data = {"trainer": "ppo", "algorithm": "ppo", "dialect": "rl_games"}
         self._params(params)
@@ -113,48 +106,48 @@ class _Translator:
             raise ConfigError(self.problems)
         origin = document_origins(self.document, self.label, "task")
 
-        def written(path: Path) -> Origin:
+        def origin_of(path: Path) -> Origin:
             for length in range(len(path), 0, -1):
                 if path[:length] in self.sources:
                     return origin(self.sources[path[:length]])
             return origin(("params",))
 
-        return Agent(self.data, written, self.notes)
+        return Agent(self.data, origin_of, self.notes)
 
     def _params(self, params: Mapping[str, Any]) -> None:
         known: dict[str, tuple[Status, str]] = {
             "seed": ("mapped", "--seed"),
-            "load_checkpoint": ("ignored", "--init-from, --resume"),
-            "load_path": ("ignored", "--init-from, --resume"),
+            "load_checkpoint": ("ignored", "use --init-from or --resume"),
+            "load_path": ("ignored", "use --init-from or --resume"),
         }
         for key, value in params.items():
             at = ("params", key)
             if key in known:
-                self._note(at, *known[key])
+                self.note(at, *known[key])
             elif key in ("algo", "model"):
                 name = value.get("name") if isinstance(value, dict) else value
                 wanted = {"algo": "a2c_continuous", "model": "continuous_a2c_logstd"}[key]
                 if name != wanted:
-                    self._problem(at, f"'{name}' has no counterpart here", f"'{wanted}' has: trainer ppo")
+                    self.problem(at, f"'{name}' has no counterpart", f"expected '{wanted}'")
                 else:
-                    self._note(at, "mapped", "trainer ppo")
+                    self.note(at, "mapped", "trainer ppo")
             elif key not in ("network", "config"):
                 near = did_you_mean(key, ("seed", "algo", "model", "network", "config", *known))
-                self._problem(at, f"unknown key '{key}'", near)
+                self.problem(at, f"unknown key '{key}'", near)
 
     def _network(self, network: Any) -> None:
         at = ("params", "network")
         if not isinstance(network, dict):
-            self._problem(at, "expected a mapping with mlp: {units, activation}")
+            self.problem(at, "expected a mapping with mlp: {units, activation}")
             return
         for key, value in network.items():
             if key == "name":
-                self._note((*at, key), "mapped", "actor and critic")
+                self.note((*at, key), "mapped", "actor and critic")
             elif key == "separate":
                 if value:
-                    self._note((*at, key), "mapped", "actor and critic are networks of their own")
+                    self.note((*at, key), "mapped", "actor and critic are separate networks")
                 else:
-                    self._note((*at, key), "approximated", "actor and critic share nothing here")
+                    self.note((*at, key), "approximated", "actor and critic are always separate networks")
             elif key == "mlp":
                 self._mlp((*at, key), value)
             elif key == "space":
@@ -162,138 +155,125 @@ class _Translator:
             elif key == "rnn":
                 self._rnn((*at, key), value)
             else:
-                self._problem((*at, key), f"unknown key '{key}'", "keys: name, separate, space, mlp, rnn")
+                self.problem((*at, key), f"unknown key '{key}'", "keys: name, separate, space, mlp, rnn")
 
     def _mlp(self, at: Path, mlp: Any) -> None:
         if not isinstance(mlp, dict):
-            self._problem(at, "expected a mapping")
+            self.problem(at, "expected a mapping")
             return
         shape: dict[str, Any] = {}
         for key, value in mlp.items():
             if key == "units":
                 shape["hidden"] = value
-                self._note((*at, key), "mapped", "actor.hidden, critic.hidden")
+                self.note((*at, key), "mapped", "actor.hidden, critic.hidden")
             elif key == "activation":
                 if value not in _ACTIVATIONS:
-                    self._problem((*at, key), f"activation '{value}' is not known", f"known: {listing(_ACTIVATIONS)}")
+                    self.problem((*at, key), f"unknown activation '{value}'", f"known: {listing(_ACTIVATIONS)}")
                 shape["activation"] = value
-                self._note((*at, key), "mapped", "actor.activation, critic.activation")
+                self.note((*at, key), "mapped", "actor.activation, critic.activation")
             elif key == "d2rl" and value:
-                self._problem((*at, key), "d2rl networks are not built here")
+                self.problem((*at, key), "d2rl networks are not supported")
             elif key in ("d2rl", "initializer", "regularizer"):
-                self._note((*at, key), "mapped" if key == "initializer" else "ignored", "init")
+                self.note((*at, key), "mapped" if key == "initializer" else "ignored", "init")
             else:
-                self._problem((*at, key), f"unknown key '{key}'")
+                self.problem((*at, key), f"unknown key '{key}'")
         for network in ("actor", "critic"):
-            self._put((network,), dict(shape), at)
+            self.put((network,), dict(shape), at)
 
     def _space(self, at: Path, space: Any) -> None:
         kinds = space if isinstance(space, dict) else {}
         continuous = kinds.get("continuous")
         if not isinstance(continuous, dict):
-            self._problem(at, f"only a continuous space is learned in, found {listing(kinds)}")
+            self.problem(at, f"only continuous action spaces are supported, found {listing(kinds)}")
             return
         for key, value in continuous.items():
             inner = (*at, "continuous", key)
             if key == "sigma_init":
                 log_std = value.get("val", 0) if isinstance(value, dict) else 0
-                if not isinstance(log_std, int | float) or abs(log_std) > _MOST_LOG_STD:
-                    self._problem(inner, f"val: expected a number between -{_MOST_LOG_STD} and {_MOST_LOG_STD}")
+                if not isinstance(log_std, int | float) or abs(log_std) > _MAX_ABS_LOG_STD:
+                    self.problem(inner, f"val: expected a number between -{_MAX_ABS_LOG_STD} and {_MAX_ABS_LOG_STD}")
                     continue
-                self._put(("init_std",), math.exp(log_std), inner)
-                self._note(inner, "mapped", "init_std")
+                self.put(("init_std",), math.exp(log_std), inner)
+                self.note(inner, "mapped", "init_std")
             elif key == "fixed_sigma" and value is not True:
-                self._note(inner, "approximated", "the deviation is the same in every state")
+                self.note(inner, "approximated", "the standard deviation never depends on the state")
             else:
-                self._note(inner, "mapped")
+                self.note(inner, "mapped")
 
     def _rnn(self, at: Path, rnn: Any) -> None:
         if not isinstance(rnn, dict) or rnn.get("name") != "lstm":
-            self._problem(at, "only {name: lstm, units, layers} is built here")
+            self.problem(at, "only {name: lstm, units, layers} is supported")
             return
-        self._put(("rnn",), {"hidden": rnn.get("units", 64), "layers": rnn.get("layers", 1)}, at)
+        self.put(("rnn",), {"hidden": rnn.get("units", 64), "layers": rnn.get("layers", 1)}, at)
         for key, value in rnn.items():
-            exact = key in ("name", "units", "layers") or (key == "before_mlp" and value is True) or not value
-            self._note((*at, key), "mapped" if exact else "approximated", "rnn")
+            is_exact = key in ("name", "units", "layers") or (key == "before_mlp" and value is True) or not value
+            self.note((*at, key), "mapped" if is_exact else "approximated", "rnn")
 
     def _config(self, config: Mapping[str, Any]) -> None:
         at = ("params", "config")
         for key, value in config.items():
             if key in _DIRECT:
-                self._put((_DIRECT[key],), value, (*at, key))
-                self._note((*at, key), "mapped", _DIRECT[key])
+                self.put((_DIRECT[key],), value, (*at, key))
+                self.note((*at, key), "mapped", _DIRECT[key])
             elif key in _IGNORED:
-                self._note((*at, key), "ignored", _IGNORED[key])
+                self.note((*at, key), "ignored", _IGNORED[key])
             elif key not in _HANDLED:
                 near = did_you_mean(key, [*_DIRECT, *_HANDLED, *_IGNORED])
-                self._problem((*at, key), f"unknown key '{key}'", near)
+                self.problem((*at, key), f"unknown key '{key}'", near)
         self._special(at, config)
 
     def _special(self, at: Path, config: Mapping[str, Any]) -> None:
         def mapped(key: str, target: str, value: Any, text: str = "") -> None:
             if key in config:
-                self._put((target,), value, (*at, key))
-                self._note((*at, key), "approximated" if text else "mapped", text or target)
+                self.put((target,), value, (*at, key))
+                self.note((*at, key), "approximated" if text else "mapped", text or target)
 
         shaper = config.get("reward_shaper")
         scale = shaper.get("scale_value", 1.0) if isinstance(shaper, dict) else 1.0
         mapped("reward_shaper", "reward_scale", scale)
         if isinstance(shaper, dict) and set(shaper) - {"scale_value"}:
             others = listing(sorted(set(shaper) - {"scale_value"}))
-            self._problem((*at, "reward_shaper"), f"only scale_value is known, found {others}")
+            self.problem((*at, "reward_shaper"), f"only scale_value is supported, found {others}")
         mapped("critic_coef", "value_coef", 0.5 * _number(config.get("critic_coef"), 2.0))
         mapped("clip_value", "clip_value", "larger" if config.get("clip_value") else None)
         mapped("normalize_advantage", "normalize_advantage", "batch" if config.get("normalize_advantage") else None)
         norm = config.get("grad_norm", 1.0) if config.get("truncate_grads", False) else None
-        self._put(("max_grad_norm",), norm, (*at, "grad_norm"))
+        self.put(("max_grad_norm",), norm, (*at, "grad_norm"))
         for key in ("grad_norm", "truncate_grads"):
             if key in config:
-                self._note((*at, key), "mapped", "max_grad_norm")
+                self.note((*at, key), "mapped", "max_grad_norm")
         self._schedule(at, config)
         if "value_bootstrap" in config:
             if config["value_bootstrap"]:
-                self._note((*at, "value_bootstrap"), "mapped", "bootstrap")
+                self.note((*at, "value_bootstrap"), "mapped", "bootstrap")
             else:
-                self._note((*at, "value_bootstrap"), "approximated", "a time-out always bootstraps here")
+                self.note((*at, "value_bootstrap"), "approximated", "rlcli always bootstraps at a time-out")
         if "clip_actions" in config:
             mapped("clip_actions", "action_bound", 1.0 if config["clip_actions"] else None)
         if "central_value_config" in config:
-            text = "the critic sees states_buf; its network and schedule are the policy's"
-            self._note((*at, "central_value_config"), "approximated", text)
+            text = "the critic observes states_buf; its network and schedule are those of the policy"
+            self.note((*at, "central_value_config"), "approximated", text)
 
     def _schedule(self, at: Path, config: Mapping[str, Any]) -> None:
         schedule = config.get("lr_schedule") or "constant"
         if str(schedule) == "None":
             schedule = "constant"
         if not isinstance(schedule, str) or schedule not in _SCHEDULES:
-            self._problem((*at, "lr_schedule"), f"no schedule '{schedule}'", f"known: {listing(_SCHEDULES)}")
+            self.problem((*at, "lr_schedule"), f"unknown schedule '{schedule}'", f"known: {listing(_SCHEDULES)}")
             return
-        self._put(("schedule",), _SCHEDULES[schedule], (*at, "lr_schedule"))
+        self.put(("schedule",), _SCHEDULES[schedule], (*at, "lr_schedule"))
         adaptive = schedule == "adaptive"
-        self._put(("desired_kl",), config.get("kl_threshold", 0.008) if adaptive else None, (*at, "kl_threshold"))
+        self.put(("desired_kl",), config.get("kl_threshold", 0.008) if adaptive else None, (*at, "kl_threshold"))
         for key in ("lr_schedule", "kl_threshold"):
             if key in config:
                 used = adaptive or key == "lr_schedule"
-                self._note((*at, key), "mapped" if used else "ignored", "schedule" if used else "not adaptive")
+                self.note((*at, key), "mapped" if used else "ignored", "schedule" if used else "not adaptive")
         if "schedule_type" in config:
-            grain = _GRAINS.get(str(config["schedule_type"]))
+            grain = _KL_GRAINS.get(str(config["schedule_type"]))
             if grain is None:
-                self._problem((*at, "schedule_type"), "no such schedule_type", f"known: {listing(_GRAINS)}")
-            self._put(("kl_grain",), grain, (*at, "schedule_type"))
-            self._note((*at, "schedule_type"), "mapped", "kl_grain")
-
-    def _put(self, target: Path, value: Any, source: Path) -> None:
-        self.data[str(target[0])] = value
-        self.sources[target] = source
-
-    def _where(self, path: Path) -> str:
-        return document_origins(self.document, self.label, "task")(path).where
-
-    def _note(self, path: Path, status: Status, text: str = "") -> None:
-        self.notes.append(Note(self._where(path), ".".join(str(step) for step in path), status, text))
-
-    def _problem(self, path: Path, message: str, hint: str | None = None) -> None:
-        self.problems.append(Problem(self._where(path), ".".join(str(step) for step in path), message, hint))
+                self.problem((*at, "schedule_type"), "unknown schedule_type", f"known: {listing(_KL_GRAINS)}")
+            self.put(("kl_grain",), grain, (*at, "schedule_type"))
+            self.note((*at, "schedule_type"), "mapped", "kl_grain")
 
 
 def _number(value: Any, default: float) -> float:

@@ -22,7 +22,7 @@ def import_task(
         ),
     ] = None,
 ) -> Imported:
-    """Import a task's YAML of OmniIsaacGymEnvs. Its class goes on as it is.
+    """Import a task's YAML of OmniIsaacGymEnvs. Its class stays unchanged except for import lines.
 
     Examples:
         rlcli import oige Cartpole.yaml

@@ -1,4 +1,4 @@
-"""Runs a task in OmniIsaacGymEnvs' form in the environment loop."""
+"""Environment that runs a task in OmniIsaacGymEnvs' form."""
 
 from __future__ import annotations
 
@@ -17,57 +17,57 @@ from rlcli.errors import TaskError
 from rlcli.registry import is_framework
 from rlcli.scene.scene import Scene
 from rlcli.sim.selection import Selection
-from rlcli_oige.stage import Stage, opened
+from rlcli_oige.articulation_view import ArticulationView
+from rlcli_oige.stage import Stage, current_stage
 from rlcli_oige.task import EnvHandle, RLTask, SimConfig
-from rlcli_oige.task_yaml import MOVED, ROOT
-from rlcli_oige.views import ArticulationView, RigidPrimView
+from rlcli_oige.task_keys import MOVED_KEYS, ROOT_SETTINGS
+from rlcli_oige.views import RigidPrimView
 
-_MEASURED = ("get_measured_joint_forces", "get_force_sensor_forces", "get_net_contact_forces")
-_LIFTED = ("disable_gravities",)
-_NEXT_TO_NONE = 1e-30
+_FORCE_METHODS = ("get_measured_joint_forces", "get_force_sensor_forces", "get_net_contact_forces")
+_GRAVITY_METHODS = ("disable_gravities",)
+_TINY_GRAVITY_COMPENSATION = 1e-30
 
 
 class OigeEnv(DirectEnv):
-    """The direct workflow for `RLTask`: one done flag split in two, clipping after rewards, forces for one step."""
+    """Direct workflow for `RLTask`: it splits the reset flag, clips after rewards, and applies forces for one step."""
 
     task: RLTask
-    not_recorded: ClassVar[str | None] = "a task in OmniIsaacGymEnvs' style runs as it is on a GPU, step by step"
+    not_recorded: ClassVar[str | None] = "tasks in OmniIsaacGymEnvs' form run step by step on a GPU"
 
     def _prepare_scene(self, scene: Scene) -> None:
         source, config = self.resolved.source, self.config
         task_class = self._task_class()
         if not issubclass(task_class, RLTask):
-            hint = "its YAML has OmniIsaacGymEnvs' form: the class derives from rlcli_oige.RLTask"
+            hint = "its YAML has OmniIsaacGymEnvs' form: derive the class from rlcli_oige.RLTask"
             raise TaskError(f"task '{source.name}' is broken: {source.task} is not an RLTask", hint=hint)
         self.block = config.foreign["oige"]
         self.stage = Stage(self.block.get("mjcf", {}), source.root)
         self.grid = grid(self.num_envs, config.scene.env_spacing).to(self.device)
         self.settings = self._settings()
-        self.pushed = True
-        self._pushes: list[tuple[RigidPrimView, Tensor, Tensor]] = []
+        self.forces_applied = True
+        self._queued_forces: list[tuple[RigidPrimView, Tensor, Tensor]] = []
         self.handle = EnvHandle(self)
-        with opened(self.stage):
+        with current_stage(self.stage):
             try:
                 name = str(self.block.get("name", source.name))
                 self.task = task_class(name=name, sim_config=SimConfig(self.settings), env=self.handle)  # type: ignore[call-arg]
             except KeyError as error:
                 raise TaskError(
-                    f"task '{source.name}' is broken: {task_class.__name__} reads a key {error} that is not there",
+                    f"task '{source.name}' is broken: {task_class.__name__} reads the key {error}, which is missing",
                     hint=f"add it to {source.label}",
                 ) from error
             self.task.set_up_scene(self.handle.world.scene)
             if not hasattr(self.task, "_env_pos"):
-                raise TaskError(
-                    f"{task_class.__name__}.set_up_scene does not call RLTask's", hint="super().set_up_scene(scene)"
-                )
-            self.stage.attach(scene, joint_forces=self._reads(_MEASURED))
-        if self._reads(_LIFTED):  # MuJoCo looks at any compensation only where the model has some
-            scene.spec.bodies[-1].gravcomp = scene.spec.bodies[-1].gravcomp or _NEXT_TO_NONE
+                what = f"{task_class.__name__}.set_up_scene does not call RLTask.set_up_scene"
+                raise TaskError(what, hint="add super().set_up_scene(scene)")
+            self.stage.attach(scene, joint_forces=self._mentions(_FORCE_METHODS))
+        if self._mentions(_GRAVITY_METHODS):  # MuJoCo skips gravity compensation in a model without it
+            scene.spec.bodies[-1].gravcomp = scene.spec.bodies[-1].gravcomp or _TINY_GRAVITY_COMPENSATION
         scene.joints.add_motors()
-        _ground(scene, self.block.get("sim", {}).get("default_physics_material") or {})
+        _set_ground_material(scene, self.block.get("sim", {}).get("default_physics_material") or {})
 
     def _settings(self) -> dict[str, Any]:
-        """All settings as the class reads them: what moved to other keys is back in its old place."""
+        """Return all settings as tasks read them; values that rlcli keeps under other keys are copied back."""
         config = self.config
         task = copy.deepcopy({key: value for key, value in self.block.items() if key != "mjcf"})
         env, sim = task.setdefault("env", {}), task.setdefault("sim", {})
@@ -83,11 +83,11 @@ class OigeEnv(DirectEnv):
                 env[key] = bound
         sim.update(dt=config.sim.dt, gravity=list(config.sim.gravity), add_ground_plane=config.scene.ground is not None)
         sim["add_distant_light"] = config.scene.lights.distant is not None
-        if any(path[0] == "viewport" for path in MOVED) and "viewport" in task:
+        if any(path[0] == "viewport" for path in MOVED_KEYS) and "viewport" in task:
             task["viewport"].update(camera_position=list(config.viewer.eye), camera_target=list(config.viewer.lookat))
         device = str(self.device)
         return {
-            **copy.deepcopy(dict(ROOT)),
+            **copy.deepcopy(dict(ROOT_SETTINGS)),
             "task_name": task.get("name", ""),
             "num_envs": self.num_envs,
             "seed": self.seed,
@@ -97,8 +97,8 @@ class OigeEnv(DirectEnv):
             "task": task,
         }
 
-    def _reads(self, names: tuple[str, ...]) -> bool:
-        """Whether the files of the task's classes and views mention one of these methods."""
+    def _mentions(self, names: tuple[str, ...]) -> bool:
+        """Return whether the files of the task's and its views' classes mention one of these methods."""
         kinds = [type(self.task), *(type(view) for view in self.handle.world.scene.views.values())]
         files = {
             function.__code__.co_filename
@@ -115,71 +115,72 @@ class OigeEnv(DirectEnv):
         for view in self.handle.world.scene.views.values():
             view.bind(self)
         if self.engine.model.nsensor:
-            self.engine.field("sensordata")  # asked for before the first reset: forces of a start state are 0
+            self.engine.field("sensordata")  # create it before the first reset: forces of an initial state are then 0
         if hasattr(self.task, "_max_episode_length"):
             length = self.task._max_episode_length
-            if self._length_is_a_guess():
+            if self._has_default_length():
                 self.max_episode_length = int(length)
             elif int(length) != self.max_episode_length:
                 self.task._max_episode_length = self.max_episode_length
-        with opened(self.stage):
+        with current_stage(self.stage):
             super()._build_workflow()
         self._resets_by_id = True
-        self._noise = self.task._dr_randomizer
-        self._noise.start()
+        self._randomizer = self.task._dr_randomizer
+        self._randomizer.start()
 
-    def _length_is_a_guess(self) -> bool:
-        """Neither the YAML nor the command line says how long an episode is, and the class's source did not either."""
+    def _has_default_length(self) -> bool:
+        """Return whether the episode length is the default: not in the YAML, on the command line or in the class."""
         origin = self.resolved.layers.origin(("episode_length_s",))
         return origin is not None and origin.layer == "task" and self.max_episode_length == 1000
 
-    def push_later(self, view: RigidPrimView, rows: Tensor, forces: Tensor) -> None:
-        """Push bodies in the step to come; the task's own forces of that step replace these."""
-        self._pushes.append((view, rows, forces))
+    def queue_forces(self, view: RigidPrimView, rows: Tensor, forces: Tensor) -> None:
+        """Apply forces in the next step. Forces that the task sets in that step replace them."""
+        self._queued_forces.append((view, rows, forces))
 
     def contact_force(self, body: int) -> Tensor:
-        """Sum of the contact forces on a body in the last substep, world frame. (num_envs, 3) [N]"""
-        outer = self.sim.derived_field("cfrc_ext")[:, body, 3:]
-        return outer - self.sim.derived_field("xfrc_applied")[:, body, :3]
+        """Return the sum of the contact forces on a body in the last substep, world frame. (num_envs, 3) [N]"""
+        external = self.sim.derived_field("cfrc_ext")[:, body, 3:]
+        return external - self.sim.derived_field("xfrc_applied")[:, body, :3]
 
     def _extras(self) -> dict[str, Any]:
-        """The task's `extras`, one level deep."""
+        """Return the task's `extras` as one flat dict."""
         flat: dict[str, Any] = {}
         for name, value in self.task.extras.items():
             flat.update(value if isinstance(value, dict) else {name: value})
         return flat
 
     def _episode_metrics(self, ended: Selection) -> dict[str, Tensor]:
-        """Tasks of OmniIsaacGymEnvs have no numbers of an episode but what they log in `extras`."""
+        """Return an empty dict: OmniIsaacGymEnvs' tasks log only to `extras`."""
         return {}
 
     def _apply_action(self, action: Tensor) -> None:
-        if self.pushed:  # a force acts for one step
+        if self.forces_applied:  # forces act for one step
             self.engine.field("xfrc_applied").zero_()
-            self.pushed = False
-        for view, rows, forces in self._pushes:
+            self.forces_applied = False
+        for view, rows, forces in self._queued_forces:
             view.apply_forces(forces, rows)
-        self._pushes.clear()
-        super()._apply_action(self._noise.noisy_actions(action))
+        self._queued_forces.clear()
+        super()._apply_action(self._randomizer.add_action_noise(action))
 
     def _compute_rewards_and_dones(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         result = super()._compute_rewards_and_dones(diverged)
-        self._noise.after_step()
+        self._randomizer.after_step()
         return result
 
     def _compute_dones(self) -> tuple[Tensor, Tensor]:
         self.task.get_extras()
-        failed, timed_out = self._split()
+        failed, timed_out = self._split_reset_flags()
         return failed, timed_out | (self.episode_length_buf >= self.max_episode_length)
 
-    def _split(self) -> tuple[Tensor, Tensor]:
-        """What the task ended because of the state, and what because of the time. (num_envs,) bool each"""
+    def _split_reset_flags(self) -> tuple[Tensor, Tensor]:
+        """Return where the task terminated, and where it timed out. (num_envs,) bool each"""
         task = self.task
         done = task.reset_buf != 0
         length = getattr(task, "_max_episode_length", self.max_episode_length)
         late = done & (task.progress_buf >= int(length) - 1)
         if not bool(late.any()):
             return done, late
+        # evaluate is_done again with an early progress: flags that are still set do not depend on the time
         flags, progress = task.reset_buf.clone(), task.progress_buf.clone()
         task.reset_buf.zero_()
         task.progress_buf.masked_fill_(late, 1)
@@ -192,31 +193,31 @@ class OigeEnv(DirectEnv):
 
     def _compute_final_obs(self) -> dict[str, Tensor]:
         super()._compute_final_obs()
-        return self._group(*self._clipped(self._final_obs, self._final_states))
+        return self._group(*self._add_noise_and_clip(self._final_obs, self._final_states))
 
     def _reset_workflow(self, selection: Selection) -> None:
         ids = selection.env_ids()
         for view in self.handle.world.scene.views.values():
             if isinstance(view, ArticulationView):
-                view.forget(ids)
-        self._noise.before_reset(ids)
+                view.clear_targets(ids)
+        self._randomizer.before_reset(ids)
         if len(ids):
             self._reset_hook(ids)
-            self._noise.after_reset(ids)
+            self._randomizer.after_reset(ids)
         self._mark_reset(selection)
 
     def _compute_observations(self) -> dict[str, Tensor]:
         obs = super()._compute_observations()["policy"]
         states = self._last_states
-        return self._group(*self._clipped(obs, states))
+        return self._group(*self._add_noise_and_clip(obs, states))
 
     def _group(self, obs: Tensor, states: Tensor) -> dict[str, Tensor]:
         self._last_states = states
         return super()._group(obs, states)
 
-    def _clipped(self, obs: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
-        """With noise, within the bounds; what the task computes its rewards from is neither."""
-        self._noise.noisy_observations(obs)
+    def _add_noise_and_clip(self, obs: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
+        """Add noise and clip, in place. Rewards were computed before, from exact values."""
+        self._randomizer.add_observation_noise(obs)
         bound = self.config.clip_observations
         if bound is not None:
             obs.clamp_(-bound, bound)
@@ -232,7 +233,7 @@ class OigeEnv(DirectEnv):
         for view in self.handle.world.scene.views.values():
             if isinstance(view, ArticulationView):
                 state |= {f"view.{view.name}.{key}": table.clone() for key, table in view.tables().items()}
-        state |= {f"randomizer.{name}": value for name, value in self._noise.state().items()}
+        state |= {f"randomizer.{name}": value for name, value in self._randomizer.state_dict().items()}
         state["torch_random"] = torch.get_rng_state()
         return state
 
@@ -252,17 +253,19 @@ class OigeEnv(DirectEnv):
             else:
                 plain[name] = value
         super()._load_workflow_state(plain)
-        self._noise.load({n.removeprefix("randomizer."): v for n, v in state.items() if n.startswith("randomizer.")})
-        self.pushed = True
+        prefix = "randomizer."
+        randomizer_state = {n.removeprefix(prefix): value for n, value in state.items() if n.startswith(prefix)}
+        self._randomizer.load_state_dict(randomizer_state)
+        self.forces_applied = True
 
 
-def _ground(scene: Scene, material: Mapping[str, Any]) -> None:
-    """Let the ground's material rule contacts with it, as the YAML's default material does."""
+def _set_ground_material(scene: Scene, material: Mapping[str, Any]) -> None:
+    """Apply the YAML's default material to contacts with the ground."""
     geom = scene.spec.geom("ground") if scene.config.ground is not None else None
     if geom is None or not material:
         return
-    geom.priority = 1
+    geom.priority = 1  # contacts take friction and solref from the ground
     restitution = float(material.get("restitution", 0.0))
-    if restitution > 0.0:  # damping ratio of a spring that gives back this share of the speed
+    if restitution > 0.0:  # damping ratio of a spring-damper with this coefficient of restitution
         decay = math.log(min(restitution, 0.99))
         geom.solref = [0.02, -decay / math.hypot(math.pi, decay)]

@@ -1,4 +1,4 @@
-"""The format of OmniIsaacGymEnvs' tasks: how a folder or a YAML file of it is recognised and read."""
+"""Format of OmniIsaacGymEnvs' tasks: how rlcli recognizes and reads a folder or a YAML file of it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def find(path: Path) -> TaskSource | None:
     """Return the task of a YAML file, or of a folder with one such file in it or in its `cfg/task`.
 
     Raises:
-        TaskError: if a folder has several, or its Python files hold no class of the task.
+        TaskError: if a folder has several, or its Python files have no class of the task.
     """
     from rlcli_oige.task_yaml import task_name
 
@@ -54,18 +54,18 @@ def read(document: Document, source: TaskSource) -> Translation | None:
 
 
 def check(block: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str, str]]:
-    """Yield every key of the block `oige` that has another place in a task file."""
-    from rlcli_oige.task_yaml import MOVED
+    """Yield every key of the block `oige` that a task file has under another name."""
+    from rlcli_oige.task_keys import MOVED_KEYS
 
-    for path, target in MOVED.items():
+    for path, target in MOVED_KEYS.items():
         section, key = map(str, path)
         values = block.get(section)
         if isinstance(values, dict) and values.get(key) is not None:
-            yield (section, key), "this key has another place here", f"set {target}"
+            yield (section, key), "this key has another name in rlcli", f"set {target}"
 
 
 def _config(folder: Path) -> Path | None:
-    """Return the one YAML of a folder, or of its `cfg/task`, that has the form; None if there is none."""
+    """Return the only YAML of a folder, or of its `cfg/task`, that has this format; None if there is none."""
     from rlcli.errors import TaskError, listing
     from rlcli_oige.task_yaml import is_oige_file
 
@@ -73,14 +73,16 @@ def _config(folder: Path) -> Path | None:
     found = [file for file in files if is_oige_file(file)]
     if len(found) > 1:
         names = listing(f"{folder.name}/{file.relative_to(folder)}" for file in found)
-        raise TaskError(f"'{folder}' holds several tasks", hint=f"name one file: {names}")
+        raise TaskError(f"'{folder}' contains several tasks", hint=f"choose one: {names}")
     return found[0] if found else None
 
 
 def _task(root: Path, config: Path, name: str) -> TaskSource:
+    """Return the task of a YAML file."""
     from rlcli.errors import TaskError
     from rlcli.registry import TaskSource
-    from rlcli_oige.task_yaml import find_class, home
+    from rlcli_oige.task_class import find_class
+    from rlcli_oige.task_yaml import home
 
     file: Path | None
     try:
@@ -88,7 +90,7 @@ def _task(root: Path, config: Path, name: str) -> TaskSource:
     except LookupError as problem:
         if next(home(config).rglob("*.py"), None) is not None:
             raise TaskError(f"'{config}' is not a task: {problem.args[0]}") from None
-        file, class_name = None, f"{name}Task"  # the YAML can be checked without
+        file, class_name = None, f"{name}Task"  # the YAML can be checked without the class
     return TaskSource(
         name=root.name if config.name == "task.yaml" else config.stem,
         root=root,

@@ -1,7 +1,7 @@
-"""Interpolations of Hydra's YAML (`${..seed}`, `${resolve_default:512,${...num_envs}}`), evaluated.
+"""Evaluation of Hydra's interpolations in YAML: `${..seed}`, `${resolve_default:512,${...num_envs}}`.
 
-Only what OmniIsaacGymEnvs writes: relative and absolute references, and its four resolvers. The library itself stays
-out: its current release does not install beside the current omegaconf, its errors have no lines, and its resolvers
+Only the syntax of OmniIsaacGymEnvs: relative and absolute references, and its four resolvers. Hydra itself is not used:
+its current release cannot be installed beside the current omegaconf, its errors have no line numbers, and its resolvers
 may read environment variables and import code.
 """
 
@@ -21,11 +21,11 @@ RESOLVERS: Mapping[str, tuple[int, Callable[..., Any]]] = {
     "if": (3, lambda condition, yes, no: yes if condition else no),
     "resolve_default": (2, lambda default, value: default if value in ("", None) else value),
 }
-"""Name -> number of arguments, and what it gives."""
+"""Name -> number of arguments, function."""
 
 
 class InterpolationError(ValueError):
-    """An interpolation that leads nowhere; `path` is the key that holds it."""
+    """An interpolation that cannot be evaluated; `path` is the key that contains it."""
 
     def __init__(self, path: Path, message: str, hint: str | None = None) -> None:
         super().__init__(message)
@@ -34,22 +34,22 @@ class InterpolationError(ValueError):
 
 
 def evaluate(tree: Mapping[str, Any], at: Path = ()) -> tuple[Any, list[InterpolationError]]:
-    """The part of a tree below `at` with every interpolation replaced, and what could not be."""
+    """Return the subtree at `at` with all interpolations evaluated, and the errors. Failed values are None."""
     evaluator = _Evaluator(tree)
-    return evaluator.below(at, evaluator.look_up(at)), evaluator.errors
+    return evaluator.evaluate(at, evaluator.look_up(at)), evaluator.errors
 
 
 @dataclass(slots=True)
 class _Evaluator:
     tree: Mapping[str, Any]
     errors: list[InterpolationError] = field(default_factory=list)
-    running: list[Path] = field(default_factory=list)
+    active: list[Path] = field(default_factory=list)
 
-    def below(self, path: Path, value: Any) -> Any:
+    def evaluate(self, path: Path, value: Any) -> Any:
         if isinstance(value, dict):
-            return {key: self.below((*path, key), item) for key, item in value.items()}
+            return {key: self.evaluate((*path, key), item) for key, item in value.items()}
         if isinstance(value, list):
-            return [self.below((*path, index), item) for index, item in enumerate(value)]
+            return [self.evaluate((*path, index), item) for index, item in enumerate(value)]
         if not isinstance(value, str) or "${" not in value:
             return value
         try:
@@ -71,7 +71,7 @@ class _Evaluator:
         return value
 
     def _text(self, path: Path, text: str) -> Any:
-        """A whole interpolation keeps its type; one within a text becomes text."""
+        """Evaluate the interpolations of a text. A text that is one interpolation keeps the type of its value."""
         parts: list[Any] = []
         position = 0
         while position < len(text):
@@ -95,11 +95,11 @@ class _Evaluator:
     def _resolver(self, path: Path, name: str, rest: str) -> Any:
         if name not in RESOLVERS:
             near = did_you_mean(name, RESOLVERS) or f"resolvers: {listing(RESOLVERS)}"
-            raise InterpolationError(path, f"there is no resolver '{name}'", near)
+            raise InterpolationError(path, f"unknown resolver '{name}'", near)
         count, function = RESOLVERS[name]
         arguments = [self._argument(path, text.strip()) for text in _split(rest)]
         if len(arguments) != count:
-            raise InterpolationError(path, f"resolver '{name}' takes {count} arguments, found {len(arguments)}")
+            raise InterpolationError(path, f"resolver '{name}' expects {count} arguments, found {len(arguments)}")
         return function(*arguments)
 
     def _argument(self, path: Path, text: str) -> Any:
@@ -116,10 +116,10 @@ class _Evaluator:
     def _reference(self, path: Path, text: str) -> Any:
         dots = len(text) - len(text.lstrip("."))
         if dots > len(path):
-            raise InterpolationError(path, f"'${{{text}}}' leads above the top of the configuration")
+            raise InterpolationError(path, f"'${{{text}}}' goes above the top level of the configuration")
         base = path[: len(path) - dots] if dots else ()
         target: Path = (*base, *(step for step in text[dots:].split(".") if step))
-        if target in self.running:
+        if target in self.active:
             raise InterpolationError(path, f"'${{{text}}}' refers to itself")
         try:
             found = self.look_up(target)
@@ -129,18 +129,19 @@ class _Evaluator:
             known = self.look_up(target[:at])
             names = list(known) if isinstance(known, dict) else []
             where = ".".join(str(part) for part in target[:at]) or "the configuration"
-            near = did_you_mean(str(step), names) or f"there: {listing(names)}"
+            near = did_you_mean(str(step), names) or f"keys: {listing(names)}"
             raise InterpolationError(path, f"'${{{text}}}': {where} has no '{step}'", near) from None
-        self.running.append(target)
+        self.active.append(target)
         try:
             if isinstance(found, str) and "${" in found:
                 return self._text(target, found)
-            return self.below(target, found)
+            return self.evaluate(target, found)
         finally:
-            self.running.pop()
+            self.active.pop()
 
 
 def _closing(path: Path, text: str, start: int) -> int:
+    """Return the position of the brace that closes an interpolation."""
     depth = 1
     for position in range(start, len(text)):
         if text.startswith("${", position) or (text[position] == "{" and text[position - 1] != "$"):
@@ -149,11 +150,11 @@ def _closing(path: Path, text: str, start: int) -> int:
             depth -= 1
             if not depth:
                 return position
-    raise InterpolationError(path, f"'{text}' is not closed", "every ${ needs its }")
+    raise InterpolationError(path, f"'{text}' is not closed", "every ${ needs a }")
 
 
 def _split(text: str) -> list[str]:
-    """At the commas that are in no bracket and in no quotes."""
+    """Split at commas outside of brackets and quotes."""
     parts, depth, quote = [""], 0, ""
     for letter in text:
         if quote:

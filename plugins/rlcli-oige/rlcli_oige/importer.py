@@ -1,4 +1,4 @@
-"""`rlcli import oige`: a task of OmniIsaacGymEnvs as a folder of rlcli's own; its class stays its class."""
+"""`rlcli import oige`: writes a task of OmniIsaacGymEnvs as a folder of rlcli. The task's class stays a class."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from rlcli.config.layers import read
 from rlcli.errors import ConfigError, Problem, TaskError, UsageError
 from rlcli.formats import Imported, Note
 from rlcli_oige import task_yaml
+from rlcli_oige.task_class import find_class, parse_file
 
 _IMPORT = re.compile(r"^(\s*)from\s+(?:omni|pxr|omniisaacgymenvs)(?:\.[\w.]+)?\s+import\s+(.*)$")
 _VOCABULARY = [Path(__file__).parent / name for name in ("vocabulary.py", "maths.py", "rotations.py")]
@@ -23,20 +24,20 @@ _MODULE = re.compile(r"^(\s*)import\s+(carb|omni|pxr)\b[\w.]*\s*$")
 
 
 _LONGEST_NAME = 100
-"""Characters of a task's name."""
+"""Maximum length of a task's name."""
 
 
 def convert(files: list[Path], output: Path | None) -> Imported:
-    """Write `task.yaml` and, with their import lines changed, the Python files of the task's class.
+    """Write `task.yaml` and the Python files of the task's class, with changed import lines.
 
     Args:
-        files: the task's YAML and, optionally, the rl_games YAML of its agent; without one, `<Task>PPO.yaml`
-            beside it is taken.
-        output: folder to write to.
+        files: the task's YAML and, optionally, the rl_games YAML of its agent; the default is `<Task>PPO.yaml`
+            beside the task's YAML.
+        output: folder to write; None: a folder with the task's name.
 
     Raises:
-        UsageError: for more files, or a folder that holds a task already.
-        ConfigError: with everything in the files that cannot be.
+        UsageError: for more than two files, or if the folder contains a task already.
+        ConfigError: with every mistake in the files.
     """
     if len(files) > 2:
         raise UsageError(f"found {len(files)} files", hint="rlcli import oige TASK.yaml [TRAINPPO.yaml]")
@@ -46,13 +47,15 @@ def convert(files: list[Path], output: Path | None) -> Imported:
         message = "is not a task of OmniIsaacGymEnvs: it has no env: and sim:"
         raise ConfigError([Problem(str(source), "", message)])
     name = str(document.data.get("name") or source.stem)
-    if not (name.isidentifier() and name.isascii() and len(name) <= _LONGEST_NAME):  # a class's name, a folder's too
-        raise ConfigError([Problem(str(source), "name", f"'{name[:_LONGEST_NAME]}' is no name of a task's class")])
+    # the name becomes the name of a class and of a folder
+    if not (name.isidentifier() and name.isascii() and len(name) <= _LONGEST_NAME):
+        message = f"'{name[:_LONGEST_NAME]}' is not a valid name of a task's class"
+        raise ConfigError([Problem(str(source), "name", message)])
     folder = output or Path(_kebab(name))
     target = folder / "task.yaml"
     if target.exists():
-        raise UsageError(f"{target} exists", hint="-o another folder")
-    class_file, class_name = _class(task_yaml.home(source), name)
+        raise UsageError(f"{target} exists", hint="choose another folder with -o")
+    class_file, class_name = _find_class(task_yaml.home(source), name)
     found = task_yaml.translate(
         document,
         str(source),
@@ -62,19 +65,20 @@ def convert(files: list[Path], output: Path | None) -> Imported:
     )
     folder.mkdir(parents=True, exist_ok=True)
     written = [target]
-    plain = json.loads(json.dumps({**_ordered(found.data), **found.agents}))  # nothing twice: YAML would make anchors
+    # copy objects that occur twice: PyYAML would write anchors and aliases for them
+    plain = json.loads(json.dumps({**_ordered(found.data), **found.agents}))
     target.write_text(to_yaml(plain), encoding="utf-8")
-    written += _models(found.data["oige"]["mjcf"], source.parent, folder)
+    written += _copy_models(found.data["oige"]["mjcf"], source.parent, folder)
     messages = []
     if class_file is None:
-        messages.append(f"put the Python file of {name}Task into {folder}: it is the task's logic")
+        messages.append(f"put the Python file of {name}Task into {folder}: it contains the task's logic")
     elif source.parent.resolve() != folder.resolve():
-        written += _code(class_file, task_yaml.home(source), folder)
-    return Imported(folder, written, sorted(found.notes, key=_place), messages)
+        written += _copy_code(class_file, task_yaml.home(source), folder)
+    return Imported(folder, written, sorted(found.notes, key=_position), messages)
 
 
 def changed_imports(text: str) -> str:
-    """The source of a task with its import lines, and nothing else, changed to `rlcli_oige`."""
+    """Return a task's source with its import lines changed to `rlcli_oige`; all other lines stay."""
     lines = []
     for line in text.splitlines():
         if match := _IMPORT.match(line):
@@ -85,9 +89,9 @@ def changed_imports(text: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _class(folder: Path, name: str) -> tuple[Path | None, str | None]:
+def _find_class(folder: Path, name: str) -> tuple[Path | None, str | None]:
     try:
-        return task_yaml.find_class(folder, name)
+        return find_class(folder, name)
     except LookupError:
         return None, None
 
@@ -97,14 +101,14 @@ def _ordered(data: dict[str, Any]) -> dict[str, Any]:
     return {**{key: data[key] for key in first if key in data}, **data}
 
 
-def _models(models: dict[str, Any], source: Path, folder: Path) -> list[Path]:
+def _copy_models(models: dict[str, Any], source: Path, folder: Path) -> list[Path]:
     written = []
     for entry in models.values():
         file, target = source / entry["model"], folder / entry["model"]
         if not target.resolve().is_relative_to(folder.resolve()):
-            raise TaskError(f"'{entry['model']}', which mjcf: names, lies outside the task's folder")
+            raise TaskError(f"'{entry['model']}' in mjcf: is outside of the task's folder")
         if not file.is_file():
-            raise TaskError(f"no file '{file}', which mjcf: names")
+            raise TaskError(f"no file '{file}', which mjcf: refers to")
         if file.resolve() != target.resolve():
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, target)
@@ -112,11 +116,11 @@ def _models(models: dict[str, Any], source: Path, folder: Path) -> list[Path]:
     return written
 
 
-def _code(class_file: Path, home: Path, folder: Path) -> list[Path]:
-    """Copy the files beside a task's YAML, and of a package the class's file with what it uses, in their folders."""
+def _copy_code(class_file: Path, home: Path, folder: Path) -> list[Path]:
+    """Copy the Python files of a task: those beside its YAML, or those of a package that its class uses."""
     beside = sorted(home.glob("*.py"))
     written = []
-    for file in beside if class_file in beside else _used(class_file, home):
+    for file in beside if class_file in beside else _used_files(class_file, home):
         target = folder / file.relative_to(home)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(changed_imports(file.read_text(encoding="utf-8")), encoding="utf-8")
@@ -124,12 +128,12 @@ def _code(class_file: Path, home: Path, folder: Path) -> list[Path]:
     return written
 
 
-def _used(start: Path, home: Path) -> list[Path]:
-    """A file and those of a package that its import lines lead to, and theirs, but not what `rlcli_oige` offers."""
-    words = [node for file in _VOCABULARY for node in ast.walk(_tree(file))]
+def _used_files(start: Path, home: Path) -> list[Path]:
+    """Return a file and all files of its package that it imports, directly or not, without names of `rlcli_oige`."""
+    words = [node for file in _VOCABULARY for node in ast.walk(parse_file(file))]
     own = {getattr(node, "name", getattr(node, "value", None)) for node in words if isinstance(node, _WORDS)}
     deepest_first = sorted(home.rglob("*.py"), key=lambda file: (-len(file.parts), file))[-500:]
-    trees = {file: _tree(file) for file in deepest_first}
+    trees = {file: parse_file(file) for file in deepest_first}
     owner = {node.name: file for file in trees for node in trees[file].body if isinstance(node, _DEFINED)}
     found = [start]
     for file in found:
@@ -141,14 +145,7 @@ def _used(start: Path, home: Path) -> list[Path]:
     return found
 
 
-def _tree(file: Path) -> ast.Module:
-    try:
-        return ast.parse(file.read_text(encoding="utf-8"))
-    except (OSError, SyntaxError, UnicodeDecodeError):
-        return ast.Module([], [])
-
-
-def _place(note: Note) -> tuple[str, int]:
+def _position(note: Note) -> tuple[str, int]:
     file, line, _ = note.where.rsplit(":", 2)
     return file, int(line)
 

@@ -1,4 +1,4 @@
-"""Names that a task's file imports from `rlcli_oige` and that another file of the task defines."""
+"""Search for names that a task's file imports from `rlcli_oige` and that another file of the task defines."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from typing import Any
 
 from rlcli.errors import did_you_mean
 from rlcli.registry import load_module
+from rlcli_oige.task_class import parse_file
 from rlcli_oige.task_yaml import is_oige_file
 
 
 def find(name: str, known: Iterable[str]) -> Any:
-    """What another file of the task defines under a name.
+    """Return the object that another file of the task defines under a name.
 
     Raises:
-        AttributeError: if none does; an import statement makes an ImportError of it.
+        AttributeError: if no file defines it; an import statement turns this into an ImportError.
     """
     importer = _importer()
     for file in _neighbours(importer) if importer else ():
@@ -28,46 +29,47 @@ def find(name: str, known: Iterable[str]) -> Any:
     raise AttributeError(f"rlcli_oige has no '{name}'{f'; {near}' if near else ''}")
 
 
-def used(known: Iterable[str]) -> list[str]:
-    """Names that the importing file uses, that it does not define itself, and that another file of the task defines."""
+def used_names(known: Iterable[str]) -> list[str]:
+    """Return the names that the importing file uses, does not define, and that another file of the task defines."""
     importer = _importer()
     if importer is None:
         return []
-    names = {node.id for node in ast.walk(_tree(importer)) if isinstance(node, ast.Name)}
-    wanted = names - _definitions(importer) - set(known) - set(dir(builtins))
-    return sorted(wanted & {name for file in _neighbours(importer) for name in _definitions(file)})
+    names = {node.id for node in ast.walk(parse_file(importer)) if isinstance(node, ast.Name)}
+    missing = names - _definitions(importer) - set(known) - set(dir(builtins))
+    return sorted(missing & {name for file in _neighbours(importer) for name in _definitions(file)})
 
 
 def _neighbours(importer: Path) -> Iterator[Path]:
-    """The other Python files beside a file and below, and of what lies above up to the folder of the task's YAML."""
+    """Yield the other Python files in the folders of `_search_folders`, subfolders included."""
     seen = {importer}
-    for place in _places(importer.parent):
-        for file in sorted(place.rglob("*.py"))[:500]:
+    for folder in _search_folders(importer.parent):
+        for file in sorted(folder.rglob("*.py"))[:500]:
             if file not in seen:
                 seen.add(file)
                 yield file
 
 
-def _places(folder: Path) -> list[Path]:
+def _search_folders(folder: Path) -> list[Path]:
+    """Return the folder of a file, and its parents up to the folder of the task's YAML."""
     above = [folder, *list(folder.parents)[:3]]
-    home = next((depth for depth, place in enumerate(above) if any(map(_is_task, _yamls(place)))), None)
+    home = next((depth for depth, parent in enumerate(above) if any(map(_is_task, _yamls(parent)))), None)
     if home is not None:
         return above[: home + 1]
-    # a folder of views lies beside the folder of tasks: look a little further up, as long as it is a package
-    return [folder, *(place for place in above[1:3] if (place / "__init__.py").is_file())]
+    # without a YAML: the folder of views may lie beside the folder of tasks, so search the parent packages too
+    return [folder, *(parent for parent in above[1:3] if (parent / "__init__.py").is_file())]
 
 
 def _is_task(file: Path) -> bool:
     return file.name == "task.yaml" or is_oige_file(file)
 
 
-def _yamls(place: Path) -> Iterator[Path]:
-    yield from sorted(place.glob("*.yaml"))
-    yield from sorted(place.glob("cfg/task/*.yaml"))
+def _yamls(folder: Path) -> Iterator[Path]:
+    yield from sorted(folder.glob("*.yaml"))
+    yield from sorted(folder.glob("cfg/task/*.yaml"))
 
 
 def _importer() -> Path | None:
-    """The file whose import statement is running."""
+    """Return the file whose import statement is running; None if the import is inside a function."""
     frame = sys._getframe(1)
     own = Path(__file__).parent
     while frame is not None:
@@ -79,11 +81,4 @@ def _importer() -> Path | None:
 
 
 def _definitions(file: Path) -> set[str]:
-    return {node.name for node in _tree(file).body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
-
-
-def _tree(file: Path) -> ast.Module:
-    try:
-        return ast.parse(file.read_text(encoding="utf-8"))
-    except (OSError, SyntaxError, UnicodeDecodeError):
-        return ast.Module([], [])
+    return {node.name for node in parse_file(file).body if isinstance(node, ast.ClassDef | ast.FunctionDef)}

@@ -1,4 +1,4 @@
-"""The grammar of OmniIsaacGymEnvs' `domain_randomization:`, read into a list of gates."""
+"""Reader of OmniIsaacGymEnvs' `domain_randomization:`: it becomes a list of gates."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ _STATE: dict[str, tuple[Status, str]] = {
 }
 _MATERIAL: tuple[Status, str] = (
     "approximated",
-    "the sliding friction of the geoms; MuJoCo has one, and no restitution",
+    "sliding friction of the geoms; MuJoCo has one friction and no restitution",
 )
-_NO_SCALE: tuple[Status, str] = ("ignored", "a model's geometry is the same in every environment")
-_NO_TENDON: tuple[Status, str] = ("ignored", "tendons are the MJCF's")
+_NO_SCALE: tuple[Status, str] = ("ignored", "all environments have the same geometry")
+_NO_TENDON: tuple[Status, str] = ("ignored", "the MJCF sets the tendons")
 ATTRIBUTES: Mapping[str, Mapping[str, tuple[Status, str]]] = {
     "articulation_views": {
         **_STATE,
         "stiffness": ("mapped", "gain of the joints' position drives"),
-        "damping": ("mapped", "damping of the joints' position drives, or of the joints that have none"),
-        "joint_friction": ("approximated", "dry friction of the joints [N m]: MuJoCo's does not grow with the load"),
+        "damping": ("mapped", "damping of the joints' position drives, or of joints without one"),
+        "joint_friction": ("approximated", "dry friction of the joints [N m]: in MuJoCo independent of the load"),
         "joint_armatures": ("mapped", "armature [kg m^2]"),
         "max_efforts": ("mapped", "limits of set_joint_efforts [N m]"),
         "lower_dof_limits": ("mapped", "lower joint limits [rad]"),
@@ -56,7 +56,7 @@ ATTRIBUTES: Mapping[str, Mapping[str, tuple[Status, str]]] = {
         "body_inertias": ("mapped", "diagonals of the inertias"),
         "material_properties": _MATERIAL,
         "scale": _NO_SCALE,
-        "joint_max_velocities": ("ignored", "MuJoCo limits no joint's velocity"),
+        "joint_max_velocities": ("ignored", "MuJoCo has no joint velocity limits"),
         **{
             f"tendon_{key}": _NO_TENDON
             for key in (
@@ -73,16 +73,16 @@ ATTRIBUTES: Mapping[str, Mapping[str, tuple[Status, str]]] = {
         "inertia": ("mapped", "diagonal of the inertia"),
         "material_properties": _MATERIAL,
         "scale": _NO_SCALE,
-        "contact_offset": ("ignored", "contacts begin at the MJCF's margin"),
-        "rest_offset": ("ignored", "contacts begin at the MJCF's margin"),
+        "contact_offset": ("ignored", "the MJCF's margin sets where contacts begin"),
+        "rest_offset": ("ignored", "the MJCF's margin sets where contacts begin"),
     },
 }  # fmt: skip
-"""Kind of view -> attribute -> what becomes of it."""
+"""Kind of view -> attribute -> how it is translated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """One randomisation: of what, when, and by which distribution."""
+    """One randomization: of which attribute, when, and with which distribution."""
 
     path: tuple[str, ...]
     """(observations,), (actions,), (simulation, gravity) or (kind of view, view, attribute)"""
@@ -91,17 +91,17 @@ class Gate:
     distribution: str
     parameters: Any
     interval: int = 1
-    """Environment steps between two firings."""
+    """Environment steps between two samples of `on_interval`."""
     schedule: str | None = None
     schedule_steps: int = 0
 
     @property
     def name(self) -> str:
-        """Unique among the gates of a task."""
+        """Unique name of the gate in its task."""
         return ".".join((*self.path, self.gate))
 
     def strength(self, step: int) -> float:
-        """How much of it acts after so many steps of training."""
+        """Return the strength in [0, 1] at a training step, from the schedule."""
         if self.schedule is None or self.schedule_steps <= 0:
             return 1.0
         if self.schedule == "constant":
@@ -110,7 +110,7 @@ class Gate:
 
 
 def gates(block: Mapping[str, Any]) -> list[Gate]:
-    """The gates of a block that `check` found nothing wrong with, those that are ignored left out."""
+    """Return the gates of a block that passed `check`, without the ignored ones."""
     found = []
     for at, params in _entries(block):
         path = at[1:-1]
@@ -134,7 +134,7 @@ def gates(block: Mapping[str, Any]) -> list[Gate]:
 def check(
     block: Any, problem: Callable[[Path, str, str | None], None], note: Callable[[Path, Status, str], None]
 ) -> None:
-    """Report every key of a `domain_randomization:` block."""
+    """Report every key of a `domain_randomization:` block, as a mistake or as a note."""
     base: Path = ("domain_randomization",)
     if not isinstance(block, dict):
         problem(base, "expected a mapping", None)
@@ -153,7 +153,7 @@ def check(
         elif key == "simulation":
             for attribute in content if isinstance(content, dict) else ():
                 if attribute != "gravity":
-                    problem((*at, attribute), f"'{attribute}' cannot be randomised", "of simulation: gravity")
+                    problem((*at, attribute), f"'{attribute}' cannot be randomized", "expected gravity")
         elif key not in ("observations", "actions"):
             groups = ("observations", "actions", "simulation", *VIEWS)
             problem(at, f"unknown key '{key}'", did_you_mean(key, groups) or f"keys: {listing(groups)}")
@@ -167,7 +167,7 @@ def _check_views(kind: str, views: Any, at: Path, problem: Callable[[Path, str, 
             if attribute not in ATTRIBUTES[kind]:
                 known = ATTRIBUTES[kind]
                 near = did_you_mean(attribute, known) or f"attributes: {listing(known, 40)}"
-                problem((*at, view, attribute), f"'{attribute}' cannot be randomised", near)
+                problem((*at, view, attribute), f"'{attribute}' cannot be randomized", near)
 
 
 def _check_gate(
@@ -179,12 +179,12 @@ def _check_gate(
 ) -> None:
     gate, target = path[-1], path[1:-1]
     if target and target[0] in VIEWS and (len(target) < 3 or target[2] not in ATTRIBUTES[target[0]]):
-        return  # that has been said
+        return  # _check_views has reported it
     if gate not in GATES:
         problem(at, f"unknown key '{gate}'", did_you_mean(gate, GATES) or f"gates: {listing(GATES)}")
         return
     if gate == "on_startup" and target[0] not in VIEWS:
-        problem(at, f"{target[0]} cannot be randomised on_startup", "on_reset or on_interval")
+        problem(at, f"{target[0]} cannot be randomized on_startup", "use on_reset or on_interval")
     if not isinstance(entry, dict):
         problem(at, "expected a mapping", None)
         return
@@ -196,18 +196,18 @@ def _check_gate(
         key for key in (*needed, *(("frequency_interval",) if gate == "on_interval" else ())) if key not in entry
     ]
     if missing:
-        problem(at, f"needs {listing(missing)}", None)
+        problem(at, f"missing {listing(missing)}", None)
         return
     for key, known in (("operation", OPERATIONS), ("distribution", tuple(DISTRIBUTIONS)), ("schedule", SCHEDULES)):
         if key in entry and entry[key] not in known:
             near = did_you_mean(str(entry[key]), known) or f"known: {listing(known)}"
-            problem((*at, key), f"no {key} '{entry[key]}'", near)
-    for key, least in (("frequency_interval", 1), ("schedule_steps", 0)):
-        count = entry.get(key, least)
-        if isinstance(count, bool) or not isinstance(count, int | float) or count != int(count) or count < least:
-            problem((*at, key), f"expected a whole number >= {least}, found {count!r}", None)
+            problem((*at, key), f"unknown {key} '{entry[key]}'", near)
+    for key, minimum in (("frequency_interval", 1), ("schedule_steps", 0)):
+        count = entry.get(key, minimum)
+        if isinstance(count, bool) or not isinstance(count, int | float) or count != int(count) or count < minimum:
+            problem((*at, key), f"expected a whole number >= {minimum}, found {count!r}", None)
     if entry["operation"] == "direct" and target[0] in ("observations", "actions"):
-        problem((*at, "operation"), "noise is additive or scaling", None)
+        problem((*at, "operation"), "expected additive or scaling for noise", None)
     _check_numbers((*at, "distribution_parameters"), entry, problem)
     status: tuple[Status, str] = ("mapped", "")
     if target[0] in VIEWS:
@@ -216,27 +216,27 @@ def _check_gate(
 
 
 def _check_numbers(at: Path, entry: Mapping[str, Any], problem: Callable[[Path, str, str | None], None]) -> None:
-    given = entry["distribution_parameters"]
-    rows = given if isinstance(given, list) and len(given) == 2 else None
+    parameters = entry["distribution_parameters"]
+    rows = parameters if isinstance(parameters, list) and len(parameters) == 2 else None
     if rows is not None and all(isinstance(row, int | float) for row in rows):
         pairs = [(rows[0], rows[1])]
     elif rows is not None and all(isinstance(row, list) for row in rows) and len(rows[0]) == len(rows[1]):
         pairs = list(zip(rows[0], rows[1], strict=True))
     else:
-        problem(at, f"expected [a, b] or [[a, ...], [b, ...]], found {given!r}", None)
+        problem(at, f"expected [a, b] or [[a, ...], [b, ...]], found {parameters!r}", None)
         return
     if not all(isinstance(x, int | float) for pair in pairs for x in pair):
         problem(at, "expected numbers", None)
     elif entry["distribution"] in ("uniform", "loguniform", "log_uniform") and any(a > b for a, b in pairs):
-        problem(at, "a lower end is above its upper end", None)
+        problem(at, "a lower bound is above its upper bound", None)
     elif entry["distribution"] in ("loguniform", "log_uniform") and any(a <= 0 for a, _ in pairs):
-        problem(at, "a loguniform distribution lies above 0", None)
+        problem(at, "a loguniform distribution needs bounds above 0", None)
     elif entry["distribution"] in ("gaussian", "normal") and any(b < 0 for _, b in pairs):
-        problem(at, "a standard deviation is not negative", None)
+        problem(at, "a standard deviation is negative", None)
 
 
 def _entries(block: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """(path below the block, content) of everything that stands where a gate does."""
+    """Yield (path below the block, content) of everything at the level of a gate."""
     params = block.get("randomization_params")
     for key, content in params.items() if isinstance(params, dict) else ():
         base: tuple[str, ...] = ("randomization_params", key)

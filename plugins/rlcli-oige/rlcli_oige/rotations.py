@@ -1,4 +1,4 @@
-"""Rotations under the names of Isaac Sim's torch utilities: quaternions are (w, x, y, z); TorchScript can read all."""
+"""Rotations under the names of Isaac Sim's torch utilities. Quaternions are (w, x, y, z). TorchScript compiles all."""
 
 import math
 
@@ -9,7 +9,7 @@ from rlcli_oige.maths import normalize, normalize_angle
 
 
 def quat_mul(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product: first b, then a. (..., 4)"""
+    """Return the Hamilton product: first rotation b, then rotation a. (..., 4)"""
     aw, ax, ay, az = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
     bw, bx, by, bz = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
     return torch.stack(
@@ -24,66 +24,66 @@ def quat_mul(a: Tensor, b: Tensor) -> Tensor:
 
 
 def quat_conjugate(a: Tensor) -> Tensor:
-    """The opposite rotation. (..., 4)"""
+    """Return the inverse of a unit quaternion. (..., 4)"""
     return torch.cat((a[..., :1], -a[..., 1:]), dim=-1)
 
 
 def quat_unit(a: Tensor) -> Tensor:
-    """Of length 1. (..., 4)"""
+    """Scale quaternions to length 1. (..., 4)"""
     return normalize(a)
 
 
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
-    """A vector in the parent frame, given in the quaternion's. (n, 4), (n, 3) -> (n, 3)"""
+    """Rotate a vector from the quaternion's frame to the parent frame. (n, 4), (n, 3) -> (n, 3)"""
     axis = q[..., 1:]
     twice = 2.0 * torch.cross(axis, v, dim=-1)
     return v + q[..., :1] * twice + torch.cross(axis, twice, dim=-1)
 
 
 def quat_apply(a: Tensor, b: Tensor) -> Tensor:
-    """`quat_rotate`."""
+    """Rotate a vector, like `quat_rotate`."""
     return quat_rotate(a, b)
 
 
 def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
-    """A vector in the quaternion's frame, given in the parent's. (n, 4), (n, 3) -> (n, 3)"""
+    """Rotate a vector from the parent frame to the quaternion's frame. (n, 4), (n, 3) -> (n, 3)"""
     return quat_rotate(quat_conjugate(q), v)
 
 
 def quat_axis(q: Tensor, axis: int = 0) -> Tensor:
-    """An axis of the quaternion's frame, in the parent's. (n, 4) -> (n, 3)"""
+    """Return an axis of the quaternion's frame in the parent frame. (n, 4) -> (n, 3)"""
     basis = torch.zeros(q.shape[0], 3, device=q.device)
     basis[:, axis] = 1.0
     return quat_rotate(q, basis)
 
 
 def quat_from_angle_axis(angle: Tensor, axis: Tensor) -> Tensor:
-    """A turn by an angle [rad] about an axis. (n,), (n, 3) -> (n, 4)"""
+    """Return the rotation by an angle [rad] around an axis. (n,), (n, 3) -> (n, 4)"""
     half = (angle / 2.0).unsqueeze(-1)
     return normalize(torch.cat([half.cos(), normalize(axis) * half.sin()], dim=-1))
 
 
 def quat_angle_axis(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Angle [rad] and axis. (n, 4) -> (n,), (n, 3)"""
+    """Return angle [rad] and axis of a rotation. (n, 4) -> (n,), (n, 3)"""
     angle = 2.0 * torch.acos(x[..., 0].clamp(-1.0, 1.0))
     axis = x[..., 1:]
     return angle, axis / axis.norm(p=2, dim=-1, keepdim=True).clamp(min=1e-9)
 
 
 def quat_to_angle_axis(q: Tensor) -> tuple[Tensor, Tensor]:
-    """`quat_angle_axis`, the angle in [-pi, pi]."""
+    """Return angle and axis of a rotation, like `quat_angle_axis`, with the angle in [-pi, pi]."""
     angle, axis = quat_angle_axis(q)
     return normalize_angle(angle), axis
 
 
 def quat_diff_rad(a: Tensor, b: Tensor) -> Tensor:
-    """Angle between two orientations [rad]. (n,)"""
+    """Return the angle between two orientations [rad]. (n,)"""
     difference = quat_mul(a, quat_conjugate(b))
     return 2.0 * torch.asin(torch.clamp(torch.norm(difference[..., 1:], p=2, dim=-1), max=1.0))
 
 
 def get_euler_xyz(q: Tensor, extrinsic: bool = True) -> tuple[Tensor, Tensor, Tensor]:
-    """Roll, pitch, yaw in [0, 2 pi) [rad], about fixed axes, or about the moving ones. (n,) each"""
+    """Return roll, pitch and yaw in [0, 2 pi) [rad], around fixed axes, or around moving axes. (n,) each"""
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     if extrinsic:
         roll = torch.atan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)
@@ -98,7 +98,7 @@ def get_euler_xyz(q: Tensor, extrinsic: bool = True) -> tuple[Tensor, Tensor, Te
 
 
 def quat_from_euler_xyz(roll: Tensor, pitch: Tensor, yaw: Tensor, extrinsic: bool = True) -> Tensor:
-    """Turns about x, y and z [rad], about fixed axes, or about the moving ones. (n,) each -> (n, 4)"""
+    """Return rotations around x, y and z [rad], around fixed axes or moving axes. (n,) each -> (n, 4)"""
     zero = torch.zeros_like(roll)
     qx = torch.stack([torch.cos(roll / 2.0), torch.sin(roll / 2.0), zero, zero], dim=-1)
     qy = torch.stack([torch.cos(pitch / 2.0), zero, torch.sin(pitch / 2.0), zero], dim=-1)
@@ -111,23 +111,23 @@ def quat_from_euler_xyz(roll: Tensor, pitch: Tensor, yaw: Tensor, extrinsic: boo
 def euler_angles_to_quats(
     euler_angles: Tensor, degrees: bool = False, extrinsic: bool = True, device: str = ""
 ) -> Tensor:
-    """(n, 3) angles about x, y, z -> (n, 4)"""
+    """Return the rotations of angles around x, y and z [rad or degrees]. (n, 3) -> (n, 4)"""
     angles = euler_angles * (math.pi / 180.0) if degrees else euler_angles
     return quat_from_euler_xyz(angles[:, 0], angles[:, 1], angles[:, 2], extrinsic)
 
 
 def quats_to_rot_matrices(quats: Tensor, device: str = "") -> Tensor:
-    """(n, 4) -> (n, 3, 3)"""
+    """Return rotation matrices. (n, 4) -> (n, 3, 3)"""
     flat = quats.reshape(-1, 4)
     columns = torch.stack([quat_axis(flat, 0), quat_axis(flat, 1), quat_axis(flat, 2)], dim=-1)
     return columns.reshape(quats.shape[:-1] + (3, 3))  # noqa: RUF005  (TorchScript)
 
 
 def rot_matrices_to_quats(rotation_matrices: Tensor, device: str = "") -> Tensor:
-    """(n, 3, 3) -> (n, 4), w >= 0"""
+    """Return the quaternions of rotation matrices, with w >= 0. (n, 3, 3) -> (n, 4)"""
     m = rotation_matrices.reshape(-1, 3, 3)
     a, b, c = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
-    # four times the squares of w, x, y, z; the largest divides the others
+    # four times the squares of w, x, y, z; dividing by the largest one avoids a division by about 0
     squares = torch.stack([1.0 + a + b + c, 1.0 + a - b - c, 1.0 - a + b - c, 1.0 - a - b + c], dim=-1)
     x, y, z = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
     xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
@@ -147,22 +147,22 @@ def rot_matrices_to_quats(rotation_matrices: Tensor, device: str = "") -> Tensor
 
 
 def matrix_to_quaternion(matrix: Tensor) -> Tensor:
-    """`rot_matrices_to_quats`."""
+    """Return the quaternions of rotation matrices, like `rot_matrices_to_quats`."""
     return rot_matrices_to_quats(matrix)
 
 
 def xyzw2wxyz(q: Tensor, ret_torch: bool = True) -> Tensor:
-    """Another order of the same quaternion."""
+    """Change the order of a quaternion from (x, y, z, w) to (w, x, y, z)."""
     return torch.roll(q, 1, -1)
 
 
 def wxyz2xyzw(q: Tensor, ret_torch: bool = True) -> Tensor:
-    """Another order of the same quaternion."""
+    """Change the order of a quaternion from (w, x, y, z) to (x, y, z, w)."""
     return torch.roll(q, -1, -1)
 
 
 def slerp(q0: Tensor, q1: Tensor, fraction: Tensor) -> Tensor:
-    """Between two orientations, the shorter way round. (n, 4), (n, 4), (n,) or (n, 1) -> (n, 4)"""
+    """Interpolate between two orientations along the shorter path. (n, 4), (n, 4), (n,) or (n, 1) -> (n, 4)"""
     t = fraction.reshape(-1, 1)
     cosine = (q0 * q1).sum(dim=-1, keepdim=True)
     q1 = torch.where(cosine < 0.0, -q1, q1)
@@ -176,33 +176,33 @@ def slerp(q0: Tensor, q1: Tensor, fraction: Tensor) -> Tensor:
 
 
 def tf_inverse(q: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """The opposite of a rotation and translation."""
+    """Return the inverse of a rotation and translation."""
     inverse = quat_conjugate(q)
     return inverse, -quat_rotate(inverse, t)
 
 
 def tf_apply(q: Tensor, t: Tensor, v: Tensor) -> Tensor:
-    """A point, moved."""
+    """Rotate and translate a point."""
     return quat_rotate(q, v) + t
 
 
 def tf_vector(q: Tensor, v: Tensor) -> Tensor:
-    """A direction, turned."""
+    """Rotate a direction."""
     return quat_rotate(q, v)
 
 
 def tf_combine(q1: Tensor, t1: Tensor, q2: Tensor, t2: Tensor) -> tuple[Tensor, Tensor]:
-    """First the second movement, then the first."""
+    """Combine two transforms: first the second, then the first."""
     return quat_mul(q1, q2), quat_rotate(q1, t2) + t1
 
 
 def get_basis_vector(q: Tensor, v: Tensor) -> Tensor:
-    """`quat_rotate`."""
+    """Rotate a vector, like `quat_rotate`."""
     return quat_rotate(q, v)
 
 
 def get_axis_params(value, axis_idx: int, x_value=0.0, dtype=float, n_dims: int = 3) -> list:
-    """A vector of one component: `value` at an axis, `x_value` at x."""
+    """Return a vector with `value` at one axis and `x_value` at x."""
     params = [dtype(0.0)] * n_dims
     params[0] = dtype(x_value)
     params[axis_idx] = dtype(value)
@@ -210,18 +210,18 @@ def get_axis_params(value, axis_idx: int, x_value=0.0, dtype=float, n_dims: int 
 
 
 def angle_axis_to_exp_map(angle: Tensor, axis: Tensor) -> Tensor:
-    """Rotation vector of an angle [rad] about an axis. (n, 3)"""
+    """Return the rotation vector of an angle [rad] around an axis. (n, 3)"""
     return angle.unsqueeze(-1) * axis
 
 
 def quat_to_exp_map(q: Tensor) -> Tensor:
-    """Rotation vector [rad]. (n, 4) -> (n, 3)"""
+    """Return the rotation vector of a quaternion [rad]. (n, 4) -> (n, 3)"""
     angle, axis = quat_to_angle_axis(q)
     return angle_axis_to_exp_map(angle, axis)
 
 
 def exp_map_to_quat(exp_map: Tensor) -> Tensor:
-    """Rotation vector [rad] -> quaternion. (n, 3) -> (n, 4)"""
+    """Return the quaternion of a rotation vector [rad]. (n, 3) -> (n, 4)"""
     angle = torch.norm(exp_map, p=2, dim=-1)
     return quat_from_angle_axis(angle, exp_map)
 
@@ -229,7 +229,7 @@ def exp_map_to_quat(exp_map: Tensor) -> Tensor:
 def compute_heading_and_up(
     torso_rotation: Tensor, inv_start_rot: Tensor, to_target: Tensor, vec0: Tensor, vec1: Tensor, up_idx: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """How upright a torso is, and how well it faces a target.
+    """Return how upright a torso is, and how well it faces a target.
 
     Returns:
         Orientation since the start (n, 4); the up axis' component `up_idx` (n,); the cosine between heading and
@@ -245,9 +245,11 @@ def compute_heading_and_up(
 def compute_rot(
     torso_quat: Tensor, velocity: Tensor, ang_velocity: Tensor, targets: Tensor, torso_positions: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """A torso's velocities in its own frame (n, 3) each, its roll, pitch and yaw, and the target's angle less the yaw.
+    """Return a torso's velocities, angles, and the angle to a target.
 
-    Angles [rad], (n,) each; the first three in [0, 2 pi).
+    Returns:
+        Linear and angular velocity in the torso's frame (n, 3) each; roll, pitch and yaw in [0, 2 pi) [rad] (n,) each;
+        the direction to the target minus the yaw [rad] (n,).
     """
     vel_loc = quat_rotate_inverse(torso_quat, velocity)
     angvel_loc = quat_rotate_inverse(torso_quat, ang_velocity)
@@ -264,4 +266,4 @@ ROTATION_NAMES = [
     "get_basis_vector", "get_axis_params", "angle_axis_to_exp_map", "quat_to_exp_map", "exp_map_to_quat",
     "compute_heading_and_up", "compute_rot",
 ]  # fmt: skip
-"""What `from rlcli_oige import *` gives of this module."""
+"""Names of this module that `from rlcli_oige import *` exports."""

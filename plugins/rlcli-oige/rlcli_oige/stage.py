@@ -1,4 +1,4 @@
-"""What a task builds its scene of: prims on a stage, robots and shapes, each an MJCF model of the scene in the end."""
+"""Stage, prims, robots and shapes that a task builds its scene from. Each becomes an MJCF model of the scene."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ MODELS = Path(__file__).parent / "models"
 BASE = "/World/envs"
 ZERO = f"{BASE}/env_0"
 
-_OPEN: list[Stage] = []
+_CURRENT_STAGES: list[Stage] = []
 
 
 class Prim:
-    """A robot or a shape of the first environment; all environments get it."""
+    """A robot or a shape of the first environment; every environment gets a copy."""
 
     def __init__(self, stage: Stage, path: str) -> None:
         self.stage = stage
@@ -40,28 +40,28 @@ class Prim:
 
     @property
     def entity(self) -> str:
-        """Name of the entity that this becomes."""
+        """Name of the entity in rlcli's scene."""
         return relative(self.prim_path).replace("/", "_")
 
     def GetPath(self) -> str:  # noqa: N802  (USD's name)
-        """The path of the prim."""
+        """Return the path."""
         return self.prim_path
 
     def GetName(self) -> str:  # noqa: N802
-        """The last part of the path."""
+        """Return the last part of the path."""
         return self.prim_path.rpartition("/")[2]
 
     def IsValid(self) -> bool:  # noqa: N802
-        """A prim that was found is valid."""
+        """Return True: every prim that was found is valid."""
         return True
 
     def GetChildren(self) -> list[Prim]:  # noqa: N802
-        """Nothing: what a model holds is its own."""
+        """Return an empty list: the elements of a model are no prims."""
         return []
 
 
 class Stage:
-    """All prims of a task under construction, by path.
+    """Prims of a task under construction, by path.
 
     Args:
         models: robot, by its path in an environment -> model file and names, as the task's `mjcf:` has it.
@@ -74,33 +74,33 @@ class Stage:
         self.prims: dict[str, Prim] = {}
 
     def GetPrimAtPath(self, path: str) -> Prim:  # noqa: N802
-        """`get_prim_at_path`."""
+        """Return the prim at a path, like `find`."""
         return self.find(path)
 
     def find(self, path: str) -> Prim:
-        """The prim at a path, or the one whose model the path leads into.
+        """Return the prim at a path, or the prim whose model contains the path.
 
         Raises:
-            TaskError: if nothing stands there.
+            TaskError: if there is none.
         """
-        path = str(path)
-        while path and path != "/":
-            if path in self.prims:
-                return self.prims[path]
-            path = path.rpartition("/")[0]
-        raise TaskError("there is no prim at that path", hint=f"prims: {listing(self.prims)}")
+        prefix = str(path)
+        while prefix and prefix != "/":
+            if prefix in self.prims:
+                return self.prims[prefix]
+            prefix = prefix.rpartition("/")[0]
+        raise TaskError(f"no prim at '{path}'", hint=f"prims: {listing(self.prims)}")
 
     def define(self, path: str, pos: Any, quat: Any) -> Prim:
-        """A new prim."""
+        """Add a prim."""
         prim = self.prims[path] = Prim(self, path)
-        prim.pos, prim.quat = _numbers(pos, (0.0, 0.0, 0.0)), _numbers(quat, (1.0, 0.0, 0.0, 0.0))
+        prim.pos, prim.quat = _to_floats(pos, (0.0, 0.0, 0.0)), _to_floats(quat, (1.0, 0.0, 0.0, 0.0))
         return prim
 
     def load(self, prim: Prim, kinds: list[str]) -> None:
-        """Give a robot its model: the one that the YAML names, or the one of its class.
+        """Load a robot's model: the file that the YAML names, or the built-in one of its class.
 
         Raises:
-            ConfigError: if there is none, or it cannot be read.
+            ConfigError: if there is no model, or it cannot be read.
         """
         path = relative(prim.prim_path)
         key = next((k for k in (path, path.rpartition("/")[2], *kinds) if k in self.models), None)
@@ -110,7 +110,7 @@ class Stage:
         where = f"mjcf.{key or path}"
         if file is None:
             hint = f"add mjcf: {{{path}: FILE.xml}} to the task's YAML"
-            raise ConfigError([Problem(where, "", f"no model stands for the robot at '{prim.prim_path}'", hint)])
+            raise ConfigError([Problem(where, "", f"the robot at '{prim.prim_path}' has no model", hint)])
         if not file.is_file():
             have = listing(sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*.xml")))
             raise ConfigError([Problem(where, "", f"no file '{file}'", f"MJCF files of the task: {have}")])
@@ -120,22 +120,22 @@ class Stage:
             raise ConfigError([Problem(where, "", f"'{file}' is not a valid MJCF: {error}")]) from None
         prim.label = str(entry.get("model", file.name))
         prim.names = {"joints": entry.get("joints", {}), "bodies": entry.get("bodies", {})}
-        self._rename(prim, where)
+        self._rename_elements(prim, where)
 
     def attach(self, scene: Scene, joint_forces: bool) -> None:
-        """Turn every prim into an entity of the scene; with sensors of joint forces where a task reads them."""
-        # robots before shapes: the options of the scene are those of its first model; a frame has none
+        """Add every prim to the scene as an entity, with sensors of joint forces if a task reads them."""
+        # robots before shapes: the scene takes its options from its first model
         for prim in sorted(self.prims.values(), key=lambda prim: prim.shape):
             if prim.child is None:
                 continue
-            _apply(prim, prim.child)
+            _apply_settings(prim, prim.child)
             if joint_forces:
                 _add_force_sensors(prim.child)
             entity = EntityConfig(model=prim.label, pos=prim.pos, quat=prim.quat)  # type: ignore[arg-type]
             scene.attach(prim.entity, entity, prim.child)
 
-    def _rename(self, prim: Prim, where: str) -> None:
-        """Give joints and bodies the names that the task knows them by."""
+    def _rename_elements(self, prim: Prim, where: str) -> None:
+        """Give joints and bodies the names that the task uses."""
         assert prim.child is not None
         kinds = {"joints": list(prim.child.joints), "bodies": list(prim.child.bodies)}
         for kind, names in prim.names.items():
@@ -151,58 +151,58 @@ class Stage:
 
 
 @contextlib.contextmanager
-def opened(stage: Stage) -> Iterator[Stage]:
-    """Robots made inside stand on this stage."""
-    _OPEN.append(stage)
+def current_stage(stage: Stage) -> Iterator[Stage]:
+    """Make a stage the current one, on which robots and shapes are created."""
+    _CURRENT_STAGES.append(stage)
     try:
         yield stage
     finally:
-        _OPEN.remove(stage)
+        _CURRENT_STAGES.remove(stage)
 
 
 def get_current_stage() -> Stage:
-    """The stage of the task that is being built.
+    """Return the stage of the task that is being built.
 
     Raises:
-        TaskError: outside `set_up_scene`.
+        TaskError: outside of `set_up_scene`.
     """
-    if not _OPEN:
-        raise TaskError("there is no stage", hint="robots and shapes are made in the task's set_up_scene")
-    return _OPEN[-1]
+    if not _CURRENT_STAGES:
+        raise TaskError("there is no stage", hint="create robots and shapes in the task's set_up_scene")
+    return _CURRENT_STAGES[-1]
 
 
 def get_prim_at_path(prim_path: str) -> Prim:
-    """The prim at a path, or the one whose model the path leads into."""
+    """Return the prim at a path, or the prim whose model contains the path."""
     return get_current_stage().find(prim_path)
 
 
 def is_prim_path_valid(prim_path: str) -> bool:
-    """Whether something stands at a path."""
+    """Return whether there is a prim at a path."""
     return any(prim_path == path or prim_path.startswith(f"{path}/") for path in get_current_stage().prims)
 
 
 def find_matching_prim_paths(prim_path_regex: str) -> list[str]:
-    """Paths of the prims that a regular expression matches, in the first environment."""
+    """Return the paths of the prims that a regular expression matches, in the first environment."""
     pattern = path_pattern(prim_path_regex)
     return [path for path in get_current_stage().prims if pattern.fullmatch(path)]
 
 
 def define_prim(prim_path: str, prim_type: str = "Xform", **kwargs: Any) -> Prim:
-    """A frame."""
+    """Add a frame."""
     return get_current_stage().define(prim_path, None, None)
 
 
 def add_reference_to_stage(usd_path: str, prim_path: str, prim_type: str = "Xform") -> None:
-    """Nothing: what stands at a path is said by the YAML's `mjcf:`."""
+    """Do nothing: the YAML's `mjcf:` names the model of each path."""
 
 
 def get_assets_root_path() -> str:
-    """Nothing is downloaded; USD paths begin with this."""
+    """Return the start of USD paths. It is empty: nothing is downloaded."""
     return ""
 
 
 def path_pattern(expression: str) -> re.Pattern[str]:
-    """A view's `prim_paths_expr`: its `.*` and `*` stand for part of one step of a path."""
+    """Compile a view's `prim_paths_expr`. `.*` and `*` match within one step of the path."""
     steps = str(expression).rstrip("/").split("/")
     steps = ["[^/]*" if step == "*" else step.replace(".*", "[^/]*") for step in steps]
     try:
@@ -233,15 +233,15 @@ class XFormPrim:
         self._build(scale)
 
     def _build(self, scale: Any) -> None:
-        """Fill the prim."""
+        """Fill the prim with a model."""
 
     def set_collision_enabled(self, enabled: bool) -> None:
-        """Whether it touches anything."""
+        """Turn collisions on or off."""
         self.prim.settings["collisions"] = bool(enabled)
 
 
 class Robot(XFormPrim):
-    """A robot; its model is the one that the YAML's `mjcf:` gives its path, or the built-in one of its class."""
+    """A robot. The YAML's `mjcf:` names its model; some classes have a built-in model."""
 
     def _build(self, scale: Any) -> None:
         self.prim.stage.load(self.prim, [kind.__name__ for kind in type(self).__mro__])
@@ -252,11 +252,11 @@ class Cartpole(Robot):
 
 
 class Ant(Robot):
-    """A four-legged walker."""
+    """A robot with four legs."""
 
 
 class Humanoid(Robot):
-    """A two-legged walker with arms."""
+    """A humanoid robot."""
 
 
 class Crazyflie(Robot):
@@ -272,11 +272,11 @@ class Ingenuity(Robot):
 
 
 ROBOTS = ("Cartpole", "Ant", "Humanoid", "Crazyflie", "Quadcopter", "Ingenuity")
-"""Robots that bring a model of their own."""
+"""Classes of robots with a built-in model."""
 
 
 class RigidPrim(XFormPrim):
-    """A frame that a model fills."""
+    """A frame whose model is loaded separately."""
 
 
 class _Shape(XFormPrim):
@@ -297,8 +297,8 @@ class _Shape(XFormPrim):
         body = child.worldbody.add_body(name=self.prim.GetName())
         if self.free:
             body.add_freejoint(name="root")
-        rgb = _numbers(self._color, (0.5, 0.5, 0.5))
-        size = np.broadcast_to(np.asarray(_numbers(scale, (1.0, 1.0, 1.0))), 3)
+        rgb = _to_floats(self._color, (0.5, 0.5, 0.5))
+        size = np.broadcast_to(np.asarray(_to_floats(scale, (1.0, 1.0, 1.0))), 3)
         geom = body.add_geom(name="shape", rgba=[*rgb[:3], 1.0], **self._geom(size))
         if self._mass is not None:
             geom.mass = float(self._mass)
@@ -315,7 +315,7 @@ class _Sphere(_Shape):
 
 class _Cuboid(_Shape):
     def _geom(self, scale: np.ndarray) -> dict[str, Any]:
-        edges = np.broadcast_to(np.asarray(_numbers(self._size, (1.0,))), 3) * scale
+        edges = np.broadcast_to(np.asarray(_to_floats(self._size, (1.0,))), 3) * scale
         return {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": (0.5 * edges).tolist()}
 
 
@@ -326,62 +326,62 @@ class _Cylinder(_Shape):
 
 
 class DynamicSphere(_Sphere):
-    """A ball that moves and touches."""
+    """A sphere that moves and collides."""
 
 
 class FixedSphere(_Sphere):
-    """A ball that stands where it is."""
+    """A sphere that is fixed and collides."""
 
     free = False
 
 
 class VisualSphere(_Sphere):
-    """A ball that is only seen."""
+    """A sphere without collisions."""
 
     free, solid = False, False
 
 
 class DynamicCuboid(_Cuboid):
-    """A box that moves and touches."""
+    """A box that moves and collides."""
 
 
 class FixedCuboid(_Cuboid):
-    """A box that stands where it is."""
+    """A box that is fixed and collides."""
 
     free = False
 
 
 class VisualCuboid(_Cuboid):
-    """A box that is only seen."""
+    """A box without collisions."""
 
     free, solid = False, False
 
 
 class DynamicCylinder(_Cylinder):
-    """A cylinder that moves and touches."""
+    """A cylinder that moves and collides."""
 
 
 class FixedCylinder(_Cylinder):
-    """A cylinder that stands where it is."""
+    """A cylinder that is fixed and collides."""
 
     free = False
 
 
 class GroundPlane:
-    """The ground; `sim.add_ground_plane` of the YAML decides whether there is one."""
+    """The ground plane. `sim.add_ground_plane` of the YAML decides whether the scene has one."""
 
     def __init__(self, prim_path: str = "/World/defaultGroundPlane", **kwargs: Any) -> None:
         self.prim_path = prim_path
 
 
-def _apply(prim: Prim, child: mujoco.MjSpec) -> None:
-    """The settings of an actor, on its model."""
+def _apply_settings(prim: Prim, child: mujoco.MjSpec) -> None:
+    """Apply the settings of an actor to its model."""
     settings = prim.settings
     for geom in child.geoms:
         if settings.get("collisions") is False:
             geom.contype = geom.conaffinity = 0
         if settings.get("density", -1) not in (-1, None):
-            geom.density, geom.mass = float(settings["density"]), np.nan
+            geom.density, geom.mass = float(settings["density"]), np.nan  # NaN: MuJoCo computes the mass
     if settings.get("make_kinematic") in (True, 1):
         for body in child.worldbody.bodies:
             for joint in [j for j in body.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]:
@@ -391,7 +391,7 @@ def _apply(prim: Prim, child: mujoco.MjSpec) -> None:
         for body in child.bodies[1:]:
             body.gravcomp = 1.0
     if settings.get("enable_self_collisions") in (False, 0):
-        _exclude(child)
+        _disable_self_collisions(child)
     if settings.get("mass", -1) not in (-1, None):
         model = child.compile()
         factor = float(settings["mass"]) / float(np.sum(model.body_mass))
@@ -406,23 +406,23 @@ def _apply(prim: Prim, child: mujoco.MjSpec) -> None:
                 body.inertia = factor * np.asarray(body.inertia)
 
 
-def _exclude(child: mujoco.MjSpec) -> None:
-    """No two bodies of the model touch each other."""
+def _disable_self_collisions(child: mujoco.MjSpec) -> None:
+    """Exclude contacts between all bodies of the model."""
     for number, body in enumerate(child.bodies[1:]):
         if not body.name:
-            body.name = f"body_{number}"  # as an entity names what its MJCF does not
+            body.name = f"body_{number}"  # the name that an entity gives to a body without one
     bodies = [b for b in child.bodies[1:] if any(g.contype or g.conaffinity for g in b.geoms)]
     for number, first in enumerate(bodies):
         for second in bodies[number + 1 :]:
-            touching = any(
+            collide = any(
                 (a.contype & b.conaffinity) or (b.contype & a.conaffinity) for a in first.geoms for b in second.geoms
             )
-            if touching:
+            if collide:
                 child.add_exclude(bodyname1=first.name, bodyname2=second.name)
 
 
 def _add_force_sensors(child: mujoco.MjSpec) -> None:
-    """The wrench that a body's parent holds it with, at the body's frame: what `get_measured_joint_forces` reads."""
+    """Add sensors of the force and torque between each body and its parent, in the body's frame."""
     for number, body in enumerate(child.bodies[1:]):
         if not body.name:
             body.name = f"body_{number}"
@@ -438,10 +438,10 @@ def _add_force_sensors(child: mujoco.MjSpec) -> None:
 
 
 FRAME, FORCE, TORQUE = ".frame", ".joint_force", ".joint_torque"
-"""Endings of the names of sites and sensors that measure joint forces."""
+"""Suffixes of the sites and sensors that measure joint forces."""
 
 
-def _numbers(value: Any, default: tuple[float, ...]) -> tuple[float, ...]:
+def _to_floats(value: Any, default: tuple[float, ...]) -> tuple[float, ...]:
     if value is None:
         return default
     return tuple(float(x) for x in np.asarray(value, dtype=float).reshape(-1))

@@ -1,4 +1,4 @@
-"""`RLTask` and what its constructor is given: the settings, and the environment as the task sees it."""
+"""`RLTask`, and the objects that its constructor receives: the settings, and the environment as tasks expect it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from torch import Tensor
 
 from rlcli.envs.direct import DirectTask
 from rlcli.errors import TaskError, did_you_mean, listing
+from rlcli_oige.articulation_view import ArticulationView
 from rlcli_oige.randomization import Randomizer
 from rlcli_oige.stage import BASE, ZERO, GroundPlane, Prim, Stage
-from rlcli_oige.views import ArticulationView, RigidPrimView, XFormPrimView
+from rlcli_oige.views import RigidPrimView, XFormPrimView
 
 if TYPE_CHECKING:
     from rlcli_oige.env import OigeEnv
@@ -34,7 +35,7 @@ ACTOR_DEFAULTS: Mapping[str, Any] = {
 
 
 class SimConfig:
-    """The task's YAML, evaluated, as OmniIsaacGymEnvs' tasks read it."""
+    """The task's YAML, evaluated, with the methods that OmniIsaacGymEnvs' tasks call."""
 
     def __init__(self, config: dict[str, Any] | None = None) -> None:
         self._config = {} if config is None else config
@@ -46,7 +47,7 @@ class SimConfig:
 
     @property
     def config(self) -> dict[str, Any]:
-        """All settings; the task's under `task`."""
+        """All settings; those of the task are under `task`."""
         return self._config
 
     @property
@@ -56,25 +57,25 @@ class SimConfig:
 
     @property
     def sim_params(self) -> dict[str, Any]:
-        """Its `sim:`, with defaults."""
+        """`sim:` of the YAML, with defaults."""
         return self._sim_params
 
     @property
     def physx_params(self) -> dict[str, Any]:
-        """Its `sim.physx:`."""
+        """`sim.physx:` of the YAML."""
         return self._physx_params
 
     def get_physics_params(self) -> dict[str, Any]:
-        """Both."""
+        """Return `sim:` and `sim.physx:` in one dict."""
         return {**self._sim_params, **self._physx_params}
 
     def parse_actor_config(self, actor_name: str) -> dict[str, Any]:
-        """The settings of an actor; -1 stands for what its model says."""
-        given = self._cfg.get("sim", {}).get(actor_name, {})
-        return {**ACTOR_DEFAULTS, **{key: value for key, value in given.items() if key in ACTOR_DEFAULTS}}
+        """Return the settings of an actor; -1 means the value of its model."""
+        settings = self._cfg.get("sim", {}).get(actor_name, {})
+        return {**ACTOR_DEFAULTS, **{key: value for key, value in settings.items() if key in ACTOR_DEFAULTS}}
 
     def apply_articulation_settings(self, name: str, prim: Prim, cfg: Mapping[str, Any]) -> None:
-        """Note an actor's settings; its model gets them when the scene is complete."""
+        """Record an actor's settings; they are applied to its model when the scene is complete."""
         for key, value in cfg.items():
             if value is not None and not (isinstance(value, int | float) and value == -1):
                 prim.settings[key] = value
@@ -82,27 +83,27 @@ class SimConfig:
     def apply_rigid_body_settings(
         self, name: str, prim: Prim, cfg: Mapping[str, Any], is_articulation: bool = False
     ) -> None:
-        """`apply_articulation_settings`."""
+        """Record an actor's settings, like `apply_articulation_settings`."""
         self.apply_articulation_settings(name, prim, cfg)
 
     def apply_rigid_shape_settings(self, name: str, prim: Prim, cfg: Mapping[str, Any]) -> None:
-        """`apply_articulation_settings`."""
+        """Record an actor's settings, like `apply_articulation_settings`."""
         self.apply_articulation_settings(name, prim, cfg)
 
     def make_kinematic(self, name: str, prim: Prim, cfg: Any = None, value: Any = None) -> None:
-        """Let a body move only where it is put."""
+        """Make a body kinematic: it moves only when its pose is set."""
         prim.settings["make_kinematic"] = self._value(name, "make_kinematic", value)
 
     def set_density(self, name: str, prim: Prim, value: float | None = None) -> None:
-        """Density of all geoms of an actor [kg/m^3]."""
+        """Set the density of all geoms of an actor [kg/m^3]."""
         prim.settings["density"] = self._value(name, "density", value)
 
     def set_mass(self, name: str, prim: Prim, value: float | None = None) -> None:
-        """Whole mass of an actor [kg]."""
+        """Set the total mass of an actor [kg]."""
         prim.settings["mass"] = self._value(name, "mass", value)
 
     def set_position_iteration(self, name: str, prim: Prim, value: float | None = None) -> None:
-        """Nothing: MuJoCo's solver iterates until it has converged."""
+        """Do nothing: MuJoCo's solver iterates until it converges."""
 
     set_velocity_iteration = set_articulation_position_iteration = set_position_iteration
     set_articulation_velocity_iteration = set_max_depenetration_velocity = set_position_iteration
@@ -115,7 +116,7 @@ class SimConfig:
 
 
 class SceneRegistry:
-    """Where views are registered: what `set_up_scene` is given."""
+    """Registry of views: the argument of `set_up_scene`."""
 
     def __init__(self) -> None:
         self.views: dict[str, XFormPrimView] = {}
@@ -145,19 +146,19 @@ class SceneRegistry:
             self.objects[getattr(item, "name", str(id(item)))] = item
             return item
         if item.name in self.views and self.views[item.name] is not item:
-            raise TaskError(f"two views are called '{item.name}'", hint="a view's name is unique in its scene")
+            raise TaskError(f"two views have the name '{item.name}'", hint="give each view of the scene its own name")
         self.views[item.name] = item
         return item
 
     def object_exists(self, name: str) -> bool:
-        """Whether a name is registered."""
+        """Return whether a name is registered."""
         return name in self.views or name in self.objects
 
     def get_object(self, name: str) -> Any:
-        """What is registered under a name.
+        """Return the object with a name.
 
         Raises:
-            TaskError: if nothing is.
+            TaskError: if there is none.
         """
         found = {**self.objects, **self.views}
         if name not in found:
@@ -165,30 +166,30 @@ class SceneRegistry:
         return found[name]
 
     def remove_object(self, name: str, registry_only: bool = False) -> None:
-        """Forget a name."""
+        """Remove a name."""
         self.views.pop(name, None)
         self.objects.pop(name, None)
 
     def add_default_ground_plane(self, *args: Any, **kwargs: Any) -> GroundPlane:
-        """Nothing more: `sim.add_ground_plane` of the YAML says whether there is a ground."""
+        """Return a ground plane. `sim.add_ground_plane` of the YAML decides whether the scene has one."""
         return GroundPlane()
 
     add_ground_plane = add_default_ground_plane
 
 
 class World:
-    """The simulation, as a task sees it."""
+    """The simulation, with the methods that tasks call."""
 
     def __init__(self, env: OigeEnv) -> None:
         self._env = env
         self.scene = SceneRegistry()
 
     def is_playing(self) -> bool:
-        """Whether the simulation runs; false while a viewer has paused it."""
+        """Return whether the simulation runs; False while a viewer has paused it."""
         return self._env.is_playing()
 
     def is_stopped(self) -> bool:
-        """Never, while a task is there."""
+        """Return False: a task's simulation never stops."""
         return False
 
     @property
@@ -197,31 +198,31 @@ class World:
         return self._env.stage
 
     def play(self) -> None:
-        """Go on."""
+        """Continue after a pause."""
         self._env.pause(False)
 
     def pause(self) -> None:
-        """Pause."""
+        """Pause the simulation."""
         self._env.pause(True)
 
     def render(self) -> None:
-        """Nothing: a viewer draws by itself."""
+        """Do nothing: viewers draw by themselves."""
 
     def get_physics_dt(self) -> float:
-        """Physics time step [s]."""
+        """Return the physics time step [s]."""
         return self._env.physics_dt
 
     def get_rendering_dt(self) -> float:
-        """Time between pictures [s]."""
+        """Return the time between two frames [s]."""
         return self._env.step_dt
 
     def get_physics_context(self) -> World:
-        """The simulation itself."""
+        """Return the simulation itself."""
         return self
 
     @property
     def prim_path(self) -> str:
-        """Where the settings of physics stand."""
+        """Path of the physics settings."""
         return "/physicsScene"
 
     @property
@@ -231,7 +232,7 @@ class World:
 
 
 class EnvHandle:
-    """The environment, as a task sees it: `self._env`."""
+    """The environment as tasks expect it in `self._env`."""
 
     def __init__(self, env: OigeEnv) -> None:
         self.runner = env
@@ -253,18 +254,20 @@ class EnvHandle:
         return self.world.current_time_step_index
 
     def render(self, *args: Any, **kwargs: Any) -> None:
-        """Nothing: a viewer draws by itself."""
+        """Do nothing: viewers draw by themselves."""
 
     create_viewport_render_product = render
 
 
 class RLTask(DirectTask):
-    """Base of a task in OmniIsaacGymEnvs' form.
+    """Base class of tasks written for OmniIsaacGymEnvs.
 
-    A subclass sets `_num_observations`, `_num_actions` and, for a critic's view, `_num_states` before it calls this
-    constructor. `reset_buf` raised where `progress_buf` has reached `_max_episode_length` (or is one short of it) for
-    that reason alone truncates the episode; raised anywhere else, it ends it: `is_done` is asked a second time with
-    `progress_buf` at 1, to tell the two apart.
+    A subclass sets `_num_observations`, `_num_actions` and, for privileged observations of the critic, `_num_states`
+    before it calls this constructor.
+
+    OmniIsaacGymEnvs has one flag, `reset_buf`, for termination and time-out. The environment splits it. Where
+    `progress_buf >= _max_episode_length - 1`, it calls `is_done` a second time with `progress_buf` at 1. If the flag is
+    then no longer set, the episode was truncated; otherwise it was terminated.
     """
 
     _num_observations: int
@@ -277,7 +280,8 @@ class RLTask(DirectTask):
         self.env = env.runner
         for attribute in ("_num_observations", "_num_actions"):
             if not isinstance(getattr(self, attribute, None), int):
-                raise TaskError(f"{type(self).__name__} sets no {attribute}", hint="before it calls RLTask.__init__")
+                what = f"{type(self).__name__} does not set {attribute}"
+                raise TaskError(what, hint="set it before calling RLTask.__init__")
         if not hasattr(self, "_num_states"):
             self._num_states = 0
         if not hasattr(self, "_num_agents"):
@@ -304,7 +308,7 @@ class RLTask(DirectTask):
         self.cleanup()
 
     def cleanup(self) -> None:
-        """Make the buffers."""
+        """Create the buffers."""
         n, device = self._num_envs, self._device
         self.obs_buf = torch.zeros(n, self._num_observations, device=device)
         self.states_buf = torch.zeros(n, self._num_states, device=device)
@@ -315,42 +319,42 @@ class RLTask(DirectTask):
 
     @property
     def num_envs(self) -> int:  # type: ignore[override]
-        """Environments."""
+        """Number of environments."""
         return self._num_envs
 
     @property
     def num_observations(self) -> int:  # type: ignore[override]
-        """Columns of obs_buf."""
+        """Number of columns of obs_buf."""
         return self._num_observations
 
     @property
     def num_actions(self) -> int:  # type: ignore[override]
-        """Columns of the action."""
+        """Number of actions."""
         return self._num_actions
 
     @property
     def num_states(self) -> int:  # type: ignore[override]
-        """Columns of states_buf."""
+        """Number of columns of states_buf."""
         return self._num_states
 
     @property
     def num_agents(self) -> int:
-        """1."""
+        """Number of agents, 1."""
         return self._num_agents
 
     @property
     def device(self) -> str:  # type: ignore[override]
-        """Where tensors live."""
+        """Device of the tensors."""
         return self._device
 
     @property
     def default_base_env_path(self) -> str:
-        """Parent of all environments."""
+        """Parent path of all environments."""
         return BASE
 
     @property
     def default_zero_env_path(self) -> str:
-        """The first environment."""
+        """Path of the first environment."""
         return ZERO
 
     @property
@@ -376,33 +380,33 @@ class RLTask(DirectTask):
         filter_collisions: bool = True,
         copy_from_source: bool = False,
     ) -> None:
-        """Called by the task's own, once its robots are made: places the environments on their grid."""
+        """Place the environments on the grid. A task's own method calls this after it created its robots."""
         self._env_pos = self._env.runner.grid
 
     def initialize_views(self, scene: Any) -> None:
-        """Not called: views are made in `set_up_scene`."""
+        """Set the positions of the environments. rlcli does not call this: `set_up_scene` creates the views."""
         self._env_pos = self._env.runner.grid
 
     def set_initial_camera_params(self, camera_position: Any = (10, 10, 3), camera_target: Any = (0, 0, 0)) -> None:
-        """Nothing: the YAML's `viewport:` places the camera."""
+        """Do nothing: the YAML's `viewport:` sets the camera."""
 
     def set_is_extension(self, is_extension: bool) -> None:
-        """Noted."""
+        """Store the flag."""
         self.is_extension = is_extension
 
     def get_states(self) -> Any:
-        """Fill states_buf, if the task has one."""
+        """Fill states_buf, if the task has states."""
         return self.states_buf
 
     def get_extras(self) -> Any:
         """Fill extras."""
 
     def reset(self, selection: Any = None) -> None:
-        """Raise all flags."""
+        """Set all reset flags."""
         self.reset_buf = torch.ones_like(self.reset_buf)
 
     def post_physics_step(self) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
-        """What the environment does after physics, in one call; the environment itself calls the hooks."""
+        """Call the hooks that follow physics. The environment calls the hooks directly instead."""
         self.progress_buf[:] += 1
         if self.world.is_playing():
             self.get_observations()

@@ -1,4 +1,4 @@
-"""Names of USD and Omniverse that task files import and, with MJCF models, do not need."""
+"""Names of USD and Omniverse that task files import. Tasks with MJCF models do not need them."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class ArticulationAction:
     joint_indices: Any = None
 
 
-class _Absent:
-    """A module that may be imported; what a task asks of it is refused by name."""
+class _MissingModule:
+    """Placeholder for a module: importing it works, using one of its names raises an error."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -31,28 +31,29 @@ class _Absent:
         if name.startswith("__"):
             raise AttributeError(name)
         raise TaskError(
-            f"{self._name}.{name} edits a USD stage, and there is none",
-            hint="models are MJCF files here: make the change there, or in the spec of the scene",
+            f"{self._name}.{name} edits a USD stage, but there is none",
+            hint="make the change in the MJCF file instead, or in the spec of the scene",
         )
 
 
 class _Carb:
-    """Omniverse's logger."""
+    """Omniverse's logger, which writes to Python's logging."""
 
     def log_error(self, message: str) -> None:
-        """To Python's log."""
+        """Log an error."""
         _LOG.error(message)
 
     def log_warn(self, message: str) -> None:
-        """To Python's log."""
+        """Log a warning."""
         _LOG.warning(message)
 
     def log_info(self, message: str) -> None:
-        """To Python's log."""
+        """Log a message."""
         _LOG.info(message)
 
 
 carb = _Carb()
-omni = _Absent("omni")
-Gf, PhysxSchema, Sdf, Usd = _Absent("Gf"), _Absent("PhysxSchema"), _Absent("Sdf"), _Absent("Usd")
-UsdGeom, UsdLux, UsdPhysics = _Absent("UsdGeom"), _Absent("UsdLux"), _Absent("UsdPhysics")
+omni = _MissingModule("omni")
+Gf, PhysxSchema = _MissingModule("Gf"), _MissingModule("PhysxSchema")
+Sdf, Usd = _MissingModule("Sdf"), _MissingModule("Usd")
+UsdGeom, UsdLux, UsdPhysics = _MissingModule("UsdGeom"), _MissingModule("UsdLux"), _MissingModule("UsdPhysics")

@@ -1,6 +1,7 @@
 # ruff: noqa: F401
-"""Every name of OmniIsaacGymEnvs' vocabulary that `rlcli_oige` itself has."""
+"""All names of OmniIsaacGymEnvs' vocabulary that `rlcli_oige` defines."""
 
+from rlcli_oige.articulation_view import ArticulationView
 from rlcli_oige.maths import *  # noqa: F403
 from rlcli_oige.maths import TENSOR_NAMES
 from rlcli_oige.rotations import *  # noqa: F403
@@ -34,7 +35,7 @@ from rlcli_oige.stage import (
 )
 from rlcli_oige.task import RLTask, SimConfig, World
 from rlcli_oige.usd import ArticulationAction, Gf, PhysxSchema, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, carb, omni
-from rlcli_oige.views import ArticulationView, RigidPrimView, XFormPrimView
+from rlcli_oige.views import RigidPrimView, XFormPrimView
 
 NAMES = [
     *TENSOR_NAMES,
@@ -46,4 +47,4 @@ NAMES = [
     "add_reference_to_stage", "carb", "define_prim", "find_matching_prim_paths", "get_assets_root_path",
     "get_current_stage", "get_prim_at_path", "is_prim_path_valid", "omni", "torch_utils",
 ]  # fmt: skip
-"""What `rlcli_oige` offers, with what it looks for in the files of a task; `torch_utils` is the package itself."""
+"""Names that `rlcli_oige` exports; `torch_utils` is the package itself."""

@@ -1,4 +1,4 @@
-"""What the tests share with those of rlcli."""
+"""Fixtures that the tests share with those of rlcli."""
 
 from support.own_session import own_console, own_state
 

@@ -1,4 +1,4 @@
-"""A small task in OmniIsaacGymEnvs' style: a two-joint arm, a ball that marks a target, and a thruster."""
+"""A small task in OmniIsaacGymEnvs' form: a two-joint arm, a sphere that marks a target, and a thruster."""
 
 ARM = """
 <mujoco model="arm">
@@ -180,7 +180,7 @@ params:
 
 
 def arm_folder(folder, yaml=YAML, task=TASK, train=TRAIN):
-    """A task's folder with the YAML, the class, a module that it shares, the agent and the model."""
+    """Write a task's folder: the YAML, the class, a module that it shares, the agent and the model."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "arm.xml").write_text(ARM)
     (folder / "Arm.yaml").write_text(yaml)

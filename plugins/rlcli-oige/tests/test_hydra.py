@@ -1,4 +1,4 @@
-"""Hydra's interpolations, as OmniIsaacGymEnvs writes them."""
+"""Hydra's interpolations as in OmniIsaacGymEnvs' files."""
 
 import pytest
 
@@ -25,7 +25,7 @@ def task(**sim):
     return evaluate({**TREE, "task": {"name": "Arm", "sim": sim}}, ("task", "sim"))
 
 
-def test_relative_references_absolute_ones_and_the_four_resolvers_are_evaluated():
+def test_references_and_resolvers_are_evaluated():
     tree = {**TREE, "task": {**TREE["task"], "sim": {**TREE["task"]["sim"], "missing": "no"}}}
     value, errors = evaluate(tree, ("task",))
     assert errors == []
@@ -35,7 +35,7 @@ def test_relative_references_absolute_ones_and_the_four_resolvers_are_evaluated(
     }  # fmt: skip
 
 
-def test_a_value_keeps_its_type_and_a_given_one_beats_the_default():
+def test_value_keeps_type_and_overrides_default():
     value, errors = evaluate(
         {"num_envs": 7, "task": {"env": {"n": "${resolve_default:512,${...num_envs}}"}}}, ("task",)
     )
@@ -45,15 +45,15 @@ def test_a_value_keeps_its_type_and_a_given_one_beats_the_default():
 @pytest.mark.parametrize(
     ("text", "message", "hint"),
     [
-        ("${....sed}", "leads above the top", None),
+        ("${....sed}", "goes above the top", None),
         ("${...sed}", "has no 'sed'", "did you mean 'seed'?"),
-        ("${oc.env:HOME}", "there is no resolver 'oc.env'", "resolvers: eq, contains, if, resolve_default"),
-        ("${eq:1}", "takes 2 arguments, found 1", None),
+        ("${oc.env:HOME}", "unknown resolver 'oc.env'", "resolvers: eq, contains, if, resolve_default"),
+        ("${eq:1}", "expects 2 arguments, found 1", None),
         ("${.a}", "refers to itself", None),
-        ("${...seed", "is not closed", "every ${ needs its }"),
+        ("${...seed", "is not closed", "every ${ needs a }"),
     ],
 )
-def test_what_leads_nowhere_is_said_with_its_key(text, message, hint):
+def test_invalid_interpolation_error_has_key(text, message, hint):
     _, errors = task(a=text)
     assert len(errors) == 1
     assert errors[0].path == ("task", "sim", "a")

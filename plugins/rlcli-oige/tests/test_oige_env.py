@@ -1,4 +1,4 @@
-"""Tasks in OmniIsaacGymEnvs' form, in the environment loop."""
+"""Tasks in OmniIsaacGymEnvs' form in the environment loop."""
 
 import pytest
 import torch
@@ -27,7 +27,7 @@ def env(tmp_path):
 IDLE = torch.zeros(4, 1)
 
 
-def test_a_task_runs_with_its_import_lines_alone_changed(env):
+def test_task_runs_with_only_import_lines_changed(env):
     for _ in range(30):
         result = env.step(torch.ones(4, 1))
     assert result.obs["policy"].shape == (4, 4)
@@ -42,7 +42,7 @@ STAR = TASK.replace("from rlcli_oige import limit_of_the_angle\n", "").replace(
 
 
 def as_package(folder):
-    """The arm's files in the folders that the original has: classes, modules that they share, and `cfg`."""
+    """Move the arm's files to the folders of the original repository: classes, shared modules, and `cfg`."""
     arm_folder(folder, task=STAR)
     for file, place in (
         ("arm.py", "tasks"),
@@ -57,28 +57,28 @@ def as_package(folder):
 
 
 @pytest.mark.parametrize("name", [".", "cfg/task/Arm.yaml"])
-def test_a_package_of_tasks_keeps_its_folders_and_one_star_imports_all(tmp_path, name):
+def test_package_keeps_folders_and_star_import_finds_all(tmp_path, name):
     folder = as_package(tmp_path / "arms")
     action = torch.linspace(-1.0, 1.0, 4)[:, None]
-    lives = []
+    rollouts = []
     for env in (build(folder / name), build(arm_folder(tmp_path / "arm"))):
         torch.manual_seed(0)
         env.reset()
-        lives.append([(step.obs["policy"].clone(), step.reward.clone()) for step in map(env.step, [action] * 15)])
+        rollouts.append([(step.obs["policy"].clone(), step.reward.clone()) for step in map(env.step, [action] * 15)])
     assert all(
-        torch.equal(a, b) for ours, theirs in zip(*lives, strict=True) for a, b in zip(ours, theirs, strict=True)
+        torch.equal(a, b) for ours, theirs in zip(*rollouts, strict=True) for a, b in zip(ours, theirs, strict=True)
     )
     assert resolve(find_task(str(folder / name))).agent.num_epochs == 3  # of cfg/train
 
 
-def test_a_star_imports_nothing_of_a_neighbour_that_the_file_defines_itself(tmp_path):
+def test_star_import_keeps_own_definitions(tmp_path):
     own = STAR.replace("class ArmTask(", "def limit_of_the_angle():\n    return 0.0\n\n\nclass ArmTask(")
     env = build(arm_folder(tmp_path / "arm", task=own))
     env.reset()
-    assert env.step(IDLE).terminated.all()  # its own limit, not that of the neighbour
+    assert env.step(IDLE).terminated.all()  # its own limit, not that of the other file
 
 
-def test_several_tasks_of_a_package_are_told_apart_by_their_files(tmp_path):
+def test_tasks_of_package_are_chosen_by_file(tmp_path):
     folder = as_package(tmp_path / "arms")
     (folder / "cfg" / "task" / "Leg.yaml").write_text(YAML.replace("name: Arm", "name: Leg"))
     with pytest.raises(TaskError, match="several tasks") as caught:
@@ -86,7 +86,7 @@ def test_several_tasks_of_a_package_are_told_apart_by_their_files(tmp_path):
     assert "arms/cfg/task/Arm.yaml" in caught.value.hint
 
 
-def test_running_into_the_length_of_an_episode_truncates_and_failing_terminates(env):
+def test_time_out_truncates_and_failure_terminates(env):
     position = env.engine.field("qpos")
     left = env.task._arms._qpos_columns[env.task._left]
     for _ in range(10):
@@ -100,7 +100,7 @@ def test_running_into_the_length_of_an_episode_truncates_and_failing_terminates(
     assert result.episodes.lengths.tolist() == [11, 11, 11, 11]
 
 
-def test_a_task_that_ends_at_its_length_and_not_one_before_is_truncated_too(tmp_path):
+def test_reset_flag_at_full_length_truncates(tmp_path):
     task = TASK.replace("self._max_episode_length - 1", "self._max_episode_length")
     env = build(arm_folder(tmp_path / "arm", task=task))
     env.reset()
@@ -110,12 +110,12 @@ def test_a_task_that_ends_at_its_length_and_not_one_before_is_truncated_too(tmp_
     assert not results[-1].terminated.any()
 
 
-def test_an_episodes_length_on_the_command_line_is_the_classs_too(tmp_path):
+def test_episode_length_override_reaches_class(tmp_path):
     env = build(arm_folder(tmp_path / "arm"), "episode_length_s=0.1")
     assert env.task._max_episode_length == env.max_episode_length == 5
 
 
-def test_rewards_are_of_what_the_task_observed_and_the_policy_gets_it_clipped(env):
+def test_reward_uses_exact_obs_and_policy_gets_clipped_obs(env):
     result = env.step(IDLE)
     assert (result.obs["policy"][:, 3] == 5.0).all()
     assert (result.reward > 90.0).all()
@@ -134,7 +134,7 @@ def test_joints_and_bodies_are_breadth_first(env):
     assert limits[0, 1].isinf().all()
 
 
-def test_values_go_to_the_rows_and_joints_that_are_named(env):
+def test_setters_write_selected_rows_and_joints(env):
     arms = env.task._arms
     before = arms.get_joint_positions()
     arms.set_joint_positions(
@@ -150,26 +150,26 @@ def test_values_go_to_the_rows_and_joints_that_are_named(env):
         arms.set_joint_positions(torch.zeros(3, 3))
 
 
-def test_poses_include_the_grid_and_the_robots_place(env):
+def test_world_poses_include_grid_and_robot_position(env):
     position, _ = env.task._arms.get_world_poses()
     assert torch.allclose(position - env.task._env_pos, torch.tensor([0.0, 0.0, 1.5]))
     assert env.task._env_pos[:, :2].unique(dim=0).shape[0] == 4
     assert torch.allclose(env.task._balls.get_world_poses()[0], env.task._env_pos + torch.tensor([0.0, 0.0, 2.0]))
 
 
-def test_a_kinematic_body_stays_where_it_is_put_and_a_free_one_falls(env):
+def test_kinematic_body_stays_and_free_body_falls(env):
     for _ in range(5):
         env.step(IDLE)
     balls, boxes = env.task._balls.get_world_poses()[0], env.task._boxes.get_world_poses()[0]
     assert torch.allclose(balls[:, 2], torch.full((4,), 2.0))
     time = 10 * 0.01
-    # semi-implicit Euler falls half a step further than the parabola
+    # semi-implicit Euler falls half a step farther than the exact parabola
     assert torch.allclose(boxes[:, 2], torch.full((4,), 2.0 - 0.5 * 9.81 * time * (time + 0.01)), atol=1e-4)
 
 
-def test_a_force_pushes_for_one_step_in_the_frame_it_is_given_in(env):
+def test_force_acts_for_one_step_in_its_frame(env):
     boxes = env.task._boxes
-    half_turn = torch.tensor([0.0, 0.0, 0.0, 1.0]).repeat(4, 1)  # about z
+    half_turn = torch.tensor([0.0, 0.0, 0.0, 1.0]).repeat(4, 1)  # around z
     boxes.set_world_poses(boxes.get_world_poses()[0], half_turn)
     boxes.set_velocities(torch.zeros(4, 6))
     env.engine.forward(env._select_all())
@@ -191,7 +191,7 @@ def test_a_force_pushes_for_one_step_in_the_frame_it_is_given_in(env):
     assert torch.allclose(boxes.get_velocities()[:, 0], speed, atol=1e-6)
 
 
-def test_a_view_of_several_links_has_a_row_for_each_environment_by_environment(env):
+def test_view_of_links_orders_rows_by_env(env):
     links = env.task._links
     assert links.count == 8
     position = links.get_world_poses()[0].reshape(4, 2, 3) - env.task._env_pos[:, None]
@@ -199,7 +199,7 @@ def test_a_view_of_several_links_has_a_row_for_each_environment_by_environment(e
     assert torch.allclose(position[:, 1, 1], torch.full((4,), -0.1), atol=1e-6)
 
 
-def test_efforts_act_beside_a_drive_and_targets_move_it(env):
+def test_effort_adds_to_drive_and_target_moves_joint(env):
     arms = env.task._arms
     arms.set_joint_efforts(torch.tensor([0.0, 0.5, 0.0]).repeat(4, 1))
     assert torch.allclose(env.engine.field("qfrc_applied")[:, arms._dof_columns[1]].float(), torch.full((4,), 0.5))
@@ -210,7 +210,7 @@ def test_efforts_act_beside_a_drive_and_targets_move_it(env):
         arms.set_joint_velocity_targets(torch.zeros(4, 3))
 
 
-def test_measured_joint_forces_hold_what_hangs_on_a_body(tmp_path):
+def test_measured_joint_forces_carry_weight_of_children(tmp_path):
     task = TASK.replace("self.obs_buf[:, 3] = 100.0", "self.wrench = self._arms.get_measured_joint_forces()")
     env = build(arm_folder(tmp_path / "arm", task=task), "oige.env.maxEffort=0.0")
     env.reset()
@@ -221,12 +221,12 @@ def test_measured_joint_forces_hold_what_hangs_on_a_body(tmp_path):
     arms.set_joint_velocities(zero)
     env.step(IDLE)
     assert env.task.wrench.shape == (4, 4, 6)
-    # all upright: each body holds the weight above it, along its own z axis
+    # all upright: each joint carries the weight above it, along the body's z axis
     weights = 9.81 * torch.tensor([0.7, 0.5, 0.2])
     assert torch.allclose(env.task.wrench[:, 1:, 2], weights.expand(4, -1), rtol=1e-2)
 
 
-def test_a_run_goes_on_from_a_saved_state_bit_for_bit(env):
+def test_restored_state_continues_bit_for_bit(env):
     actions = [torch.rand(4, 1) * 2 - 1 for _ in range(20)]
     for action in actions[:5]:
         env.step(action)
@@ -245,16 +245,22 @@ def test_a_run_goes_on_from_a_saved_state_bit_for_bit(env):
     [
         ("task", '/.*/Arm"', '/.*/Army"', TaskError, "nothing matches '/World/envs/.*/Army'"),
         ("task", '"left_a"', '"left_c"', TaskError, "view 'arm_view' has no joint 'left_c'"),
-        ("task", '["maxEffort"]', '["maxForce"]', TaskError, "ArmTask reads a key 'maxForce' that is not there"),
-        ("task", "super().set_up_scene(scene)", "pass", TaskError, "set_up_scene does not call RLTask's"),
-        ("task", "self._num_actions = 1", "pass", TaskError, "ArmTask sets no _num_actions"),
+        ("task", '["maxEffort"]', '["maxForce"]', TaskError, "ArmTask reads the key 'maxForce', which is missing"),
+        ("task", "super().set_up_scene(scene)", "pass", TaskError, "set_up_scene does not call RLTask.set_up_scene"),
+        ("task", "self._num_actions = 1", "pass", TaskError, "ArmTask does not set _num_actions"),
         ("task", "limit_of_the_angle", "limit_of_the_angel", TaskError, "rlcli_oige"),
-        ("yaml", "  /World/envs/.*/Arm: arm.xml", "  Leg: arm.xml", ConfigError, "no model stands for the robot"),
+        (
+            "yaml",
+            "  /World/envs/.*/Arm: arm.xml",
+            "  Leg: arm.xml",
+            ConfigError,
+            "the robot at '/World/envs/env_0/Arm' has no model",
+        ),
         ("yaml", "arm.xml", "leg.xml", ConfigError, "no file"),
         ("yaml", "Arm: arm.xml", "Arm: {model: arm.xml, joints: {x: knee}}", ConfigError, "no 'knee' in arm.xml"),
     ],
 )
-def test_what_does_not_fit_is_said_when_the_environment_is_built(tmp_path, where, old, new, error, message):
+def test_invalid_task_is_reported_when_env_is_built(tmp_path, where, old, new, error, message):
     text = {"task": TASK, "yaml": YAML}
     text[where] = text[where].replace(old, new)
     with pytest.raises(error) as caught:
@@ -262,7 +268,7 @@ def test_what_does_not_fit_is_said_when_the_environment_is_built(tmp_path, where
     assert message in str(caught.value)
 
 
-def test_names_of_the_yaml_stand_for_the_models(tmp_path):
+def test_names_in_yaml_replace_names_of_model(tmp_path):
     yaml = YAML.replace("Arm: arm.xml", "Arm: {model: arm.xml, joints: {shoulder: left_a}, bodies: {hand: left_tip}}")
     env = build(arm_folder(tmp_path / "arm", yaml=yaml, task=TASK.replace('"left_a"', '"shoulder"')))
     assert env.task._arms.dof_names == ["shoulder", "right_a", "left_b"]
@@ -270,7 +276,7 @@ def test_names_of_the_yaml_stand_for_the_models(tmp_path):
 
 
 @pytest.mark.parametrize("robot", ["Cartpole", "Ant", "Humanoid", "Crazyflie", "Quadcopter", "Ingenuity"])
-def test_the_six_robots_bring_their_models(tmp_path, robot):
+def test_robot_classes_have_built_in_models(tmp_path, robot):
     task = TASK.replace("Robot(prim_path", f"{robot}(prim_path").replace('"left_a"', "self._arms.dof_names[0]")
     task = task.replace("/Arm/(left|right)", "/Arm").replace("self.dof_pos\n", "self.dof_pos[:, :1]\n")
     task = task.replace("import ArticulationView", f"import {robot}, ArticulationView")

@@ -1,4 +1,4 @@
-"""The front end as a plugin: nothing heavy before it is needed, former module names, what a run records."""
+"""The front end as a plugin: lazy imports, former module names, and the plugin's entry in a run's record."""
 
 import json
 import subprocess
@@ -13,7 +13,7 @@ OLD = TASK.replace("rlcli_oige", "rlcli.oige")
 
 
 @pytest.mark.parametrize("command", ["validate", "show"])
-def test_a_yaml_is_read_without_torch(tmp_path, command):
+def test_yaml_is_read_without_torch(tmp_path, command):
     folder = arm_folder(tmp_path / "arm")
     program = (
         f"import sys; from rlcli.cli.app import main; code = main([{command!r}, {str(folder)!r}]); "
@@ -23,13 +23,13 @@ def test_a_yaml_is_read_without_torch(tmp_path, command):
     assert done.stdout.splitlines()[-1] == "0", done.stderr
 
 
-def test_importing_the_package_imports_nothing_heavy():
+def test_import_loads_nothing_heavy():
     program = "import sys, rlcli_oige, rlcli_oige.format; print('torch' in sys.modules, 'pydantic' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", "False"]
 
 
-def test_a_task_with_the_former_module_name_trains_and_its_run_records_the_plugin(tmp_path, capsys):
+def test_former_module_name_trains_and_run_records_plugin(tmp_path, capsys):
     folder = arm_folder(tmp_path / "arm", task=OLD)
     words = ["train", str(folder), "--num-envs", "4", "--max-iterations", "1", "--logger", "none", "--device", "cpu"]
     words += ["-q", "--runs-dir", str(tmp_path / "runs"), "agent.minibatch_size=16"]

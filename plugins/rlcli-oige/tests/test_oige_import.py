@@ -1,4 +1,4 @@
-"""`rlcli import oige`: an imported task is the same task."""
+"""`rlcli import oige`: the imported task equals the original."""
 
 import json
 
@@ -19,7 +19,7 @@ def imported(folder, output, *words):
     return main(["import", "oige", str(folder / "Arm.yaml"), *words, "-o", str(output)])
 
 
-def test_an_imported_task_is_the_task_it_came_from_step_by_step(tmp_path):
+def test_imported_task_equals_original_step_by_step(tmp_path):
     source = arm_folder(tmp_path / "arm")
     assert imported(source, tmp_path / "mine") == 0
     assert sorted(p.name for p in (tmp_path / "mine").iterdir()) == ["arm.py", "arm.xml", "shared.py", "task.yaml"]
@@ -27,27 +27,27 @@ def test_an_imported_task_is_the_task_it_came_from_step_by_step(tmp_path):
     assert now.task.model_dump(exclude={"agents"}) == was.task.model_dump(exclude={"agents"})
     assert now.agent == was.agent
     assert now.notes == ()
-    lives = []
+    rollouts = []
     for resolved in (was, now):
         torch.manual_seed(0)
         env = make_env(resolved, seed=1)
         env.reset()
-        lives.append(torch.stack([env.step(torch.ones(4, 1)).obs["policy"].clone() for _ in range(20)]))
-    assert torch.equal(*lives)
+        rollouts.append(torch.stack([env.step(torch.ones(4, 1)).obs["policy"].clone() for _ in range(20)]))
+    assert torch.equal(*rollouts)
 
 
 @pytest.mark.parametrize("name", ["../../evil", "..", "{tmp}/evil", "a\\nb", "x" * 300])
-def test_a_name_that_is_a_path_is_not_written_to(tmp_path, monkeypatch, capsys, name):
+def test_task_name_that_is_path_is_refused(tmp_path, monkeypatch, capsys, name):
     (tmp_path / "a" / "b").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "a" / "b")
     file = tmp_path / "given.yaml"
     file.write_text(f'name: "{name}"\nenv: {{numEnvs: 4}}\nsim: {{dt: 0.01}}\n'.replace("{tmp}", str(tmp_path)))
     assert main(["import", "oige", str(file)]) == 3
-    assert "is no name of a task's class" in capsys.readouterr().err
+    assert "is not a valid name of a task's class" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == [tmp_path / "a", tmp_path / "a" / "b", file]
 
 
-def test_a_model_beside_the_task_is_not_copied_beside_the_output(tmp_path, capsys):
+def test_model_outside_task_folder_is_not_copied(tmp_path, capsys):
     source = arm_folder(tmp_path / "deep" / "arm")
     text = (source / "Arm.yaml").read_text()
     assert "arm.xml" in text
@@ -58,7 +58,7 @@ def test_a_model_beside_the_task_is_not_copied_beside_the_output(tmp_path, capsy
     assert not (tmp_path / "arm.xml").exists()
 
 
-def test_of_a_package_the_class_comes_with_the_files_that_it_uses(tmp_path):
+def test_import_from_package_copies_used_files(tmp_path):
     source = arm_folder(tmp_path / "arms")
     for file, place in (("arm.py", "tasks"), ("shared.py", "views"), ("Arm.yaml", "cfg/task"), ("arm.xml", "cfg/task")):
         (source / place).mkdir(parents=True, exist_ok=True)
@@ -76,7 +76,7 @@ def test_of_a_package_the_class_comes_with_the_files_that_it_uses(tmp_path):
     assert env.step(torch.ones(4, 1)).obs["policy"].isfinite().all()
 
 
-def test_every_key_is_in_the_report(tmp_path, capsys):
+def test_every_key_is_reported(tmp_path, capsys):
     source = arm_folder(tmp_path / "arm")
     assert imported(source, tmp_path / "mine", "--json") == 0
     document = json.loads(capsys.readouterr().out)
@@ -89,7 +89,7 @@ def test_every_key_is_in_the_report(tmp_path, capsys):
     assert lines == sorted(lines)
 
 
-def test_without_a_class_the_files_validate_and_the_message_says_what_is_missing(tmp_path, capsys):
+def test_import_without_class_validates_and_names_missing_file(tmp_path, capsys):
     source = arm_folder(tmp_path / "arm")
     for file in source.glob("*.py"):
         file.unlink()
@@ -99,7 +99,7 @@ def test_without_a_class_the_files_validate_and_the_message_says_what_is_missing
     assert main(["validate", "--deep", str(tmp_path / "mine")]) == 4
 
 
-def test_a_task_that_is_there_already_is_not_written_over(tmp_path, capsys):
+def test_existing_task_is_not_overwritten(tmp_path, capsys):
     source = arm_folder(tmp_path / "arm")
     assert imported(source, tmp_path / "mine") == 0
     before = (tmp_path / "mine" / "task.yaml").read_bytes()
@@ -108,7 +108,7 @@ def test_a_task_that_is_there_already_is_not_written_over(tmp_path, capsys):
     assert (tmp_path / "mine" / "task.yaml").read_bytes() == before
 
 
-def test_a_file_of_another_form_and_a_form_that_is_not_known_are_refused(tmp_path, capsys):
+def test_other_formats_are_refused(tmp_path, capsys):
     (tmp_path / "task.yaml").write_text("decimation: 2\nscene: {}\n")
     assert main(["import", "oige", str(tmp_path / "task.yaml"), "-o", str(tmp_path / "out")]) == 3
     assert "is not a task of OmniIsaacGymEnvs" in capsys.readouterr().err
@@ -117,7 +117,7 @@ def test_a_file_of_another_form_and_a_form_that_is_not_known_are_refused(tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-def test_import_lines_alone_are_changed():
+def test_only_import_lines_change():
     text = (
         "import torch\nfrom omni.isaac.core.utils.torch.rotations import *\n"
         "from omniisaacgymenvs.tasks.base.rl_task import RLTask\nimport carb\n\nx = 'import omni'\n"
@@ -130,7 +130,7 @@ def test_import_lines_alone_are_changed():
 
 
 @pytest.mark.slow
-def test_an_imported_task_trains_plays_and_resumes(tmp_path):
+def test_imported_task_trains_plays_and_resumes(tmp_path):
     yaml = YAML.replace("resolve_default:4", "resolve_default:16").replace(
         "maxEpisodeLength: 12", "maxEpisodeLength: 40"
     )

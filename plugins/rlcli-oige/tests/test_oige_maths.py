@@ -1,4 +1,4 @@
-"""The torch functions that tasks import."""
+"""Torch functions that tasks import."""
 
 import math
 import warnings
@@ -43,7 +43,7 @@ def close(left, right):
     return torch.allclose(left, right, atol=1e-5)
 
 
-def test_a_quarter_turn_about_z_takes_x_to_y():
+def test_quarter_turn_around_z_rotates_x_to_y():
     assert close(quat_rotate(QUARTER_Z, X), Y)
     assert close(quat_rotate_inverse(QUARTER_Z, Y), X)
     assert close(quat_axis(QUARTER_Z, 1), -X)
@@ -53,16 +53,16 @@ def test_a_quarter_turn_about_z_takes_x_to_y():
 
 
 @pytest.mark.parametrize("extrinsic", [True, False])
-def test_euler_angles_matrices_and_quaternions_are_each_others_inverses(extrinsic):
+def test_euler_matrix_quaternion_round_trip(extrinsic):
     q = quats()
     assert quat_diff_rad(rot_matrices_to_quats(quats_to_rot_matrices(q)), q).max() < 1e-3
     assert quat_diff_rad(quat_from_euler_xyz(*get_euler_xyz(q, extrinsic), extrinsic), q).max() < 1e-3
 
 
-def test_fixed_axes_turn_roll_first_and_moving_ones_roll_last():
+def test_extrinsic_euler_rolls_first_and_intrinsic_last():
     roll, pitch, yaw = (torch.tensor([a]) for a in (math.pi / 2, 0.0, math.pi / 2))
-    assert close(quat_rotate(quat_from_euler_xyz(roll, pitch, yaw), Y), Z)  # y -> z, which yaw leaves
-    assert close(quat_rotate(quat_from_euler_xyz(roll, pitch, yaw, False), Y), -X)  # y -> -x, which roll leaves
+    assert close(quat_rotate(quat_from_euler_xyz(roll, pitch, yaw), Y), Z)  # y -> z, unchanged by yaw
+    assert close(quat_rotate(quat_from_euler_xyz(roll, pitch, yaw, False), Y), -X)  # y -> -x, unchanged by roll
 
 
 def test_frames_combine_and_invert():
@@ -72,12 +72,12 @@ def test_frames_combine_and_invert():
     assert back[1].abs().max() < 1e-5
 
 
-def test_slerp_goes_the_shorter_way():
+def test_slerp_takes_shorter_path():
     half = slerp(torch.tensor([[1.0, 0, 0, 0]]), -QUARTER_Z, torch.tensor([0.5]))
     assert close(half, quat_from_angle_axis(torch.tensor([math.pi / 4]), Z))
 
 
-def test_scaling_and_clamping():
+def test_scale_and_clamp():
     low, high = torch.tensor([-1.0, 2.0]), torch.tensor([3.0, 4.0])
     assert unscale(torch.tensor([[1.0, 2.0]]), low, high).tolist() == [[0.0, -1.0]]
     assert scale(torch.tensor([[0.0, -1.0]]), low, high).tolist() == [[1.0, 2.0]]
@@ -88,7 +88,7 @@ def test_scaling_and_clamping():
     assert (drawn < -1.0).all()
 
 
-def test_a_torso_that_faces_y_and_runs_along_y_runs_ahead():
+def test_heading_and_velocity_of_torso_facing_y():
     start = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
     quat, up, heading, up_vec, heading_vec = compute_heading_and_up(QUARTER_Z, start, 5.0 * Y, X, Z, 2)
     assert (up.item(), heading.item()) == (pytest.approx(1.0), pytest.approx(1.0))
@@ -101,9 +101,9 @@ def test_a_torso_that_faces_y_and_runs_along_y_runs_ahead():
     assert ahead.item() == pytest.approx(0.0, abs=1e-6)
 
 
-def test_functions_of_a_task_that_is_scripted_can_call_them():
+def test_torchscript_functions_can_call_them():
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # torch deprecates scripting; task files do it
+        warnings.simplefilter("ignore", DeprecationWarning)  # torch deprecates scripting, but task files use it
 
         def heading(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
             return compute_heading_and_up(q, q, v, v, v, 2)[2] + unscale(q[:, 0], q[:, 1] - 3.0, q[:, 2] + 3.0)
@@ -115,7 +115,7 @@ def test_functions_of_a_task_that_is_scripted_can_call_them():
     assert torch.allclose(scripted(q, q[:, 1:]), heading(q, q[:, 1:]))
 
 
-def test_everything_that_is_offered_is_there():
+def test_every_exported_name_exists():
     assert all(hasattr(oige, name) for name in NAMES)
     with pytest.raises(ImportError, match="cannot import name 'quat_rotat'"):
         exec("from rlcli_oige import quat_rotat")

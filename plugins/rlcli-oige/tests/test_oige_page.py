@@ -1,4 +1,4 @@
-"""The example of docs/guides/omniisaacgymenvs.md works as it stands there."""
+"""The example of docs/guides/omniisaacgymenvs.md works as printed."""
 
 import re
 from pathlib import Path
@@ -28,7 +28,7 @@ def folder(tmp_path):
     return tmp_path / "pushed"
 
 
-def test_the_example_validates_and_a_push_towards_the_middle_earns_more_than_none(folder):
+def test_example_validates_and_good_action_earns_more(folder):
     assert main(["validate", str(folder), "--deep"]) == 0
     returns = []
     for gain in (0.0, 1.0):
@@ -44,6 +44,6 @@ def test_the_example_validates_and_a_push_towards_the_middle_earns_more_than_non
     assert returns[1] > returns[0] + 10.0
 
 
-def test_the_example_is_imported(folder, tmp_path):
+def test_example_is_imported(folder, tmp_path):
     assert main(["import", "oige", str(folder / "Pushed.yaml"), "-o", str(tmp_path / "mine")]) == 0
     assert main(["validate", str(tmp_path / "mine"), "--deep"]) == 0

@@ -1,4 +1,4 @@
-"""What views read and write of the simulation, and every attribute that `domain_randomization:` may draw."""
+"""Data that views read from and write to the simulation, and every attribute of `domain_randomization:`."""
 
 from types import SimpleNamespace
 
@@ -37,7 +37,7 @@ def forward(env):
     env.sim.refresh()
 
 
-def test_a_mass_that_is_written_is_read_in_its_row_and_inertia_follows(env):
+def test_written_mass_is_read_back_and_inertia_scales(env):
     boxes = env.task._boxes
     before = boxes.get_inertias()
     boxes.set_masses(torch.tensor([6.0, 1.5]), indices=torch.tensor([2, 0]))
@@ -55,7 +55,7 @@ def test_a_mass_that_is_written_is_read_in_its_row_and_inertia_follows(env):
     assert torch.equal(arms.get_body_masses([1], [2]), torch.tensor([[9.0]]))
 
 
-def test_without_gravity_a_box_stays_and_with_it_again_it_falls(tmp_path):
+def test_disabled_gravity_stops_fall_and_enabled_restarts_it(tmp_path):
     lifting = STILL.replace(
         "    def post_reset(self):\n", "    def post_reset(self):\n        self.lift = self._boxes.disable_gravities\n"
     )
@@ -73,12 +73,12 @@ def test_without_gravity_a_box_stays_and_with_it_again_it_falls(tmp_path):
     assert boxes.get_linear_velocities()[1, 2] < -0.1
 
 
-def test_gravity_that_the_task_never_spoke_of_lifting_is_not_silently_kept(env):
-    with pytest.raises(TaskError, match="view 'box_view': gravity cannot be lifted"):
+def test_disable_gravities_outside_task_file_is_refused(env):
+    with pytest.raises(TaskError, match="view 'box_view': gravity cannot be turned off"):
         env.task._boxes.disable_gravities()
 
 
-def test_linear_and_angular_velocities_are_set_apart(env):
+def test_linear_and_angular_velocities_are_set_separately(env):
     boxes = env.task._boxes
     turned = torch.tensor([[0.6, 0.8, 0.0, 0.0]]).repeat(4, 1)
     boxes.set_world_poses(None, turned)
@@ -92,7 +92,7 @@ def test_linear_and_angular_velocities_are_set_apart(env):
     assert torch.allclose(boxes.get_angular_velocities([0]), torch.full((1, 3), -2.0), atol=1e-6)
 
 
-def test_a_links_velocity_is_how_its_place_changes(env):
+def test_link_velocity_equals_change_of_position(env):
     arms, links = env.task._arms, env.task._links
     arms.set_joint_velocities(torch.tensor([[0.0, 2.0, 0.0]]).repeat(4, 1))
     forward(env)
@@ -102,7 +102,7 @@ def test_a_links_velocity_is_how_its_place_changes(env):
     assert torch.allclose(speed[:, 0], torch.zeros(6), atol=1e-5)
 
 
-def test_gains_are_those_of_the_drives_and_the_other_joints_have_none(env):
+def test_gains_belong_to_drives_and_other_joints_have_none(env):
     arms = env.task._arms
     column = arms.get_dof_index("right_a")
     stiffness, damping = arms.get_gains()
@@ -124,7 +124,7 @@ MOTOR = ARM.replace(
 )
 
 
-def test_efforts_are_kept_within_what_was_set(tmp_path):
+def test_efforts_are_limited_by_max_efforts(tmp_path):
     folder = arm_folder(tmp_path / "arm", task=STILL)
     (folder / "arm.xml").write_text(MOTOR)
     env = build(folder)
@@ -136,18 +136,18 @@ def test_efforts_are_kept_within_what_was_set(tmp_path):
     driven = arms.get_dof_index("right_a")
     arms.set_max_efforts(torch.tensor([[0.5]]), indices=[0], joint_indices=[driven])
     motor = arms._drives["motor"][1][arms._drives["motor"][0] == column]
-    for asked in (5.0, -5.0):
-        arms.set_joint_efforts(torch.full((4, 2), asked), joint_indices=[column, driven])
-        control = env.engine.field("ctrl")[:, motor].flatten() / asked
+    for target in (5.0, -5.0):
+        arms.set_joint_efforts(torch.full((4, 2), target), joint_indices=[column, driven])
+        control = env.engine.field("ctrl")[:, motor].flatten() / target
         assert (5 * control).tolist() == pytest.approx([1.5, 1.5, 0.5, 1.5]), "half of the effort: the gear is 2"
-        beside = env.engine.field("qfrc_applied")[:, arms._dof_columns[driven]] / asked
+        beside = env.engine.field("qfrc_applied")[:, arms._dof_columns[driven]] / target
         assert (5 * beside).tolist() == pytest.approx([0.5, 5.0, 5.0, 5.0])
 
 
-def test_one_action_may_say_several_things(env):
+def test_apply_action_sets_targets_and_efforts(env):
     arms = env.task._arms
-    said = {"joint_positions": torch.full((4, 1), 0.2), "joint_efforts": torch.full((4, 1), 0.7)}
-    arms.apply_action(SimpleNamespace(**said, joint_velocities=None, joint_indices=[arms.get_dof_index("right_a")]))
+    message = {"joint_positions": torch.full((4, 1), 0.2), "joint_efforts": torch.full((4, 1), 0.7)}
+    arms.apply_action(SimpleNamespace(**message, joint_velocities=None, joint_indices=[arms.get_dof_index("right_a")]))
     assert torch.allclose(arms.get_joint_position_targets(joint_indices=[1]), torch.tensor(0.2))
     assert torch.allclose(arms.get_applied_joint_efforts(joint_indices=[1]), torch.tensor(0.7))
     assert torch.allclose(env.engine.field("ctrl")[:, arms._drives["position"][1]].float(), torch.full((4, 1), 0.2))
@@ -159,19 +159,19 @@ EARLY = """        super().set_up_scene(scene)
 """
 
 
-def test_a_view_before_the_simulation_runs_says_what_is_missing(tmp_path):
+def test_view_before_simulation_gives_hint(tmp_path):
     task = STILL.replace("        super().set_up_scene(scene)\n", EARLY)
     with pytest.raises(TaskError, match="view 'early' is not connected to a simulation"):
         build(arm_folder(tmp_path / "arm", task=task))
 
 
-def test_two_views_of_one_name_and_an_object_that_is_not_there_are_refused(env):
+def test_duplicate_view_name_and_missing_object_are_refused(env):
     from rlcli_oige import RigidPrimView
 
     registry = env.handle.world.scene
     assert registry.object_exists("box_view")
     assert registry.get_object("box_view") is env.task._boxes
-    with pytest.raises(TaskError, match="two views are called 'box_view'"):
+    with pytest.raises(TaskError, match="two views have the name 'box_view'"):
         registry.add(RigidPrimView("/World/envs/.*/ball", name="box_view"))
     with pytest.raises(TaskError, match="the scene has no 'box_veiw'"):
         registry.get_object("box_veiw")
@@ -179,7 +179,7 @@ def test_two_views_of_one_name_and_an_object_that_is_not_there_are_refused(env):
     assert not registry.object_exists("box_view")
 
 
-# --- randomisation, attribute by attribute ---
+# --- randomization of each attribute ---
 
 READ = {
     "stiffness": lambda env: env.task._arms.get_gains()[0][:, 1],
@@ -200,14 +200,14 @@ def gate(operation, low, high, **more):
     return {"operation": operation, "distribution": "uniform", "distribution_parameters": [low, high], **more}
 
 
-def randomised(place, params, **more):
+def randomized(place, params, **more):
     block = {"domain_randomization": {"randomize": True, **more, "randomization_params": params}}
     return build(arm_folder(place / "arm", yaml=YAML + yaml_module.safe_dump(block), task=STILL))
 
 
 @pytest.mark.parametrize("attribute", READ)
-def test_an_attribute_of_a_robot_is_drawn_for_each_environment_within_its_bounds(tmp_path, attribute):
-    env = randomised(
+def test_robot_attribute_is_sampled_per_env_within_bounds(tmp_path, attribute):
+    env = randomized(
         tmp_path, {"articulation_views": {"arm_view": {attribute: {"on_reset": gate("direct", 0.25, 0.75)}}}}
     )
     values = READ[attribute](env)
@@ -216,9 +216,9 @@ def test_an_attribute_of_a_robot_is_drawn_for_each_environment_within_its_bounds
     assert len({tuple(row.tolist()) for row in rows}) == 4, "no two environments alike"
 
 
-def test_the_friction_of_a_robots_geoms_is_the_second_of_the_three(tmp_path):
+def test_geom_friction_is_second_material_property(tmp_path):
     entry = gate("direct", 0, 0) | {"distribution_parameters": [[0.0, 0.3, 0.0], [0.0, 0.6, 0.0]]}
-    env = randomised(tmp_path, {"articulation_views": {"arm_view": {"material_properties": {"on_reset": entry}}}})
+    env = randomized(tmp_path, {"articulation_views": {"arm_view": {"material_properties": {"on_reset": entry}}}})
     model = env.engine.model
     geoms = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in env.task._arms._body_ids]
     friction = env.engine.expand("geom_friction")[:, geoms, 0]
@@ -238,8 +238,8 @@ def test_the_friction_of_a_robots_geoms_is_the_second_of_the_three(tmp_path):
         ("velocity", 6, lambda box: box.get_velocities()),
     ],
 )
-def test_the_state_of_a_body_is_drawn_at_each_reset(tmp_path, attribute, columns, read):
-    env = randomised(
+def test_body_state_is_sampled_at_each_reset(tmp_path, attribute, columns, read):
+    env = randomized(
         tmp_path, {"rigid_prim_views": {"box_view": {attribute: {"on_reset": gate("direct", 0.25, 0.75)}}}}
     )
     values = read(env.task._boxes)
@@ -251,8 +251,8 @@ def test_the_state_of_a_body_is_drawn_at_each_reset(tmp_path, attribute, columns
 @pytest.mark.parametrize(
     ("operation", "yaw", "expected"), [("additive", 0.5, 0.8), ("direct", 0.5, 0.5), ("scaling", 0.5, 0.15)]
 )
-def test_an_orientation_is_changed_by_angles(tmp_path, operation, yaw, expected):
-    """The boxes begin turned by 0.3 about z; roll and pitch are 0."""
+def test_orientation_is_changed_by_euler_angles(tmp_path, operation, yaw, expected):
+    """Check the yaw of boxes that start with yaw 0.3 and no roll or pitch."""
     entry = gate(operation, 0, 0, frequency_interval=1) | {
         "distribution_parameters": [[0.0, 0.0, yaw], [0.0, 0.0, yaw]]
     }
@@ -267,9 +267,9 @@ def test_an_orientation_is_changed_by_angles(tmp_path, operation, yaw, expected)
     assert torch.allclose(torch.cat(angles[:2]) % (2 * torch.pi), torch.tensor(0.0), atol=1e-4)
 
 
-def test_a_drawn_force_pushes_a_body(tmp_path):
+def test_sampled_force_moves_body(tmp_path):
     entry = gate("direct", 0, 0, frequency_interval=1) | {"distribution_parameters": [[9.0, 0.0, 0.0], [9.0, 0.0, 0.0]]}
-    env = randomised(tmp_path, {"rigid_prim_views": {"box_view": {"force": {"on_interval": entry}}}})
+    env = randomized(tmp_path, {"rigid_prim_views": {"box_view": {"force": {"on_interval": entry}}}})
     before = env.task._boxes.get_velocities()[:, 0].clone()
     for _ in range(2):
         env.step(IDLE)
@@ -280,8 +280,8 @@ def test_a_drawn_force_pushes_a_body(tmp_path):
 @pytest.mark.parametrize(
     ("attribute", "read"), [("mass", "get_masses"), ("density", "get_masses"), ("inertia", "get_inertias")]
 )
-def test_what_a_body_weighs_is_drawn_and_a_saved_state_keeps_it(tmp_path, attribute, read):
-    env = randomised(tmp_path, {"rigid_prim_views": {"box_view": {attribute: {"on_reset": gate("scaling", 0.5, 2.0)}}}})
+def test_sampled_mass_is_part_of_saved_state(tmp_path, attribute, read):
+    env = randomized(tmp_path, {"rigid_prim_views": {"box_view": {attribute: {"on_reset": gate("scaling", 0.5, 2.0)}}}})
     values = getattr(env.task._boxes, read)()
     assert values.unique(dim=0).shape[0] == 4
     state = env.state_dict()
@@ -299,7 +299,7 @@ def quats(count=50):
     return torch.nn.functional.normalize(torch.randn(count, 4, generator=torch.Generator().manual_seed(1)), dim=1)
 
 
-def test_rotation_vectors_angles_and_axes_are_the_same_rotations():
+def test_rotation_vector_and_angle_axis_round_trip():
     q = quats()
     same = [
         rotations.exp_map_to_quat(rotations.quat_to_exp_map(q)),
@@ -321,7 +321,7 @@ def test_rotation_vectors_angles_and_axes_are_the_same_rotations():
     assert torch.allclose(rotations.quat_from_euler_xyz(*radians.T), rotations.euler_angles_to_quats(radians))
 
 
-def test_points_move_and_directions_turn():
+def test_transform_of_points_and_directions():
     q, t, v = quats(), torch.ones(50, 3), torch.randn(50, 3, generator=torch.Generator().manual_seed(2))
     moved = rotations.tf_apply(q, t, v)
     assert torch.allclose(rotations.tf_apply(*rotations.tf_inverse(q, t), moved), v, atol=1e-5)
@@ -331,7 +331,7 @@ def test_points_move_and_directions_turn():
     assert rotations.get_axis_params(1.0, 1, x_value=0.5) == [0.5, 1.0, 0.0]
 
 
-def test_the_two_ways_of_scaling_are_each_others_opposite():
+def test_scale_and_unscale_are_inverse():
     lower, upper = torch.tensor([-1.0, 0.0]), torch.tensor([3.0, 10.0])
     ends = torch.stack([lower, upper])
     assert torch.equal(maths.scale_transform(ends, lower, upper), torch.tensor([[-1.0, -1.0], [1.0, 1.0]]))
@@ -346,7 +346,7 @@ def test_the_two_ways_of_scaling_are_each_others_opposite():
     assert torch.allclose(turned, torch.tensor([7.0 - 2 * torch.pi, 2 * torch.pi - 7.0, 0.5]), atol=1e-5)
 
 
-def test_a_seed_is_that_of_all_three_generators():
+def test_set_seed_seeds_all_three_generators():
     import random
 
     import numpy as np

@@ -1,4 +1,4 @@
-"""OmniIsaacGymEnvs' own YAML, read as it is."""
+"""Translation of OmniIsaacGymEnvs' YAML."""
 
 import pytest
 import yaml
@@ -13,7 +13,7 @@ def resolved(folder, *overrides):
     return resolve(find_task(str(folder)), overrides=overrides)
 
 
-def test_what_the_framework_does_goes_to_its_own_keys(tmp_path):
+def test_framework_settings_become_task_config_keys(tmp_path):
     task = resolved(arm_folder(tmp_path / "arm")).task
     assert (task.sim.dt, task.decimation, task.scene.num_envs, task.scene.env_spacing) == (0.01, 2, 4, 3.0)
     assert (task.max_episode_length, task.clip_actions, task.clip_observations) == (12, 1.0, 5.0)
@@ -22,7 +22,7 @@ def test_what_the_framework_does_goes_to_its_own_keys(tmp_path):
     assert task.foreign["oige"]["mjcf"] == {"Arm": {"model": "arm.xml"}}
 
 
-def test_the_agents_yaml_beside_it_becomes_an_agent_of_the_ppo_trainer(tmp_path):
+def test_agent_yaml_beside_task_becomes_ppo_agent(tmp_path):
     agent = resolved(arm_folder(tmp_path / "arm")).agent
     assert (agent.trainer, agent.dialect, agent.max_iterations) == ("ppo", "rl_games", 7)
     assert (agent.gamma, agent.lam, agent.num_steps, agent.minibatch_size, agent.num_epochs) == (0.98, 0.9, 8, 16, 3)
@@ -41,7 +41,7 @@ def leaves(data, at=()):
             yield ".".join((*at, key))
 
 
-def test_every_key_of_both_files_is_accounted_for_once_with_its_line(tmp_path):
+def test_every_key_has_one_note_with_line(tmp_path):
     notes = resolved(arm_folder(tmp_path / "arm")).notes
     keys = [note.key for note in notes]
     assert len(keys) == len(set(keys))
@@ -73,7 +73,7 @@ def test_every_key_of_both_files_is_accounted_for_once_with_its_line(tmp_path):
         ("controlFrequencyInv: 2", "controlFrequencyInv: 0.5", "expected a whole number >= 1, found 0.5", None),
     ],
 )
-def test_a_wrong_key_is_refused_with_its_line(tmp_path, old, new, message, hint):
+def test_wrong_task_key_error_has_line(tmp_path, old, new, message, hint):
     folder = arm_folder(tmp_path / "arm", yaml=YAML.replace(old, new))
     with pytest.raises(ConfigError) as caught:
         resolved(folder)
@@ -82,27 +82,27 @@ def test_a_wrong_key_is_refused_with_its_line(tmp_path, old, new, message, hint)
     assert hint is None or hint in (problem.hint or "")
 
 
-def test_a_wrong_key_of_the_agent_is_refused_with_its_line(tmp_path):
+def test_wrong_agent_key_error_has_line(tmp_path):
     folder = arm_folder(tmp_path / "arm", train=TRAIN.replace("e_clip", "eclip"))
     with pytest.raises(ConfigError, match=r"ArmPPO\.yaml:\d+:5: params\.config\.eclip: unknown key 'eclip'"):
         resolved(folder)
 
 
-def test_a_key_that_has_another_place_here_is_not_taken_twice(tmp_path):
+def test_moved_key_is_refused_in_oige_block(tmp_path):
     with pytest.raises(ConfigError, match=r"oige\.env\.numEnvs.*set scene\.num_envs"):
         resolved(arm_folder(tmp_path / "arm"), "oige.env.numEnvs=3")
 
 
-def test_the_class_is_found_by_the_tasks_name(tmp_path):
+def test_class_is_found_by_task_name(tmp_path):
     folder = arm_folder(tmp_path / "arm")
     assert find_task(str(folder)).task.endswith("arm.py:ArmTask")
     assert find_task(str(folder / "Arm.yaml")).task.endswith("arm.py:ArmTask")
     (folder / "arm.py").write_text("class Other:\n    pass\n")
-    with pytest.raises(TaskError, match="no task class in any Python file there; 'ArmTask' was looked for"):
+    with pytest.raises(TaskError, match="no task class in any Python file of the folder; expected 'ArmTask'"):
         find_task(str(folder))
 
 
-def test_a_length_of_episodes_that_only_the_class_knows_is_read_from_its_source(tmp_path):
+def test_episode_length_is_read_from_class_source(tmp_path):
     folder = arm_folder(tmp_path / "arm", yaml=YAML.replace("  maxEpisodeLength: 12\n", ""))
     source = (folder / "arm.py").read_text()
     (folder / "arm.py").write_text(source.replace('self._task_cfg["env"]["maxEpisodeLength"]', "30"))

@@ -1,4 +1,4 @@
-"""An rl_games YAML that cannot be learned from as it is: said with the key, never a traceback."""
+"""Mistakes in an rl_games YAML: the error names the key, without a traceback."""
 
 import pytest
 from reacher import TRAIN, arm_folder
@@ -27,7 +27,7 @@ SPACE = TRAIN[TRAIN.index("    space: {") : TRAIN.index("    mlp: {")]
     [
         ("params:\n", "parms:\n", "parms", "unknown key 'parms'", "keys: params"),
         ("  config:\n", "  conf:\n", "params", "an rl_games YAML has params:", None),
-        ("name: a2c_continuous", "name: sac", "params.algo", "'sac' has no counterpart here", "'a2c_continuous' has"),
+        ("name: a2c_continuous", "name: sac", "params.algo", "'sac' has no counterpart", "expected 'a2c_continuous'"),
         ("{name: a2c_continuous}", "a2c_discrete", "params.algo", "'a2c_discrete' has no counterpart", None),
         ("name: continuous_a2c_logstd", "name: [x]", "params.model", "has no counterpart", "'continuous_a2c_logstd'"),
         ("  load_path:", "  load_pth:", "params.load_pth", "unknown key 'load_pth'", "did you mean 'load_path'"),
@@ -40,8 +40,14 @@ SPACE = TRAIN[TRAIN.index("    space: {") : TRAIN.index("    mlp: {")]
         ),
         ("    separate: False", "    cnn: {}", "params.network.cnn", "unknown key 'cnn'", "keys: name, separate"),
         (UNITS, "mlp: [32, 16]", "params.network.mlp", "expected a mapping", None),
-        ("activation: elu", "activation: gelu", "params.network.mlp.activation", "'gelu' is not known", "known: elu"),
-        ("activation: elu", "activation: [elu]", "params.network.mlp.activation", "is not known", "known: elu"),
+        (
+            "activation: elu",
+            "activation: gelu",
+            "params.network.mlp.activation",
+            "unknown activation 'gelu'",
+            "known: elu",
+        ),
+        ("activation: elu", "activation: [elu]", "params.network.mlp.activation", "unknown activation", "known: elu"),
         ("activation: elu", "activation: elu, d2rl: True", "params.network.mlp.d2rl", "d2rl networks are not", None),
         (
             "activation: elu",
@@ -50,8 +56,8 @@ SPACE = TRAIN[TRAIN.index("    space: {") : TRAIN.index("    mlp: {")]
             "unknown key",
             None,
         ),
-        (SPACE, "    space: {discrete: {}}\n", "params.network.space", "only a continuous space", None),
-        (SPACE, "    space: 3\n", "params.network.space", "only a continuous space", None),
+        (SPACE, "    space: {discrete: {}}\n", "params.network.space", "only continuous action spaces", None),
+        (SPACE, "    space: 3\n", "params.network.space", "only continuous action spaces", None),
         (SIGMA, "sigma_init: {val: wide}", "params.network.space.continuous.sigma_init", "expected a number", None),
         (SIGMA, "sigma_init: {val: 1e6}", "params.network.space.continuous.sigma_init", "expected a number", None),
         ("    separate: False", "    rnn: {name: gru}", "params.network.rnn", "only {name: lstm, units, layers}", None),
@@ -60,27 +66,33 @@ SPACE = TRAIN[TRAIN.index("    space: {") : TRAIN.index("    mlp: {")]
             "{scale_value: 0.1}",
             "{scale_value: 0.1, shift_value: 1, min_val: 0}",
             "params.config.reward_shaper",
-            "only scale_value is known, found min_val, shift_value",
+            "only scale_value is supported, found min_val, shift_value",
             None,
         ),
         (
             "lr_schedule: adaptive",
             "lr_schedule: cosine",
             "params.config.lr_schedule",
-            "no schedule 'cosine'",
+            "unknown schedule 'cosine'",
             "known: ",
         ),
-        ("lr_schedule: adaptive", "lr_schedule: {a: 1}", "params.config.lr_schedule", "no schedule", "known: adaptive"),
+        (
+            "lr_schedule: adaptive",
+            "lr_schedule: {a: 1}",
+            "params.config.lr_schedule",
+            "unknown schedule",
+            "known: adaptive",
+        ),
         (
             "schedule_type: standard",
             "schedule_type: x",
             "params.config.schedule_type",
-            "no such schedule_type",
+            "unknown schedule_type",
             "legacy",
         ),
     ],
 )
-def test_what_an_agent_cannot_be_is_refused_at_its_key(tmp_path, old, new, key, message, hint):
+def test_invalid_agent_value_error_has_key(tmp_path, old, new, key, message, hint):
     with pytest.raises(ConfigError) as caught:
         resolved(tmp_path, edited(old, new))
     found = next(p for p in caught.value.problems if message in p.message)
@@ -108,12 +120,12 @@ def test_what_an_agent_cannot_be_is_refused_at_its_key(tmp_path, old, new, key, 
         ("reward_shaper: {scale_value: 0.1}", "reward_shaper: {}", {"reward_scale": 1.0}),
     ],
 )
-def test_what_an_agent_says_is_what_it_learns_with(tmp_path, old, new, expected):
+def test_agent_settings_reach_trainer(tmp_path, old, new, expected):
     agent = resolved(tmp_path, edited(old, new)).agent
     assert {key: getattr(agent, key) for key in expected} == expected
 
 
-def test_a_recurrent_network_has_the_size_that_is_written(tmp_path):
+def test_recurrent_network_has_configured_size(tmp_path):
     agent = resolved(tmp_path, edited("separate: False", "rnn: {name: lstm, units: 24, layers: 2}")).agent
     assert (agent.rnn.hidden, agent.rnn.layers) == (24, 2)
 
@@ -141,6 +153,6 @@ def test_a_recurrent_network_has_the_size_that_is_written(tmp_path):
         ),
     ],
 )
-def test_what_is_only_near_is_noted_as_such(tmp_path, old, new, key, status):
+def test_approximated_key_is_noted(tmp_path, old, new, key, status):
     notes = {note.key: note.status for note in resolved(tmp_path, edited(old, new)).notes}
     assert notes[key] == status

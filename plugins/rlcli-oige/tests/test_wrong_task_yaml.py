@@ -1,4 +1,4 @@
-"""A task's YAML, its randomisation and its folder, wrong in the ways that people write them."""
+"""Common mistakes in a task's YAML, its randomization and its folder."""
 
 import pytest
 import yaml as yaml_module
@@ -7,7 +7,8 @@ from reacher import TASK, YAML, arm_folder
 from rlcli.config.load import resolve
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
-from rlcli_oige.task_yaml import find_class, relative
+from rlcli_oige.task_class import find_class
+from rlcli_oige.task_yaml import relative
 
 
 def problem_of(place, yaml, message):
@@ -19,11 +20,11 @@ def problem_of(place, yaml, message):
 @pytest.mark.parametrize(
     ("old", "new", "key", "message", "hint"),
     [
-        ("name: Arm\n", "name: Arm\ndefaults: [_self_]\n", "defaults", "defaults list is not followed", "one file"),
+        ("name: Arm\n", "name: Arm\ndefaults: [_self_]\n", "defaults", "defaults lists are not supported", "one file"),
         ("  physx:\n", "  physx: 3\n  other:\n", "sim.physx", "expected a mapping, found 3", None),
         ("  dt: 0.01", "  dt: 0.01\n  substep: 2", "sim.substep", "unknown key 'substep'", "did you mean 'substeps'"),
         ("mjcf:\n", "viewport: {camera_psition: [1, 1, 1]}\nmjcf:\n", "viewport.camera_psition", "unknown key", None),
-        ("mjcf:\n  /World/envs/.*/Arm: arm.xml", "mjcf: arm.xml", "mjcf", "expected a mapping of robots", None),
+        ("mjcf:\n  /World/envs/.*/Arm: arm.xml", "mjcf: arm.xml", "mjcf", "expected a mapping from robots", None),
         (
             "  /World/envs/.*/Arm: arm.xml",
             "  Arm: {model: arm.xml, joint: {a: b}}",
@@ -48,7 +49,7 @@ def problem_of(place, yaml, message):
         ("mjcf:\n", "domain_randomization: [1]\nmjcf:\n", "domain_randomization", "expected a mapping", None),
     ],
 )
-def test_a_wrong_part_of_a_task_is_refused_at_its_key(tmp_path, old, new, key, message, hint):
+def test_invalid_task_value_error_has_key(tmp_path, old, new, key, message, hint):
     assert YAML.count(old) == 1
     found = problem_of(tmp_path, YAML.replace(old, new), message)
     assert found.path == key
@@ -87,20 +88,20 @@ NOISE = f"{BLOCK}.randomization_params.observations.on_reset"
         (
             {"randomization_params": {"simulation": {"wind": {"on_reset": GATE}}}},
             f"{BLOCK}.randomization_params.simulation.wind",
-            "'wind' cannot be randomised",
-            "of simulation: gravity",
+            "'wind' cannot be randomized",
+            "expected gravity",
         ),
         (
             views("body_mass", on_reset=GATE),
             f"{BLOCK}.randomization_params.articulation_views.arm_view.body_mass",
-            "'body_mass' cannot be randomised",
+            "'body_mass' cannot be randomized",
             "did you mean 'body_masses'",
         ),
         (noise("on_rest"), f"{BLOCK}.randomization_params.observations.on_rest", "unknown key 'on_rest'", "on_reset"),
         (
             noise("on_startup"),
             f"{BLOCK}.randomization_params.observations.on_startup",
-            "observations cannot be randomised on_startup",
+            "observations cannot be randomized on_startup",
             "on_reset or on_interval",
         ),
         ({"randomization_params": {"observations": {"on_reset": 3}}}, NOISE, "expected a mapping", None),
@@ -108,16 +109,16 @@ NOISE = f"{BLOCK}.randomization_params.observations.on_reset"
         (
             {"randomization_params": {"observations": {"on_reset": without("distribution")}}},
             NOISE,
-            "needs distribution",
+            "missing distribution",
             None,
         ),
         (
             noise("on_interval"),
             f"{BLOCK}.randomization_params.observations.on_interval",
-            "needs frequency_interval",
+            "missing frequency_interval",
             None,
         ),
-        (noise(operation="add"), f"{NOISE}.operation", "no operation 'add'", "additive"),
+        (noise(operation="add"), f"{NOISE}.operation", "unknown operation 'add'", "additive"),
         (noise(distribution="normall"), f"{NOISE}.distribution", "no distribution 'normall'", "did you mean 'normal'"),
         (noise(schedule="cubic"), f"{NOISE}.schedule", "no schedule 'cubic'", "constant"),
         (noise(operation="direct"), f"{NOISE}.operation", "noise is additive or scaling", None),
@@ -147,13 +148,13 @@ NOISE = f"{BLOCK}.randomization_params.observations.on_reset"
         (noise(schedule="linear", schedule_steps=[1]), f"{NOISE}.schedule_steps", "expected a whole number", None),
     ],
 )
-def test_a_wrong_randomisation_is_refused_at_its_key(tmp_path, block, key, message, hint):
+def test_invalid_randomization_error_has_key(tmp_path, block, key, message, hint):
     found = problem_of(tmp_path, YAML + yaml_module.safe_dump({BLOCK: block}), message)
     assert found.path == key
     assert hint is None or hint in (found.hint or "")
 
 
-def test_a_randomisation_that_nothing_here_corresponds_to_is_noted_as_ignored(tmp_path):
+def test_randomization_without_counterpart_is_noted_as_ignored(tmp_path):
     block = views("scale", on_startup=GATE)
     folder = arm_folder(tmp_path / "arm", yaml=YAML + yaml_module.safe_dump({BLOCK: block}))
     notes = {note.key: note.status for note in resolve(find_task(str(folder))).notes}
@@ -169,13 +170,13 @@ def test_a_randomisation_that_nothing_here_corresponds_to_is_noted_as_ignored(tm
         ("", 1000),
     ],
 )
-def test_an_episode_is_as_long_as_any_of_the_spellings_says(tmp_path, env, steps):
+def test_every_spelling_of_episode_length_is_read(tmp_path, env, steps):
     yaml = YAML.replace("  maxEpisodeLength: 12\n", env)
     task = resolve(find_task(str(arm_folder(tmp_path / "arm", yaml=yaml)))).task
     assert task.max_episode_length == steps
 
 
-def test_without_a_timestep_it_is_a_sixtieth_of_a_second_and_the_ground_and_the_light_are_there(tmp_path):
+def test_defaults_of_timestep_ground_and_light(tmp_path):
     yaml = YAML.replace("  dt: 0.01\n", "").replace("  add_ground_plane: False\n", "")
     task = resolve(find_task(str(arm_folder(tmp_path / "arm", yaml=yaml)))).task
     assert task.sim.dt == pytest.approx(1 / 60)
@@ -196,7 +197,7 @@ def test_without_a_timestep_it_is_a_sixtieth_of_a_second_and_the_ground_and_the_
         ({"arm.py": "class ArmTask(RLTask): pass", "warp/arm.py": "class ArmTask(RLTask): pass"}, "ArmTask"),
     ],
 )
-def test_the_class_is_the_one_that_can_be_meant(tmp_path, files, expected):
+def test_find_class_chooses_matching_class(tmp_path, files, expected):
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text + "\n")
@@ -205,13 +206,13 @@ def test_the_class_is_the_one_that_can_be_meant(tmp_path, files, expected):
     assert file.parent == tmp_path
 
 
-def test_classes_that_cannot_be_told_apart_are_named(tmp_path):
+def test_ambiguous_classes_are_listed(tmp_path):
     (tmp_path / "a.py").write_text("class ReachTask(RLTask): pass\nclass PushTask(RLTask): pass\n")
     with pytest.raises(LookupError, match=r"several task classes, and none is 'ArmTask': .*ReachTask"):
         find_class(tmp_path, "Arm")
 
 
-def test_a_length_that_the_class_computes_is_not_guessed(tmp_path):
+def test_computed_episode_length_is_not_read_from_source(tmp_path):
     yaml = YAML.replace("  maxEpisodeLength: 12\n", "")
     computed = TASK.replace('self._task_cfg["env"]["maxEpisodeLength"]', "10 * 3")
     task = resolve(find_task(str(arm_folder(tmp_path / "arm", yaml=yaml, task=computed)))).task
@@ -227,5 +228,5 @@ def test_a_length_that_the_class_computes_is_not_guessed(tmp_path):
         ("/World/Ant", "World/Ant"),
     ],
 )
-def test_a_prim_path_is_told_below_its_environment(path, below):
+def test_prim_path_is_made_relative_to_env(path, below):
     assert relative(path) == below

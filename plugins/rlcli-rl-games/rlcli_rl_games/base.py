@@ -1,4 +1,4 @@
-"""What the trainers of rl_games' PPO and SAC have in common."""
+"""Base of the trainers that run rl_games' PPO and SAC."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from rlcli_rl_games.vec_env import RlGamesVecEnv
 ACTIVATIONS = {"swish": "silu"}
 """rl_games' names of activations that differ from those of a saved policy."""
 OBSERVATION_CLIP = 5.0
-"""rl_games clips normalised observations to +-this."""
+"""rl_games clips normalized observations to +-this."""
 _EPSILON = 1e-5
 """rl_games adds this to the variance of observations."""
 _LEARNER_HINT = "lower the learning rate or grad_norm in params.config; the last good checkpoint is kept"
 
 
 class RlGamesTrainer(BaseTrainer):
-    """What PPO and SAC have in common.
+    """Base of the trainers for PPO and SAC.
 
     Args:
         env: the environment.
@@ -92,11 +92,11 @@ class RlGamesTrainer(BaseTrainer):
 
     @abstractmethod
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
-        """Return the optimisers, by name."""
+        """Return the optimizers, by name."""
 
     @abstractmethod
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normaliser; the critics keep their own."""
+        """Load a policy's weights, with its normalizer; the critics keep their own."""
 
     def start(self) -> None:
         """Reset the environment to its first episodes."""
@@ -195,7 +195,7 @@ class RlGamesTrainer(BaseTrainer):
     def _error(self, key: str, message: str, hint: str) -> ConfigError:
         return agent_error(self.env, ("params", "config", key), message, hint)
 
-    # --- the observation normaliser, which a saved policy has in another form ---
+    # --- the observation normalizer, which a saved policy has in another form ---
 
     def _normalizer_tensors(self) -> dict[str, Tensor]:
         if not self.spec.normalize:

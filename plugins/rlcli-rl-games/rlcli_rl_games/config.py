@@ -1,4 +1,4 @@
-"""rl_games' settings as they stand in a train YAML, under `params`.
+"""rl_games' settings in the form of a train YAML, under `params`.
 
 Light: a YAML is checked without importing torch or rl_games.
 """
@@ -15,9 +15,9 @@ from rlcli.trainers import TrainerSpec
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Activation = Literal["elu", "relu", "tanh", "swish"]
-"""Those that a saved policy can have too; swish is SiLU."""
+"""Activations that a saved policy supports too; swish is SiLU."""
 Initializer = dict[str, str | int | float]
-"""`{name: default}`, or another of rl_games' with its parameters."""
+"""`{name: default}`, or another initializer of rl_games with its parameters."""
 Nothing = Literal["None"] | None
 _DEFAULT: Initializer = {"name": "default"}
 _ZERO: Initializer = {"name": "const_initializer", "val": 0}
@@ -26,25 +26,25 @@ IGNORED: Mapping[str, str] = {
     "name": "a run is named by its task",
     "full_experiment_name": "--name",
     "env_name": "there is one environment loop",
-    "device": "--device decides",
-    "device_name": "--device decides",
+    "device": "use --device",
+    "device_name": "use --device",
     "multi_gpu": "one process trains",
-    "ppo": "algorithm decides",
-    "num_actors": "scene.num_envs decides",
+    "ppo": "use algorithm",
+    "num_actors": "use scene.num_envs",
     "score_to_win": "training runs to its budget",
-    "save_best_after": "save_interval decides",
+    "save_best_after": "use save_interval",
     "print_stats": "",
     "player": "rlcli play",
     "games_to_track": "",
-    "max_frames": "--max-steps decides",
+    "max_frames": "use --max-steps",
     "seq_length": "of networks with a memory",
     "num_seed_steps": "rl_games itself does not read it",
 }
-"""Key of `params.config` that is accepted and not read -> why."""
+"""Key of `params.config` that has no effect -> reason."""
 
 
 class _Settings(StrictModel):
-    """Keys that are not read are dropped before anything is checked."""
+    """Settings whose ignored keys are dropped before validation."""
 
     @model_validator(mode="before")
     @classmethod
@@ -53,7 +53,7 @@ class _Settings(StrictModel):
 
 
 class Named(StrictModel):
-    """What rl_games looks up by a name."""
+    """Something that rl_games finds by its name."""
 
     name: str
     """The name."""
@@ -69,31 +69,31 @@ class MlpConfig(StrictModel):
     initializer: Initializer = _DEFAULT
     """Initial weights."""
     regularizer: dict[str, Any] | None = None
-    """Accepted and not read, as in rl_games."""
+    """Ignored, as in rl_games."""
     d2rl: Literal[False] = False
-    """The input goes to the first layer only."""
+    """Only the first layer receives the input."""
 
 
 class ContinuousConfig(StrictModel):
     """The distribution of continuous actions."""
 
     mu_activation: Nothing = None
-    """The mean is what the network gives."""
+    """No activation for the mean."""
     sigma_activation: Nothing = None
-    """So is the logarithm of the deviation."""
+    """No activation for the logarithm of the standard deviation."""
     mu_init: Initializer = _DEFAULT
-    """Initial weights of the mean's layer."""
+    """Initial weights of the layer that gives the mean."""
     sigma_init: Initializer = _ZERO
-    """Initial logarithm of the deviation."""
+    """Initial logarithm of the standard deviation."""
     fixed_sigma: Literal[True] = True
-    """The deviation is learned and the same in every state."""
+    """The standard deviation is trained and does not depend on the state."""
 
 
 class SpaceConfig(StrictModel):
-    """The space of actions."""
+    """The action space."""
 
     continuous: ContinuousConfig | None = ContinuousConfig()
-    """Continuous."""
+    """Continuous actions."""
 
 
 class NetworkConfig(StrictModel):
@@ -102,9 +102,9 @@ class NetworkConfig(StrictModel):
     name: Literal["actor_critic"] = "actor_critic"
     """actor_critic"""
     separate: bool = False
-    """Whether the critic has a network of its own, or one more output of the actor's."""
+    """Whether the critic has a separate network; otherwise it is one more output of the actor's."""
     space: SpaceConfig = SpaceConfig()
-    """The space of actions."""
+    """The action space."""
     mlp: MlpConfig
     """The network."""
 
@@ -115,22 +115,22 @@ class SacNetworkConfig(StrictModel):
     name: Literal["soft_actor_critic"] = "soft_actor_critic"
     """soft_actor_critic"""
     separate: Literal[True] = True
-    """Actor and critics share nothing."""
+    """Actor and critics are separate networks."""
     space: dict[str, Any] | None = None
-    """Accepted and not read, as in rl_games."""
+    """Ignored, as in rl_games."""
     mlp: MlpConfig
     """The networks."""
     log_std_bounds: tuple[float, float] = (-5.0, 2.0)
-    """Where the logarithm of the deviation lies."""
+    """Bounds of the logarithm of the standard deviation."""
 
 
 class RewardShaper(StrictModel):
-    """What is learned of a reward: (reward + shift_value) x scale_value, clipped."""
+    """Reward used in training: (reward + shift_value) * scale_value, clipped."""
 
     scale_value: float = 1.0
-    """Factor."""
+    """Factor of the reward."""
     shift_value: float = 0.0
-    """Added before."""
+    """Added to the reward before scaling."""
     min_val: float | None = None
     """Lower limit; null: none."""
     max_val: float | None = None
@@ -138,32 +138,32 @@ class RewardShaper(StrictModel):
 
 
 class CentralValueConfig(_Settings):
-    """A critic of its own, which sees the observation group `critic`."""
+    """A separate critic, which observes the group `critic`."""
 
     network: CentralNetworkConfig
-    """Its network."""
+    """Network of the critic."""
     learning_rate: Positive
-    """Step size of its optimiser."""
+    """Learning rate."""
     lr_schedule: Literal["linear", "constant", "None"] | None = None
-    """How it moves."""
+    """Schedule of the learning rate."""
     mini_epochs: Count
-    """Passes over the rollout an iteration."""
+    """Epochs per iteration."""
     minibatch_size: Count
-    """Samples an update."""
+    """Samples per minibatch."""
     clip_value: bool
-    """Clip the value's change."""
+    """Clip the change of the value."""
     normalize_input: bool
-    """Normalise what it sees."""
+    """Normalize its observations."""
     truncate_grads: bool = False
     """Clip the gradient's norm to grad_norm."""
     grad_norm: Positive = 1.0
-    """That norm."""
+    """Maximum norm of the gradient."""
     e_clip: Positive = 0.2
     """Clipping of the value's change."""
     kl_threshold: Positive | None = None
-    """Accepted and not read, as in rl_games."""
+    """Ignored, as in rl_games."""
     weight_decay: NotNegative = 0.0
-    """Weight decay of its optimiser."""
+    """Weight decay."""
 
 
 class CentralNetworkConfig(StrictModel):
@@ -172,7 +172,7 @@ class CentralNetworkConfig(StrictModel):
     name: Literal["actor_critic"] = "actor_critic"
     """actor_critic"""
     central_value: Literal[True] = True
-    """It has no actions."""
+    """Only a value output, no actions."""
     mlp: MlpConfig
     """The network."""
 
@@ -181,61 +181,61 @@ class PpoSettings(_Settings):
     """`params.config` of PPO."""
 
     normalize_input: bool
-    """Normalise observations by their running mean and deviation."""
+    """Normalize observations by running mean and standard deviation."""
     normalize_value: bool = False
-    """The critic learns returns normalised by their running mean and deviation."""
+    """Train the critic on returns normalized by running mean and standard deviation."""
     normalize_advantage: bool
-    """Normalise advantages over the rollout."""
+    """Normalize advantages over the rollout."""
     value_bootstrap: bool = True
-    """Whether a time-out earns what came after it; how, `bootstrap` says."""
+    """Whether a time-out is bootstrapped; `bootstrap` sets how."""
     reward_shaper: RewardShaper = RewardShaper()
-    """What is learned of a reward."""
+    """Scale, shift and limits of the reward."""
     mixed_precision: Literal[False] = False
-    """Updates are float32."""
+    """Updates use float32."""
     gamma: Fraction
-    """Discount."""
+    """Discount factor."""
     tau: Fraction
-    """Lambda of generalised advantage estimation."""
+    """Lambda of generalized advantage estimation."""
     learning_rate: Positive
-    """Step size of Adam."""
+    """Learning rate of Adam."""
     lr_schedule: Literal["adaptive", "linear", "constant", "identity", "None"] | None = None
-    """How it moves: adaptive follows kl_threshold; linear goes to 0 over the budget."""
+    """Schedule of the learning rate: adaptive follows kl_threshold; linear falls to 0 over the budget."""
     schedule_type: Literal["legacy", "standard"] = "legacy"
-    """An adaptive rate moves after each minibatch, or after each pass."""
+    """When an adaptive rate changes: after each minibatch, or after each epoch."""
     kl_threshold: Positive = 0.008
-    """Divergence that an adaptive rate aims at."""
+    """Target KL divergence of an adaptive rate."""
     grad_norm: Positive = 1.0
-    """Norm the gradient is clipped to, with truncate_grads."""
+    """Maximum norm of the gradient, with truncate_grads."""
     truncate_grads: bool = False
-    """Whether it is."""
+    """Whether the gradient is clipped to grad_norm."""
     entropy_coef: NotNegative
     """Weight of the entropy bonus."""
     e_clip: Positive
     """Clipping of the probability ratio and of the value's change."""
     clip_value: bool
-    """Take the larger error of the value and of the value clipped about its old one."""
+    """Use the larger error of the value and of the value clipped around its old prediction."""
     clip_actions: bool = True
     """Whether actions are clipped to +-1."""
     horizon_length: Count
-    """Steps an environment and iteration."""
+    """Steps per environment and iteration."""
     minibatch_size: Count | None = None
-    """Samples an update; it divides the rollout."""
+    """Samples per minibatch; the rollout must be divisible by it."""
     minibatch_size_per_env: Count | None = None
-    """The same, for each environment."""
+    """Samples per minibatch and environment."""
     mini_epochs: Count
-    """Passes over the rollout an iteration."""
+    """Epochs per iteration."""
     critic_coef: NotNegative
-    """Weight of the value loss, of which rl_games takes half."""
+    """Weight of the value loss; rl_games multiplies it by 0.5."""
     bounds_loss_coef: NotNegative | None = None
     """Weight of the bounds loss; null: none."""
     bound_loss_type: Literal["bound", "regularisation"] = "bound"
-    """The square of what the mean action exceeds 1.1 by, or of the mean action."""
+    """bound: square of the excess of the mean action over 1.1; otherwise square of the mean action."""
     use_smooth_clamp: bool = False
-    """A smooth clipping of the probability ratio."""
+    """Clip the probability ratio smoothly."""
     weight_decay: NotNegative = 0.0
     """Weight decay of Adam."""
     central_value_config: CentralValueConfig | None = None
-    """A critic of its own; null: none."""
+    """A separate critic; null: none."""
 
     @model_validator(mode="after")
     def _minibatch(self) -> PpoSettings:
@@ -248,54 +248,54 @@ class SacSettings(_Settings):
     """`params.config` of SAC."""
 
     normalize_input: bool = False
-    """Normalise observations by their running mean and deviation."""
+    """Normalize observations by running mean and standard deviation."""
     value_bootstrap: bool = True
-    """Whether a time-out earns what came after it; how, `bootstrap` says."""
+    """Whether a time-out is bootstrapped; `bootstrap` sets how."""
     reward_shaper: RewardShaper = RewardShaper()
-    """What is learned of a reward."""
+    """Scale, shift and limits of the reward."""
     mixed_precision: Literal[False] = False
-    """Updates are float32."""
+    """Updates use float32."""
     gamma: Fraction = 0.99
-    """Discount."""
+    """Discount factor."""
     num_steps_per_episode: Count = 1
-    """Steps an environment and iteration."""
+    """Steps per environment and iteration."""
     num_updates_per_step: Count = 1
-    """Updates a step."""
+    """Gradient updates per step."""
     num_warmup_steps: Count = 1000
     """Iterations of random actions before the first update."""
     num_warmup_frames: Count | None = None
-    """The same in environment steps."""
+    """Random actions before the first update, in environment steps."""
     batch_size: Count
-    """Transitions an update."""
+    """Transitions per update."""
     replay_buffer_size: Count
-    """Transitions kept, over all environments."""
+    """Size of the replay buffer, over all environments."""
     init_alpha: Positive
-    """Entropy temperature at the beginning."""
+    """Initial entropy temperature."""
     learnable_temperature: bool
-    """Whether it is learned."""
+    """Whether the temperature is trained."""
     target_entropy_coef: Positive = 1.0
-    """It aims at an entropy of minus this for each action."""
+    """Target entropy: minus this for each action."""
     alpha_lr: Positive
-    """Step size of the temperature's optimiser."""
+    """Learning rate of the temperature."""
     actor_lr: Positive
-    """Of the actor's."""
+    """Learning rate of the actor."""
     critic_lr: Positive
-    """Of the critics'."""
+    """Learning rate of the critics."""
     critic_tau: Fraction = 0.005
-    """Share of the new weights that a target network takes on at each update."""
+    """Fraction of the new weights in each update of the target networks."""
     policy_frequency: Count = 2
-    """Updates of the critics for one of the actor."""
+    """Updates of the critics per update of the actor."""
     critic_grad_clip: NotNegative = 5.0
-    """Norm the critics' gradient is clipped to; 0: none."""
+    """Maximum norm of the critics' gradient; 0: no clipping."""
 
 
 class _Params(StrictModel):
     seed: int | None = None
-    """Accepted and not read: --seed."""
+    """Ignored: use --seed."""
     load_checkpoint: bool = False
-    """Accepted and not read: --resume, --init-from."""
+    """Ignored: use --resume, --init-from."""
     load_path: str | None = None
-    """Accepted and not read: --resume, --init-from."""
+    """Ignored: use --resume, --init-from."""
 
 
 class PpoParams(_Params):
@@ -308,7 +308,7 @@ class PpoParams(_Params):
     network: NetworkConfig
     """Networks."""
     config: PpoSettings
-    """Everything else."""
+    """All other settings."""
 
     @model_validator(mode="after")
     def _names(self) -> PpoParams:
@@ -327,7 +327,7 @@ class SacParams(_Params):
     network: SacNetworkConfig
     """Networks."""
     config: SacSettings
-    """Everything else."""
+    """All other settings."""
 
     @model_validator(mode="after")
     def _names(self) -> SacParams:
@@ -336,20 +336,20 @@ class SacParams(_Params):
         return self
 
 
-def _require(given: Named, key: str, name: str, algorithm: str) -> None:
-    if given.name != name:
-        raise ValueError(f"{key}.name '{given.name}' does not go with algorithm {algorithm}, whose {key} is '{name}'")
+def _require(named: Named, key: str, name: str, algorithm: str) -> None:
+    if named.name != name:
+        raise ValueError(f"{key}.name '{named.name}' does not fit algorithm {algorithm}: expected '{name}'")
 
 
 class RlGamesConfig(AgentConfig):
-    """What both algorithms have. `max_epochs` and `save_frequency` of `params.config` are rlcli's budget."""
+    """Settings of both algorithms. `max_epochs` and `save_frequency` of `params.config` set rlcli's budget."""
 
     budget: ClassVar[Mapping[str, str]] = {"max_epochs": "max_iterations", "save_frequency": "save_interval"}
 
     bootstrap: Literal["final_obs", "pre_step", "none"] = "final_obs"
-    """What a step that ran out of time still earns: gamma times the value of its true last observation; or, as rl_games
-    itself has it, of the observation before the step; or nothing, as if it were a failure, which is what
-    OmniIsaacGymEnvs' tasks make of it. `params.config.value_bootstrap: false` is none as well."""
+    """Return after a time-out: gamma times the value of the last observation of the episode; or, as rl_games
+    itself, of the observation before the step; or 0, as for a failure, which is what OmniIsaacGymEnvs' tasks
+    use. `params.config.value_bootstrap: false` is the same as none."""
 
     @model_validator(mode="before")
     @classmethod
@@ -363,19 +363,19 @@ class RlGamesConfig(AgentConfig):
         data = {**given, **data, "params": {**params, "config": rest}}
         network = params.get("network")
         if isinstance(network, dict) and isinstance(network.get("log_std_bounds"), list):
-            # what a validator returns counts as Python's, where a list is no tuple
+            # pydantic's strict mode accepts only tuples from a validator
             network = {**network, "log_std_bounds": tuple(network["log_std_bounds"])}
             data["params"]["network"] = network
         return data
 
 
 class PpoConfig(RlGamesConfig):
-    """Proximal policy optimisation (rl_games' `a2c_continuous`)."""
+    """Proximal policy optimization (rl_games' `a2c_continuous`)."""
 
     algorithm: Literal["ppo"] = "ppo"
     """ppo"""
     params: PpoParams
-    """A train YAML's `params`, as they stand."""
+    """`params` of a train YAML, unchanged."""
 
     @model_validator(mode="before")
     @classmethod
@@ -396,9 +396,9 @@ class SacConfig(RlGamesConfig):
     algorithm: Literal["sac"] = "sac"
     """sac"""
     action_bound: Positive = 1.0
-    """Actions are tanh times this."""
+    """Actions are tanh times this bound."""
     params: SacParams
-    """A train YAML's `params`, as they stand."""
+    """`params` of a train YAML, unchanged."""
 
 
 CentralValueConfig.model_rebuild()

@@ -19,7 +19,7 @@ _DEFAULTS = {"lr_schedule": None, "bounds_loss_coef": 0.0}
 
 
 class PpoTrainer(RlGamesTrainer):
-    """rl_games' PPO."""
+    """Trainer for rl_games' PPO."""
 
     config: PpoConfig
 
@@ -101,7 +101,7 @@ class PpoTrainer(RlGamesTrainer):
             self.agent.central_value_net.update_lr(self.agent.central_value_net.lr)
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normaliser; a critic that shares the network keeps its own output layer."""
+        """Load a policy's weights, with its normalizer; a critic that shares the network keeps its own output layer."""
         network = self.agent.model.a2c_network
         weights = network.state_dict()
         weights |= {theirs: policy[ours].clone() for theirs, ours in self._names().items()}

@@ -41,7 +41,7 @@ class ReplayBuffer(VectorizedReplayBuffer):
 
 
 class SacTrainer(RlGamesTrainer):
-    """rl_games' SAC."""
+    """Trainer for rl_games' SAC."""
 
     config: SacConfig
 
@@ -105,7 +105,7 @@ class SacTrainer(RlGamesTrainer):
         super().load(state)
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normaliser; the critics keep their own."""
+        """Load a policy's weights, with its normalizer; the critics keep their own."""
         actor, last = self.agent.model.sac_network.actor, 2 * len(self.spec.hidden)
         weights = {}
         for name in actor.state_dict():
@@ -128,7 +128,7 @@ class SacTrainer(RlGamesTrainer):
         last, tensors = 2 * len(self.spec.hidden), {}
         for name, value in self.agent.model.sac_network.actor.state_dict().items():
             _, index, kind = name.split(".")
-            if int(index) == last:  # the means, then the logarithms of the deviations
+            if int(index) == last:  # the means, then the logarithms of the standard deviations
                 mean, tensors[f"log_std_head.{kind}"] = (half.clone() for half in value.chunk(2))
                 value = mean
             tensors[f"actor.{index}.{kind}"] = value.detach().clone()

@@ -1,4 +1,4 @@
-"""rl_games' PPO and SAC, one iteration at a time, saved and restored exactly; only rlcli writes files."""
+"""Trainers that run rl_games' PPO and SAC one iteration at a time, with exact save and restore."""
 
 from __future__ import annotations
 

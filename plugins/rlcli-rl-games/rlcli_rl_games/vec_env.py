@@ -1,4 +1,4 @@
-"""The environment as rl_games steps it."""
+"""Environment with rl_games' interface."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class RlGamesVecEnv(IVecEnv):
 
     @property
     def timed_out(self) -> Tensor:
-        """Where the last step truncated an episode and did not terminate it. (num_envs,) bool"""
+        """Return where the last step truncated an episode without terminating it. (num_envs,) bool"""
         assert self.result is not None
         return self.result.truncated & ~self.result.terminated
 

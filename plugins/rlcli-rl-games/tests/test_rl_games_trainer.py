@@ -1,5 +1,4 @@
-"""rl_games' PPO and SAC as trainers: what rl_games itself computes, saved policies that compute the same, exact
-resumes."""
+"""rl_games' PPO and SAC as trainers: equal to rl_games itself, equal saved policies, exact resumes."""
 
 import contextlib
 import io
@@ -73,7 +72,7 @@ def one_thread():
 
 @pytest.fixture
 def sac_task(tmp_path):
-    """The manager-based cartpole with an agent of rl_games' SAC."""
+    """Return the manager-based cartpole with an agent of rl_games' SAC."""
     root, folder = find_task("cartpole").root, tmp_path / "pole"
     folder.mkdir()
     (folder / "task.yaml").write_text((root / "task.yaml").read_text().partition("agents:")[0] + SAC)
@@ -83,7 +82,7 @@ def sac_task(tmp_path):
 
 @pytest.fixture
 def asymmetric(tmp_path):
-    """The manager-based cartpole with the direct one's agent and a critic that sees more."""
+    """Return the manager-based cartpole with privileged observations for the critic."""
     root, folder = find_task("cartpole").root, tmp_path / "pole"
     folder.mkdir()
     agents = (root / "direct.yaml").read_text().partition("agents:")[2]
@@ -110,21 +109,21 @@ def differing(first, second):
 
 
 def outcomes_of(trainer, monkeypatch):
-    """Every step: its reward, who was cut off by time, who was terminated, and last observations."""
+    """Return per step: reward, truncated, terminated, and last observations."""
     seen, step = [], trainer.env.step
 
-    def watched(action):
+    def record_step(action):
         result = step(action)
         cut = result.truncated & ~result.terminated
         final = None if result.final_obs is None else result.final_obs["policy"].clone()
         seen.append((result.reward.clone(), cut.clone(), result.terminated.clone(), final))
         return result
 
-    monkeypatch.setattr(trainer.env, "step", watched)
+    monkeypatch.setattr(trainer.env, "step", record_step)
     return seen
 
 
-def test_iterations_are_those_of_rl_games_own_loop_bit_for_bit(tmp_path):
+def test_iterations_equal_rl_games_loop_bit_for_bit(tmp_path):
     ours = trainer_of("agent.bootstrap=pre_step")
     for _ in range(3):
         ours.iterate()
@@ -138,7 +137,7 @@ def test_iterations_are_those_of_rl_games_own_loop_bit_for_bit(tmp_path):
     assert ours.agent.last_lr == agent.last_lr != 3e-4
 
 
-def test_oiges_values_reach_rl_games():
+def test_oige_settings_reach_rl_games():
     agent = trainer_of().agent
     assert (agent.gamma, agent.tau, agent.e_clip, agent.critic_coef, agent.bounds_loss_coef) == (
         0.99,
@@ -161,7 +160,7 @@ def test_oiges_values_reach_rl_games():
 
 
 @pytest.mark.parametrize("bootstrap", ["final_obs", "pre_step", "none"])
-def test_a_time_out_earns_what_was_chosen(monkeypatch, bootstrap):
+def test_time_out_bootstraps_as_configured(monkeypatch, bootstrap):
     trainer = trainer_of(f"agent.bootstrap={bootstrap}", "agent.params.config.reward_shaper={scale_value: 0.5}")
     with torch.no_grad():
         trainer.agent.model.a2c_network.value.weight.mul_(20.0)
@@ -183,12 +182,12 @@ def test_a_time_out_earns_what_was_chosen(monkeypatch, bootstrap):
     assert cuts > 0
 
 
-def test_no_value_bootstrap_means_that_time_outs_earn_nothing():
+def test_value_bootstrap_false_disables_bootstrap():
     assert trainer_of("agent.params.config.value_bootstrap=false").bootstrap == "none"
 
 
 @pytest.mark.parametrize("bootstrap", ["final_obs", "pre_step", "none"])
-def test_sac_stores_time_outs_as_was_chosen(monkeypatch, sac_task, bootstrap):
+def test_sac_stores_time_outs_as_configured(monkeypatch, sac_task, bootstrap):
     trainer = trainer_of(f"agent.bootstrap={bootstrap}", task=sac_task, small=SMALL_SAC)
     seen = outcomes_of(trainer, monkeypatch)
     trainer.iterate()
@@ -208,7 +207,7 @@ def test_sac_stores_time_outs_as_was_chosen(monkeypatch, sac_task, bootstrap):
 @pytest.mark.parametrize(
     "extra", [(), ("agent.params.network.separate=true", "agent.params.config.normalize_input=false")]
 )
-def test_the_saved_policy_computes_what_rl_games_actor_does(extra):
+def test_saved_policy_equals_rl_games_actor(extra):
     trainer = trainer_of(*extra)
     for _ in range(3):
         trainer.iterate()
@@ -222,7 +221,7 @@ def test_the_saved_policy_computes_what_rl_games_actor_does(extra):
         torch.testing.assert_close(saved.log_std.exp().expand(6, 1), theirs["sigmas"], rtol=1e-5, atol=1e-5)
 
 
-def test_the_saved_sac_policy_computes_what_rl_games_actor_does(sac_task):
+def test_saved_sac_policy_equals_rl_games_actor(sac_task):
     trainer = trainer_of("agent.action_bound=0.7", task=sac_task, small=SMALL_SAC)
     for _ in range(4):
         trainer.iterate()
@@ -261,19 +260,19 @@ def resumed(make):
         ("agent.params.config.schedule_type=standard",),
     ],
 )
-def test_a_resumed_run_goes_on_with_the_same_bits(extra):
+def test_resume_continues_bit_for_bit(extra):
     resumed(lambda seed: trainer_of(*extra, seed=seed))
 
 
-def test_a_resumed_run_with_a_critic_of_its_own_goes_on_with_the_same_bits(asymmetric):
+def test_resume_with_central_value_continues_bit_for_bit(asymmetric):
     resumed(lambda seed: trainer_of(CRITIC, CENTRAL, task=asymmetric, seed=seed))
 
 
-def test_a_resumed_sac_run_goes_on_with_the_same_bits(sac_task):
+def test_sac_resume_continues_bit_for_bit(sac_task):
     resumed(lambda seed: trainer_of(task=sac_task, seed=seed, small=SMALL_SAC))
 
 
-def test_the_ants_agent_learns_with_sac():
+def test_ant_agent_trains_with_sac():
     small = ("scene.num_envs=4", "agent.params.config.num_warmup_steps=1", "agent.params.config.batch_size=16")
     small += ("agent.params.config.replay_buffer_size=500", "agent.params.network.mlp.units=[8, 8]")
     resolved = resolve(find_task("ant-direct"), agent="rl-games-sac", overrides=small)
@@ -284,7 +283,7 @@ def test_the_ants_agent_learns_with_sac():
     assert "actor.0.weight" in differing(before, dict(trainer.policy().state_dict()))
 
 
-def test_the_critic_of_its_own_sees_the_critics_group(asymmetric):
+def test_central_value_observes_critic_group(asymmetric):
     trainer = trainer_of(CRITIC, CENTRAL, task=asymmetric)
     before = {name: value.clone() for name, value in trainer.agent.central_value_net.state_dict().items()}
     trainer.iterate()
@@ -293,7 +292,7 @@ def test_the_critic_of_its_own_sees_the_critics_group(asymmetric):
     assert {"model.a2c_network.value.weight", "model.a2c_network.actor_mlp.0.weight"} <= set(moved)
 
 
-def test_weights_alone_make_the_same_policy(sac_task):
+def test_load_weights_gives_same_policy(sac_task):
     for make in (
         lambda seed: trainer_of(seed=seed),
         lambda seed: trainer_of(task=sac_task, seed=seed, small=SMALL_SAC),
@@ -324,7 +323,7 @@ def test_weights_alone_make_the_same_policy(sac_task):
         (["agent.params.config.minibatch_size_per_env=4"], "params.config", "one of minibatch_size"),
     ],
 )
-def test_settings_that_cannot_be_are_refused_before_anything_heavy(overrides, place, words):
+def test_invalid_settings_are_refused_without_heavy_imports(overrides, place, words):
     with pytest.raises(ConfigError) as caught:
         resolve(find_task("cartpole-direct"), agent="rl-games", overrides=overrides)
     assert place in str(caught.value.problems)
@@ -338,14 +337,14 @@ def test_settings_that_cannot_be_are_refused_before_anything_heavy(overrides, pl
         ([CENTRAL], "params.config.central_value_config", "observation group critic"),
     ],
 )
-def test_settings_that_do_not_fit_the_environment_name_their_place(overrides, place, words):
+def test_settings_that_do_not_fit_env_name_their_key(overrides, place, words):
     with pytest.raises(ConfigError) as caught:
         trainer_of(*overrides)
     assert place in str(caught.value.problems)
     assert words in str(caught.value.problems)
 
 
-def test_unclipped_actions_are_an_unbounded_policy():
+def test_clip_actions_false_gives_unbounded_policy():
     resolved = resolve(
         find_task("cartpole-direct"), agent="rl-games", overrides=["agent.params.config.clip_actions=false"]
     )
@@ -358,7 +357,7 @@ def rlcli(capsys, *words, code=0):
     return capsys.readouterr()
 
 
-def test_a_run_is_played_exported_resumed_and_holds_no_pickle(tmp_path, capsys, monkeypatch):
+def test_run_is_played_exported_resumed_without_pickle(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small = ("--agent", "rl-games", "--num-envs", 8, "--logger", "none", "-q", "agent.params.config.minibatch_size=64")
     run = rlcli(capsys, "train", "cartpole-direct", *small, "--max-iterations", 2).out
@@ -377,7 +376,7 @@ def test_a_run_is_played_exported_resumed_and_holds_no_pickle(tmp_path, capsys, 
         assert len({(folder / f"{part}.safetensors").read_bytes() for folder in newest}) == 1, part
 
 
-def test_a_sac_run_is_evaluated_with_its_own_deviation(tmp_path, sac_task, capsys, monkeypatch):
+def test_sac_run_is_evaluated_with_its_own_std(tmp_path, sac_task, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ("train", "./pole", "--num-envs", 8, "--logger", "none", "-q", "--max-iterations", 4)
     run = rlcli(capsys, *words).out.strip()
@@ -385,7 +384,7 @@ def test_a_sac_run_is_evaluated_with_its_own_deviation(tmp_path, sac_task, capsy
 
 
 @pytest.mark.slow
-def test_oiges_numbers_learn_to_balance(tmp_path, capsys, monkeypatch):
+def test_oige_settings_learn_to_balance(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ("--agent", "rl-games", "--seed", 0, "--logger", "none", "-q")
     run = rlcli(capsys, "train", "cartpole-direct", *words).out.strip()

@@ -1,4 +1,4 @@
-"""RSL-RL's settings as they stand in a `RslRlOnPolicyRunnerCfg`, or in RSL-RL 5's own form.
+"""RSL-RL's settings, in the form of a `RslRlOnPolicyRunnerCfg` or of RSL-RL 5.
 
 Light: a YAML is checked without importing torch or RSL-RL.
 """
@@ -15,7 +15,7 @@ from rlcli.trainers import TrainerSpec
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Activation = Literal["elu", "relu", "tanh", "swish"]
-"""Those that a saved policy can have too; swish is SiLU."""
+"""Activations that a saved policy supports too; swish is SiLU."""
 Widths = Annotated[list[Count], Field(min_length=1)]
 _WIDE = [256, 256, 256]
 _AS_WIDE_AS_THE_INPUT = [-1]
@@ -26,17 +26,17 @@ class PolicyConfig(StrictModel):
     """Both networks, in the form of RSL-RL up to 4 and of Isaac Lab."""
 
     class_name: Literal["ActorCritic", "ActorCriticRecurrent"] = "ActorCritic"
-    """ActorCriticRecurrent: with a memory before each network."""
+    """ActorCriticRecurrent: with an LSTM before each network."""
     init_noise_std: Positive = 1.0
-    """Deviation of the untrained policy."""
+    """Standard deviation of the untrained policy."""
     noise_std_type: Literal["scalar", "log"] = "scalar"
-    """Whether the deviation is learned or its logarithm."""
+    """scalar: train the standard deviation; log: train its logarithm."""
     state_dependent_std: Literal[False] = False
-    """The deviation is the same in every state."""
+    """The standard deviation does not depend on the state."""
     actor_obs_normalization: bool | None = None
-    """Normalise what the actor sees by its running mean and deviation; null: as empirical_normalization says."""
+    """Normalize the actor's observations by running mean and standard deviation; null: use empirical_normalization."""
     critic_obs_normalization: bool | None = None
-    """The same of the critic."""
+    """Normalize the critic's observations; null: use empirical_normalization."""
     actor_hidden_dims: Widths = _WIDE
     """Widths of the actor's hidden layers."""
     critic_hidden_dims: Widths = _WIDE
@@ -44,60 +44,60 @@ class PolicyConfig(StrictModel):
     activation: Activation = "elu"
     """Activation between layers."""
     rnn_type: Literal["lstm"] = "lstm"
-    """Kind of the memory of an ActorCriticRecurrent."""
+    """Recurrent network of an ActorCriticRecurrent."""
     rnn_hidden_dim: Count = 256
-    """Cells of a layer of the memory."""
+    """Cells of each recurrent layer."""
     rnn_num_layers: Count = 1
-    """Layers of the memory."""
+    """Number of recurrent layers."""
 
 
 class DistributionConfig(StrictModel):
     """The distribution of actions, in the form of RSL-RL 5."""
 
     class_name: Literal["GaussianDistribution"] = "GaussianDistribution"
-    """A mean from the network and a deviation that no state changes."""
+    """The network gives the mean; the standard deviation does not depend on the state."""
     init_std: Positive = 1.0
-    """Deviation of the untrained policy."""
+    """Standard deviation of the untrained policy."""
     std_type: Literal["scalar", "log"] = "scalar"
-    """Whether the deviation is learned or its logarithm."""
+    """scalar: train the standard deviation; log: train its logarithm."""
     std_range: tuple[NotNegative, Positive] = (1e-6, 1e6)
-    """Where the deviation stays."""
+    """Bounds of the standard deviation."""
     learn_std: bool = True
-    """Whether the deviation is learned at all."""
+    """Whether the standard deviation is trained."""
 
 
 class ModelConfig(StrictModel):
     """A network, in the form of RSL-RL 5."""
 
     class_name: Literal["MLPModel", "RNNModel"] = "MLPModel"
-    """RNNModel: with a memory before the network."""
+    """RNNModel: with an LSTM before the network."""
     hidden_dims: Widths = _WIDE
     """Widths of the hidden layers."""
     activation: Activation = "elu"
     """Activation between layers."""
     obs_normalization: bool = False
-    """Normalise observations by their running mean and deviation."""
+    """Normalize observations by running mean and standard deviation."""
     distribution_cfg: DistributionConfig | None = None
-    """Of the actor."""
+    """Distribution of the actions; for the actor only."""
     rnn_type: Literal["lstm"] = "lstm"
-    """Kind of the memory of an RNNModel."""
+    """Recurrent network of an RNNModel."""
     rnn_hidden_dim: Count = 256
-    """Cells of a layer of the memory."""
+    """Cells of each recurrent layer."""
     rnn_num_layers: Count = 1
-    """Layers of the memory."""
+    """Number of recurrent layers."""
 
 
 class WeightScheduleConfig(StrictModel):
-    """How the weight of the curiosity reward moves, by environment steps."""
+    """Schedule of the weight of the curiosity reward, by environment steps."""
 
     mode: Literal["constant", "step", "linear"]
-    """constant, a step, or a straight line."""
+    """Shape of the schedule."""
     initial_step: NotNegative | None = None
-    """Where a line begins."""
+    """Step at which the linear change begins."""
     final_step: NotNegative | None = None
-    """Where a line ends, or the step is."""
+    """Step at which the linear change ends, or of the jump."""
     final_value: NotNegative | None = None
-    """The weight from there on."""
+    """Weight after final_step."""
 
     @model_validator(mode="after")
     def _needs(self) -> WeightScheduleConfig:
@@ -110,22 +110,22 @@ class WeightScheduleConfig(StrictModel):
 
 
 class RndConfig(StrictModel):
-    """Random network distillation (Burda et al. 2018): a reward for what is new."""
+    """Random network distillation (Burda et al. 2018): a reward for states that are new."""
 
     weight: NotNegative = 0.0
-    """Weight of that reward; RSL-RL multiplies it by the time of a step."""
+    """Weight of the curiosity reward; RSL-RL multiplies it by the step time."""
     weight_schedule: WeightScheduleConfig | None = None
-    """How the weight moves; null: it does not."""
+    """Schedule of the weight; null: constant."""
     reward_normalization: bool = False
-    """Divide that reward by the deviation of its discounted sum."""
+    """Divide the curiosity reward by the standard deviation of its discounted sum."""
     state_normalization: bool = False
-    """Normalise what the networks see."""
+    """Normalize the inputs of the networks."""
     learning_rate: Positive = 1e-3
-    """Step size of the predictor's optimiser."""
+    """Learning rate of the predictor."""
     num_outputs: Count = 1
-    """Columns that the predictor predicts."""
+    """Number of outputs of target and predictor."""
     predictor_hidden_dims: Annotated[list[int], Field(min_length=1)] = _AS_WIDE_AS_THE_INPUT
-    """Widths of the predictor; -1: as wide as what it sees."""
+    """Widths of the predictor; -1: as wide as its input."""
     target_hidden_dims: Annotated[list[int], Field(min_length=1)] = _AS_WIDE_AS_THE_INPUT
     """Widths of the target."""
     activation: Activation = "elu"
@@ -140,48 +140,48 @@ class SymmetryConfig(StrictModel):
     `f(env=, obs=, actions=)`: the samples and, after them, their mirror images; `obs` or `actions` may be None.
     `env.unwrapped` is rlcli's."""
     use_data_augmentation: bool = False
-    """Learn from the mirror images as well."""
+    """Also train on mirrored samples."""
     use_mirror_loss: bool = False
-    """Punish what the policy does differently in the mirror."""
+    """Add a loss for actions that are not symmetric."""
     mirror_loss_coeff: NotNegative = 0.0
-    """Weight of that loss."""
+    """Weight of the mirror loss."""
 
 
 class AlgorithmConfig(StrictModel):
-    """The update."""
+    """Settings of the PPO update."""
 
     class_name: Literal["PPO"] = "PPO"
-    """Proximal policy optimisation."""
+    """Proximal policy optimization."""
     num_learning_epochs: Count = 5
-    """Passes over the rollout an iteration."""
+    """Epochs per iteration."""
     num_mini_batches: Count = 4
-    """Parts of the rollout, an update each; what does not divide is left out."""
+    """Minibatches per epoch; samples that remain after the division are dropped."""
     learning_rate: Positive = 1e-3
-    """Step size of the optimiser."""
+    """Learning rate."""
     optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
-    """The optimiser."""
+    """Optimizer."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
-    """adaptive: the step size follows desired_kl, a minibatch at a time."""
+    """adaptive: the learning rate follows desired_kl after every minibatch."""
     desired_kl: Positive | None = 0.01
-    """Divergence between the policies before and after an update that an adaptive schedule aims at."""
+    """Target KL divergence between the policies before and after an update, for the adaptive schedule."""
     gamma: Fraction = 0.99
-    """Discount."""
+    """Discount factor."""
     lam: Fraction = 0.95
-    """Lambda of generalised advantage estimation."""
+    """Lambda of generalized advantage estimation."""
     entropy_coef: NotNegative = 0.01
     """Weight of the entropy bonus."""
     value_loss_coef: NotNegative = 1.0
     """Weight of the value loss, a mean square."""
     use_clipped_value_loss: bool = True
-    """Take the larger error of the value and of the value clipped about its old one."""
+    """Use the larger error of the value and of the value clipped around its old prediction."""
     clip_param: Positive = 0.2
     """Clipping of the probability ratio and of the value's change."""
     max_grad_norm: Positive = 1.0
-    """Norm the gradients of actor and critic are clipped to, each its own."""
+    """Maximum norm of the gradients; actor and critic are clipped separately."""
     normalize_advantage_per_mini_batch: bool = False
-    """Normalise advantages in each minibatch, not over the rollout."""
+    """Normalize advantages in each minibatch instead of over the rollout."""
     rnd_cfg: RndConfig | None = None
-    """A reward for what is new; null: none."""
+    """Curiosity reward; null: none."""
     symmetry_cfg: SymmetryConfig | None = None
     """Symmetry of the task; null: not used."""
 
@@ -195,58 +195,58 @@ _ELSEWHERE: Mapping[str, tuple[Any, str]] = {
     "load_run": (".*", "--resume"),
     "load_checkpoint": ("model_.*.pt", "--resume"),
 }
-"""Key of a runner's configuration that is accepted and not read -> its default there, and what decides here."""
+"""Key of a runner's configuration that has no effect -> (RSL-RL's default, what to use instead)."""
 
 
 class RunnerConfig(AgentConfig):
-    """A training run: the keys of `RslRlOnPolicyRunnerCfg`, and those that every agent of rlcli has."""
+    """Settings of a training: the keys of `RslRlOnPolicyRunnerCfg`, and those of every agent of rlcli."""
 
     algorithm: AlgorithmConfig = AlgorithmConfig()  # type: ignore[assignment]
-    """The update; `ppo` alone: with RSL-RL's defaults."""
+    """The update; `ppo`: RSL-RL's defaults."""
     bootstrap: Literal["final_obs", "pre_step"] = "final_obs"
-    """What a step that ran out of time still earns: gamma times the value of its true last observation, or, as RSL-RL
-    itself has it, of the observation before the step."""
+    """Return after a time-out: gamma times the value of the last observation of the episode, or, as in RSL-RL
+    itself, of the observation before the step."""
     action_bound: Positive | None = None
     """Actions are clipped to +-this in training, play and export alike; null: unbounded. RSL-RL's name for it,
     `clip_actions`, is accepted."""
     class_name: Literal["OnPolicyRunner"] = "OnPolicyRunner"
     """OnPolicyRunner"""
     num_steps_per_env: Count = 24
-    """Steps an environment and iteration."""
+    """Steps per environment and iteration."""
     obs_groups: dict[str, Annotated[list[str], Field(min_length=1)]] = _NO_GROUPS
     """Which observation groups the actor (`actor`, or `policy` as before RSL-RL 5), the `critic` and the curiosity
-    (`rnd_state`) see. Not given: the critic sees the group critic if the task has one, else policy; the others see
-    policy."""
+    (`rnd_state`) observe. Default: the critic observes the group critic if the task has one, else policy; the others
+    observe policy."""
     policy: PolicyConfig | None = None
-    """Both networks, in the older form; null, with actor and critic null as well: RSL-RL's defaults."""
+    """Both networks, in the older form; if actor and critic are null too: RSL-RL's defaults."""
     actor: ModelConfig | None = None
-    """The policy's network, in the form of RSL-RL 5."""
+    """Actor network, in the form of RSL-RL 5."""
     critic: ModelConfig | None = None
-    """The value's network, in the form of RSL-RL 5."""
+    """Critic network, in the form of RSL-RL 5."""
     empirical_normalization: bool | None = None
-    """Of the older form: normalise observations of both networks."""
+    """Older form: normalize observations of both networks."""
     experiment_name: str = ""
-    """Accepted and not read: a run is named by its task and --name."""
+    """Ignored: the task and --name set the name of a run."""
     run_name: str = ""
-    """Accepted and not read: --name."""
+    """Ignored: use --name."""
     seed: int = 42
-    """Accepted and not read: --seed."""
+    """Ignored: use --seed."""
     device: str = "cuda:0"
-    """Accepted and not read: --device."""
+    """Ignored: use --device."""
     logger: str = "tensorboard"
-    """Accepted and not read: --logger."""
+    """Ignored: use --logger."""
     neptune_project: str = "isaaclab"
-    """Accepted and not read."""
+    """Ignored."""
     wandb_project: str = "isaaclab"
-    """Accepted and not read."""
+    """Ignored."""
     resume: bool = False
-    """Accepted and not read: --resume."""
+    """Ignored: use --resume."""
     load_run: str = ".*"
-    """Accepted and not read: --resume."""
+    """Ignored: use --resume."""
     load_checkpoint: str = "model_.*.pt"
-    """Accepted and not read: --resume."""
+    """Ignored: use --resume."""
     check_for_nan: bool = True
-    """Accepted and not read: what is not finite always ends a run."""
+    """Ignored: non-finite values always stop a training."""
 
     @model_validator(mode="before")
     @classmethod
@@ -259,16 +259,17 @@ class RunnerConfig(AgentConfig):
         if "clip_actions" in data:
             clip = data.pop("clip_actions")
             if data.get("action_bound", clip) != clip:
-                raise ValueError(f"clip_actions ({clip}) and action_bound ({data['action_bound']}) are one thing")
+                bound = data["action_bound"]
+                raise ValueError(f"clip_actions ({clip}) and action_bound ({bound}) are two names of one setting")
             data["action_bound"] = clip
         return _tuples(data)
 
     @model_validator(mode="after")
     def _relations(self) -> RunnerConfig:
         if self.policy is not None and (self.actor is not None or self.critic is not None):
-            raise ValueError("policy and actor, critic are two forms of the same: give one")
+            raise ValueError("policy is the older form of actor and critic: give one of the two forms")
         if self.algorithm.symmetry_cfg is not None and self.memory is not None:
-            raise ValueError("RSL-RL has no symmetry for networks with a memory")
+            raise ValueError("RSL-RL does not support symmetry for recurrent networks")
         if self.algorithm.schedule == "adaptive" and self.algorithm.desired_kl is None:
             raise ValueError("algorithm.schedule adaptive needs algorithm.desired_kl")
         if self.critic is not None and self.critic.distribution_cfg is not None:
@@ -277,7 +278,7 @@ class RunnerConfig(AgentConfig):
 
     @property
     def networks(self) -> tuple[ModelConfig, ModelConfig]:
-        """Actor and critic in the form of RSL-RL 5."""
+        """Return actor and critic in the form of RSL-RL 5."""
         policy = self.policy
         if policy is None:
             actor = self.actor or ModelConfig()
@@ -305,7 +306,7 @@ class RunnerConfig(AgentConfig):
 
     @property
     def memory(self) -> list[int] | None:
-        """Cells of each layer of the actor's memory; None: it has none."""
+        """Return the cells of each recurrent layer of the actor; None: no recurrent layers."""
         actor, critic = self.networks
         if "RNNModel" not in (actor.class_name, critic.class_name):
             return None
@@ -313,13 +314,12 @@ class RunnerConfig(AgentConfig):
 
     @property
     def not_read(self) -> list[str]:
-        """What was set and decides nothing here, with what does."""
-        said = [f"{key}: {flag} decides" for key, (usual, flag) in _ELSEWHERE.items() if getattr(self, key) != usual]
-        return said
+        """Return the settings that have no effect, each with what to use instead."""
+        return [f"{key}: use {flag}" for key, (default, flag) in _ELSEWHERE.items() if getattr(self, key) != default]
 
 
 def _tuples(data: dict[str, Any]) -> dict[str, Any]:
-    """What a validator returns counts as Python's, where a list is no tuple."""
+    """Turn lists into tuples: pydantic's strict mode accepts only tuples from a validator."""
     try:
         distribution = data["actor"]["distribution_cfg"]
         pair = tuple(distribution["std_range"])

@@ -1,4 +1,4 @@
-"""RSL-RL's PPO, one iteration at a time, saved and restored exactly."""
+"""Trainer that runs RSL-RL's PPO one iteration at a time, with exact save and restore."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class RslRlTrainer(BaseTrainer):
         _require_batch(env, config)
         torch.set_num_threads(torch_threads)
         seed_generators(derive(seed, "trainer"))
-        with contextlib.redirect_stdout(io.StringIO()):  # RSL-RL prints its networks; standard output is for data
+        with contextlib.redirect_stdout(io.StringIO()):  # RSL-RL prints its networks; stdout is for data
             settings = _settings(env, config, self._groups)
             self.alg = PPO.construct_algorithm(self._adapter.zero_observations(), self._adapter, settings, device)
         self.alg.train_mode()
@@ -72,7 +72,7 @@ class RslRlTrainer(BaseTrainer):
     def start(self) -> None:
         """Reset the environment to its first episodes."""
         for key in self.config.not_read:
-            _log.warning(f"not read by trainer rsl-rl: {key}")
+            _log.warning(f"ignored by trainer rsl-rl: {key}")
         obs = self.env.reset(seed=self.env.seed)
         self._obs = self._adapter.observations(obs)
         self._keep_recent_obs(obs["policy"])
@@ -141,7 +141,7 @@ class RslRlTrainer(BaseTrainer):
         load_rng_state(state.tensors["rng"])
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normaliser; the critic keeps its own."""
+        """Load a policy's weights, with its normalizer; the critic keeps its own."""
         actor = self.alg.get_policy()
         weights = actor.state_dict()
         for theirs, ours in self._names().items():
@@ -289,13 +289,14 @@ def _groups(env: VecEnv, config: RunnerConfig) -> dict[str, list[str]]:
 
 def _require_batch(env: VecEnv, config: RunnerConfig) -> None:
     parts = config.algorithm.num_mini_batches
-    whole = config.num_steps_per_env if config.memory is not None else 1  # samples that stay together
+    # minibatches of recurrent networks consist of whole environments, others of single samples
+    whole = config.num_steps_per_env if config.memory is not None else 1
     samples = config.num_steps_per_env * env.num_envs // whole
     if samples // parts < 2:
         what = "environments" if whole > 1 else "samples"
         message = f"{parts} minibatches cannot be made of a rollout of {samples} {what}"
         at = ("algorithm", "num_mini_batches")
-        raise agent_error(env, at, message, "more environments, more num_steps_per_env, or fewer minibatches")
+        raise agent_error(env, at, message, "use more environments, more num_steps_per_env, or fewer minibatches")
 
 
 def _settings(env: VecEnv, config: RunnerConfig, groups: dict[str, list[str]]) -> dict[str, Any]:
@@ -341,7 +342,7 @@ def _mirror(env: VecEnv, reference: str) -> Any:
         file = (root / module).resolve()
         if not file.is_relative_to(root):
             at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
-            raise agent_error(env, at, f"'{module}' lies outside the task's folder {root}", "put it beside the task")
+            raise agent_error(env, at, f"'{module}' is outside of the task's folder {root}", "move it beside the task")
         module = str(file)
     elif not is_offered(module, env.resolved.source):
         at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
@@ -356,5 +357,5 @@ def _mirror(env: VecEnv, reference: str) -> Any:
     if not callable(found):
         at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
         hint = "module:function of the task's package or a plugin, or file.py:function beside the task"
-        raise agent_error(env, at, f"there is no function '{reference}'{why}", hint)
+        raise agent_error(env, at, f"no function '{reference}'{why}", hint)
     return found

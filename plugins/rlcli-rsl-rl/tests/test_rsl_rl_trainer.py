@@ -1,4 +1,4 @@
-"""RSL-RL's PPO as a trainer: what RSL-RL itself computes, saved policies that compute the same, exact resumes."""
+"""RSL-RL's PPO as a trainer: equal to RSL-RL itself, equal saved policies, exact resumes."""
 
 import json
 import math
@@ -88,7 +88,7 @@ RUNNER = {
 }
 
 
-def test_iterations_are_those_of_rsl_rls_own_runner_bit_for_bit(capsys):
+def test_iterations_equal_rsl_rl_runner_bit_for_bit(capsys):
     trainer = trainer_of("agent.bootstrap=pre_step")
     ours = bits(trainer)
     for _ in range(3):
@@ -104,7 +104,7 @@ def test_iterations_are_those_of_rsl_rls_own_runner_bit_for_bit(capsys):
     assert trainer.alg.learning_rate == runner.alg.learning_rate != 1e-3
 
 
-def test_both_forms_of_the_settings_are_one_agent():
+def test_both_forms_of_settings_give_same_agent():
     after = []
     for form in ((), NEW_FORM):
         trainer = trainer_of(*form)
@@ -113,7 +113,7 @@ def test_both_forms_of_the_settings_are_one_agent():
     assert same(*after) == []
 
 
-def test_the_seeds_settings_reach_rsl_rl():
+def test_shipped_settings_reach_rsl_rl():
     alg = trainer_of().alg
     assert [layer.out_features for layer in alg.actor.mlp if hasattr(layer, "out_features")] == [32, 32, 1]
     assert (alg.gamma, alg.lam, alg.clip_param, alg.entropy_coef) == (0.99, 0.95, 0.2, 0.005)
@@ -123,23 +123,23 @@ def test_the_seeds_settings_reach_rsl_rl():
 
 @pytest.mark.parametrize("bootstrap", ["final_obs", "pre_step"])
 @pytest.mark.parametrize("extra", [(), LSTM])
-def test_a_time_out_earns_the_value_of_the_chosen_observation(monkeypatch, bootstrap, extra):
+def test_time_out_bootstraps_as_configured(monkeypatch, bootstrap, extra):
     trainer = trainer_of(f"agent.bootstrap={bootstrap}", *extra)
     with torch.no_grad():
         for parameter in trainer.alg.critic.parameters():
-            parameter.mul_(4.0)  # values that differ from one observation to the next
+            parameter.mul_(4.0)  # make the values of observations differ
     steps, outcomes, step = [], [], trainer.env.step
 
-    def watched_step(action):
+    def recorded_step(action):
         steps.append(step(action))
         outcomes.append((steps[-1].reward.clone(), steps[-1].truncated & ~steps[-1].terminated))
         return steps[-1]
 
-    monkeypatch.setattr(trainer.env, "step", watched_step)
+    monkeypatch.setattr(trainer.env, "step", recorded_step)
     values, memories = [], []
     act, process = trainer.alg.act, trainer.alg.process_env_step
 
-    def watched_act(obs):
+    def recorded_act(obs):
         action = act(obs)
         values.append(trainer.alg.transition.values.squeeze(-1).clone())
         memory = trainer.alg.critic.get_hidden_state()
@@ -148,7 +148,7 @@ def test_a_time_out_earns_the_value_of_the_chosen_observation(monkeypatch, boots
 
     kept = []
 
-    def watched_process(obs, rewards, dones, extras):
+    def recorded_process(obs, rewards, dones, extras):
         final = steps[-1].final_obs
         if final is not None:
             trainer.alg.critic.reset(hidden_state=memories[-1])
@@ -161,8 +161,8 @@ def test_a_time_out_earns_the_value_of_the_chosen_observation(monkeypatch, boots
         kept.append((trainer.alg.storage.rewards[len(kept)].squeeze(-1).clone(), after))
         return result
 
-    monkeypatch.setattr(trainer.alg, "act", watched_act)
-    monkeypatch.setattr(trainer.alg, "process_env_step", watched_process)
+    monkeypatch.setattr(trainer.alg, "act", recorded_act)
+    monkeypatch.setattr(trainer.alg, "process_env_step", recorded_process)
     trainer._collect()
     ended = 0
     for (plain, cut), (reward, after), before in zip(outcomes, kept, values, strict=True):
@@ -175,7 +175,7 @@ def test_a_time_out_earns_the_value_of_the_chosen_observation(monkeypatch, boots
 
 
 @pytest.mark.parametrize("extra", [(), NORMALIZED, LSTM, (*LSTM, *NORMALIZED), ("agent.policy.noise_std_type=log",)])
-def test_the_saved_policy_computes_what_rsl_rls_actor_does(extra):
+def test_saved_policy_equals_rsl_rl_actor(extra):
     trainer = trainer_of(*extra)
     for _ in range(3):
         trainer.iterate()
@@ -197,7 +197,7 @@ def test_the_saved_policy_computes_what_rsl_rls_actor_does(extra):
     "extra", [(), (*NORMALIZED, CRITIC), LSTM, CURIOUS, ("agent.algorithm.optimizer=sgd",)],
     ids=["plain", "normalized", "lstm", "curious", "sgd"],
 )  # fmt: skip
-def test_a_resumed_run_goes_on_with_the_same_bits(extra):
+def test_resume_continues_bit_for_bit(extra):
     trainer = trainer_of(*extra)
     trainer.iterate()
     trainer.iterate()
@@ -217,7 +217,7 @@ def json_round_trip(state):
 
 
 @pytest.mark.parametrize("extra", [(), NORMALIZED, LSTM])
-def test_weights_alone_make_the_same_policy(extra):
+def test_load_weights_gives_same_policy(extra):
     trainer = trainer_of(*extra)
     trainer.iterate()
     wanted = trainer.state().tensors["policy"]
@@ -229,14 +229,14 @@ def test_weights_alone_make_the_same_policy(extra):
         torch.testing.assert_close(found[name], value, rtol=1e-5, atol=1e-6)
 
 
-def test_the_critic_sees_its_own_group():
+def test_critic_observes_its_own_group():
     assert trainer_of(CRITIC).alg.critic.obs_dim == 5
     both = trainer_of(CRITIC, "agent.obs_groups={policy: [policy], critic: [policy, critic]}")
     assert (both.alg.actor.obs_dim, both.alg.critic.obs_dim) == (4, 9)
     both.iterate()
 
 
-def test_curiosity_rewards_what_is_new_and_fades_by_its_schedule():
+def test_curiosity_rewards_new_states_and_follows_schedule():
     trainer = trainer_of(*CURIOUS)
     first = trainer.iterate().metrics
     assert first["Loss/rnd"] > 0.0
@@ -246,7 +246,7 @@ def test_curiosity_rewards_what_is_new_and_fades_by_its_schedule():
     assert trainer.iterate().metrics["Rnd/weight"] == 0.5
 
 
-def test_symmetry_makes_the_policy_an_odd_function(tmp_path):
+def test_symmetry_makes_policy_odd(tmp_path):
     source = find_task("cartpole").root
     for file in ("task.yaml", "cartpole.xml"):
         (tmp_path / file).write_text((source / file).read_text())
@@ -269,7 +269,7 @@ def test_symmetry_makes_the_policy_an_odd_function(tmp_path):
     assert metrics["Loss/symmetry"] < 0.1
 
 
-def test_actions_are_clipped_where_clip_actions_says(monkeypatch):
+def test_actions_are_clipped_to_clip_actions(monkeypatch):
     trainer = trainer_of("agent.clip_actions=0.05")
     taken, step = [], trainer.env.step
     monkeypatch.setattr(trainer.env, "step", lambda action: taken.append(action) or step(action))
@@ -279,7 +279,7 @@ def test_actions_are_clipped_where_clip_actions_says(monkeypatch):
     assert trainer_of().policy().spec.action_bound is None
 
 
-def test_what_is_not_read_is_said_once(caplog):
+def test_ignored_settings_are_reported_once(caplog):
     trainer = trainer_of("agent.seed=7", "agent.logger=wandb", "agent.device=cuda:0")
     trainer.iterate()
     first, _ = [record.message for record in caplog.records if record.name.startswith("rlcli")]
@@ -299,7 +299,7 @@ def test_what_is_not_read_is_said_once(caplog):
         (["agent.clip_actions=1.0", "agent.action_bound=2.0"], "agents.rsl-rl", "one thing"),
     ],
 )
-def test_settings_that_cannot_be_are_refused_before_anything_heavy(overrides, place, words):
+def test_invalid_settings_are_refused_without_heavy_imports(overrides, place, words):
     with pytest.raises(ConfigError) as caught:
         resolve(find_task("cartpole"), agent="rsl-rl", overrides=overrides)
     assert place in str(caught.value.problems)
@@ -320,7 +320,7 @@ def test_settings_that_cannot_be_are_refused_before_anything_heavy(overrides, pl
         ),
     ],
 )
-def test_settings_that_do_not_fit_the_environment_name_their_place(overrides, place, words):
+def test_settings_that_do_not_fit_env_name_their_key(overrides, place, words):
     with pytest.raises(ConfigError) as caught:
         trainer_of(*overrides)
     assert place in str(caught.value.problems)
@@ -328,18 +328,16 @@ def test_settings_that_do_not_fit_the_environment_name_their_place(overrides, pl
 
 
 @pytest.mark.parametrize("reference", ["stranger:mirror", "stranger.mirror", "{folder}/stranger.py:mirror"])
-def test_symmetry_of_a_configuration_imports_nothing_but_the_tasks_and_the_plugins_modules(
-    reference, tmp_path, monkeypatch
-):
+def test_symmetry_function_is_imported_only_from_task_and_plugins(reference, tmp_path, monkeypatch):
     (tmp_path / "stranger.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\ndef mirror(**_): ...\n")
     monkeypatch.syspath_prepend(tmp_path)
     named = reference.format(folder=tmp_path)
-    with pytest.raises(ConfigError, match=r"belongs neither|lies outside"):
+    with pytest.raises(ConfigError, match=r"belongs neither|is outside"):
         trainer_of(f"agent.algorithm.symmetry_cfg={{data_augmentation_func: '{named}'}}")
     assert not (tmp_path / "ran").exists()
 
 
-def test_a_name_alone_takes_rsl_rls_defaults():
+def test_ppo_alone_uses_rsl_rl_defaults():
     overrides = [*SMALL, "agent.algorithm=ppo", "agent.policy=null", "agent.experiment_name=null"]
     agent = resolve(find_task("cartpole"), agent="rsl-rl", overrides=[*overrides[:-1]]).agent
     actor, critic = agent.networks
@@ -353,7 +351,7 @@ def rlcli(capsys, *words, code=0):
     return capsys.readouterr()
 
 
-def test_a_run_is_played_exported_resumed_and_holds_no_pickle(tmp_path, capsys, monkeypatch):
+def test_run_is_played_exported_resumed_without_pickle(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small = ("--agent", "rsl-rl", "--num-envs", 8, "--logger", "none", "-q")
     run = rlcli(capsys, "train", "cartpole", *small, "--max-iterations", 2, *NORMALIZED, "agent.save_interval=1").out
@@ -373,24 +371,24 @@ def test_a_run_is_played_exported_resumed_and_holds_no_pickle(tmp_path, capsys, 
         assert len({(folder / f"{part}.safetensors").read_bytes() for folder in newest}) == 1, part
 
 
-def test_a_checkpoint_of_another_trainer_is_refused_with_both_names(tmp_path, capsys, monkeypatch):
+def test_checkpoint_of_other_trainer_is_refused_with_names(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small = ("--num-envs", 8, "--max-iterations", 1, "--logger", "none", "-q")
     run = Path(rlcli(capsys, "train", "cartpole", "--agent", "rsl-rl", *small).out.strip())
-    said = rlcli(capsys, "train", "cartpole", "--agent", "sac", *small, "--init-from", run, code=5).err
-    assert "'rsl-rl'" in said
-    assert "'sb3'" in said
-    assert "squashed-gaussian-mlp" in said
+    error = rlcli(capsys, "train", "cartpole", "--agent", "sac", *small, "--init-from", run, code=5).err
+    assert "'rsl-rl'" in error
+    assert "'sb3'" in error
+    assert "squashed-gaussian-mlp" in error
     step = next(folder for folder in (run / "checkpoints").iterdir() if folder.name == f"{128:012d}")
     manifest = json.loads((step / "manifest.json").read_text())
     assert manifest["trainer"] == "rsl-rl"
     (step / "manifest.json").write_text(json.dumps({**manifest, "trainer": "sb3"}))
-    said = rlcli(capsys, "train", "--resume", run, "--max-iterations", 2, code=5).err
-    assert "a checkpoint of trainer 'sb3'" in said
-    assert "one of 'rsl-rl'" in said
+    error = rlcli(capsys, "train", "--resume", run, "--max-iterations", 2, code=5).err
+    assert "a checkpoint of trainer 'sb3'" in error
+    assert "one of 'rsl-rl'" in error
 
 
-def test_a_policy_of_the_same_form_begins_with_another_trainers_weights(tmp_path, capsys, monkeypatch):
+def test_init_from_other_trainer_with_same_policy_form(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small = ("--num-envs", 8, "--max-iterations", 1, "--logger", "none", "-q")
     first = rlcli(capsys, "train", "cartpole", "--agent", "sb3-ppo", *small).out.strip()
@@ -398,7 +396,7 @@ def test_a_policy_of_the_same_form_begins_with_another_trainers_weights(tmp_path
 
 
 @pytest.mark.slow
-def test_the_seeds_numbers_learn_to_balance(tmp_path, capsys, monkeypatch):
+def test_shipped_settings_learn_to_balance(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ("train", "cartpole", "--agent", "rsl-rl", "--num-envs", 1024, "--logger", "none", "-q", "--seed", 1)
     run = rlcli(capsys, *words).out.strip()

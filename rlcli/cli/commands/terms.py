@@ -13,12 +13,22 @@ if TYPE_CHECKING:
 
 
 def command(
-    pattern: Annotated[str, typer.Argument(help="Show only terms whose name, section or summary contains this.")] = "",
-    task: Annotated[str | None, typer.Option("--task", help="Include the own terms of this task.")] = None,
+    pattern: Annotated[str, typer.Argument()] = "",
+    task: Annotated[str | None, typer.Option("--task", metavar="TASK")] = None,
 ) -> None:
     """List the terms for the sections of a task file: names, keys, types and defaults.
 
     An exact name prints the meaning of each key, with its unit, and an example.
+
+    Options:
+        pattern: Text in the name, section or summary of the terms. [default: all terms]
+        task: Add the terms of this task.
+
+    Examples:
+        rlcli terms track_lin_vel
+            List the terms whose name or summary contains a text.
+        rlcli terms joint_vel_l1
+            Describe one term with its keys.
     """
     from rlcli.config.term_reference import term_entries
     from rlcli.errors import did_you_mean

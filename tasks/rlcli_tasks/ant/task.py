@@ -1,4 +1,4 @@
-"""Ant in the direct workflow: four legs run towards a far target. docs/reference/zoo/ant-direct.md lists its 60 columns."""
+"""Ant in the direct workflow: run on four legs towards a far target. See docs/reference/zoo/ant-direct.md."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class AntTask(LocomotionTask):
     action_names = JOINTS
 
     class Params(LocomotionTask.Params):
-        """The task's own settings."""
+        """Settings of the task."""
 
         effort: float = Field(7.5, gt=0, description="Torque at action 1 [N m].")
         termination_height: float = Field(0.31, description="Torso height below which the episode fails [m].")
         death_reward: float = Field(-2.0, description="Reward of the step that fails, in place of all others.")
-        alive_weight: float = Field(0.5, description="Reward a step.")
+        alive_weight: float = Field(0.5, description="Reward per step.")
         action_cost: float = Field(0.005, ge=0, description="Penalty on squared actions.")
         energy_cost: float = Field(0.05, ge=0, description="Penalty on |action x joint velocity / (5 rad/s)|.")
         limit_cost: float = Field(
@@ -39,9 +39,9 @@ class AntTask(LocomotionTask):
     params: Params
 
     def efforts(self) -> tuple[float, ...]:
-        """The same for every joint."""
+        """Return the same torque for every joint."""
         return (self.params.effort,) * len(JOINTS)
 
     def at_limits(self, position: Tensor) -> Tensor:
-        """1 for each that is."""
+        """Return 1 for each joint at a limit."""
         return position.abs() > 0.99

@@ -49,7 +49,7 @@ class BallBalanceTask(DirectTask):
     action_names = KNEES
 
     class Params(StrictModel):
-        """The task's own settings."""
+        """Settings of the task."""
 
         speed: float = Field(20.0, gt=0, description="Rate of a knee's target at action 1 [rad/s].")
         target_height: float = Field(0.7, description="Height of the point where the ball should rest [m].")
@@ -72,22 +72,22 @@ class BallBalanceTask(DirectTask):
         self.tables = scene.add(ArticulationView("robot", name="table_view"))
 
     def post_reset(self) -> None:
-        """Make what the hooks use: constants, and buffers that keep their place."""
+        """Create constants and buffers. The hooks write the buffers in place."""
         self.robot, self.ball = self.env.entities["robot"], self.env.entities["ball"]
         assert tuple(self.robot.joint_names) == JOINTS
         params, device = self.params, self.device
         low, high = self.robot.data.joint_pos_limits.to(device).unbind(dim=1)
         self.lowest, self.highest = low[1::2].contiguous(), high[1::2].contiguous()
-        self.targets = torch.zeros(self.num_envs, len(JOINTS), device=device)  # of the knees; hips have no motor [rad]
+        self.targets = torch.zeros(self.num_envs, len(JOINTS), device=device)  # knees [rad]; hips have no motor
         self.goal = torch.tensor([0.0, 0.0, params.target_height], device=device)
-        # distance, direction, height, and the share of the highest speed inwards
+        # distance, direction, height, and inward speed as a fraction of the highest
         ranges = [params.start_distance, (-math.pi, math.pi), params.start_height, (0.0, 1.0)]
         self.start_low, self.start_high = torch.tensor(ranges, device=device).unbind(dim=1)
         self.distance = torch.zeros(self.num_envs, device=device)
-        self.extras["distance"] = self.distance  # of the ball from where it should rest [m]
+        self.extras["distance"] = self.distance  # distance of the ball from its goal [m]
 
     def reset(self, selection: Selection) -> None:
-        """The table at rest; the ball falls, and moves towards the middle the faster the further out it is."""
+        """Set the table to rest. The ball falls, and moves towards the middle faster the farther away it starts."""
         params = self.params
         distance, direction, height, share = selection.uniform(self.start_low, self.start_high, (4,)).unbind(dim=1)
         nearest, furthest = params.start_distance
@@ -100,7 +100,7 @@ class BallBalanceTask(DirectTask):
         selection.write(self.targets, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Move the targets of the knees, inside their limits."""
+        """Move the targets of the knees, within their limits."""
         knees = self.targets[:, 1::2]
         knees.add_(actions, alpha=self.params.speed * self.step_dt)
         knees.copy_(torch.minimum(torch.maximum(knees, self.lowest), self.highest))
@@ -109,7 +109,7 @@ class BallBalanceTask(DirectTask):
     def get_observations(self) -> None:
         """Fill obs_buf."""
         robot, ball = self.robot.data, self.ball.data
-        # a new episode has had no physics step: what the sensors show is not of its state
+        # no physics step yet in a new episode: sensor values belong to the old state
         scale = (self.progress_buf > 0).mul(1.0 / 20.0)
         readings = robot.sensordata.unflatten(1, (len(LEGS), 6)).transpose(1, 2) * scale[:, None, None]
         torch.cat(
@@ -126,11 +126,11 @@ class BallBalanceTask(DirectTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Near the middle, and slow."""
+        """Reward a ball that is slow and near the middle."""
         speed = torch.linalg.vector_norm(self.obs_buf[:, BALL_VEL], dim=1)
         torch.linalg.vector_norm(self.obs_buf[:, BALL_POS] - self.goal, dim=1, out=self.distance)
         self.rew_buf.copy_(((1.0 + self.distance) * (1.0 + speed)).reciprocal_())
 
     def is_done(self) -> None:
-        """The ball has fallen off; the framework adds the time-out."""
+        """Terminate where the ball has fallen off. The environment adds the time-out."""
         self.reset_buf.copy_(self.obs_buf[:, BALL_POS][:, 2] < self.params.fall_height)

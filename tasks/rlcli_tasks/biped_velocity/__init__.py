@@ -1,4 +1,4 @@
-"""Biped velocity: the humanoid walks and turns as it is told. Numbers and sources: docs/reference/zoo/biped-velocity.md."""
+"""Biped velocity: the humanoid follows velocity commands. Numbers and sources: docs/reference/zoo/biped-velocity.md."""
 
 from rlcli.task import TaskSpec
 

@@ -1,7 +1,7 @@
 """Cart with two links: a force on the cart and a torque between the links balance both.
 
-The original is a task for two agents, the cart and the pendulum. One policy plays both here: it sees what either sees,
-its two actions are theirs, and its reward is the sum of theirs.
+The original is a task for two agents, the cart and the pendulum. Here one policy controls both: it has the observations
+and actions of both, and its reward is the sum of theirs.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class CartDoublePendulumTask(DirectTask):
     action_names = (CART, PENDULUM)
 
     class Params(StrictModel):
-        """The task's own settings."""
+        """Settings of the task."""
 
         cart_effort: float = Field(100.0, gt=0, description="Force on the cart at action 1 [N].")
         pendulum_effort: float = Field(50.0, gt=0, description="Torque of the pole on the pendulum at action 1 [N m].")
@@ -54,7 +54,7 @@ class CartDoublePendulumTask(DirectTask):
         self.carts = scene.add(ArticulationView("robot", name="cart_view"))
 
     def post_reset(self) -> None:
-        """Make what the hooks use: the spread of start states and the efforts, a column a joint."""
+        """Create the ranges of initial states and the efforts, one column per joint."""
         self.robot = self.env.entities["robot"]
         assert tuple(self.robot.joint_names) == JOINTS
         params = self.params
@@ -63,16 +63,16 @@ class CartDoublePendulumTask(DirectTask):
         self.scale = torch.tensor([params.cart_effort, params.pendulum_effort], device=self.device)
 
     def reset(self, selection: Selection) -> None:
-        """The cart in the middle, the links at random angles, all at rest."""
+        """Set the cart to the middle and the links to random angles, all at rest."""
         self.robot.write_joint_positions(selection, selection.uniform(-self.start, self.start, (len(JOINTS),)))
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Push the cart, turn the pendulum against the pole."""
+        """Push the cart, and apply a torque between the links."""
         torch.mul(actions, self.scale, out=self.efforts[:, ::2])
         self.carts.set_joint_efforts(self.efforts)
 
     def get_observations(self) -> None:
-        """Fill obs_buf: what the cart sees, then what the pendulum sees."""
+        """Fill obs_buf: first the observations of the cart, then those of the pendulum."""
         position, velocity = self.robot.data.joint_pos, self.robot.data.joint_vel
         pole, between = position[:, 1], wrap_to_pi(position[:, 2])
         torch.stack(
@@ -85,7 +85,7 @@ class CartDoublePendulumTask(DirectTask):
         )
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]]:
-        """The same in the vocabulary of manager-based tasks."""
+        """Return the observations as terms of a manager-based task."""
         params = self.params
         return {
             "observations": [
@@ -101,7 +101,7 @@ class CartDoublePendulumTask(DirectTask):
         }
 
     def calculate_metrics(self) -> None:
-        """Both links upright and all joints calm; a failure costs."""
+        """Reward upright links and slow joints; a failure has a cost."""
         params = self.params
         _, cart_vel, pole, pole_vel, tilt, _, pendulum_vel = self.obs_buf.unbind(dim=1)
         self.rew_buf.fill_(params.alive_weight).masked_fill_(self._failed(), params.failure_reward)
@@ -109,7 +109,7 @@ class CartDoublePendulumTask(DirectTask):
         self.rew_buf.sub_(cart_vel.abs() + pole_vel.abs() + pendulum_vel.abs(), alpha=params.speed_weight)
 
     def is_done(self) -> None:
-        """Off the rail, or the pole has fallen; the framework adds the time-out."""
+        """Terminate where the cart left the rail or the pole fell. The environment adds the time-out."""
         self.reset_buf.copy_(self._failed())
 
     def _failed(self) -> Tensor:

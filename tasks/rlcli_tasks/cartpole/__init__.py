@@ -1,4 +1,4 @@
-"""Cartpole: balance a pole on a cart, in both workflows and from pictures. Numbers: docs/reference/zoo/cartpole.md."""
+"""Cartpole: balance a pole on a cart, in both workflows and from images. Numbers: docs/reference/zoo/cartpole.md."""
 
 from rlcli.task import TaskSpec
 

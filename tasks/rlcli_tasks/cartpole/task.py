@@ -24,7 +24,7 @@ class CartpoleTask(DirectTask):
     action_names = ("slider_to_cart",)
 
     class Params(StrictModel):
-        """The task's own settings."""
+        """Settings of the task."""
 
         reset_dist: float = Field(3.0, gt=0, description="Cart position at which the episode fails [m].")
         max_effort: float = Field(400.0, gt=0, description="Force at action 1 [N].")
@@ -38,7 +38,7 @@ class CartpoleTask(DirectTask):
         self.cartpoles = scene.add(ArticulationView("robot", name="cartpole_view"))
 
     def post_reset(self) -> None:
-        """Look up joints once."""
+        """Look up the joints."""
         self.cart = self.cartpoles.get_dof_index("slider_to_cart")
         self.pole = self.cartpoles.get_dof_index("cart_to_pole")
         self.position_span, self.velocity_span = torch.empty(2, self.cartpoles.num_dof, device=self.device)
@@ -46,7 +46,7 @@ class CartpoleTask(DirectTask):
         self.velocity_span[self.cart], self.velocity_span[self.pole] = 0.5, 0.25 * math.pi
 
     def reset_idx(self, env_ids: Tensor) -> None:
-        """Cart +-1 m and +-0.5 m/s, pole +-pi/8 and +-pi/4 rad/s."""
+        """Sample the cart in +-1 m and +-0.5 m/s, the pole in +-pi/8 rad and +-pi/4 rad/s."""
         draws = self.draws(env_ids)
         position = self.position_span * draws.uniform(-1.0, 1.0, (self.cartpoles.num_dof,))
         velocity = self.velocity_span * draws.uniform(-1.0, 1.0, (self.cartpoles.num_dof,))
@@ -70,7 +70,7 @@ class CartpoleTask(DirectTask):
         return {self.cartpoles.name: {"obs_buf": self.obs_buf}}
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]]:
-        """The same in the vocabulary of manager-based tasks."""
+        """Return the observations as terms of a manager-based task."""
         cart, pole = ["slider_to_cart"], ["cart_to_pole"]
         observed = [{"func": func, "joints": joints} for joints in (cart, pole) for func in ("joint_pos", "joint_vel")]
         return {
@@ -79,7 +79,7 @@ class CartpoleTask(DirectTask):
         }
 
     def calculate_metrics(self) -> None:
-        """Upright and calm is good, out of bounds costs 2."""
+        """Reward an upright pole and slow joints; a failure costs 2."""
         _, cart_vel, pole_pos, pole_vel = self.obs_buf.unbind(dim=1)
         reward = 1.0 - pole_pos.square()
         reward -= self.params.cart_vel_weight * cart_vel.abs()
@@ -87,7 +87,7 @@ class CartpoleTask(DirectTask):
         self.rew_buf[:] = torch.where(self._failed(), -2.0, reward)
 
     def is_done(self) -> None:
-        """Off the rail or fallen; the framework adds the time-out."""
+        """Terminate where the cart left the rail or the pole fell. The environment adds the time-out."""
         self.reset_buf[:] = self._failed()
 
     def _failed(self) -> Tensor:

@@ -1,4 +1,7 @@
-"""Crazyflie: rise to a point with four slow motors and hover. Numbers and their sources: docs/reference/zoo/crazyflie.md."""
+"""Crazyflie: rise to a point with four slow motors and hover.
+
+Numbers and their sources: docs/reference/zoo/crazyflie.md.
+"""
 
 from rlcli.task import TaskSpec
 

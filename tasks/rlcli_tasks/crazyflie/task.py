@@ -28,15 +28,19 @@ class CrazyflieTask(FlightTask):
     motors = False
 
     class Params(FlightTask.Params):
-        """The task's own settings."""
+        """Settings of the task."""
 
-        thrust_to_weight: float = Field(1.9, gt=1, description="All four motors at full speed, over the weight.")
+        thrust_to_weight: float = Field(
+            1.9, gt=1, description="Thrust of all four motors at full speed, divided by the weight."
+        )
         motor_time: float = Field(
             0.15, gt=0, description="Time in which a motor's speed settles [s]; 4 time constants."
         )
-        thrust_noise: float = Field(0.01, ge=0, description="Noise of a thrust, over what is asked of it (deviation).")
+        thrust_noise: float = Field(
+            0.01, ge=0, description="Standard deviation of the thrust noise, divided by the commanded thrust."
+        )
         target_low: tuple[float, float, float] = Field(
-            (0.0, 0.0, 2.0), description="Targets: lower corner of the box they are drawn from [m]."
+            (0.0, 0.0, 2.0), description="Targets: lower corner of the box from which they are sampled [m]."
         )
         target_high: tuple[float, float, float] = Field((0.0, 0.0, 2.0), description="Targets: upper corner [m].")
         height_range: tuple[float, float] = Field((0.5, 5.0), description="Heights outside which it fails [m].")
@@ -45,35 +49,35 @@ class CrazyflieTask(FlightTask):
     params: Params
 
     def post_reset(self) -> None:
-        """Make what the hooks use: constants, and buffers that keep their place."""
+        """Create constants and buffers. The hooks write the buffers in place."""
         super().post_reset()
         params, n, model = self.params, self.num_envs, self.env.engine.model
         weight = float(model.body_mass[self.robot.body_ids].sum()) * -float(model.opt.gravity[2])
         self.max_thrust = params.thrust_to_weight * weight / len(MOTORS)
-        """Of a motor [N]."""
+        """Maximum thrust of a motor [N]."""
         self.follow = min(4.0 * self.step_dt / params.motor_time, 1.0)
-        """Share of the way to the speed asked for that a motor makes in a step."""
+        """Fraction of the speed error that a motor corrects in one step."""
         self.everywhere = torch.ones(n, dtype=torch.bool, device=self.device)
         self.actions = torch.zeros(n, len(MOTORS), device=self.device)
         self.speeds = torch.zeros(n, len(MOTORS), device=self.device)
-        """Motor speeds, over the highest. (n, 4)"""
+        """Motor speeds, divided by the highest speed. (n, 4)"""
 
     def reset(self, selection: Selection) -> None:
-        """Level and at rest below the target, motors off."""
+        """Set the drone level and at rest below the target, with motors off."""
         super().reset(selection)
         selection.write(self.actions, 0.0)
         selection.write(self.speeds, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Thrusts asked for, which motors follow by their speed: its square is the thrust."""
+        """Set the commanded thrusts. Motor speeds follow with a lag; the thrust is the square of the speed."""
         self.move_target()
         self.actions.copy_(actions)
-        asked = (actions + 1.0).mul_(0.5).clamp_(0.0, 1.0)
-        self.speeds.lerp_(asked.sqrt(), self.follow)
+        command = (actions + 1.0).mul_(0.5).clamp_(0.0, 1.0)
+        self.speeds.lerp_(command.sqrt(), self.follow)
         everyone = self.selection(self.everywhere, "thrust")
         assert everyone is not None
         noise = everyone.normal(0.0, self.params.thrust_noise, (len(MOTORS),))
-        thrusts = torch.addcmul(self.speeds.square(), asked, noise).clamp_(0.0, 1.0)
+        thrusts = torch.addcmul(self.speeds.square(), command, noise).clamp_(0.0, 1.0)
         self.env.engine.field("ctrl").copy_(thrusts.mul_(self.max_thrust))
 
     def get_observations(self) -> None:
@@ -94,7 +98,7 @@ class CrazyflieTask(FlightTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Nearness; near the target, uprightness and not to turn; less a little where actions are small."""
+        """Reward nearness, and near the target an upright pose without spin; small actions cost a little."""
         data = self.robot.data
         self.distance.copy_(length(self.target - data.root_pos_w))
         near = 1.0 / (1.0 + self.distance)
@@ -105,7 +109,7 @@ class CrazyflieTask(FlightTask):
         self.rew_buf.copy_(reward.sub_(low_effort, alpha=self.params.effort_cost))
 
     def is_done(self) -> None:
-        """Too far, too low, too high or upside down; the framework adds the time-out."""
+        """Terminate where the drone is too far, too low, too high or upside down. The environment adds the time-out."""
         data = self.robot.data
         low, high = self.params.height_range
         height, up = data.root_pos_w[:, 2], axis_z(data.root_quat_w)[:, 2]

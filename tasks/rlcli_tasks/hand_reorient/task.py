@@ -24,7 +24,7 @@ GOAL = slice(45, 53)
 
 
 class HandTask(DirectTask):
-    """Turn the cube to the goal, again and again. Observations: docs/reference/zoo/hand-reorient.md lists the 69 columns.
+    """Turn the cube to one goal after another. Observations: docs/reference/zoo/hand-reorient.md lists the 69 columns.
 
     The critic's states are these and what the ends of the fingers do and feel, 145 columns in all.
     """
@@ -56,16 +56,25 @@ class HandTask(DirectTask):
     motors = False
 
     class Params(StrictModel):
-        """The task's own settings."""
+        """Settings of the task."""
 
-        goal_pos: tuple[float, float, float] = Field((-0.01, 0.0, 0.55), description="Where the cube belongs [m].")
-        shown_pos: tuple[float, float, float] = Field((0.12, 0.2, 0.62), description="Where the goal is shown [m].")
+        goal_pos: tuple[float, float, float] = Field(
+            (-0.01, 0.0, 0.55), description="Position where the cube should stay [m]."
+        )
+        shown_pos: tuple[float, float, float] = Field(
+            (0.12, 0.2, 0.62), description="Position where the goal is displayed [m]."
+        )
         smoothing: float = Field(
-            0.5, gt=0, le=1, description="Share of the new target in a step; the rest is the last step's target."
+            0.5,
+            gt=0,
+            le=1,
+            description="Weight of the new target in a step; the rest is the weight of the previous target.",
         )
         success_tolerance: float = Field(0.4, gt=0, description="Angle at which a goal counts as reached [rad].")
-        fall_distance: float = Field(0.24, gt=0, description="Distance from its place at which the cube is lost [m].")
-        distance_weight: float = Field(-10.0, description="Reward on the distance from the cube's place [1/m].")
+        fall_distance: float = Field(
+            0.24, gt=0, description="Distance from that position at which the cube counts as lost [m]."
+        )
+        distance_weight: float = Field(-10.0, description="Reward on the distance of the cube from its position [1/m].")
         rotation_weight: float = Field(1.0, description="Reward on 1 / (angle to the goal + rotation_eps) [rad].")
         rotation_eps: float = Field(0.1, gt=0, description="See rotation_weight [rad].")
         action_weight: float = Field(-0.0002, description="Reward on the sum of squared actions.")
@@ -73,7 +82,10 @@ class HandTask(DirectTask):
         fall_reward: float = Field(0.0, description="Reward of the step in which the cube is lost, besides the others.")
         position_noise: float = Field(0.01, ge=0, description="Start: position of the cube +- [m].")
         joint_noise: float = Field(
-            0.2, ge=0, le=1, description="Start: share of the way from the default to a position drawn in the range."
+            0.2,
+            ge=0,
+            le=1,
+            description="Start: fraction of the way from the default to a position sampled in the range.",
         )
 
     params: Params
@@ -83,7 +95,7 @@ class HandTask(DirectTask):
         self.hands = scene.add(ArticulationView("robot", name="hand_view"))
 
     def post_reset(self) -> None:
-        """Make what the hooks use: constants, and buffers that keep their place."""
+        """Create constants and buffers. The hooks write the buffers in place."""
         self.robot, self.cube, self.shown = (self.env.entities[name] for name in ("robot", "object", "goal"))
         data, params, n, device = self.robot.data, self.params, self.num_envs, self.device
         self.low, self.high = (ends.clone() for ends in data.joint_pos_limits.to(device).unbind(dim=1))
@@ -100,25 +112,25 @@ class HandTask(DirectTask):
         self.targets = torch.zeros(n, self.num_actions, device=device)
         self.distance = torch.zeros(n, device=device)
         self.angle = torch.zeros(n, device=device)
-        self.successes = torch.zeros(n, device=device)  # goals reached in the running episode
+        self.successes = torch.zeros(n, device=device)  # goals reached in the current episode
         self.episode_metrics["successes"] = self.successes
-        self.extras["angle"] = self.angle  # to the goal [rad]
+        self.extras["angle"] = self.angle  # angle to the goal [rad]
 
     def reset(self, selection: Selection) -> None:
-        """Fingers about their default and at rest, the cube above the palm in any orientation, and a goal."""
+        """Set the fingers near their default pose and the cube above the palm, randomly oriented; sample a goal."""
         joints = selection.uniform(self.start_low, self.start_high, (self.num_actions,))
         self.robot.write_joint_positions(selection, joints)
         noise = self.params.position_noise
         place = selection.read(self.cube.data.default_root_state[:, :3])
         place += selection.uniform(-noise, noise, (3,))
-        self.cube.write_root_pose(selection, place, _any_rotation(selection))
+        self.cube.write_root_pose(selection, place, _random_rotation(selection))
         self._draw_goal(selection)
         selection.write(self.targets, joints)
         selection.write(self.actions, 0.0)
         selection.write(self.successes, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Position targets, smoothed."""
+        """Set smoothed position targets."""
         self.actions.copy_(actions)
         wanted = torch.addcmul(self.middle, self.half, actions)
         self.targets.lerp_(wanted, self.params.smoothing)
@@ -144,9 +156,9 @@ class HandTask(DirectTask):
         )
 
     def get_states(self) -> None:
-        """Fill states_buf: what the policy sees, then position, orientation, velocity and load of the fingers' ends."""
+        """Fill states_buf: the observations, then position, orientation, velocity and load of the fingertips."""
         data, ends = self.robot.data, self.ends
-        # a new episode has had no physics step: what the sensors show is not of its state
+        # no physics step yet in a new episode: sensor values belong to the old state
         felt = (self.progress_buf > 0).mul(0.1)
         torch.cat(
             [
@@ -162,7 +174,7 @@ class HandTask(DirectTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Closeness in place and in orientation, less effort; a bonus for a goal, which is then drawn anew."""
+        """Reward a cube near its position and goal, minus effort. A reached goal earns a bonus and is replaced."""
         params, cube = self.params, self.cube.data
         self.distance.copy_(length(cube.root_pos_w - self.goal_pos))
         self.angle.copy_(turn_between(self.goal_quat, cube.root_quat_w))
@@ -177,25 +189,25 @@ class HandTask(DirectTask):
         due = self.selection(reached, "goal")
         if due is not None:
             self._draw_goal(due)
-            self.obs_buf[:, GOAL] = self._goal()  # the policy acts on the new goal at once
+            self.obs_buf[:, GOAL] = self._goal()  # the next action already uses the new goal
             if self.num_states:
                 self.states_buf[:, GOAL] = self.obs_buf[:, GOAL]
 
     def is_done(self) -> None:
-        """The cube is lost; the framework adds the time-out."""
+        """Terminate where the cube has fallen. The environment adds the time-out."""
         self.reset_buf.copy_(self.distance >= self.params.fall_distance)
 
     def _draw_goal(self, selection: Selection) -> None:
-        quat = _any_rotation(selection)
+        quat = _random_rotation(selection)
         selection.write(self.goal_quat, quat)
         self.shown.write_root_pose(selection, selection.read(self.shown_pos), quat)
 
     def _goal(self) -> Tensor:
-        """Orientation of the goal, and the turn from it to the cube. (num_envs, 8)"""
+        """Return the goal's orientation, and the rotation from it to the cube. (num_envs, 8)"""
         turn = multiply(self.cube.data.root_quat_w, conjugate(self.goal_quat))
         return torch.cat([self.goal_quat, unique(turn)], dim=1)
 
 
-def _any_rotation(selection: Selection) -> Tensor:
-    """A rotation drawn uniformly, w >= 0. (rows, 4)"""
+def _random_rotation(selection: Selection) -> Tensor:
+    """Sample rotations uniformly, with w >= 0. (rows, 4)"""
     return unique(random_quaternion(*selection.uniform(0.0, 1.0, (3,)).unbind(1)))

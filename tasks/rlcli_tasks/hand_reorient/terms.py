@@ -1,4 +1,4 @@
-"""What counts as success. (num_envs,) bool each."""
+"""Success terms. (num_envs,) bool each."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from rlcli.envs.direct import DirectEnv
 
 
 def goals_reached(env: DirectEnv, *, at_least: int) -> Tensor:
-    """The running episode of `hand-reorient` has reached so many goals. (num_envs,)"""
+    """Return where the current episode of `hand-reorient` has reached at least this many goals. (num_envs,)"""
     return env.task.successes >= at_least  # type: ignore[attr-defined]

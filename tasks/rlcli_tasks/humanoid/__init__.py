@@ -1,4 +1,4 @@
-"""Humanoid: a human figure runs towards a far target. Numbers and their sources: docs/reference/zoo/humanoid.md."""
+"""Humanoid: a humanoid robot runs towards a far target. Numbers and their sources: docs/reference/zoo/humanoid.md."""
 
 from rlcli.task import TaskSpec
 

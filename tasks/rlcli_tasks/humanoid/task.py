@@ -1,4 +1,4 @@
-"""Humanoid in the direct workflow: a human figure runs towards a far target. docs/reference/zoo/humanoid-direct.md."""
+"""Humanoid in the direct workflow: run on two legs towards a far target. See docs/reference/zoo/humanoid-direct.md."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class HumanoidTask(LocomotionTask):
     action_names = JOINTS
 
     class Params(LocomotionTask.Params):
-        """The task's own settings."""
+        """Settings of the task."""
 
         power: float = Field(1.0, gt=0, description="Factor on the motors' torques.")
         termination_height: float = Field(0.8, description="Torso height below which the episode fails [m].")
         death_reward: float = Field(-1.0, description="Reward of the step that fails, in place of all others.")
-        alive_weight: float = Field(2.0, description="Reward a step.")
+        alive_weight: float = Field(2.0, description="Reward per step.")
         action_cost: float = Field(0.01, ge=0, description="Penalty on squared actions.")
         energy_cost: float = Field(
             0.05, ge=0, description="Penalty on |action x joint velocity / (10 rad/s)| x the motor's share of 135 N m."
@@ -52,14 +52,14 @@ class HumanoidTask(LocomotionTask):
     params: Params
 
     def post_reset(self) -> None:
-        """Legs start side by side or apart: drawn inwards, a fifth of all starts would have them inside each other."""
+        """Sample initial hip angles only outwards: inwards, the legs would overlap in a fifth of all initial states."""
         super().post_reset()
         self.start_high[[JOINTS.index("hip_roll_l"), JOINTS.index("hip_roll_r")]] = 0.0
 
     def efforts(self) -> tuple[float, ...]:
-        """Each motor's own."""
+        """Return the torque of each motor."""
         return tuple(self.params.power * effort for effort in EFFORTS.values())
 
     def at_limits(self, position: Tensor) -> Tensor:
-        """0 at 98% of the half range, 1 times the motor's share at the limit."""
+        """Return 0 at 98 % of the half range, and at the limit 1 times the motor's weight."""
         return (position.abs() - 0.98).clamp_(min=0.0).mul_(self.share / 0.02)

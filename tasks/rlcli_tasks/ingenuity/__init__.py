@@ -1,4 +1,7 @@
-"""Ingenuity: fly from point to point on Mars with two coaxial rotors. Numbers, sources: docs/reference/zoo/ingenuity.md."""
+"""Ingenuity: fly from point to point on Mars with two coaxial rotors.
+
+Numbers and their sources: docs/reference/zoo/ingenuity.md.
+"""
 
 from rlcli.task import TaskSpec
 

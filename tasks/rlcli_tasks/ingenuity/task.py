@@ -15,7 +15,7 @@ ROTORS = ("lower", "upper")
 
 
 class IngenuityTask(FlightTask):
-    """Hover at the target, which jumps. Observations: docs/reference/zoo/ingenuity.md lists the 13 columns."""
+    """Hover at the target, which changes. Observations: docs/reference/zoo/ingenuity.md lists the 13 columns."""
 
     num_observations = 13
     num_actions = 6
@@ -28,35 +28,35 @@ class IngenuityTask(FlightTask):
     motors = False
 
     class Params(FlightTask.Params):
-        """The task's own settings."""
+        """Settings of the task."""
 
         max_thrust: float = Field(20.0, gt=0, description="Largest thrust of a rotor, either way [N].")
         lateral: float = Field(0.2, ge=0, description="Largest share of the thrust along each of x and y.")
         target_low: tuple[float, float, float] = Field(
-            (-1.0, -1.0, 1.0), description="Targets: lower corner of the box they are drawn from [m]."
+            (-1.0, -1.0, 1.0), description="Targets: lower corner of the box from which they are sampled [m]."
         )
         target_high: tuple[float, float, float] = Field((1.0, 1.0, 2.0), description="Targets: upper corner [m].")
         start_offset: float = Field(0.5, ge=0, description="Start: offset from the default position +- [m].")
         max_distance: float = Field(20.0, gt=0, description="Distance to the target beyond which it fails [m].")
         min_height: float = Field(0.5, description="Height below which it fails [m].")
         steadiness: float = Field(
-            0.0, ge=0, description="Weight of nearness / (1 + 10 speed^2) in the reward, which upstream's lacks [1]."
+            0.0, ge=0, description="Weight of nearness / (1 + 10 speed^2), a term that the original reward lacks [1]."
         )
 
     params: Params
 
     def post_reset(self) -> None:
-        """Make what the hooks use: constants, and buffers that keep their place."""
+        """Create constants and buffers. The hooks write the buffers in place."""
         super().post_reset()
         self.forces = torch.zeros(self.num_envs, len(ROTORS), 3, device=self.device)
-        """Of each rotor, in its own frame. (n, 2, 3) [N]"""
+        """Force of each rotor, in the rotor's frame. (n, 2, 3) [N]"""
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Of each rotor: two sideways shares of its thrust, and the thrust."""
+        """Set each rotor's thrust, and two sideways fractions of it."""
         self.move_target()
-        asked = actions.view(-1, len(ROTORS), 3).clamp(-1.0, 1.0)
-        thrust = asked[..., 2:] * self.params.max_thrust
-        torch.mul(asked[..., :2], thrust * self.params.lateral, out=self.forces[..., :2])
+        command = actions.view(-1, len(ROTORS), 3).clamp(-1.0, 1.0)
+        thrust = command[..., 2:] * self.params.max_thrust
+        torch.mul(command[..., :2], thrust * self.params.lateral, out=self.forces[..., :2])
         self.forces[..., 2:].copy_(thrust)
         self.env.engine.field("ctrl").copy_(self.forces.view(-1, 6))
 
@@ -75,7 +75,7 @@ class IngenuityTask(FlightTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Nearness; and near the target, uprightness, not to spin, and `steadiness`."""
+        """Reward nearness, and near the target an upright pose, no spin, and `steadiness`."""
         data = self.robot.data
         self.distance.copy_(length(self.target - data.root_pos_w))
         _, x, y, _ = data.root_quat_w.unbind(dim=1)
@@ -84,11 +84,11 @@ class IngenuityTask(FlightTask):
         near = 1.0 / (1.0 + 2.5 * self.distance.square())
         posture = 1.0 / (1.0 + 30.0 * tilt.square()) + 1.0 / (1.0 + 10.0 * spin.square())
         self.rew_buf.copy_(near + near * posture)
-        if self.params.steadiness:  # a sway of 10 cm costs upstream's reward 2 %, so that what it trains may sway
+        if self.params.steadiness:  # without it a sway of 10 cm costs only 2 % of the reward
             rest = 1.0 / (1.0 + 10.0 * data.root_lin_vel_w.square().sum(dim=1))
             self.rew_buf.addcmul_(near, rest, value=self.params.steadiness)
 
     def is_done(self) -> None:
-        """Too far or too low; the framework adds the time-out."""
+        """Terminate where the robot is too far or too low. The environment adds the time-out."""
         low = self.robot.data.root_pos_w[:, 2] < self.params.min_height
         self.reset_buf.copy_((self.distance > self.params.max_distance) | low)

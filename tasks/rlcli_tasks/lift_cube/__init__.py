@@ -1,4 +1,7 @@
-"""Lift: an arm takes a cube and holds it where it is asked to. Numbers and their sources: docs/reference/zoo/lift-cube.md."""
+"""Lift: an arm grasps a cube and holds it at a commanded position.
+
+Numbers and their sources: docs/reference/zoo/lift-cube.md.
+"""
 
 from rlcli.task import TaskSpec
 

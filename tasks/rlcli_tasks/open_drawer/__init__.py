@@ -1,4 +1,7 @@
-"""Open drawer: an arm pulls a drawer open by its handle. Numbers and their sources: docs/reference/zoo/open-drawer.md."""
+"""Open drawer: an arm pulls a drawer open by its handle.
+
+Numbers and their sources: docs/reference/zoo/open-drawer.md.
+"""
 
 from rlcli.task import TaskSpec
 

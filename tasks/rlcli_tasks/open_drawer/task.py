@@ -42,13 +42,15 @@ class DrawerTask(DirectTask):
         *("m", "m", "m", "m", "m/s"),
     )
     action_names = JOINTS
-    motors = False  # the drawer has none
+    motors = False  # the drawer has no motor
 
     class Params(StrictModel):
-        """The task's own settings."""
+        """Settings of the task."""
 
         action_scale: float = Field(2.5, gt=0, description="Speed of a joint's target at action 1 [rad/s].")
-        finger_speed: float = Field(0.1, gt=0, description="Of the fingers' targets, as a share of that [m/rad].")
+        finger_speed: float = Field(
+            0.1, gt=0, description="Speed of the fingers' targets, as a fraction of it [m/rad]."
+        )
         velocity_scale: float = Field(0.1, gt=0, description="Factor on observed joint velocities.")
         start_noise: float = Field(0.125, ge=0, description="Start: joints +- about their default [rad, m].")
         start_opening: float = Field(0.01, ge=0, description="Start: the drawer is up to this far open [m].")
@@ -58,7 +60,7 @@ class DrawerTask(DirectTask):
         finger_weight: float = Field(100.0, description="Reward on how near to its height these are [1/m].")
         close_weight: float = Field(10.0, description="Reward on fingers closed at the handle [1/m].")
         open_weight: float = Field(7.5, description="Reward on the drawer's opening, half as much again if held [1/m].")
-        reach: float = Field(0.05, gt=0, description="From how far on fingers count as about the handle [m].")
+        reach: float = Field(0.05, gt=0, description="Distance from which fingers count as around the handle [m].")
         action_cost: float = Field(0.01, ge=0, description="Penalty on squared actions.")
 
     params: Params
@@ -68,7 +70,7 @@ class DrawerTask(DirectTask):
         self.arms = scene.add(ArticulationView("robot", name="arm_view"))
 
     def post_reset(self) -> None:
-        """Make what the hooks use: constants, and buffers that keep their place."""
+        """Create constants and buffers. The hooks write the buffers in place."""
         self.robot, self.cabinet = self.env.entities["robot"], self.env.entities["cabinet"]
         data, params, n = self.robot.data, self.params, self.num_envs
         self.low, self.high = data.joint_pos_limits.to(self.device).unbind(dim=1)
@@ -80,11 +82,11 @@ class DrawerTask(DirectTask):
         share = torch.ones(self.num_actions)
         share[FINGERS] = params.finger_speed
         self.stride = (params.action_scale * self.step_dt * share).to(self.device)
-        """How far a target moves in a step at action 1. (9,)"""
+        """Change of each target in one step at action 1. (9,)"""
         self.targets = data.default_joint_pos.clone()
         self.actions = torch.zeros(n, self.num_actions, device=self.device)
         self.opening = torch.zeros(n, device=self.device)
-        self.extras["opening"] = self.opening  # of the drawer [m]
+        self.extras["opening"] = self.opening  # opening of the drawer [m]
         names = self.robot.names
         self.hand = names["Bodies"].index("hand")
         self.left, self.right = (names["Bodies"].index(f"finger_{side}") for side in ("left", "right"))
@@ -92,7 +94,7 @@ class DrawerTask(DirectTask):
         self.handle = self.cabinet.names["Sites"].index("handle")
 
     def reset(self, selection: Selection) -> None:
-        """The arm about its default pose, the drawer nearly shut, all at rest."""
+        """Set the arm near its default pose and the drawer nearly shut, all at rest."""
         position = selection.uniform(self.start_low, self.start_high, (self.num_actions,))
         self.robot.write_joint_positions(selection, position)
         self.cabinet.write_joint_positions(selection, selection.uniform(0.0, self.params.start_opening, (1,)))
@@ -122,7 +124,7 @@ class DrawerTask(DirectTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Nearness, attitude, grasp and opening, less the size of the actions."""
+        """Reward nearness, orientation, grasp and opening, minus the size of the actions."""
         params, arm = self.params, self.robot.data
         self.opening.copy_(self.obs_buf[:, OPENING])
         opening, distance = self.opening, length(self.obs_buf[:, WAY])
@@ -151,5 +153,5 @@ class DrawerTask(DirectTask):
         self.rew_buf.copy_(reward)
 
     def is_done(self) -> None:
-        """Time alone ends an episode: an open drawer is to be held open."""
+        """Never terminate: an open drawer must be held open until the time-out."""
         self.reset_buf.zero_()

@@ -1,4 +1,7 @@
-"""Quadcopter: fly to a point and hover, with tilting rotors. Numbers and their sources: docs/reference/zoo/quadcopter.md."""
+"""Quadcopter: fly to a point and hover, with tilting rotors.
+
+Numbers and their sources: docs/reference/zoo/quadcopter.md.
+"""
 
 from rlcli.task import TaskSpec
 

@@ -37,7 +37,7 @@ class QuadcopterTask(DirectTask):
     motors = False
 
     class Params(StrictModel):
-        """The task's own settings."""
+        """Settings of the task."""
 
         tilt_speed: float = Field(25.132741, gt=0, description="Speed of a tilt's target at action 1, 8 pi [rad/s].")
         thrust_speed: float = Field(100.0, gt=0, description="Change of a thrust at action 1 [N/s].")
@@ -53,7 +53,7 @@ class QuadcopterTask(DirectTask):
     params: Params
 
     def post_reset(self) -> None:
-        """Make what the hooks use: constants, and buffers that keep their place."""
+        """Create constants and buffers. The hooks write the buffers in place."""
         params, n = self.params, self.num_envs
         self.robot, self.goal = self.env.entities["robot"], self.env.entities["target"]
         self.low, self.high = self.robot.data.joint_pos_limits.to(self.device).unbind(dim=1)
@@ -62,14 +62,14 @@ class QuadcopterTask(DirectTask):
         self.start_low = torch.tensor(params.start_low, device=self.device)
         self.start_high = torch.tensor(params.start_high, device=self.device)
         self.tilts = torch.zeros(n, len(JOINTS), device=self.device)
-        """What the servos hold. (n, 8) [rad]"""
+        """Target angles of the servos. (n, 8) [rad]"""
         self.thrusts = torch.zeros(n, len(THRUSTS), device=self.device)
-        """(n, 4) [N]"""
+        """Thrusts. (n, 4) [N]"""
         self.distance = torch.zeros(n, device=self.device)
-        self.extras["distance"] = self.distance  # to the target [m]
+        self.extras["distance"] = self.distance  # distance to the target [m]
 
     def reset(self, selection: Selection) -> None:
-        """Somewhere about the target, level and at rest, with tilted rotors and no thrust."""
+        """Set the robot near the target, level and at rest, with tilted rotors and no thrust."""
         default = selection.read_view(self.robot.data.default_root_state)
         position = default[:, :3] + selection.uniform(self.start_low, self.start_high, (3,))
         tilts = selection.uniform(self.tilt_low, self.tilt_high, (len(JOINTS),))
@@ -79,7 +79,7 @@ class QuadcopterTask(DirectTask):
         selection.write(self.thrusts, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Actions are speeds: of the tilts that the servos hold, and of the thrusts."""
+        """Change the target tilts and the thrusts: the actions are rates."""
         params, dt = self.params, self.step_dt
         tilts, thrusts = actions.split([len(JOINTS), len(THRUSTS)], dim=1)
         torch.clamp(self.tilts.add_(tilts, alpha=dt * params.tilt_speed), self.low, self.high, out=self.tilts)
@@ -102,7 +102,7 @@ class QuadcopterTask(DirectTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Nearness; and near the target, uprightness and not to spin."""
+        """Reward nearness, and near the target an upright pose without spin."""
         data = self.robot.data
         self.distance.copy_(length(self.goal.data.root_pos_w - data.root_pos_w))
         _, x, y, _ = data.root_quat_w.unbind(dim=1)
@@ -113,6 +113,6 @@ class QuadcopterTask(DirectTask):
         torch.clamp(near + near * posture, min=0.0, out=self.rew_buf)
 
     def is_done(self) -> None:
-        """Too far or too low; the framework adds the time-out."""
+        """Terminate where the robot is too far or too low. The environment adds the time-out."""
         low = self.robot.data.root_pos_w[:, 2] < self.params.min_height
         self.reset_buf.copy_((self.distance > self.params.max_distance) | low)

@@ -1,4 +1,7 @@
-"""Quadruped: a four-legged robot follows velocity commands. Numbers and their sources: docs/reference/zoo/quadruped-flat.md."""
+"""Quadruped: a four-legged robot follows velocity commands.
+
+Numbers and their sources: docs/reference/zoo/quadruped-flat.md.
+"""
 
 from rlcli.task import TaskSpec
 

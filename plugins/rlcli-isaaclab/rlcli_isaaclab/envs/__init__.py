@@ -13,7 +13,7 @@ from rlcli_isaaclab.sim import SimulationCfg
 
 @configclass
 class ViewerCfg:
-    """Where the camera stands."""
+    """Position of the camera."""
 
     eye: Any = (7.5, 7.5, 7.5)
     lookat: Any = (0.0, 0.0, 0.0)
@@ -59,14 +59,14 @@ class ManagerBasedRLEnvCfg(ManagerBasedEnvCfg):
     commands: Any = None
 
     def __rlcli_task__(self, root: Path) -> Any:
-        """The task that this is here."""
+        """Return this configuration as a task of rlcli."""
         from rlcli.config.python_task import PythonTask
         from rlcli_isaaclab.convert import task
         from rlcli_isaaclab.settings import Report
 
         report = Report()
         data = task(to_dict(self), report, root)
-        return PythonTask(data, notes=report.news())
+        return PythonTask(data, notes=report.user_notes())
 
 
 ManagerBasedEnv = ManagerBasedRLEnv

@@ -1,4 +1,4 @@
-"""Names as in `isaaclab.envs.mdp`: those of `rlcli_isaaclab.mdp`."""
+"""Names as in `isaaclab.envs.mdp`; the same as in `rlcli_isaaclab.mdp`."""
 
 from typing import Any
 

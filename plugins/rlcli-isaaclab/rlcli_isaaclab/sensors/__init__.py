@@ -1,18 +1,18 @@
-"""Sensors. Names as in `isaaclab.sensors`."""
+"""Configuration classes of sensors. Names as in `isaaclab.sensors`."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from rlcli_isaaclab.config_class import MISSING, configclass
-from rlcli_isaaclab.runtime import Sensor as ContactSensor
-from rlcli_isaaclab.runtime import Sensor as RayCaster
+from rlcli_isaaclab.scene_facade import Sensor as ContactSensor
+from rlcli_isaaclab.scene_facade import Sensor as RayCaster
 from rlcli_isaaclab.sensors import patterns
 
 
 @configclass
 class SensorBaseCfg:
-    """What all sensors have."""
+    """Settings of all sensors."""
 
     class_type: Any = "SensorBase"
     prim_path: str = MISSING
@@ -23,7 +23,7 @@ class SensorBaseCfg:
 
 @configclass
 class ContactSensorCfg(SensorBaseCfg):
-    """Forces of contacts on bodies."""
+    """Contact forces on bodies."""
 
     class_type: Any = "ContactSensor"
     track_pose: bool = False
@@ -31,7 +31,7 @@ class ContactSensorCfg(SensorBaseCfg):
     track_friction_forces: bool = False
     track_air_time: bool = False
     force_threshold: float = 1.0
-    filter_prim_paths_expr: Any = []  # noqa: RUF012  (every object gets its own)
+    filter_prim_paths_expr: Any = []  # noqa: RUF012  (configclass copies it for each object)
     max_contact_data_count_per_prim: int = 4
     visualizer_cfg: Any = None
 
@@ -42,7 +42,7 @@ class RayCasterCfg(SensorBaseCfg):
 
     @configclass
     class OffsetCfg:
-        """Where the sensor sits in its body's frame."""
+        """Sensor pose in the frame of its body."""
 
         pos: Any = (0.0, 0.0, 0.0)
         rot: Any = (1.0, 0.0, 0.0, 0.0)
@@ -61,7 +61,7 @@ class RayCasterCfg(SensorBaseCfg):
 
 @configclass
 class ImuCfg(SensorBaseCfg):
-    """Orientation, rates and acceleration of a body; an MJCF has sensors for them."""
+    """Orientation, angular velocity and acceleration of a body. An MJCF has its own sensors for them."""
 
     class_type: Any = "Imu"
     offset: Any = None

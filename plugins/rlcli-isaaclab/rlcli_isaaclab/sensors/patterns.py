@@ -1,4 +1,4 @@
-"""Where rays start and go. Names as in `isaaclab.sensors.patterns`."""
+"""Start points and directions of rays. Names as in `isaaclab.sensors.patterns`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rlcli_isaaclab.config_class import MISSING, configclass
 
 @configclass
 class GridPatternCfg:
-    """Parallel rays from a grid."""
+    """Parallel rays that start on a grid."""
 
     func: Any = "grid_pattern"
     resolution: float = MISSING

@@ -1,4 +1,4 @@
-"""Where Isaac Lab's models lie; only the ends of such paths matter here."""
+"""Folders of Isaac Lab's models. Only the ends of such paths matter: `assets.USD_TO_MJCF` maps them."""
 
 NUCLEUS_ASSET_ROOT_DIR = "nucleus"
 NVIDIA_NUCLEUS_DIR = f"{NUCLEUS_ASSET_ROOT_DIR}/NVIDIA"

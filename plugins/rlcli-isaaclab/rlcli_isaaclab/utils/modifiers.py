@@ -1,4 +1,4 @@
-"""What is done to an observation before noise. Names as in `isaaclab.utils.modifiers`."""
+"""Modifiers, which change an observation before noise is added. Names as in `isaaclab.utils.modifiers`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class ModifierCfg:
     """A function with parameters: `scale` (multiplier), `clip` (bounds) or `bias` (value)."""
 
     func: Any = MISSING
-    params: dict[str, Any] = {}  # noqa: RUF012  (every object gets its own)
+    params: dict[str, Any] = {}  # noqa: RUF012  (configclass copies it for each object)
 
 
 @configclass
@@ -28,7 +28,7 @@ class DigitalFilterCfg(ModifierCfg):
 
 @configclass
 class IntegratorCfg(ModifierCfg):
-    """The integral over the episode."""
+    """Integral of the observation over the episode."""
 
     func: Any = "Integrator"
     dt: float = MISSING

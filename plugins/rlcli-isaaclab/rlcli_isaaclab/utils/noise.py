@@ -1,4 +1,4 @@
-"""Noise on observations. Names as in `isaaclab.utils.noise`."""
+"""Configuration classes of observation noise. Names as in `isaaclab.utils.noise`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rlcli_isaaclab.config_class import MISSING, configclass
 
 @configclass
 class NoiseCfg:
-    """What all noise has: `operation` is add, scale or abs."""
+    """Settings of all noise; `operation` is add, scale or abs."""
 
     func: Any = "noise"
     operation: str = "add"
@@ -17,7 +17,7 @@ class NoiseCfg:
 
 @configclass
 class ConstantNoiseCfg(NoiseCfg):
-    """The same value in every step."""
+    """Constant noise: the same value in every step."""
 
     func: Any = "constant_noise"
     bias: Any = 0.0
@@ -25,7 +25,7 @@ class ConstantNoiseCfg(NoiseCfg):
 
 @configclass
 class UniformNoiseCfg(NoiseCfg):
-    """Uniform in [n_min, n_max)."""
+    """Uniform noise in [n_min, n_max)."""
 
     func: Any = "uniform_noise"
     n_min: Any = -1.0
@@ -34,7 +34,7 @@ class UniformNoiseCfg(NoiseCfg):
 
 @configclass
 class GaussianNoiseCfg(NoiseCfg):
-    """Gaussian."""
+    """Normally distributed noise."""
 
     func: Any = "gaussian_noise"
     mean: Any = 0.0
@@ -43,7 +43,7 @@ class GaussianNoiseCfg(NoiseCfg):
 
 @configclass
 class NoiseModelCfg:
-    """Noise drawn anew in every step."""
+    """Noise that is sampled in every step."""
 
     class_type: Any = "NoiseModel"
     noise_cfg: Any = MISSING
@@ -51,7 +51,7 @@ class NoiseModelCfg:
 
 @configclass
 class NoiseModelWithAdditiveBiasCfg(NoiseModelCfg):
-    """The same with a bias drawn when an episode begins."""
+    """Noise in every step, plus a bias that is sampled at the start of an episode."""
 
     class_type: Any = "NoiseModelWithAdditiveBias"
     bias_noise_cfg: Any = MISSING

@@ -1,0 +1,116 @@
+"""Managers under Isaac Lab's names: `env.command_manager.get_command("base_velocity")`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from torch import Tensor
+
+from rlcli.errors import did_you_mean, listing
+from rlcli.scene.names import NameProblem
+
+
+class ManagerFacade:
+    """A manager of rlcli with the attributes of Isaac Lab's."""
+
+    def __init__(self, manager: Any) -> None:
+        self._manager = manager
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._manager, name)
+
+    @property
+    def active_terms(self) -> list[str]:
+        """Names of the terms, in order."""
+        return [term.name for term in self._manager.terms]
+
+
+class ActionManagerFacade(ManagerFacade):
+    """Action manager."""
+
+    @property
+    def total_action_dim(self) -> int:
+        """Number of actions."""
+        return self._manager.size
+
+    def get_term(self, name: str) -> Any:
+        """Return an action term; its `processed_actions` are the commands to the joints."""
+        return _find_term(self._manager.terms, name, "action")
+
+
+class TerminationManagerFacade(ManagerFacade):
+    """Termination manager."""
+
+    @property
+    def dones(self) -> Tensor:
+        """Terminated or timed out in this step. (num_envs,) bool"""
+        return self._manager.terminated | self._manager.time_outs
+
+    def get_term(self, name: str) -> Tensor:
+        """Return where a term fired in this step. (num_envs,) bool"""
+        fired = self._manager.fired
+        if name not in fired:
+            raise NameProblem(f"no termination '{name}'; there are {listing(fired)}")
+        return fired[name]
+
+
+class CommandManagerFacade(ManagerFacade):
+    """Command manager."""
+
+    def get_command(self, name: str) -> Tensor:
+        """Return the current command. (num_envs, k)"""
+        return _find_term(self._manager.terms, name, "command").command
+
+    def get_term(self, name: str) -> Any:
+        """Return a command term; for the user's own command, the user's object."""
+        term = _find_term(self._manager.terms, name, "command")
+        return getattr(term, "term", term)
+
+
+class RewardManagerFacade(ManagerFacade):
+    """Reward manager."""
+
+    def __init__(self, manager: Any, tunable: Any) -> None:
+        super().__init__(manager)
+        self._tunable = tunable
+
+    def get_term_cfg(self, name: str) -> Any:
+        """Return the settings of a term. An assigned weight takes effect in the next step."""
+        found = {term.name: term for term in self._manager.terms}
+        if name not in found:
+            raise NameProblem(f"no reward '{name}'", did_you_mean(name, found) or f"there are {listing(found)}")
+        return RewardSettings(found[name].config, self._tunable.get((*found[name].path, "weight")))
+
+    def set_term_cfg(self, name: str, cfg: Any) -> None:
+        """Set the weight of a term to that of the settings."""
+        self.get_term_cfg(name).weight = cfg.weight
+
+
+class RewardSettings:
+    """Settings of a reward. Only the weight can change, and only in a curriculum term."""
+
+    def __init__(self, config: Any, weight: Tensor | None) -> None:
+        self._config, self._weight = config, weight
+        self.params: Mapping[str, Any] = MappingProxyType(config.params)
+
+    @property
+    def weight(self) -> float:
+        """Current weight."""
+        return self._config.weight if self._weight is None else float(self._weight)
+
+    @weight.setter
+    def weight(self, value: float) -> None:
+        if self._weight is None:
+            raise AttributeError("only a curriculum term can change the weight of a reward")
+        self._weight.fill_(value)
+
+
+def _find_term(terms: Any, name: str, kind: str) -> Any:
+    found = {term.name: term.instance for term in terms}
+    if name not in found:
+        raise NameProblem(f"no {kind} '{name}'; there are {listing(found)}")
+    return found[name]

@@ -1,0 +1,136 @@
+"""Reader of Isaac Lab's ground, terrain and contact materials."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rlcli.errors import listing
+from rlcli_isaaclab.settings import Node, as_float, kind_of, to_plain
+
+PLANE_SIZE = 100.0
+"""Edge length of the ground plane that replaces a terrain without a generator [m]."""
+
+_SUB_TERRAINS = {
+    "flat_terrain": "flat",
+    "random_uniform_terrain": "noise",
+    "pyramid_sloped_terrain": "slope",
+    "wave_terrain": "waves",
+    "discrete_obstacles_terrain": "obstacles",
+    "stepping_stones_terrain": "stones",
+    "pyramid_stairs_terrain": "stairs",
+    "inverted_pyramid_stairs_terrain": "stairs",
+    "random_grid_terrain": "grid",
+}
+"""Isaac Lab's terrain function -> rlcli's kind of sub-terrain."""
+
+_HEIGHT_RANGES = {
+    "slope": ("slope_range", "slope"),
+    "waves": ("amplitude_range", "amplitude"),
+    "stairs": ("step_height_range", "step_height"),
+    "obstacles": ("obstacle_height_range", "height"),
+    "grid": ("grid_height_range", "height"),
+    "noise": ("noise_range", "height"),
+}
+"""Kind of sub-terrain -> the range that the difficulty scales: Isaac Lab's key, rlcli's key."""
+
+_OTHER_KEYS = {
+    "noise": {"downsampled_scale": "spacing"},
+    "waves": {"num_waves": "count"},
+    "obstacles": {"obstacle_width_range": "width", "num_obstacles": "count"},
+    "stones": {"stone_width_range": "width", "stone_distance_range": "gap"},
+    "stairs": {"step_width": "step_width"},
+    "grid": {"grid_width": "cell"},
+}
+"""Kind of sub-terrain -> Isaac Lab's key -> rlcli's key."""
+
+
+def read_ground(item: Node, spawn: Node) -> dict[str, Any]:
+    """Return `scene.ground` for a ground plane."""
+    item.skip("prim_path", "collision_group", "debug_vis", "class_type", "init_state")
+    spawn.skip("func", "visible", "color", "usd_path", "semantic_tags", "copy_from_source")
+    size = as_float(max(spawn.get("size", (PLANE_SIZE, PLANE_SIZE))))
+    return {"size": size, **read_friction(spawn.node("physics_material"))}
+
+
+def read_friction(material: Node) -> dict[str, float]:
+    """Return `friction`, the sliding friction; empty for Isaac Lab's default of 0.5, which is also rlcli's."""
+    material.skip("func", "restitution_combine_mode", "friction_combine_mode", "improve_patch_friction")
+    material.skip("compliant_contact_stiffness", "compliant_contact_damping")
+    static = material.get("static_friction", 0.5)
+    dynamic = material.get("dynamic_friction", 0.5)
+    if static != dynamic:
+        material.note("approximated", "static_friction", "MuJoCo has one friction, the dynamic one")
+    if material.data.get("restitution"):
+        material.note("ignored", "restitution", "in MuJoCo, solref of a geom sets how contacts bounce")
+    else:
+        material.skip("restitution")
+    return {} if dynamic == 0.5 else {"friction": as_float(dynamic)}
+
+
+def read_terrain(item: Node, scene: dict[str, Any]) -> dict[str, Any] | None:
+    """Return `scene.ground` for a plane, or write `scene.terrain` for a generator and return None."""
+    item.skip("class_type", "prim_path", "collision_group", "debug_vis", "num_envs", "env_spacing", "usd_path")
+    item.skip("visual_material", "use_terrain_origins")
+    kind = item.get("terrain_type", "generator")
+    friction = read_friction(item.node("physics_material"))
+    plane = {"size": PLANE_SIZE, **friction}
+    if kind == "plane":
+        item.skip("terrain_generator", "max_init_terrain_level")
+        return plane
+    generator = item.node("terrain_generator")
+    if kind != "generator" or not generator.data:
+        item.note("approximated", "terrain_type", "replaced by a plane")
+        return plane
+    scene["terrain"] = _read_generator(generator) | friction
+    start_level = item.get("max_init_terrain_level")
+    if start_level is not None:
+        scene["terrain"]["max_start_level"] = start_level
+    return None
+
+
+def _read_generator(node: Node) -> dict[str, Any]:
+    """Return the settings of a terrain generator; rlcli builds every sub-terrain as a height field."""
+    config: dict[str, Any] = {
+        "kind": "generator",
+        "rows": node.get("num_rows", 1),
+        "columns": node.get("num_cols", 1),
+        "patch": [as_float(v) for v in node.get("size", (8.0, 8.0))],
+        "border": as_float(node.get("border_width", 0.0)),
+        "resolution": as_float(node.get("horizontal_scale", 0.1)),
+        "difficulty": [as_float(v) for v in node.get("difficulty_range", (0.0, 1.0))],
+        "curriculum": bool(node.get("curriculum", False)),
+        "sub_terrains": {},
+    }
+    if node.get("seed") is not None:
+        config["seed"] = node.get("seed")
+    node.skip("class_type", "color_scheme", "use_cache", "cache_dir", "vertical_scale", "slope_threshold")
+    node.skip("border_height")
+    for name, patch in node.node("sub_terrains").nodes():
+        config["sub_terrains"][name] = _read_sub_terrain(patch)
+    return config
+
+
+def _read_sub_terrain(node: Node) -> dict[str, Any]:
+    """Return the settings of one sub-terrain. The name of its function decides its kind."""
+    function = kind_of(node.get("function"))
+    proportion = as_float(node.get("proportion", 1.0))
+    node.skip("size", "horizontal_scale", "vertical_scale", "slope_threshold", "border_width", "flat_patch_sampling")
+    kind = _SUB_TERRAINS.get(function)
+    if kind is None:
+        why = f"replaced by flat ground: '{function}' has no counterpart; known are {listing(_SUB_TERRAINS)}"
+        node.report.entries[node.key] = ("approximated", why)
+        return {"kind": "flat", "proportion": proportion}
+    inverted = "inverted" in function or bool(node.data.get("inverted"))
+    node.skip("inverted")
+    config: dict[str, Any] = {"proportion": proportion, "kind": kind}
+    if kind not in ("flat", "noise", "waves") and "platform_width" in node:
+        config["platform"] = as_float(node.get("platform_width"))
+    their_range, our_range = _HEIGHT_RANGES.get(kind, ("", ""))
+    if their_range in node:
+        config[our_range] = [as_float(v) for v in node.get(their_range)]
+    for theirs, ours in _OTHER_KEYS.get(kind, {}).items():
+        if theirs in node:
+            config[ours] = to_plain(node.get(theirs))
+    if kind in ("slope", "stairs") and inverted:
+        config["inverted"] = True
+    return config

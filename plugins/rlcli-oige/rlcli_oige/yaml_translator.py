@@ -1,0 +1,46 @@
+"""Base of the translators of OmniIsaacGymEnvs' YAML files: records values, their sources, notes and mistakes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from rlcli.config.layers import document_origins
+from rlcli.config.strict_yaml import Document, Path
+from rlcli.errors import Problem
+from rlcli.formats import Note, Status
+
+
+@dataclass(slots=True)
+class YamlTranslator:
+    """State of one translation."""
+
+    document: Document
+    label: str
+    """Name of the file in messages."""
+    data: dict[str, Any] = field(default_factory=dict)
+    """Translated settings."""
+    sources: dict[Path, Path] = field(default_factory=dict)
+    """Key of a translated setting -> key of the file."""
+    notes: list[Note] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
+
+    def put(self, target: Path, value: Any, source: Path) -> None:
+        """Set a translated setting and record its source."""
+        node = self.data
+        for step in target[:-1]:
+            node = node.setdefault(str(step), {})
+        node[str(target[-1])] = value
+        self.sources[target] = source
+
+    def where(self, path: Path) -> str:
+        """Return `file:line:column` of a key."""
+        return document_origins(self.document, self.label, "task")(path).where
+
+    def note(self, path: Path, status: Status, text: str = "") -> None:
+        """Record how a key was translated."""
+        self.notes.append(Note(self.where(path), ".".join(str(step) for step in path), status, text))
+
+    def problem(self, path: Path, message: str, hint: str | None = None) -> None:
+        """Record a mistake."""
+        self.problems.append(Problem(self.where(path), ".".join(str(step) for step in path), message, hint))
