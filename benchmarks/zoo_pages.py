@@ -153,9 +153,9 @@ def index(zoo: Path, found: list[Any]) -> str:
     lines = [
         "# Built-in tasks",
         "",
-        "After reading this page you can choose a task to start from. `rlcli play TASK` shows the policy that comes with",
-        "a task, and `rlcli train TASK` trains a new one. The page of a task has its model, numbers, learning curves and",
-        "results.",
+        "After reading this page you can choose a task to start from. `rlcli play TASK` shows the policy that comes",
+        "with a task, and `rlcli train TASK` trains a new one. The page of a task has its model, numbers, learning",
+        "curves and results.",
         "",
         "```{toctree}",
         ":hidden:",

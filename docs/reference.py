@@ -289,7 +289,12 @@ def _help_text(command: Any) -> str:
     text = inspect.cleandoc(command.help or "")
     if not command.epilog:
         return text
-    lines = [f"# {line.strip()}" if line.startswith(" ") else line for line in command.epilog.strip().splitlines()]
+    lines: list[str] = []
+    for line in command.epilog.strip().splitlines():
+        if line.startswith(" "):
+            lines.insert(-1, f"# {line.strip()}")  # the explanation of the command above
+        else:
+            lines.append(line)
     return f"{text}\n\n<!-- not run: names of runs and files are examples; a test parses each command -->\n```sh\n" + (
         "\n".join(lines) + "\n```"
     )

@@ -120,7 +120,7 @@ def test_another_process_and_hash_seed_give_equal_trajectories(hash_seed, task, 
 
 @pytest.mark.parametrize(("one", "other"), chosen(list(combinations_with_replacement(TASKS, 2)), 2))
 def test_two_environments_of_one_process_do_not_touch_each_other(one, other, folder, reference):
-    lives = [HashedRollout(make(one, folder, 7, 2)), HashedRollout(make(other, folder, 3, 1, seed=5))]
+    trajectories = [HashedRollout(make(one, folder, 7, 2)), HashedRollout(make(other, folder, 3, 1, seed=5))]
     alone = rollout_hashes(make(other, folder, 3, 1, seed=5))
     for _ in range(STEPS):
         for life in trajectories:
