@@ -119,7 +119,12 @@ NOISE = f"{BLOCK}.randomization_params.observations.on_reset"
             None,
         ),
         (noise(operation="add"), f"{NOISE}.operation", "unknown operation 'add'", "additive"),
-        (noise(distribution="normall"), f"{NOISE}.distribution", "unknown distribution 'normall'", "did you mean 'normal'"),
+        (
+            noise(distribution="normall"),
+            f"{NOISE}.distribution",
+            "unknown distribution 'normall'",
+            "did you mean 'normal'",
+        ),
         (noise(schedule="cubic"), f"{NOISE}.schedule", "unknown schedule 'cubic'", "constant"),
         (noise(operation="direct"), f"{NOISE}.operation", "expected additive or scaling for noise", None),
         (noise(distribution_parameters=[1.0]), f"{NOISE}.distribution_parameters", "expected [a, b] or", None),
