@@ -43,7 +43,7 @@ def reference(folder):
         life = HashedRollout(make(task, folder, ENVS, seed=seed))
         differing = against_plain_steps(life.env)
         for _ in range(STEPS):
-            life.step()
+            trajectory.step()
         assert differing == [], "steps that differ from mj_step"
         assert life.ends >= ENVS, "every life crosses a reset"
         assert len(set(life.hashes())) == ENVS, "no two lives are alike"
@@ -71,13 +71,13 @@ def test_partial_reset_does_not_depend_on_order_or_grouping(task, order, folder)
     for env, groups in ((together, [ids]), (apart, parts)):
         life = HashedRollout(env, steps=60)
         for _ in range(20):
-            life.step()
+            trajectory.step()
         env.episode_index[ids] += 1
         for group in groups:
             env._reset_envs(IdSelection(group, env.seed, env.episode_index.numpy()[group]))
         env.sim.forward_moved()
         for _ in range(40):
-            life.step()
+            trajectory.step()
         hashes.append(life.hashes())
     assert hashes[0] == hashes[1]
 
@@ -123,8 +123,8 @@ def test_two_environments_of_one_process_do_not_touch_each_other(one, other, fol
     trajectories = [HashedRollout(make(one, folder, 7, 2)), HashedRollout(make(other, folder, 3, 1, seed=5))]
     alone = rollout_hashes(make(other, folder, 3, 1, seed=5))
     for _ in range(STEPS):
-        for life in trajectories:
-            life.step()
+        for trajectory in trajectories:
+            trajectory.step()
     assert trajectories[0].hashes() == reference(one)[:7]
     assert trajectories[1].hashes() == alone
     assert alone != reference(other)[:3]
