@@ -59,7 +59,7 @@ TRAINERS = {"ppo": "rlcli.rl.ppo.config", "sb3": "rlcli.rl.sb3.config"}
 SECTIONS = {
     "observations": "Values that the policy or the critic receives, one row per environment.",
     "actions": "Conversions of raw policy outputs into actuator targets.",
-    "rewards": "Values of which the weighted sum is the reward; each is scaled by the length of a step.",
+    "rewards": "The reward is the sum of weight x value x length of a step [s] over all terms.",
     "terminations": "Conditions that end an episode.",
     "events": "Changes at startup, at resets or at intervals.",
     "randomization": "Events that sample properties of the model.",

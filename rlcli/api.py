@@ -26,7 +26,7 @@ from rlcli.runs.policy_ref import choose
 from rlcli.runs.restore import require_fit
 from rlcli.runs.run_ref import default_runs_dir
 from rlcli.training.job import Job, TrainingResult
-from rlcli.training.launch import TrainingRequest, broadcast_job, setup_job
+from rlcli.training.launch import TrainingRequest, broadcast_job, process_device, setup_job
 from rlcli.training.runner import run_training
 from rlcli.training.signals import StopRequest
 
@@ -102,10 +102,10 @@ def train(
     )
     stop = StopRequest()
     with stop:
-        resolved, process_device = request.resolve() if resume is None else (None, device)
-        result = broadcast_job(request, resolved, process_device)
+        resolved, place = request.resolve() if resume is None else (None, process_device(device, None))
+        result = broadcast_job(request, resolved, place)
         if isinstance(result, Job):
-            trainer, env = setup_job(result, process_device, stop)
+            trainer, env = setup_job(result, place, stop)
             result = run_training(result, trainer, env, stop, _ProgressCallback(on_progress))
     assert result is not None  # None is returned on ranks other than 0, and there is one rank
     return result

@@ -1,0 +1,43 @@
+"""`rlcli terms`: list terms, describe one, and include a task's own terms."""
+
+import pytest
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+def test_terms_lists_one_line_per_term_with_types_and_defaults(cli):
+    done = cli("terms", "track_lin_vel_xy_exp")
+    assert done.code == 0
+    lines = cli("terms", "track_lin_vel").out.splitlines()
+    assert lines[0] == "rewards:"
+    assert "  track_lin_vel_xy_exp(entity: entity name = robot, command: command name, std: number)" in lines
+
+
+def test_terms_describes_exact_name_with_units_and_example(cli):
+    out = cli("terms", "randomize_body_mass").out
+    assert "[kg]" in out
+    assert "inertias are scaled by the same factor" in out
+    assert "example: events: {randomize_body_mass: {func: randomize_body_mass, mode: reset" in out
+
+
+def test_terms_of_task_include_own_terms(cli, tmp_path):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "task.yaml").write_text("scene: {}\n")
+    (folder / "terms.py").write_text(
+        'def calmness(env, *, speed: float = 2.0):\n    """Calmness of the robot. (num_envs,)"""\n'
+    )
+    assert "calmness" not in cli("terms").out
+    assert "own:\n  calmness(speed: number = 2.0)" in cli("terms", "calm", "--task", str(folder)).out
+
+
+def test_terms_json_has_every_key(cli):
+    (term,) = cli("terms", "joint_vel_l1", "--json").json["terms"]
+    assert [key["name"] for key in term["keys"]] == ["entity", "joints"]
+    assert term["section"] == "rewards"
+
+
+def test_terms_suggests_near_names(cli):
+    done = cli("terms", "joint_vel_l11")
+    assert done.code == 0
+    assert "joint_vel_l1" in done.err
