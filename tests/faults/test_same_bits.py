@@ -40,14 +40,14 @@ def reference(folder):
     @functools.cache
     def trajectories(task, seed=42):
         torch.set_num_threads(1)
-        life = HashedRollout(make(task, folder, ENVS, seed=seed))
-        differing = against_plain_steps(life.env)
+        trajectory = HashedRollout(make(task, folder, ENVS, seed=seed))
+        differing = against_plain_steps(trajectory.env)
         for _ in range(STEPS):
             trajectory.step()
         assert differing == [], "steps that differ from mj_step"
-        assert life.ends >= ENVS, "every life crosses a reset"
-        assert len(set(life.hashes())) == ENVS, "no two lives are alike"
-        return life.hashes()
+        assert trajectory.ends >= ENVS, "every trajectory crosses a reset"
+        assert len(set(trajectory.hashes())) == ENVS, "all trajectories differ"
+        return trajectory.hashes()
 
     return trajectories
 
@@ -55,7 +55,7 @@ def reference(folder):
 @pytest.mark.parametrize(
     ("task", "num_envs", "threads", "seed"), chosen(list(product(TASKS, NUM_ENVS, THREADS, SEEDS)), 7)
 )
-def test_lives_equal_plain_steps_at_any_number_of_threads_and_environments(
+def test_trajectories_equal_plain_steps_for_any_threads_and_num_envs(
     task, num_envs, threads, seed, folder, reference
 ):
     assert rollout_hashes(make(task, folder, num_envs, threads, seed)) == reference(task, seed)[:num_envs]
@@ -69,7 +69,7 @@ def test_partial_reset_does_not_depend_on_order_or_grouping(task, order, folder)
     parts = [np.sort(part) for part in np.array_split(rng.permutation(ids), int(rng.integers(2, len(ids) + 1)))]
     hashes = []
     for env, groups in ((together, [ids]), (apart, parts)):
-        life = HashedRollout(env, steps=60)
+        trajectory = HashedRollout(env, steps=60)
         for _ in range(20):
             trajectory.step()
         env.episode_index[ids] += 1
@@ -78,7 +78,7 @@ def test_partial_reset_does_not_depend_on_order_or_grouping(task, order, folder)
         env.sim.forward_moved()
         for _ in range(40):
             trajectory.step()
-        hashes.append(life.hashes())
+        hashes.append(trajectory.hashes())
     assert hashes[0] == hashes[1]
 
 
@@ -132,9 +132,9 @@ def test_two_environments_of_one_process_do_not_touch_each_other(one, other, fol
 
 @pytest.mark.parametrize(("task", "work"), chosen(list(product(TASKS, sorted(other_work()))), 3))
 def test_other_work_in_between_changes_nothing(task, work, folder, reference):
-    life = HashedRollout(make(task, folder, 7, 2))
+    trajectory = HashedRollout(make(task, folder, 7, 2))
     for step in range(STEPS):
         if step % 20 == 0:
             other_work()[work]()
-        life.step()
-    assert life.hashes() == reference(task)[:7]
+        trajectory.step()
+    assert trajectory.hashes() == reference(task)[:7]
