@@ -40,7 +40,7 @@ class TaskSpec:
 
     def __post_init__(self) -> None:
         if isinstance(self.terms, str):
-            raise TypeError(f"terms is a tuple of modules: ({self.terms!r},)")
+            raise TypeError(f"terms must be a tuple of modules; write ({self.terms!r},)")
         if not isinstance(self.api, int) or self.api < 1:
             raise TypeError(f"api is the number of a plugin interface, 1 or more, not {self.api!r}")
         for name in ("package", "summary", "config", "policies"):

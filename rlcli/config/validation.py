@@ -380,7 +380,9 @@ class TaskCheck:
                 self.problem((key, *path), message, hint)
         for section in SECTIONS:
             if section != "success" and data.get(section):
-                self.problem((section,), f"a direct task has no {section} terms; its class implements them")
+                self.problem(
+                    (section,), f"a direct task has no {section} terms; its class implements them: delete this section"
+                )
 
 
 def term_entries(data: Mapping[str, Any]) -> list[tuple[str, Path, dict[str, Any]]]:

@@ -161,7 +161,7 @@ def _require_equal(run: PolicyFunction, graph: DeployedPolicy, observations: Ten
 
 @contextlib.contextmanager
 def _temporary_file(file: Path) -> Iterator[Path]:
-    """Yield a temporary file in the folder of `file` and rename it to `file` at the end; after an error remove both."""
+    """Yield a temporary file that becomes `file` at the end. After an error remove it and new folders."""
     temporary = file.with_name(f".{file.stem}.tmp-{os.getpid()}{file.suffix}")
     made: list[Path] = []
     try:

@@ -90,7 +90,7 @@ class ObservationManager(TensorState):
         return self._final
 
     def recompute_last(self) -> dict[str, Tensor]:
-        """Return the last result of `compute`, after `load_state_dict`."""
+        """Compute the observations of the last `compute` again, after `load_state_dict`."""
         result, draws = {}, self._draws(np.uint64(0))
         for name, group in self.groups.items():
             if not _has_memory(group):

@@ -86,7 +86,7 @@ def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], l
 def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
     name, version = distribution.metadata["Name"], distribution.version
     if not name or not version:
-        raise ValueError("no Name and Version in its METADATA")
+        raise ValueError("its METADATA has no Name or no Version; reinstall the package")
     return name, version
 
 

@@ -130,7 +130,7 @@ class _Formula(_Record):
         if value is not None:
             check_formula(value)
         if closed and value is None:
-            raise ValueError("closed, but without a formula")
+            raise ValueError("'closed' is true, but 'formula' is missing")
         if not closed and isinstance(self, ObservationFormula) and not _is_external_input(value):
             raise ValueError("not closed, but with a formula")
         return self

@@ -170,7 +170,7 @@ class JointCommand:
                 self._model_targets.append((actuator.targets[:, _ROW[kind]], from_columns, to_joints))
 
     def write(self, command: Tensor) -> None:
-        """Set the controls and targets until the next call. command (num_envs, columns)"""
+        """Write the controls and joint targets, which hold until the next call. command (num_envs, columns)"""
         if self._has_native:
             own = command if self._all_native else command[:, self._sources]
             own = own if self._factor is None else own * self._factor

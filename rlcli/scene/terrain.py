@@ -45,7 +45,7 @@ TerrainProblem = tuple[tuple[str, ...], str, str | None]
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """Heights, blocks and origins of a terrain."""
+    """Generated terrain: its height field, its boxes, and the origin of each patch."""
 
     heights: Heights
     """Heights of the height field, x along the first axis, its middle at the world's origin [m]."""

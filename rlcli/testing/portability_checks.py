@@ -1,4 +1,4 @@
-"""Checks of portability: threads, number of environments, engines, checkpoints, versions and speed."""
+"""Checks that a task gives equal results elsewhere: other threads, environments, engines, restored checkpoints."""
 
 from __future__ import annotations
 

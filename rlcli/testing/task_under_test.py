@@ -182,7 +182,7 @@ def random_actions(env: VecEnv, bound: float, steps: int = STEPS) -> Iterator[Te
 
 
 def extreme_actions(env: VecEnv, bound: float, steps: int = STEPS) -> Iterator[Tensor]:
-    """Yield actions at the bound whose sign changes every step, but is held for two steps after each 8th step.
+    """Yield actions at the bound with alternating signs; every eighth sign is repeated: + - + - + - + - - + - + ...
 
     Every second environment gets the opposite sign.
     """

@@ -55,9 +55,7 @@ def reference(folder):
 @pytest.mark.parametrize(
     ("task", "num_envs", "threads", "seed"), chosen(list(product(TASKS, NUM_ENVS, THREADS, SEEDS)), 7)
 )
-def test_trajectories_equal_plain_steps_for_any_threads_and_num_envs(
-    task, num_envs, threads, seed, folder, reference
-):
+def test_trajectories_equal_plain_steps_for_any_threads_and_num_envs(task, num_envs, threads, seed, folder, reference):
     assert rollout_hashes(make(task, folder, num_envs, threads, seed)) == reference(task, seed)[:num_envs]
 
 

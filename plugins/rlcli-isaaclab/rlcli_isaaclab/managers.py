@@ -113,7 +113,7 @@ class ActionTermCfg:
 
 @configclass
 class CommandTermCfg:
-    """A command; `mdp` has its subclasses."""
+    """Base configuration of a command term, a goal for the policy; its subclasses are in `mdp`."""
 
     class_type: Any = MISSING
     resampling_time_range: Any = MISSING

@@ -116,7 +116,9 @@ class _Evaluator:
     def _reference(self, path: Path, text: str) -> Any:
         dots = len(text) - len(text.lstrip("."))
         if dots > len(path):
-            raise InterpolationError(path, f"'${{{text}}}' goes above the top level of the configuration")
+            raise InterpolationError(
+                path, f"'${{{text}}}' has too many leading dots: it points above the top level of the configuration"
+            )
         base = path[: len(path) - dots] if dots else ()
         target: Path = (*base, *(step for step in text[dots:].split(".") if step))
         if target in self.active:

@@ -208,7 +208,7 @@ def path_pattern(expression: str) -> re.Pattern[str]:
     try:
         return re.compile("/".join(steps))
     except re.error as error:
-        raise TaskError(f"'{expression}' is not a path expression: {error}") from None
+        raise TaskError(f"'{expression}' is not a valid pattern of prim paths: {error}") from None
 
 
 class XFormPrim:

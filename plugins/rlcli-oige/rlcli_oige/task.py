@@ -162,7 +162,9 @@ class SceneRegistry:
         """
         found = {**self.objects, **self.views}
         if name not in found:
-            raise TaskError(f"the scene has no '{name}'", hint=did_you_mean(name, found) or f"names: {listing(found)}")
+            raise TaskError(
+                f"the scene has no view '{name}'", hint=did_you_mean(name, found) or f"names: {listing(found)}"
+            )
         return found[name]
 
     def remove_object(self, name: str, registry_only: bool = False) -> None:
@@ -281,7 +283,7 @@ class RLTask(DirectTask):
         for attribute in ("_num_observations", "_num_actions"):
             if not isinstance(getattr(self, attribute, None), int):
                 what = f"{type(self).__name__} does not set {attribute}"
-                raise TaskError(what, hint="set it before calling RLTask.__init__")
+                raise TaskError(what, hint=f"set self.{attribute} before calling RLTask.__init__")
         if not hasattr(self, "_num_states"):
             self._num_states = 0
         if not hasattr(self, "_num_agents"):

@@ -45,7 +45,7 @@ def test_value_keeps_type_and_overrides_default():
 @pytest.mark.parametrize(
     ("text", "message", "hint"),
     [
-        ("${....sed}", "goes above the top", None),
+        ("${....sed}", "too many leading dots", None),
         ("${...sed}", "has no 'sed'", "did you mean 'seed'?"),
         ("${oc.env:HOME}", "unknown resolver 'oc.env'", "resolvers: eq, contains, if, resolve_default"),
         ("${eq:1}", "expects 2 arguments, found 1", None),

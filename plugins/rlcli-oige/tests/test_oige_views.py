@@ -173,7 +173,7 @@ def test_duplicate_view_name_and_missing_object_are_refused(env):
     assert registry.get_object("box_view") is env.task._boxes
     with pytest.raises(TaskError, match="two views have the name 'box_view'"):
         registry.add(RigidPrimView("/World/envs/.*/ball", name="box_view"))
-    with pytest.raises(TaskError, match="the scene has no 'box_veiw'"):
+    with pytest.raises(TaskError, match="the scene has no view 'box_veiw'"):
         registry.get_object("box_veiw")
     registry.remove_object("box_view")
     assert not registry.object_exists("box_view")
