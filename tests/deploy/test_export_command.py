@@ -156,7 +156,7 @@ def test_unknown_format_or_wrong_suffix_is_usage_error(copied, tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
-        ([], 2, "a TASK, or --checkpoint"),
+        ([], 2, "rlcli export TASK, or --checkpoint"),
         (["--checkpoint", "latest"], 5, "there is no run in"),
         (["--checkpoint", "nothing"], 5, "no run 'nothing'"),
         (["cartpole", "--checkpoint", "latest"], 5, "rlcli train cartpole"),

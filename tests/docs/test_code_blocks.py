@@ -50,7 +50,7 @@ RUN_BY = {
     "export.md": f"{HERE}::test_an_exported_file_is_used_as_the_page_says",
     "isaac-lab.md": f"{OF_PAGES}::test_isaac_lab_examples_train",
     "omniisaacgymenvs.md": "plugins/rlcli-oige/tests/test_oige_page.py::"
-    "test_the_example_validates_and_a_push_towards_the_middle_earns_more_than_none",
+    "test_example_validates_and_good_action_earns_more",
     "train-on-a-gpu.md: On a cluster": f"{HERE}::test_cluster_script_trains_and_resumes",
     "python-api.md": f"{HERE}::test_the_scripts_of_the_python_page_run_as_written",
     "put-a-policy-on-a-robot.md": "tests/docs/test_robot_page.py::test_control_loop_balances_the_pole",

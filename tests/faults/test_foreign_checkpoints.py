@@ -562,7 +562,7 @@ def test_tensor_that_is_not_a_plain_matrix_is_refused(name, form):
 
 
 def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
-    monkeypatch.setattr("rlcli.training.import_checkpoint.memory", lambda: 2**26)
+    monkeypatch.setattr("rlcli.training.import_checkpoint.available_memory", lambda: 2**26)
     one = torch.zeros(1000, 1000)
     torch.save({"model_state_dict": {f"actor.{i}.weight": one for i in range(50)}}, "model.pt")
     assert "more than" in refused("rsl-rl", "model.pt")

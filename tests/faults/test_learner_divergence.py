@@ -137,7 +137,7 @@ def test_weight_made_non_finite_by_the_optimiser_is_named(tmp_path, name):
     if name == "ppo":
         trainer.learner.learning_rate.fill_(math.inf)
     else:
-        trainer._set_learning_rate(math.inf)
+        trainer._learning_rate = math.inf
     with pytest.raises(DivergedError, match=r"weight|learning rate"):
         trainer.iterate()
 

@@ -56,7 +56,7 @@ def test_plots_and_reports_page_works(tmp_path):
 def test_task_card_of_page_is_printed(capsys):
     (block,) = blocks(DOCS / "guides" / "plots-and-reports.md", "## The card of a task")
     exec(compile(block.text, "plots-and-reports.md", "exec"), {})
-    assert "| `pole_pos` | -1 | Squared joint deviation" in capsys.readouterr().out
+    assert "| `pole_pos` | -1 | Sum of the squared deviations" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -83,7 +83,7 @@ def test_report_has_all_sections(cli, tmp_path):
     page = read(result.json["file"])
     require_harmless(page)
     for words in (
-        "cartpole", "Balance a pole on a cart", "1,000 steps in 10 iterations", "Squared joint deviation from",
+        "cartpole", "Balance a pole on a cart", "1,000 steps in 10 iterations", "Sum of the squared deviations of joints from",
         "rewards.alive.weight", "override 'rewards.alive.weight=1.5'", "A chip", "rlcli train cartpole --seed 1",
         "rlcli reproduce", "mujoco",
     ):  # fmt: skip
@@ -177,7 +177,7 @@ def test_untrusted_task_code_is_not_executed(cli, tmp_path, coin):
     result = cli("report", run.folder)
     assert result.code == 0, result.err
     page = read(run.folder / "report.html")
-    assert "Squared joint deviation from" in page.text  # rlcli's own terms are described
+    assert "Sum of the squared deviations of joints from" in page.text  # rlcli's own terms are described
     assert not canary.exists()
 
 
@@ -206,7 +206,7 @@ def test_page_without_matplotlib_names_pip_command(cli, tmp_path, monkeypatch):
     page = read(run.folder / "report.html")
     assert 'pip install "rlcli[plot]"' in page.text
     assert "svg" not in page.tags
-    assert "Squared joint deviation from" in page.text
+    assert "Sum of the squared deviations of joints from" in page.text
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def test_observation_table_has_meaning_unit_size_elements():
     terms = rows(built("cartpole", layout="task.layout.json"), "Observations: policy")
     assert terms["joint_vel_rel"] == {
         "Term": "joint_vel_rel",
-        "What": "Joint velocities less their defaults [m/s or rad/s].",
+        "What": "Joint velocities minus their defaults [m/s or rad/s].",
         "Unit": "m/s or rad/s",
         "Size": "2",
         "Of": "slider_to_cart, cart_to_pole",
@@ -68,7 +68,10 @@ def test_reward_table_has_weight_docstring_parameters():
     content = built("cartpole", "rewards.pole_pos.weight=-2.5", "rewards.pole_pos.target=0.125")
     term = rows(content, "Rewards")["pole_pos"]
     assert term["Weight"] == "-2.5"
-    assert term["Value"] == "Squared joint deviation from `target` [rad^2], positions wrapped to [-pi, pi]."
+    assert (
+        term["Value"]
+        == "Sum of the squared deviations of joints from `target` [rad^2], positions wrapped to [-pi, pi]."
+    )
     assert term["Parameters"] == "`joints` = [cart_to_pole], `target` = 0.125"
     note = next(table for table in content.tables if table.title == "Rewards").note
     assert "0.0166667 s" in note

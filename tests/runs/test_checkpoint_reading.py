@@ -69,7 +69,7 @@ def test_tensors_refuses_a_part_above_its_limit(folder):
 
 
 def test_tensors_refuses_a_part_larger_than_memory(folder, monkeypatch):
-    monkeypatch.setattr(checkpoint, "memory", lambda: 90)
+    monkeypatch.setattr(checkpoint, "available_memory", lambda: 90)
     with pytest.raises(CheckpointError, match=r"env\.safetensors is too large: .* at most 30 are read"):
         checkpoint.open_checkpoint(folder).tensors("env")
 

@@ -114,7 +114,7 @@ def test_invalid_arguments_fail_before_measuring(coin, cli, words, code, message
 
 def test_sizes_beyond_memory_are_left_out(coin, cli, short_measurements, monkeypatch):
     monkeypatch.setattr(bench, "SIZES", (4, 8, 1 << 20))
-    monkeypatch.setattr(bench, "memory", lambda: 64 << 20)
+    monkeypatch.setattr(bench, "available_memory", lambda: 64 << 20)
     rows = cli("bench", coin, "--quick", "--json").json["environment"]
     assert [row["left_out"] is None for row in rows[:3]] == [True, True, False]
     assert "GiB" in rows[2]["left_out"]

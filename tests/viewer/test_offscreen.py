@@ -99,7 +99,7 @@ def test_unknown_followed_entity_is_rejected():
 
 def test_disabled_gl_is_machine_error(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
-    with pytest.raises(MachineError, match="switched off by MUJOCO_GL=disable"):
+    with pytest.raises(MachineError, match="rendering is disabled by MUJOCO_GL=disable"):
         open_context(64, 48)
 
 

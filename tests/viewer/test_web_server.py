@@ -44,7 +44,7 @@ def status(answer):
 
 def test_address_and_ssh_tunnel_are_printed(playing):
     assert f"open {playing.url} in a browser" in playing.err
-    assert "viewer: web (as asked)" in playing.err
+    assert "viewer: web (--viewer is given)" in playing.err
     (line,) = [line for line in playing.err.splitlines() if "ssh -N" in line]
     assert f"-L {playing.port}:127.0.0.1:{playing.port} " in line
     assert "@10.0.0.9" in line

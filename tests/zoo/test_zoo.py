@@ -82,7 +82,9 @@ def test_index_lists_every_task():
 def test_results_belong_to_shipped_policy_and_reach_bar(task):
     rows = json.loads((zoo.ZOO / "results" / f"{task}.json").read_text(encoding="utf-8"))
     bundle = open_bundle(find_task(task).policy)
-    (own,) = [row for row in rows if row["seed"] == bundle.manifest["seed"] and row["agent"] == bundle.agent]
+    (own,) = [
+        row for row in rows if row["seed"] == bundle.manifest["seed"] and row["agent"] == bundle.manifest["agent"]
+    ]
     assert own["steps"] == bundle.manifest["step"]
     assert own["evaluation"]["return"] == bundle.manifest["evaluation"]["return"]
     assert ENTRIES[task].missed(own["evaluation"]) == []
@@ -94,9 +96,9 @@ def test_shipped_policy_is_small_and_fits_task(task):
     folder = find_task(task).policy
     assert sum(file.stat().st_size for file in folder.iterdir()) <= 2.5 * MEGABYTE
     checkpoint, bundle = open_checkpoint(folder), open_bundle(folder)
-    assert bundle.task["name"] == task
+    assert bundle.manifest["task"]["name"] == task
     assert checkpoint.policy().spec.observation_size > 0
-    one = resolve(find_task(task), agent=bundle.agent, play=True, flags={"scene.num_envs": 1})
+    one = resolve(find_task(task), agent=bundle.manifest["agent"], play=True, flags={"scene.num_envs": 1})
     env = make_env(one)
     require_fit(checkpoint, env.layout)
     env.close()

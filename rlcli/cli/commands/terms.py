@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def command(
-    pattern: Annotated[str, typer.Argument()] = "",
+    pattern: Annotated[str | None, typer.Argument()] = None,
     task: Annotated[str | None, typer.Option("--task", metavar="TASK")] = None,
 ) -> None:
     """List the terms for the sections of a task file: names, keys, types and defaults.
@@ -35,14 +35,14 @@ def command(
     from rlcli.registry import find_task
 
     term_files = find_task(task).term_files if task else ()
-    entries = term_entries(pattern, term_files)
+    entries = term_entries(pattern or "", term_files)
     exact = [entry for entry in entries if entry.name == pattern]
     for entry in exact:
         _print_details(entry)
     if not exact:
         _print_lines(entries)
     if not entries:
-        near = did_you_mean(pattern, [entry.name for entry in term_entries("", term_files)])
+        near = did_you_mean(pattern or "", [entry.name for entry in term_entries("", term_files)])
         console.info(f"no term's name or summary contains '{pattern}'; {near or 'rlcli terms lists all'}")
     console.document("terms", terms=[entry.document() for entry in exact or entries])
 

@@ -386,7 +386,7 @@ def test_resume_in_changed_environment_warns(cli, run):
     edit(run / "run.json", lambda record: record.update(libc="another"))
     result = cli("train", "--resume", run, "--max-iterations", "4")
     assert result.code == 0
-    assert "resumed in another environment" in result.err
+    assert "resumed on another machine or with other versions" in result.err
     (entry,) = json.loads((run / "run.json").read_text())["resumed"]
     assert entry["step"] == 192
     assert list(entry["changed"]) == ["libc"]
