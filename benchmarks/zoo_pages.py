@@ -1,4 +1,4 @@
-"""The generated parts of docs/reference/zoo/*.md: what a task is, what came of its trainings, and how they went."""
+"""Write the generated parts of docs/reference/zoo/*.md: task card, results and learning curves."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BLOCKS = ("card", "results", "curves")
 
 
 def built_in() -> list[str]:
-    """The built-in tasks whose package is there."""
+    """Return the names of the built-in tasks whose package is installed."""
     from rlcli.errors import TaskError
 
     found = []
@@ -31,7 +31,7 @@ def built_in() -> list[str]:
 
 
 def write_all(zoo: Path, entries: Mapping[str, Any]) -> None:
-    """Fill every page that there is, and write the index."""
+    """Update the generated blocks of every page and write the index."""
     tasks = [name for name in built_in() if name in entries]
     for name in tasks:
         file = zoo / f"{name}.md"
@@ -48,7 +48,7 @@ def write_all(zoo: Path, entries: Mapping[str, Any]) -> None:
 
 
 def filled(text: str, zoo: Path, entry: Any) -> str:
-    """A page with its generated blocks as they should be."""
+    """Return the page with up-to-date generated blocks."""
     made = {"card": card(entry.name), "results": results(zoo, entry), "curves": curves(zoo, entry)}
     for block in BLOCKS:
         text = re.sub(
@@ -61,33 +61,33 @@ def filled(text: str, zoo: Path, entry: Any) -> str:
 
 
 def block(text: str, name: str) -> str | None:
-    """What stands in a block of a page; None where it has no such block."""
+    """Return the content of a block, or None if the page has no such block."""
     found = re.search(rf"<!-- {name} -->\n(.*?)<!-- end {name} -->", text, re.DOTALL)
     return None if found is None else found[1]
 
 
 def card(task: str) -> str:
-    """The MDP card, folded."""
+    """Return the folded table of the task's terms."""
     source = find_task(task)
     resolved = resolve(source)
     file = source.config.with_name(f"{source.config.stem}.layout.json")
     layout = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
     _, _, text = markdown(task_card(resolved, layout), level=2).partition("\n\n")
-    return f"<details>\n<summary>The MDP, as configured</summary>\n\n{text.rstrip()}\n\n</details>\n"
+    return f"<details>\n<summary>Observations, actions, rewards and terminations</summary>\n\n{text.rstrip()}\n\n</details>\n"
 
 
 def rows_of(zoo: Path, task: str) -> list[dict[str, Any]]:
-    """The results of a task; empty where none are there."""
+    """Return the results of a task; an empty list if it has none."""
     file = zoo / "results" / f"{task}.json"
     return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else []
 
 
 def results(zoo: Path, entry: Any) -> str:
-    """The bar, and a row of each seed."""
+    """Return the bar and a table with one row per seed."""
     where = "one H200" if entry.device == "cuda" else "two CPU cores"
     held = (
-        f"Tier {entry.tier}: {bars(entry)} over {entry.episodes:,} episodes, trained in {entry.minutes:g} min on"
-        f" {where}; `make learn-{entry.name}` checks it.\n"
+        f"Tier {entry.tier}. Bar: {bars(entry)} over {entry.episodes:,} episodes, after at most {entry.minutes:g} min of"
+        f" training on {where}. `make learn-{entry.name}` trains the task and checks the bar.\n"
     )
     rows = rows_of(zoo, entry.name)
     if not rows:
@@ -107,11 +107,11 @@ def results(zoo: Path, entry: Any) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in rows[0]["versions"].items())
     commands = list(dict.fromkeys(re.sub(r"--seed[ =]\d+", "--seed N", row["command"]) for row in rows))
     said = "; ".join(f"`{command}`" for command in commands)
-    return f"{held}\n" + "\n".join(lines) + f"\n\n{said}, with {versions}. Brackets are 95 % intervals.\n"
+    return f"{held}\n" + "\n".join(lines) + f"\n\nTrained with {said}; {versions}. Numbers in brackets are 95 % intervals.\n"
 
 
 def bars(entry: Any) -> str:
-    """The bar in words."""
+    """Format the bar as text."""
     return ", ".join(
         f"{name} <= {bound['max']:g}" if isinstance(bound, dict) else f"{name} >= {bound:g}"
         for name, bound in entry.bar.items()
@@ -119,7 +119,7 @@ def bars(entry: Any) -> str:
 
 
 def with_interval(evaluation: dict[str, Any], name: str) -> str:
-    """A number and the interval behind it."""
+    """Format a value with its interval."""
     found = evaluation.get(name)
     if found is None:
         values = evaluation.get("values", {})
@@ -133,16 +133,16 @@ def with_interval(evaluation: dict[str, Any], name: str) -> str:
 
 
 def curves(zoo: Path, entry: Any) -> str:
-    """The learning curves, and what the shipped policy looks like."""
+    """Return the picture of the shipped policy and the learning curves."""
     parts = []
     if (zoo / "pictures" / f"{entry.name}.jpg").is_file():
         parts.append(
-            f"![{entry.name}: the shipped policy](pictures/{entry.name}.jpg)\n\nThe shipped policy, over"
-            f" {entry.picture:g} s: `rlcli play {entry.name} --video`.\n"
+            f"![{entry.name}: the shipped policy](pictures/{entry.name}.jpg)\n\nThe picture shows"
+            f" {entry.picture:g} s of the policy that comes with rlcli. `rlcli play {entry.name} --video` records a video.\n"
         )
     if (zoo / "curves" / f"{entry.name}.svg").is_file():
         parts.append(
-            f"![learning curves of {entry.name}](curves/{entry.name}.svg)\n\nThe numbers:"
+            f"![learning curves of {entry.name}](curves/{entry.name}.svg)\n\nData:"
             f" [curves/{entry.name}.csv](curves/{entry.name}.csv).\n"
         )
     return "\n".join(parts)
