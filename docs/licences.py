@@ -32,7 +32,7 @@ LICENCES = {
     "mujoco-warp": ("Apache-2.0", "physics on a GPU"),
     "mypy": ("MIT", "type checks"),
     "myst-parser": ("MIT", "Markdown in Sphinx"),
-    "numpy": ("BSD-3-Clause and others as free", "arrays between MuJoCo and torch"),
+    "numpy": ("BSD-3-Clause and other free licences", "arrays between MuJoCo and torch"),
     "onnx": ("Apache-2.0", "format of exported policies"),
     "onnxruntime": ("MIT", "verification of exported policies"),
     "onnxscript": ("MIT", "dependency of torch's ONNX exporter"),
@@ -59,7 +59,7 @@ LICENCES = {
     "tensorboard": ("Apache-2.0", "logger `tensorboard`"),
     "tensorboardx": ("MIT", "import of RSL-RL or rl_games, for tests of the trainer plugins"),
     "tensordict": ("MIT", "import of RSL-RL or rl_games, for tests of the trainer plugins"),
-    "torch": ("BSD-3-Clause and others as free", "tensors, networks, gradients"),
+    "torch": ("BSD-3-Clause and other free licences", "tensors, networks, gradients"),
     "trackio": ("MIT", "tracker Trackio"),
     "typer": ("MIT", "command-line interface"),
     "wandb": ("MIT", "tracker Weights & Biases"),
@@ -72,11 +72,14 @@ _HEAD = """# Licences
 After reading this page you know the licence of rlcli and of every package that it depends on.
 
 rlcli and its plugins are under the Apache License 2.0; the file `LICENSE` has its text. The pages of
-[the built-in tasks](zoo/index.md) name the sources of their models and numbers. `python docs/licences.py` writes this page.
+[the built-in tasks](zoo/index.md) name the sources of their models and numbers.
+
+`python docs/licences.py` writes this page.
 """
 _TAIL = """
 The dependencies of these packages have the same kinds of licence: MIT, BSD, Apache-2.0, ISC, PSF, and MPL-2.0 (certifi,
-pathspec, tqdm). On Linux with a GPU, torch installs NVIDIA's CUDA libraries, which are free of charge but not free software.
+pathspec, tqdm). On Linux with a GPU, torch installs NVIDIA's CUDA libraries, which are free of charge but not free
+software.
 """
 
 
