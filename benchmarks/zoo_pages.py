@@ -73,7 +73,8 @@ def card(task: str) -> str:
     file = source.config.with_name(f"{source.config.stem}.layout.json")
     layout = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
     _, _, text = markdown(task_card(resolved, layout), level=2).partition("\n\n")
-    return f"<details>\n<summary>Observations, actions, rewards and terminations</summary>\n\n{text.rstrip()}\n\n</details>\n"
+    summary = "Observations, actions, rewards and terminations"
+    return f"<details>\n<summary>{summary}</summary>\n\n{text.rstrip()}\n\n</details>\n"
 
 
 def rows_of(zoo: Path, task: str) -> list[dict[str, Any]]:
@@ -86,8 +87,8 @@ def results(zoo: Path, entry: Any) -> str:
     """Return the bar and a table with one row per seed."""
     where = "one H200" if entry.device == "cuda" else "two CPU cores"
     held = (
-        f"Tier {entry.tier}. Bar: {bars(entry)} over {entry.episodes:,} episodes, after at most {entry.minutes:g} min of"
-        f" training on {where}. `make learn-{entry.name}` trains the task and checks the bar.\n"
+        f"Tier {entry.tier}. Bar: {bars(entry)} over {entry.episodes:,} episodes, after at most {entry.minutes:g} min"
+        f" of training on {where}. `make learn-{entry.name}` trains the task and checks the bar.\n"
     )
     rows = rows_of(zoo, entry.name)
     if not rows:
@@ -107,7 +108,11 @@ def results(zoo: Path, entry: Any) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in rows[0]["versions"].items())
     commands = list(dict.fromkeys(re.sub(r"--seed[ =]\d+", "--seed N", row["command"]) for row in rows))
     said = "; ".join(f"`{command}`" for command in commands)
-    return f"{held}\n" + "\n".join(lines) + f"\n\nTrained with {said}; {versions}. Numbers in brackets are 95 % intervals.\n"
+    return (
+        f"{held}\n"
+        + "\n".join(lines)
+        + f"\n\nTrained with {said}; {versions}. Numbers in brackets are 95 % intervals.\n"
+    )
 
 
 def bars(entry: Any) -> str:
@@ -138,7 +143,8 @@ def curves(zoo: Path, entry: Any) -> str:
     if (zoo / "pictures" / f"{entry.name}.jpg").is_file():
         parts.append(
             f"![{entry.name}: the shipped policy](pictures/{entry.name}.jpg)\n\nThe picture shows"
-            f" {entry.picture:g} s of the policy that comes with rlcli. `rlcli play {entry.name} --video` records a video.\n"
+            f" {entry.picture:g} s of the policy that comes with rlcli. `rlcli play {entry.name} --video` records"
+            " a video.\n"
         )
     if (zoo / "curves" / f"{entry.name}.svg").is_file():
         parts.append(
@@ -153,8 +159,9 @@ def index(zoo: Path, found: list[Any]) -> str:
     lines = [
         "# Built-in tasks",
         "",
-        "After reading this page you can choose a task to start from. `rlcli play TASK` shows the policy that comes with a",
-        "task, and `rlcli train TASK` trains a new one. A task's page has its model, numbers, learning curves and results.",
+        "After reading this page you can choose a task to start from. `rlcli play TASK` shows the policy that comes with",
+        "a task, and `rlcli train TASK` trains a new one. A task's page has its model, numbers, learning curves",
+        "and results.",
         "",
         "```{toctree}",
         ":hidden:",
