@@ -159,8 +159,8 @@ def index(zoo: Path, found: list[Any]) -> str:
     lines = [
         "# Built-in tasks",
         "",
-        "After reading this page you can choose a task to start from. `rlcli play TASK` shows the policy that comes with",
-        "a task, and `rlcli train TASK` trains a new one. A task's page has its model, numbers, learning curves",
+        "After reading this page you can choose a task to start from. `rlcli play TASK` shows the policy that comes",
+        "with a task, and `rlcli train TASK` trains a new one. A task's page has its model, numbers, learning curves",
         "and results.",
         "",
         "```{toctree}",
