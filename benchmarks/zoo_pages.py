@@ -1,4 +1,4 @@
-"""Generated parts of docs/reference/zoo/*.md: the task card, the results of the trainings, and the curves."""
+"""Write the generated parts of docs/reference/zoo/*.md: task card, results and learning curves."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BLOCKS = ("card", "results", "curves")
 
 
 def built_in() -> list[str]:
-    """Return the built-in tasks whose package is installed."""
+    """Return the names of the built-in tasks whose package is installed."""
     from rlcli.errors import TaskError
 
     found = []
@@ -31,7 +31,7 @@ def built_in() -> list[str]:
 
 
 def write_all(zoo: Path, entries: Mapping[str, Any]) -> None:
-    """Fill all existing pages, and write the index."""
+    """Update the generated blocks of every page and write the index."""
     tasks = [name for name in built_in() if name in entries]
     for name in tasks:
         file = zoo / f"{name}.md"
@@ -48,7 +48,7 @@ def write_all(zoo: Path, entries: Mapping[str, Any]) -> None:
 
 
 def filled(text: str, zoo: Path, entry: Any) -> str:
-    """Return a page with its generated blocks filled."""
+    """Return the page with up-to-date generated blocks."""
     made = {"card": card(entry.name), "results": results(zoo, entry), "curves": curves(zoo, entry)}
     for block in BLOCKS:
         text = re.sub(
@@ -61,33 +61,34 @@ def filled(text: str, zoo: Path, entry: Any) -> str:
 
 
 def block(text: str, name: str) -> str | None:
-    """Return the content of a block of a page; None if there is no such block."""
+    """Return the content of a block, or None if the page has no such block."""
     found = re.search(rf"<!-- {name} -->\n(.*?)<!-- end {name} -->", text, re.DOTALL)
     return None if found is None else found[1]
 
 
 def card(task: str) -> str:
-    """Return the MDP card, folded."""
+    """Return the folded table of the task's terms."""
     source = find_task(task)
     resolved = resolve(source)
     file = source.config.with_name(f"{source.config.stem}.layout.json")
     layout = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
     _, _, text = markdown(task_card(resolved, layout), level=2).partition("\n\n")
-    return f"<details>\n<summary>The MDP, as configured</summary>\n\n{text.rstrip()}\n\n</details>\n"
+    summary = "Observations, actions, rewards and terminations"
+    return f"<details>\n<summary>{summary}</summary>\n\n{text.rstrip()}\n\n</details>\n"
 
 
 def rows_of(zoo: Path, task: str) -> list[dict[str, Any]]:
-    """Return the results of a task; an empty list if there are none."""
+    """Return the results of a task; an empty list if it has none."""
     file = zoo / "results" / f"{task}.json"
     return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else []
 
 
 def results(zoo: Path, entry: Any) -> str:
-    """Return the bar, and a row for each seed."""
+    """Return the bar and a table with one row per seed."""
     where = "one H200" if entry.device == "cuda" else "two CPU cores"
     held = (
-        f"Tier {entry.tier}: {bars(entry)} over {entry.episodes:,} episodes, trained in {entry.minutes:g} min on"
-        f" {where}; `make learn-{entry.name}` checks it.\n"
+        f"Tier {entry.tier}. Bar: {bars(entry)} over {entry.episodes:,} episodes, after at most {entry.minutes:g} min"
+        f" of training on {where}. `make learn-{entry.name}` trains the task and checks the bar.\n"
     )
     rows = rows_of(zoo, entry.name)
     if not rows:
@@ -107,11 +108,15 @@ def results(zoo: Path, entry: Any) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in rows[0]["versions"].items())
     commands = list(dict.fromkeys(re.sub(r"--seed[ =]\d+", "--seed N", row["command"]) for row in rows))
     said = "; ".join(f"`{command}`" for command in commands)
-    return f"{held}\n" + "\n".join(lines) + f"\n\n{said}, with {versions}. Brackets are 95 % intervals.\n"
+    return (
+        f"{held}\n"
+        + "\n".join(lines)
+        + f"\n\nTrained with {said}; {versions}. Numbers in brackets are 95 % intervals.\n"
+    )
 
 
 def bars(entry: Any) -> str:
-    """Return the bar as text."""
+    """Format the bar as text."""
     return ", ".join(
         f"{name} <= {bound['max']:g}" if isinstance(bound, dict) else f"{name} >= {bound:g}"
         for name, bound in entry.bar.items()
@@ -119,7 +124,7 @@ def bars(entry: Any) -> str:
 
 
 def with_interval(evaluation: dict[str, Any], name: str) -> str:
-    """Return a number with its interval as text."""
+    """Format a value with its interval."""
     found = evaluation.get(name)
     if found is None:
         values = evaluation.get("values", {})
@@ -133,16 +138,17 @@ def with_interval(evaluation: dict[str, Any], name: str) -> str:
 
 
 def curves(zoo: Path, entry: Any) -> str:
-    """Return the learning curves, and the pictures of the shipped policy."""
+    """Return the picture of the shipped policy and the learning curves."""
     parts = []
     if (zoo / "pictures" / f"{entry.name}.jpg").is_file():
         parts.append(
-            f"![{entry.name}: the shipped policy](pictures/{entry.name}.jpg)\n\nThe shipped policy, over"
-            f" {entry.picture:g} s: `rlcli play {entry.name} --video`.\n"
+            f"![{entry.name}: the shipped policy](pictures/{entry.name}.jpg)\n\nThe picture shows"
+            f" {entry.picture:g} s of the policy that comes with rlcli. `rlcli play {entry.name} --video` records"
+            " a video.\n"
         )
     if (zoo / "curves" / f"{entry.name}.svg").is_file():
         parts.append(
-            f"![learning curves of {entry.name}](curves/{entry.name}.svg)\n\nThe numbers:"
+            f"![learning curves of {entry.name}](curves/{entry.name}.svg)\n\nData:"
             f" [curves/{entry.name}.csv](curves/{entry.name}.csv).\n"
         )
     return "\n".join(parts)
@@ -154,8 +160,8 @@ def index(zoo: Path, found: list[Any]) -> str:
         "# Built-in tasks",
         "",
         "After reading this page you can choose a task to start from. `rlcli play TASK` shows the policy that comes",
-        "with a task, and `rlcli train TASK` trains a new one. The page of a task has its model, numbers, learning",
-        "curves and results.",
+        "with a task, and `rlcli train TASK` trains a new one. A task's page has its model, numbers, learning curves",
+        "and results.",
         "",
         "```{toctree}",
         ":hidden:",

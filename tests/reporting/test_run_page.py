@@ -83,7 +83,8 @@ def test_report_has_all_sections(cli, tmp_path):
     page = read(result.json["file"])
     require_harmless(page)
     for words in (
-        "cartpole", "Balance a pole on a cart", "1,000 steps in 10 iterations", "Sum of the squared deviations of joints from",
+        "cartpole", "Balance a pole on a cart", "1,000 steps in 10 iterations",
+        "Sum of the squared deviations of joints from",
         "rewards.alive.weight", "override 'rewards.alive.weight=1.5'", "A chip", "rlcli train cartpole --seed 1",
         "rlcli reproduce", "mujoco",
     ):  # fmt: skip
