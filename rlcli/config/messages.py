@@ -18,16 +18,12 @@ from rlcli.safe_text import shorten
 
 _EXPECTED = {
     "float": "a number",
-    "int": "a whole number",
-    "int_from_float": "a whole number",
+    **dict.fromkeys(("int", "int_from_float"), "a whole number"),
     "finite_number": "a finite number",
     "string": "text",
     "bool": "true or false",
-    "dict": "a mapping",
-    "model": "a mapping",
-    "model_attributes": "a mapping",
-    "list": "a list",
-    "tuple": "a list",
+    **dict.fromkeys(("dict", "model", "model_attributes"), "a mapping"),
+    **dict.fromkeys(("list", "tuple"), "a list"),
     "none": "null",
 }
 _BOUNDS = {

@@ -143,8 +143,7 @@ def _framework_packages() -> frozenset[str]:
 
 def known_trainers() -> dict[str, str]:
     """Return the trainers that plugins offer, each with the arguments of `pip install`."""
-    trainers: dict[str, str] = _known_plugins()["trainers"]
-    return trainers
+    return dict(_known_plugins()["trainers"])
 
 
 def known_formats() -> dict[str, KnownFormat]:
