@@ -168,7 +168,7 @@ def flags(**values: Any) -> dict[str, Any]:
 
 def leaves(value: object, path: Path = ()) -> Iterator[tuple[Path, Any]]:
     """Yield every value in nested mappings with its path. An empty mapping counts as a value."""
-    if isinstance(value, dict) and value:
+    if isinstance(value, Mapping) and value:
         for key, item in value.items():
             yield from leaves(item, (*path, key))
     else:

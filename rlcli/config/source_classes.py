@@ -197,10 +197,8 @@ def _fields(source: SourceClass, search: ClassSearch) -> dict[str, _Field]:
 
 def _dataclass_decorator(node: ast.ClassDef) -> ast.expr | None:
     """Return the decorator `@dataclass` or `@dataclass(...)` of a class; None without one."""
-    for decorator in node.decorator_list:
-        if last_name(decorator.func if isinstance(decorator, ast.Call) else decorator) == "dataclass":
-            return decorator
-    return None
+    named = ((last_name(d.func if isinstance(d, ast.Call) else d), d) for d in node.decorator_list)
+    return next((decorator for name, decorator in named if name == "dataclass"), None)
 
 
 def _default(value: ast.expr | None) -> ast.expr | None:

@@ -62,9 +62,9 @@ def try_format(name: str) -> Details:
     """
     form = load_format(name)
     spec = form.spec
-    for reference in (spec.find, spec.read, spec.check, spec.environment, spec.importer, spec.hint, spec.agents_beside):
-        if reference:
-            form.load(reference)
+    references = (spec.find, spec.read, spec.check, spec.environment, spec.importer, spec.hint, spec.agents_beside)
+    for reference in filter(None, references):
+        form.load(reference)
     return Details(summary=spec.summary)
 
 

@@ -175,7 +175,7 @@ def matching_elements(elements: list[Any], params: dict[str, Any], key: str, kin
 
 
 def unset_simple(spec: mujoco.MjSpec, params: dict[str, Any], key: str) -> None:
-    """Mark the selected bodies as not simple: MuJoCo ignores a changed centre of mass of a simple body."""
+    """Clear the `simple` flag of the selected bodies, with which MuJoCo assumes the inertial frame to be the body's."""
     for body in matching_elements(spec.bodies, params, key, "body"):
         body.simple = 0
 
