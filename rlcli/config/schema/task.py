@@ -7,9 +7,18 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from rlcli.config.schema import terms
 from rlcli.config.schema.base import Count, Number, Positive, StrictModel, Threads, Vec3, _FractionString
 from rlcli.config.schema.scene import SceneConfig
+from rlcli.config.schema.terms import (
+    ActionConfig,
+    CommandConfig,
+    CurriculumConfig,
+    EventConfig,
+    ObservationGroupConfig,
+    RewardConfig,
+    SuccessConfig,
+    TerminationConfig,
+)
 
 
 class SimConfig(StrictModel):
@@ -83,21 +92,21 @@ class TaskConfig(StrictModel):
     """Environments, ground, lights, robots and objects."""
     viewer: ViewerConfig = ViewerConfig()
     """Camera of viewers, images and videos."""
-    actions: dict[str, terms.ActionConfig | None] = {}
+    actions: dict[str, ActionConfig | None] = {}
     """Action terms, in the order of the policy's output. null removes a term."""
-    commands: dict[str, terms.CommandConfig | None] = {}
+    commands: dict[str, CommandConfig | None] = {}
     """Command terms."""
-    observations: dict[str, terms.ObservationGroupConfig] = {}
+    observations: dict[str, ObservationGroupConfig] = {}
     """Groups of observation terms. The group `policy` is the input of the policy."""
-    events: dict[str, terms.EventConfig | None] = {}
+    events: dict[str, EventConfig | None] = {}
     """Event terms."""
-    rewards: dict[str, terms.RewardConfig | None] = {}
+    rewards: dict[str, RewardConfig | None] = {}
     """Reward terms."""
-    terminations: dict[str, terms.TerminationConfig | None] = {}
+    terminations: dict[str, TerminationConfig | None] = {}
     """Termination terms."""
-    curriculum: dict[str, terms.CurriculumConfig | None] = {}
+    curriculum: dict[str, CurriculumConfig | None] = {}
     """Curriculum terms."""
-    success: terms.SuccessConfig | None = None
+    success: SuccessConfig | None = None
     """Condition under which an episode counts as a success in `eval`."""
     reward_dt_scaling: bool = True
     """true: rewards of manager-based tasks are multiplied by step_dt, so that returns do not depend on the control
