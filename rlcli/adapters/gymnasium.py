@@ -17,6 +17,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rlcli.config.layers import leaves
 from rlcli.config.load import Resolved, resolve
 from rlcli.config.schema import TaskConfig
 from rlcli.envs.make import make_env
@@ -53,9 +54,9 @@ def open_task(
         return make_env(cfg.model_copy(update={"scene": scene}), seed=seed, device=device, root=source.root)
     if isinstance(cfg, str):
         raise TypeError(f"cfg must be a mapping or a list of overrides: [{cfg!r}]")
-    changes = dict(_flat(cfg)) if isinstance(cfg, Mapping) else {}
+    changes = leaves(cfg) if isinstance(cfg, Mapping) and cfg else ()
     overrides = () if cfg is None or isinstance(cfg, Mapping) else tuple(cfg)
-    flags = {**changes, "scene.num_envs": num_envs}
+    flags = {".".join(map(str, path)): value for path, value in changes} | {"scene.num_envs": num_envs}
     resolved = resolve(find_task(task), agent=agent, device=device.partition(":")[0], overrides=overrides, flags=flags)
     return make_env(resolved, seed=seed, device=device)
 
@@ -340,12 +341,3 @@ def _check_mode(render_mode: str | None) -> str | None:
 def _policy_obs(groups: Mapping[str, Tensor]) -> Floats:
     """Return a copy of the observation group `policy`. (num_envs, d)"""
     return np.array(groups["policy"].cpu().numpy())
-
-
-def _flat(changes: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
-    """Yield the values of a nested mapping with their dotted keys."""
-    for key, value in changes.items():
-        if isinstance(value, Mapping) and value:
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value

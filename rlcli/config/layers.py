@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -49,7 +50,7 @@ class Layers:
                 continue
             if key in target:
                 self._forget(path)
-            target[key] = _copy(value)
+            target[key] = copy.deepcopy(value)
             for below in _paths(value):
                 self.origins[path + below] = origin(source + below)
 
@@ -167,7 +168,7 @@ def flags(**values: Any) -> dict[str, Any]:
 
 def leaves(value: object, path: Path = ()) -> Iterator[tuple[Path, Any]]:
     """Yield every value in nested mappings with its path. An empty mapping counts as a value."""
-    if isinstance(value, dict) and value:
+    if isinstance(value, Mapping) and value:
         for key, item in value.items():
             yield from leaves(item, (*path, key))
     else:
@@ -211,9 +212,3 @@ def _paths(value: object) -> list[Path]:
     if isinstance(value, list):
         return [(), *((index, *below) for index, item in enumerate(value) for below in _paths(item))]
     return [()]
-
-
-def _copy(value: object) -> Any:
-    if isinstance(value, dict):
-        return {key: _copy(item) for key, item in value.items()}
-    return [_copy(item) for item in value] if isinstance(value, list) else value

@@ -61,10 +61,10 @@ class Resolved:
         """
         if self.agent is None:
             names = agent_names(self.layers)
-            message = "no default among the agents" if names else "this task has no agent to train"
-            hint = (
-                f"--agent {' or '.join(names)}" if names else "add agents: {default: NAME, NAME: {trainer: sb3, ...}}"
-            )
+            message = "this task has no agent to train"
+            hint = "add agents: {default: NAME, NAME: {trainer: sb3, ...}}"
+            if names:
+                message, hint = "no default among the agents", f"--agent {' or '.join(names)}"
             raise ConfigError([self.problem(("agents",), message, hint)])
 
 
@@ -136,11 +136,9 @@ def check_all(source: TaskSource, *, config_file: FilePath | None = None, overri
     """
     check = TaskCheck(source)
     check.read_task(check.document())
-    agents = check.layers.get(("agents",))
-    names = [name for name in agents if name != "default"] if isinstance(agents, dict) else []
     problems: list[Problem] = []
     unchecked: list[str] = []
-    for name in names or [None]:
+    for name in tuple(agent_names(check.layers)) or (None,):
         for play in (False, True):
             try:
                 resolve(source, agent=name, play=play, config_file=config_file, overrides=overrides)

@@ -18,16 +18,12 @@ from rlcli.safe_text import shorten
 
 _EXPECTED = {
     "float": "a number",
-    "int": "a whole number",
-    "int_from_float": "a whole number",
+    **dict.fromkeys(("int", "int_from_float"), "a whole number"),
     "finite_number": "a finite number",
     "string": "text",
     "bool": "true or false",
-    "dict": "a mapping",
-    "model": "a mapping",
-    "model_attributes": "a mapping",
-    "list": "a list",
-    "tuple": "a list",
+    **dict.fromkeys(("dict", "model", "model_attributes"), "a mapping"),
+    **dict.fromkeys(("list", "tuple"), "a list"),
     "none": "null",
 }
 _BOUNDS = {
@@ -220,10 +216,8 @@ def _tags(model: type[BaseModel], path: Path) -> list[str]:
 
 def _length(model: type[BaseModel], path: Path) -> int | None:
     """Return the length of the list at a path of a model; None if it is not fixed."""
-    for arm in _arms_at(model, path):
-        if get_origin(arm) is tuple and get_args(arm)[-1] is not ...:
-            return len(get_args(arm))
-    return None
+    items = (get_args(arm) for arm in _arms_at(model, path) if get_origin(arm) is tuple)
+    return next((len(kinds) for kinds in items if kinds[-1] is not ...), None)
 
 
 def _arms_at(model: type[BaseModel], path: Path) -> list[Any]:

@@ -284,8 +284,5 @@ def _location(error: BaseException) -> str:
 
 def _hint(error: BaseException) -> str | None:
     """Return the hint of an installed format about an error of a task's code; None if no format has one."""
-    for form in installed_formats():
-        hint: str | None = form.load(form.spec.hint)(error) if form.spec.hint else None
-        if hint is not None:
-            return hint
-    return None
+    hints = (form.load(form.spec.hint)(error) for form in installed_formats() if form.spec.hint)
+    return next((hint for hint in hints if hint is not None), None)

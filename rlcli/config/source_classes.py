@@ -33,8 +33,7 @@ def parse(file: Path) -> ast.Module:
         SyntaxError: if the file is not Python.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             return ast.parse(file.read_bytes(), filename=str(file))
     except SyntaxError as error:
         error.filename = str(file)  # Python leaves it out for a file with a null byte
@@ -43,47 +42,19 @@ def parse(file: Path) -> ast.Module:
         raise SyntaxError(str(error) or "nested too deeply", (str(file), 1, 1, None)) from None
 
 
-def constructor(source: SourceClass, trees: dict[Path, ast.Module]) -> ast.FunctionDef | None:
-    """Return the `__init__` of a class: its own, the one that `@dataclass` generates, or that of a base; else None.
+class ClassSearch:
+    """Search for classes in source files. It stops after `MOST` classes.
 
-    `trees` is a cache of the syntax trees of files; new files are added to it.
-
-    Raises:
-        SyntaxError: if the file of a base is not Python.
+    Base classes are found in the same file, in other files of the same package, and in `rlcli.mdp`. `trees` is a cache
+    of the syntax trees of files; new files are added to it. Methods raise SyntaxError if a file is not Python.
     """
-    return _constructor(source, _Search(trees))
-
-
-def lineage(file: Path, name: str) -> list[SourceClass]:
-    """Return a class and its base classes, depth first, each once; an empty list if the file has no such class.
-
-    Base classes are found in the same file, in other files of the same package, and in `rlcli.mdp`.
-
-    Raises:
-        SyntaxError: if one of the files is not Python.
-    """
-    return _Search().lineage(file, name)
-
-
-def nested_lineage(file: Path, name: str, nested: str) -> list[SourceClass]:
-    """Return a class in the body of another class (or of its bases), and the base classes of the inner class.
-
-    Raises:
-        SyntaxError: if one of the files is not Python.
-    """
-    search = _Search()
-    found = search.nested(file, name, nested)
-    return [] if found is None else list(search.walk(found))
-
-
-class _Search:
-    """Search for classes in source files. It stops after `MOST` classes."""
 
     def __init__(self, trees: dict[Path, ast.Module] | None = None) -> None:
         self._trees = {} if trees is None else trees
         self._left = MOST
 
     def lineage(self, file: Path, name: str) -> list[SourceClass]:
+        """Return a class and its base classes, depth first, each once; an empty list if the file has no such class."""
         first = self._find(file, name)
         return [] if first is None else list(self.walk(first))
 
@@ -91,6 +62,11 @@ class _Search:
         """Return the class `name` in the body of the class `outer` or of one of its bases."""
         found = (owner.nested(name) for owner in self.lineage(file, outer))
         return next((inner for inner in found if inner is not None), None)
+
+    def nested_lineage(self, file: Path, outer: str, name: str) -> list[SourceClass]:
+        """Return a class in the body of another class (or of its bases), and the base classes of the inner class."""
+        found = self.nested(file, outer, name)
+        return [] if found is None else list(self.walk(found))
 
     def walk(self, first: SourceClass, seen: set[ast.ClassDef] | None = None) -> Iterator[SourceClass]:
         """Yield a class and its base classes, depth first, each once."""
@@ -167,14 +143,19 @@ class _Field:
     keyword_only: bool
 
 
-def _constructor(source: SourceClass, search: _Search) -> ast.FunctionDef | None:
+def constructor(source: SourceClass, search: ClassSearch) -> ast.FunctionDef | None:
+    """Return the `__init__` of a class: its own, the one that `@dataclass` generates, or that of a base; else None.
+
+    Raises:
+        SyntaxError: if the file of a base is not Python.
+    """
     node = source.node
     own = next((n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"), None)
     if own is not None:
         return own
     if _dataclass_decorator(node) is not None:
         return _dataclass_init(node, list(_fields(source, search).values()))
-    inits = (_constructor(base, search) for base in search.bases(source))
+    inits = (constructor(base, search) for base in search.bases(source))
     return next((init for init in inits if init is not None), None)
 
 
@@ -191,7 +172,7 @@ def _dataclass_init(node: ast.ClassDef, fields: list[_Field]) -> ast.FunctionDef
     return ast.FunctionDef("__init__", arguments, body=[], decorator_list=[], lineno=node.lineno)
 
 
-def _fields(source: SourceClass, search: _Search) -> dict[str, _Field]:
+def _fields(source: SourceClass, search: ClassSearch) -> dict[str, _Field]:
     """Return the fields of a dataclass in the order of its `__init__`: the fields of its last base class first."""
     fields: dict[str, _Field] = {}
     for base in reversed(search.bases(source)):
@@ -216,10 +197,8 @@ def _fields(source: SourceClass, search: _Search) -> dict[str, _Field]:
 
 def _dataclass_decorator(node: ast.ClassDef) -> ast.expr | None:
     """Return the decorator `@dataclass` or `@dataclass(...)` of a class; None without one."""
-    for decorator in node.decorator_list:
-        if last_name(decorator.func if isinstance(decorator, ast.Call) else decorator) == "dataclass":
-            return decorator
-    return None
+    named = ((last_name(d.func if isinstance(d, ast.Call) else d), d) for d in node.decorator_list)
+    return next((decorator for name, decorator in named if name == "dataclass"), None)
 
 
 def _default(value: ast.expr | None) -> ast.expr | None:

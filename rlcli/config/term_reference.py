@@ -15,9 +15,10 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from rlcli.config.strict_yaml import load
-from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, Vocabulary, builtin_terms
+from rlcli.config.term_signatures import SECTIONS, SELECTORS, Parameter, Signature, Vocabulary, builtin_terms
 
 _KEYS = Path(__file__).resolve().parent.parent / "mdp" / "term_keys.yaml"
+_ELEMENTS = {"Bodies": "body", "Sensors": "MJCF sensor", "Pairs": "contact pair"}
 _ALIAS_TYPES = {
     "Entity": "entity name",
     "Command": "command name",
@@ -25,14 +26,7 @@ _ALIAS_TYPES = {
     "ContactSensor": "contact sensor name",
     "RaySensor": "ray sensor name",
     "CameraSensor": "camera name",
-    "Joints": "joint names or patterns",
-    "Bodies": "body names or patterns",
-    "Sites": "site names or patterns",
-    "Sensors": "MJCF sensor names or patterns",
-    "Actuators": "actuator names or patterns",
-    "Geoms": "geom names or patterns",
-    "Tendons": "tendon names or patterns",
-    "Pairs": "contact pair names or patterns",
+    **{alias: f"{_ELEMENTS.get(alias, alias[:-1].lower())} names or patterns" for alias in SELECTORS},
 }
 _SECTION_KEYS: dict[str, dict[str, Any]] = {
     "rewards": {"weight": 1.0},

@@ -20,32 +20,18 @@ from typing import Any, Literal, Union
 
 from pydantic import ConfigDict, Field, create_model
 
-from rlcli.config.schema import (
-    ActionConfig,
-    CommandConfig,
-    CurriculumConfig,
-    EventConfig,
-    Names,
-    Number,
-    ObservationConfig,
-    Range,
-    RewardConfig,
-    StrictModel,
-    SuccessConfig,
-    TermConfig,
-    TerminationConfig,
-)
-from rlcli.config.source_classes import SourceClass, constructor, last_name, nested_lineage, parse
+from rlcli.config import schema
+from rlcli.config.source_classes import ClassSearch, SourceClass, constructor, last_name, parse
 
-SECTIONS: dict[str, type[TermConfig]] = {
-    "actions": ActionConfig,
-    "commands": CommandConfig,
-    "observations": ObservationConfig,
-    "events": EventConfig,
-    "rewards": RewardConfig,
-    "terminations": TerminationConfig,
-    "curriculum": CurriculumConfig,
-    "success": SuccessConfig,
+SECTIONS: dict[str, type[schema.TermConfig]] = {
+    "actions": schema.ActionConfig,
+    "commands": schema.CommandConfig,
+    "observations": schema.ObservationConfig,
+    "events": schema.EventConfig,
+    "rewards": schema.RewardConfig,
+    "terminations": schema.TerminationConfig,
+    "curriculum": schema.CurriculumConfig,
+    "success": schema.SuccessConfig,
 }
 """Section of the YAML -> model of the keys that all its terms share."""
 
@@ -56,14 +42,14 @@ NAMED = ("Entity", "Command", "Address", "ContactSensor", "RaySensor", "CameraSe
 """Aliases of `rlcli.task` that name one object."""
 
 _TYPES: dict[str, Any] = {
-    "float": Number,
+    "float": schema.Number,
     "int": int,
     "bool": bool,
     "str": str,
     "None": None,
-    "Range": Range,
+    "Range": schema.Range,
     **dict.fromkeys(NAMED, str),
-    **dict.fromkeys(SELECTORS, Names),
+    **dict.fromkeys(SELECTORS, schema.Names),
 }
 _MDP = Path(__file__).resolve().parent.parent / "mdp"
 
@@ -154,7 +140,7 @@ def read_terms(file: Path) -> dict[str, Signature]:
         if isinstance(node, ast.FunctionDef) and _takes_env(node.args, 0) and not node.name.startswith("_"):
             terms[node.name] = _signature(node, node, node.name, file)
         elif isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-            init = constructor(SourceClass(file, node), trees)
+            init = constructor(SourceClass(file, node), ClassSearch(trees))
             if init is not None and _takes_env(init.args, 1):
                 name = snake_case(node.name)
                 terms[name] = _signature(node, init, name, file)
@@ -174,7 +160,7 @@ def signature_of(term: Any, name: str) -> Signature:
         raise SignatureError("its source cannot be read; define it at the top of a file") from None
     call: ast.stmt | None = node
     if isinstance(node, ast.ClassDef):
-        call = constructor(SourceClass(Path(file or "?"), node), {})
+        call = constructor(SourceClass(Path(file or "?"), node), ClassSearch())
     if not isinstance(node, ast.FunctionDef | ast.ClassDef) or not isinstance(call, ast.FunctionDef):
         raise SignatureError("a term is a function (env, *, ...), or a class whose __init__ takes (self, env, *, ...)")
     if not _takes_env(call.args, 1 if isinstance(node, ast.ClassDef) else 0):
@@ -182,14 +168,14 @@ def signature_of(term: Any, name: str) -> Signature:
     return replace(_signature(node, call, name, Path(file or "?")), target=term)
 
 
-def read_params(file: Path, class_name: str) -> type[StrictModel] | None:
+def read_params(file: Path, class_name: str) -> type[schema.StrictModel] | None:
     """Return the `Params` model of a direct task's class (own or inherited), rebuilt from its source; None without one.
 
     Raises:
         SyntaxError: if a file is not Python.
         SignatureError: if YAML cannot express the type of a field.
     """
-    params = nested_lineage(file, class_name, "Params")
+    params = ClassSearch().nested_lineage(file, class_name, "Params")
     if not params:
         return None
     fields: dict[str, Any] = {}
@@ -200,10 +186,10 @@ def read_params(file: Path, class_name: str) -> type[StrictModel] | None:
                     fields[node.target.id] = (annotation_type(node.annotation), _field_default(node.value))
                 except SignatureError as error:
                     raise SignatureError(f"line {node.lineno}: '{node.target.id}': {error}") from None
-    return _model("Params", StrictModel, fields)
+    return _model("Params", schema.StrictModel, fields)
 
 
-def params_model(signature: Signature, section: str) -> type[TermConfig]:
+def params_model(signature: Signature, section: str) -> type[schema.TermConfig]:
     """Return the model of a term's YAML entry. Its keys are the keys of the section and the function's parameters.
 
     Raises:
@@ -258,14 +244,13 @@ def annotation_type(node: ast.expr) -> Any:
     )
 
 
-def _model(name: str, base: type[StrictModel], fields: dict[str, Any]) -> type[Any]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a parameter may have the name of a pydantic method
+def _model(name: str, base: type[schema.StrictModel], fields: dict[str, Any]) -> type[Any]:
+    with warnings.catch_warnings(action="ignore"):  # a parameter may have the name of a pydantic method
         return create_model(name, __base__=base, **fields)
 
 
 @functools.cache
-def _closed(section: str) -> type[TermConfig]:
+def _closed(section: str) -> type[schema.TermConfig]:
     """Return the model of a section's terms that refuses unknown keys."""
     base = SECTIONS[section]
     config = ConfigDict(extra="forbid", protected_namespaces=())  # a parameter may start with `model_`

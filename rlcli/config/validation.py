@@ -17,15 +17,7 @@ from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, Vocabulary, params_model, read_params
 from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing
 from rlcli.formats import Note
-from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, load_entry
-from rlcli.registry.formats import (
-    Format,
-    format_of_key,
-    installed_formats,
-    known_trainers,
-    missing_formats,
-    require_format,
-)
+from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, formats, load_entry
 from rlcli.registry.imports import load_spec
 from rlcli.trainers import TrainerSpec
 
@@ -67,7 +59,7 @@ class TaskCheck:
     locations: messages.KeyLocations = field(default_factory=dict)
     functions: dict[str, Signature] = field(default_factory=dict)
     notes: list[Note] = field(default_factory=list)
-    format: Format | None = None
+    format: formats.Format | None = None
 
     def document(self) -> Document:
         """Return the content of the task's file. For a configuration in Python, also store its functions and notes."""
@@ -105,7 +97,7 @@ class TaskCheck:
         unknown = {key: value for key, value in document.data.items() if key not in TaskConfig.model_fields}
         if not unknown:
             return False
-        for form in installed_formats():
+        for form in formats.installed_formats():
             found = form.load(form.spec.read)(document, self.source) if form.spec.read else None
             if found is not None:
                 self.layers.merge(found.data, found.origin)
@@ -113,11 +105,11 @@ class TaskCheck:
                     self.layers.merge(found.agents, found.agents_origin)
                 self.notes += found.notes
                 return True
-        for known in missing_formats().values():
+        for known in formats.missing_formats().values():
             if unknown.get(known.key):
                 raise known.missing(self.source.label)
         if "scene" not in document.data:
-            require_format(self.source.config)
+            formats.require_format(self.source.config)
         return False
 
     def changes(self, overrides: Iterable[str], flags: Mapping[str, Any]) -> list[Change]:
@@ -243,9 +235,9 @@ class TaskCheck:
         try:
             entry = find_entry(TRAINERS, name, what="trainer")
         except TaskError as error:
-            if name in known_trainers() and name not in {entry.name for entry in catalog(TRAINERS)[0]}:
+            if name in formats.known_trainers() and name not in {entry.name for entry in catalog(TRAINERS)[0]}:
                 where = f"{self.layers.place((*at, 'trainer'))}: {messages.dotted((*at, 'trainer'))}"
-                install = f"pip install {known_trainers()[name]}"
+                install = f"pip install {formats.known_trainers()[name]}"
                 self.missing = DependencyError(f"{where}: trainer '{name}' is not installed", hint=install)
             else:
                 self.problem((*at, "trainer"), error.message, error.hint)
@@ -272,7 +264,7 @@ class TaskCheck:
         self.read_terms()
         data = {key: value for key, value in self.layers.data.items() if key not in PATCHES}
         unknown = {key: value for key, value in data.items() if key not in TaskConfig.model_fields}
-        self.format = format_of_key(unknown) or self.format
+        self.format = formats.format_of_key(unknown) or self.format
         entries = term_entries(data)
         # each term is validated with the model of its own function, then removed from the data for `TaskConfig`
         terms = {path: self._term(section, path, entry) for section, path, entry in entries}

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.sim.column_views import as_index
 from rlcli.sim.rotations import rotate_inverse
 from rlcli.sim.selection import Columns, write_rows
-
-if TYPE_CHECKING:
-    from rlcli.envs.vec_env import VecEnv
 
 
 class ArticulationView:

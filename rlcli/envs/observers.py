@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from rlcli.envs.step import StepRecord
-    from rlcli.sim.divergence_report import Divergence
+from rlcli.envs.step import StepRecord
+from rlcli.sim.divergence_report import Divergence
 
 
 class StepObserver:

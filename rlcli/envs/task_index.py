@@ -11,17 +11,8 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 
+from rlcli import registry
 from rlcli.errors import RlcliError
-from rlcli.registry import (
-    FORMATS,
-    TASKS,
-    TRAINERS,
-    catalog,
-    find_entry,
-    find_task,
-    load_entry,
-    malformed_metadata_ignored,
-)
 from rlcli.registry.formats import load_format
 from rlcli.registry.probe import Details
 from rlcli.trainers import TrainerSpec
@@ -36,7 +27,7 @@ def describe(name: str) -> Details:
     from rlcli.config.load import resolve
     from rlcli.envs.make import make_env
 
-    source = find_task(name)
+    source = registry.find_task(name)
     task = resolve(source)
     env = make_env(resolve(source, flags={"scene.num_envs": 1}))
     return Details(
@@ -56,10 +47,10 @@ def try_trainer(name: str) -> Details:
     Raises:
         RlcliError: if one of them cannot be loaded.
     """
-    entry = find_entry(TRAINERS, name, what="trainer")
-    spec = load_entry(entry, TrainerSpec)
+    entry = registry.find_entry(registry.TRAINERS, name, what="trainer")
+    spec = registry.load_entry(entry, TrainerSpec)
     for reference in (*spec.algorithms.values(), spec.trainer):
-        load_entry(replace(entry, value=reference), object)
+        registry.load_entry(replace(entry, value=reference), object)
     return Details(summary=spec.summary)
 
 
@@ -71,13 +62,13 @@ def try_format(name: str) -> Details:
     """
     form = load_format(name)
     spec = form.spec
-    for reference in (spec.find, spec.read, spec.check, spec.environment, spec.importer, spec.hint, spec.agents_beside):
-        if reference:
-            form.load(reference)
+    references = (spec.find, spec.read, spec.check, spec.environment, spec.importer, spec.hint, spec.agents_beside)
+    for reference in filter(None, references):
+        form.load(reference)
     return Details(summary=spec.summary)
 
 
-_LOADERS = {TASKS: describe, TRAINERS: try_trainer, FORMATS: try_format}
+_LOADERS = {registry.TASKS: describe, registry.TRAINERS: try_trainer, registry.FORMATS: try_format}
 
 
 def main(arguments: list[str]) -> None:
@@ -89,13 +80,13 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("names", nargs="*")
     options = parser.parse_args(arguments)
     if options.index:
-        names = [entry.qualified for entry in catalog()[0] if entry.distribution == options.index]
+        names = [entry.qualified for entry in registry.catalog()[0] if entry.distribution == options.index]
         index = {name.partition(":")[2]: describe(name).record() for name in names}
         sys.stdout.write(json.dumps(index, indent=1) + "\n")
         return
     if options.file is None:
         parser.error("the following arguments are required: group, file")
-    with malformed_metadata_ignored():
+    with registry.malformed_metadata_ignored():
         for name in options.names:
             details = _details(name, _LOADERS[options.group])
             with open(options.file, "ab") as rows:

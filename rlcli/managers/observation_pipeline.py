@@ -14,19 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.config.schema import (
-    ClipModifierConfig,
-    ConstantNoiseConfig,
-    DelayConfig,
-    DigitalFilterModifierConfig,
-    GaussianNoiseConfig,
-    IntegratorModifierConfig,
-    ModifierConfig,
-    NoiseConfig,
-    ObservationConfig,
-    ObservationGroupConfig,
-    UniformNoiseConfig,
-)
+from rlcli.config import schema
 from rlcli.managers.term import BoundTerm, resets
 from rlcli.managers.tunable import TunableValues
 from rlcli.sim.selection import Selection
@@ -69,14 +57,14 @@ class Pipeline:
         self,
         term: BoundTerm,
         shape: tuple[int, ...],
-        group: ObservationGroupConfig,
+        group: schema.ObservationGroupConfig,
         num_envs: int,
         step_dt: float,
         device: torch.device,
         tunable: TunableValues,
     ) -> None:
         config = term.config
-        assert isinstance(config, ObservationConfig)
+        assert isinstance(config, schema.ObservationConfig)
         self.term = term
         self.shape = shape
         """Shape of the term's value in one environment; the columns are its numbers in row-major order."""
@@ -94,7 +82,7 @@ class Pipeline:
         if config.scale is not None:
             self._stages.append(_Constant("scale", self._columns("scale", config.scale)))
         if group.enable_corruption and config.delay is not None and config.delay.steps[1]:
-            self._stages.append(_Delay(config.delay, term.stream, num_envs, width, device))
+            self._stages.append(_Delay(config.delay, term.stream, self._zeros(config.delay.steps[1] + 1, width)))
         self._frames = self._zeros(self.history * width) if self.history > 1 else None
         self._value = self._zeros(width) if self.history > 1 else None
 
@@ -154,28 +142,28 @@ class Pipeline:
             raise self.term.error(f"has {len(setting)} values for {self.width} columns", *key.split("."))
         return setting
 
-    def _modifier(self, number: int, config: ModifierConfig) -> Stage:
+    def _modifier(self, number: int, config: schema.ModifierConfig) -> Stage:
         key = f"modifiers.{number}"
-        if isinstance(config, ClipModifierConfig):
+        if isinstance(config, schema.ClipModifierConfig):
             return _Clip(config.bounds)
-        if isinstance(config, IntegratorModifierConfig):
+        if isinstance(config, schema.IntegratorModifierConfig):
             return _Integrator(self._zeros(2, self.width), self._step_dt)
-        if isinstance(config, DigitalFilterModifierConfig):
+        if isinstance(config, schema.DigitalFilterModifierConfig):
             return _DigitalFilter(self._zeros(len(config.a) + len(config.b) - 1, self.width), config)
         if config.kind == "scale":
             return _Constant("scale", self._columns(f"{key}.factor", config.factor))
         return _Constant("add", self._columns(f"{key}.offset", config.offset))
 
-    def _sampler(self, key: str, config: NoiseConfig) -> Sampler:
+    def _sampler(self, key: str, config: schema.NoiseConfig) -> Sampler:
         """Return a function that draws from a distribution for the rows of a selection. -> (rows, width)"""
         shape = (self.width,)
-        if isinstance(config, UniformNoiseConfig):
+        if isinstance(config, schema.UniformNoiseConfig):
             low, high = self._columns(f"{key}.low", config.low), self._columns(f"{key}.high", config.high)
             return lambda selection: selection.uniform(low, high, shape)
-        if isinstance(config, GaussianNoiseConfig):
+        if isinstance(config, schema.GaussianNoiseConfig):
             mean, std = self._columns(f"{key}.mean", config.mean), self._columns(f"{key}.std", config.std)
             return lambda selection: selection.normal(mean, std, shape)
-        assert isinstance(config, ConstantNoiseConfig)
+        assert isinstance(config, schema.ConstantNoiseConfig)
         value = self._columns(f"{key}.value", config.value)
         zeros = self._zeros(self.width)
         return lambda selection: selection.read_view(zeros) + value
@@ -244,7 +232,7 @@ class _Filter(Stage):
 class _DigitalFilter(_Filter):
     """Linear filter. `past`: the inputs before this step, newest first, then the outputs likewise. (num_envs, m, k)"""
 
-    def __init__(self, past: Tensor, config: DigitalFilterModifierConfig) -> None:
+    def __init__(self, past: Tensor, config: schema.DigitalFilterModifierConfig) -> None:
         self._past, self._inputs = past, len(config.b) - 1
         self._now = config.b[0]
         self._weights = [*config.b[1:], *(-a for a in config.a)]
@@ -277,11 +265,11 @@ class _Integrator(_Filter):
 class _Delay(Stage):
     """Delay of a few steps. `frames`: the last values, the oldest first. (num_envs, n, k)"""
 
-    def __init__(self, config: DelayConfig, stream: np.uint64, num_envs: int, width: int, device: torch.device) -> None:
+    def __init__(self, config: schema.DelayConfig, stream: np.uint64, frames: Tensor) -> None:
         self._low, high = config.steps
         self._options, self._redraw, self._stream = high - self._low + 1, config.redraw, stream
-        self._frames = torch.zeros(num_envs, high + 1, width, device=device)
-        self._lag = torch.full((num_envs,), self._low, dtype=torch.int64, device=device)
+        self._frames = frames
+        self._lag = torch.full((len(frames),), self._low, dtype=torch.int64, device=frames.device)
 
     def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         frames = torch.cat([self._frames[:, 1:], value[:, None]], dim=1)

@@ -6,7 +6,7 @@ import functools
 import importlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -21,12 +21,9 @@ from rlcli.managers.attribute_state import TermState
 from rlcli.managers.tunable import TunableValues
 from rlcli.random import stream
 from rlcli.registry import is_framework, load_module
+from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem
-
-if TYPE_CHECKING:
-    from rlcli.scene.entity import Entity
-    from rlcli.scene.sensors import Sensor
-
+from rlcli.scene.sensors import Sensor
 
 SENSORS = {"ContactSensor": "contact", "RaySensor": "rays", "CameraSensor": "camera"}
 """Type alias of `rlcli.task` -> kind of its sensors in `scene.sensors`."""

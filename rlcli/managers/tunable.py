@@ -18,17 +18,8 @@ from rlcli.scene.names import NameProblem
 
 _SECTIONS = ("rewards", "terminations", "commands", "events", "observations", "actions")
 _FIXED = {
-    "min_steps_between",
-    "axes",
-    "func",
-    "mode",
-    "time_out",
-    "while_alive",
-    "history",
-    "delay",
-    "modifiers",
-    "interval_range_s",
-    "resampling_time_s",
+    *("min_steps_between", "axes", "func", "mode", "time_out", "while_alive", "history", "delay", "modifiers"),
+    *("interval_range_s", "resampling_time_s"),
 }
 """Settings of terms that are read only once."""
 

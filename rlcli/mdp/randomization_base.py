@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+import mujoco
 import torch
 from torch import Tensor
 
@@ -171,6 +172,12 @@ def matching_elements(elements: list[Any], params: dict[str, Any], key: str, kin
     except NameProblem:
         return []
     return [of_entity[position] for position in found]
+
+
+def unset_simple(spec: mujoco.MjSpec, params: dict[str, Any], key: str) -> None:
+    """Clear the `simple` flag of the selected bodies, with which MuJoCo assumes the inertial frame to be the body's."""
+    for body in matching_elements(spec.bodies, params, key, "body"):
+        body.simple = 0
 
 
 def element_names(entity: Any, kind: str, index: Columns) -> list[str]:

@@ -112,11 +112,8 @@ def usable_formats() -> Iterator[Format]:
 
 def find_in_formats(path: Path) -> TaskSource | None:
     """Return the task of a folder or file in an installed format; None if no working format recognises it."""
-    for form in usable_formats():
-        found: TaskSource | None = form.load(form.spec.find)(path) if form.spec.find else None
-        if found is not None:
-            return found
-    return None
+    tasks = (form.load(form.spec.find)(path) for form in usable_formats() if form.spec.find)
+    return next((task for task in tasks if task is not None), None)
 
 
 def format_of_key(keys: Mapping[str, Any]) -> Format | None:
@@ -143,8 +140,7 @@ def _framework_packages() -> frozenset[str]:
 
 def known_trainers() -> dict[str, str]:
     """Return the trainers that plugins offer, each with the arguments of `pip install`."""
-    trainers: dict[str, str] = _known_plugins()["trainers"]
-    return trainers
+    return dict(_known_plugins()["trainers"])
 
 
 def known_formats() -> dict[str, KnownFormat]:

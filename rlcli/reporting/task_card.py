@@ -20,7 +20,7 @@ from rlcli.config.layers import leaves
 from rlcli.config.load import Resolved
 from rlcli.config.messages import dotted
 from rlcli.config.schema import ObservationConfig, ObservationGroupConfig, TaskConfig, TermConfig
-from rlcli.config.source_classes import lineage
+from rlcli.config.source_classes import ClassSearch
 from rlcli.config.term_signatures import SECTIONS, SELECTORS, SignatureError, Vocabulary, first_paragraph, read_params
 from rlcli.registry import TaskSource
 from rlcli.reporting.card_text import columns_text, modifier_text, noise_text, number, span, text_of, when_text
@@ -325,7 +325,7 @@ def _direct(task: TaskConfig, source: TaskSource | None) -> Iterable[Table]:
 def _hooks(file: Path, class_name: str) -> list[tuple[str, str, str]]:
     """Return (what it decides, name, first paragraph of the docstring) for a class and its hooks, bases included."""
     docstrings: dict[str, str] = {}
-    for source in reversed(lineage(file, class_name)):  # bases first, so that a class overrides them
+    for source in reversed(ClassSearch().lineage(file, class_name)):  # bases first, so that a class overrides them
         functions = [inner for inner in source.node.body if isinstance(inner, ast.FunctionDef)]
         docstrings |= {inner.name: text for inner in functions if (text := ast.get_docstring(inner))}
         docstrings[class_name] = ast.get_docstring(source.node) or ""

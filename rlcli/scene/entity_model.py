@@ -35,16 +35,8 @@ def entity_model(name: str, entity: EntityConfig, root: Path, *, installed: bool
 
 def name_all(child: mujoco.MjSpec) -> None:
     """Name the elements that the MJCF leaves unnamed: an entity finds its elements by the prefix of their names."""
-    for kind, elements in (
-        ("body", child.bodies[1:]),
-        ("joint", child.joints),
-        ("site", child.sites),
-        ("sensor", child.sensors),
-        ("actuator", child.actuators),
-        ("geom", child.geoms),
-        ("tendon", child.tendons),
-        ("pair", child.pairs),
-    ):
+    for kind in ("body", "joint", "site", "sensor", "actuator", "geom", "tendon", "pair"):
+        elements = child.bodies[1:] if kind == "body" else getattr(child, f"{kind}s")  # the first body is the world
         used = {element.name for element in elements}
         for number, element in enumerate(elements):
             if not element.name:
@@ -57,8 +49,7 @@ def name_all(child: mujoco.MjSpec) -> None:
 
 def write_masses(child: mujoco.MjSpec) -> None:
     """Set the mass and inertia of every body explicitly: attaching would lose the MJCF's `settotalmass`."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # MuJoCo has deprecated the attribute, but models still use it
+    with warnings.catch_warnings(action="ignore"):  # MuJoCo has deprecated the attribute, but models still use it
         model = child.compile()
     for body in child.bodies[1:]:
         compiled = model.body(body.name)

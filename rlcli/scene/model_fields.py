@@ -33,14 +33,12 @@ FIELDS: dict[str, str] = {
 }
 """Field -> kind of element of its rows; '' for the whole world. All other fields are the same in all worlds."""
 
-DERIVED_FROM = frozenset(
-    [
-        *("qpos0", "qpos_spring", "body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"),
-        *("body_gravcomp", "jnt_pos", "jnt_axis", "dof_armature", "geom_size", "geom_pos", "geom_quat"),
-        *("geom_margin", "geom_gap", "site_pos", "site_quat", "actuator_gear"),
-        *("tendon_stiffness", "tendon_damping", "tendon_armature"),
-    ]
-)
+DERIVED_FROM = {
+    *("qpos0", "qpos_spring", "body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"),
+    *("body_gravcomp", "jnt_pos", "jnt_axis", "dof_armature", "geom_size", "geom_pos", "geom_quat"),
+    *("geom_margin", "geom_gap", "site_pos", "site_quat", "actuator_gear"),
+    *("tendon_stiffness", "tendon_damping", "tendon_armature"),
+}
 """Fields from which MuJoCo derives constants: after a write to one, `Engine.set_constants` must be called."""
 
 

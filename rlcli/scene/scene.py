@@ -67,9 +67,8 @@ class Scene:
             ConfigError: if MuJoCo refuses the model.
         """
         try:
-            with warnings.catch_warnings():
-                # MuJoCo warns about options of the MJCF that `sim` overrides
-                warnings.simplefilter("ignore")
+            # MuJoCo warns about options of the MJCF that `sim` overrides
+            with warnings.catch_warnings(action="ignore"):
                 return self.spec.compile()
         except ValueError as error:
             message = f"MuJoCo cannot compile the model: {one_line(error)}"
@@ -99,8 +98,7 @@ class Scene:
         self.spec.memory = max(self.spec.memory, child.memory)
         quat = np.asarray(entity.quat) / np.linalg.norm(entity.quat)
         frame = self.spec.worldbody.add_frame(pos=entity.pos, quat=quat)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             self.spec.attach(child, prefix=f"{name}/", frame=frame)
         self.joints.override(name, entity, degrees=bool(child.compiler.degree))
         self.joints.add_models(name, entity)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -19,12 +19,10 @@ from torch import Tensor
 from rlcli import random
 from rlcli.config import schema
 from rlcli.config.schema import TerrainConfig
+from rlcli.scene.entity import Entity
 from rlcli.scene.sub_terrains import Block, Heights, Patch, PatchSite, make_patch, ring
 from rlcli.sim.selection import Selection
 from rlcli.sim.tensor_state import require_in_range
-
-if TYPE_CHECKING:
-    from rlcli.scene.entity import Entity
 
 TERRAIN_BODY = "terrain"
 """Body that has the geoms of the terrain."""

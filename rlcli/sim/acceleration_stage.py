@@ -5,12 +5,10 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-ACCELERATION_FIELDS = frozenset(
-    [
-        *("qacc", "qacc_smooth", "actuator_force", "qfrc_actuator", "qfrc_smooth", "qfrc_constraint", "qfrc_inverse"),
-        *("act_dot", "cacc", "cfrc_int", "cfrc_ext"),
-    ]
-)
+ACCELERATION_FIELDS = {
+    *("qacc", "qacc_smooth", "actuator_force", "qfrc_actuator", "qfrc_smooth", "qfrc_constraint", "qfrc_inverse"),
+    *("act_dot", "cacc", "cfrc_int", "cfrc_ext"),
+}
 """Fields of MjData that the acceleration stage writes. They keep the values of the last substep."""
 _BODY_FORCE_SENSORS = [
     int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}"))

@@ -17,27 +17,16 @@ from torch import Tensor
 from rlcli.config.schema import SimConfig
 from rlcli.errors import did_you_mean
 from rlcli.machine import available_cores
+from rlcli.sim import divergence_report as report
 from rlcli.sim.acceleration_stage import ACCELERATION_FIELDS, force_sensors
 from rlcli.sim.batch_model import engine_call
 from rlcli.sim.batch_state import BatchState
-from rlcli.sim.divergence_report import (
-    DIVERGENCE_WARNINGS,
-    ENGINE_ERROR,
-    MAX_DESCRIBED,
-    OTHER_WARNINGS,
-    STATE_LIMIT,
-    TOO_FAST,
-    Divergence,
-    DivergenceReporter,
-)
 from rlcli.sim.mujoco_private import STATE_FIELDS, forward_of, without_profiler
 from rlcli.sim.selection import Field, Groups, IdSelection, Selection, ids_of
 from rlcli.sim.skippable_work import FIELDS_OF_SKIPPED_WORK
 from rlcli.sim.tensor_state import substate
 
-_MOTION_FIELDS = frozenset(
-    ["time", "qpos", "qvel", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"]
-)
+_MOTION_FIELDS = {"time", "qpos", "qvel", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"}
 """Fields of a state in which a physics step changes only positions, velocities, time and the warm start."""
 _NONE, _VEL, _ACC = (
     int(s) for s in (mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL, mujoco.mjtStage.mjSTAGE_ACC)
@@ -65,15 +54,15 @@ class BatchEngine(BatchState):
         self.shared_streams = 0
         self.device = torch.device("cpu")
         self.divergence_causes: dict[str, int] = {}
-        self.described_divergences: list[Divergence] = []
-        self.warnings = dict.fromkeys(OTHER_WARNINGS, 0)
+        self.described_divergences: list[report.Divergence] = []
+        self.warnings = dict.fromkeys(report.OTHER_WARNINGS, 0)
         self._warning_words = self._batch.warning.reshape(-1).view(np.int64)
         self._failed = np.zeros(num_envs, dtype=bool)
         self._error = ""
         self._only_motion = not any(size for name, size in self._sizes.items() if name not in _MOTION_FIELDS)
-        self._max_velocity = config.max_velocity or STATE_LIMIT
+        self._max_velocity = config.max_velocity or report.STATE_LIMIT
         self._qvel = self._rows[:, self.state_layout.columns("qvel")]
-        self._reporter = DivergenceReporter(
+        self._reporter = report.DivergenceReporter(
             self.state_layout, self._rows, self._batch.warning, self._expanded, self._max_velocity
         )
         self._bound_inputs: list[NDArray[np.float64]] = []
@@ -109,8 +98,7 @@ class BatchEngine(BatchState):
                 raise ValueError(f"'{name}' is not an MjData field; {did_you_mean(name, DATA_FIELDS) or ''}")
             if name in FIELDS_OF_SKIPPED_WORK:
                 self._skip_nothing()
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # torch warns about the read-only arrays of derived fields
+            with warnings.catch_warnings(action="ignore"):  # torch warns about the read-only arrays of derived fields
                 bound = self._bind(name)
             if self._of_substep(name):
                 self._forward_stage = _ACC
@@ -176,7 +164,7 @@ class BatchEngine(BatchState):
         finite = finite and all([math.isfinite(np.add.reduce(values, axis=None)) for values in self._bound_inputs])
         # the sum of whole rows is faster than a sum without the columns that never change
         finite = finite or math.isfinite(self._state.sum().item()) or bool(self._state.isfinite().all())
-        fast = self._max_velocity < STATE_LIMIT and bool((np.abs(self._qvel) > self._max_velocity).any())
+        fast = self._max_velocity < report.STATE_LIMIT and bool((np.abs(self._qvel) > self._max_velocity).any())
         if not warned and finite and not self._error and not fast:
             return None
         bad, causes = self._find_diverged(finite)
@@ -190,23 +178,23 @@ class BatchEngine(BatchState):
     def _find_diverged(self, finite: bool) -> tuple[NDArray[np.bool_], NDArray[np.object_]]:
         """Return which worlds diverged, and the cause of each; clear the warning counters."""
         counts = self._batch.warning[:, :, 1]
-        for name, kind in OTHER_WARNINGS.items():
+        for name, kind in report.OTHER_WARNINGS.items():
             self.warnings[name] += int((counts[:, kind] > 0).sum())
         bad = self._failed if finite else self._failed | ~np.isfinite(self._rows).all(axis=1)
         causes = np.full(self.num_envs, "", dtype=object)
-        causes[self._failed] = ENGINE_ERROR
-        for name, kind in DIVERGENCE_WARNINGS.items():
+        causes[self._failed] = report.ENGINE_ERROR
+        for name, kind in report.DIVERGENCE_WARNINGS.items():
             warned = counts[:, kind] > 0
             causes[warned & (causes == "")] = name
             bad = bad | warned
         fast = np.asarray((np.abs(self._qvel) > self._max_velocity).any(axis=1)) & ~bad
-        causes[fast] = TOO_FAST
+        causes[fast] = report.TOO_FAST
         bad = bad | fast
         for env in (bad & (causes == "")).nonzero()[0]:
             causes[env] = f"{self._reporter.nonfinite_field(env)} not finite"
         self.described_divergences = [
             self._reporter.describe(env, causes[env], self.history.last_state(env), self._error)
-            for env in bad.nonzero()[0].tolist()[:MAX_DESCRIBED]
+            for env in bad.nonzero()[0].tolist()[: report.MAX_DESCRIBED]
         ]
         self._batch.warning[:] = 0
         self._failed = np.zeros(self.num_envs, dtype=bool)

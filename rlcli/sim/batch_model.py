@@ -23,13 +23,11 @@ from rlcli.sim.selection import Selection, ids_of
 from rlcli.sim.skippable_work import skippable_flags
 
 INTEGRATION_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-_FLAGS = frozenset(
-    [
-        *("geom_contype", "geom_conaffinity", "geom_priority", "geom_group", "jnt_limited", "jnt_actgravcomp"),
-        *("jnt_actfrclimited", "tendon_limited", "tendon_actfrclimited", "actuator_ctrllimited", "actuator_actlimited"),
-        *("actuator_forcelimited", "eq_active0", "opt.disableactuator"),
-    ]
-)
+_FLAGS = {
+    *("geom_contype", "geom_conaffinity", "geom_priority", "geom_group", "jnt_limited", "jnt_actgravcomp"),
+    *("jnt_actfrclimited", "tendon_limited", "tendon_actfrclimited", "actuator_ctrllimited", "actuator_actlimited"),
+    *("actuator_forcelimited", "eq_active0", "opt.disableactuator"),
+}
 """Integer fields of a model that are flags: no value of them can make MuJoCo read outside of its arrays."""
 _MIN_STATES_PER_ENV = 3
 """Least memory of an environment, as a number of integration states; the built-in tasks need 3.3 to 16."""

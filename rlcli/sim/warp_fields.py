@@ -10,12 +10,10 @@ STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
 """Fields of the state, which every reset restores."""
 INPUTS = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
 """Further fields of the state, which have the model's values until a term binds them."""
-_KINEMATIC_FIELDS = frozenset(
-    [
-        *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos"),
-        *("site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir", "subtree_com", "ten_length", "cinert"),
-    ]
-)
+_KINEMATIC_FIELDS = {
+    *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos"),
+    *("site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir", "subtree_com", "ten_length", "cinert"),
+}
 """Derived fields of the position stage that need only kinematics."""
 _MOTION_FIELDS = frozenset(["cvel", "cdof", "cdof_dot"])
 """Derived fields of the velocity stage that need only the motion of bodies: no inertias, contacts and constraints."""

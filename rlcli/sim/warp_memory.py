@@ -14,14 +14,10 @@ from rlcli.errors import ConfigError, DeviceError, DivergedError, Problem, one_l
 from rlcli.sim.capacity import Capacity
 from rlcli.sim.skippable_work import skippable_flags
 
+_BIT = mjw.OverflowType
 OVERFLOW_SETTINGS = {
-    mjw.OverflowType.NEFC: "constraints_per_env",
-    mjw.OverflowType.NJMAX_NNZ: "constraints_per_env",
-    mjw.OverflowType.BROADPHASE: "contacts_per_env",
-    mjw.OverflowType.NARROWPHASE: "contacts_per_env",
-    mjw.OverflowType.CCD: "contacts_per_env",
-    mjw.OverflowType.HFIELD: "contacts_per_env",
-    mjw.OverflowType.EPA_HORIZON: "contacts_per_env",
+    **dict.fromkeys((_BIT.NEFC, _BIT.NJMAX_NNZ), "constraints_per_env"),
+    **dict.fromkeys((_BIT.BROADPHASE, _BIT.NARROWPHASE, _BIT.CCD, _BIT.HFIELD, _BIT.EPA_HORIZON), "contacts_per_env"),
 }
 """Capacity that a step may exceed -> setting that raises it. Overflows of solver iterations are not included."""
 
@@ -36,8 +32,7 @@ def put_on_device(
         DeviceError: for more worlds than the device's memory holds.
     """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             on_device = mjw.put_model(model)
         if not on_device.nsensorcollision:  # distance sensors need the collision pass
             on_device.opt.disableflags |= skippable_flags(model) & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)

@@ -51,18 +51,6 @@ def _nonzero(message: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-class _TermFunction:
-    """Annotation of the name of a term. A configuration in Python may have the function instead of its name."""
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        name = core_schema.str_schema(strict=True)
-        either = core_schema.union_schema([name, core_schema.callable_schema()])
-        return core_schema.json_or_python_schema(json_schema=name, python_schema=either)
-
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return {"type": "string"}
-
-
 Number = Annotated[float, _FractionString()]
 Positive = Annotated[float, Field(gt=0), _FractionString()]
 NotNegative = Annotated[float, Field(ge=0), _FractionString()]
@@ -105,7 +93,3 @@ class StrictModel(BaseModel):
         described = super().__get_pydantic_json_schema__(schema, handler)
         describe(handler.resolve_ref_schema(described), cls)
         return described
-
-
-Columns = Number | Annotated[list[Number], Field(min_length=1)]
-"""One number for all columns of a term, or one number for each column."""

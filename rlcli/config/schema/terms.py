@@ -7,20 +7,25 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
+from pydantic_core import CoreSchema, core_schema
 
-from rlcli.config.schema.base import (
-    Columns,
-    Count,
-    NotNegative,
-    Number,
-    PositiveRange,
-    Range,
-    Share,
-    StepRange,
-    StrictModel,
-    _TermFunction,
-)
+from rlcli.config.schema.base import Count, NotNegative, Number, PositiveRange, Range, Share, StepRange, StrictModel
+
+Columns = Number | Annotated[list[Number], Field(min_length=1)]
+"""One number for all columns of a term, or one number for each column."""
+
+
+class _TermFunction:
+    """Annotation of the name of a term. A configuration in Python may have the function instead of its name."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        name = core_schema.str_schema(strict=True)
+        either = core_schema.union_schema([name, core_schema.callable_schema()])
+        return core_schema.json_or_python_schema(json_schema=name, python_schema=either)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return {"type": "string"}
 
 
 class TermConfig(StrictModel):

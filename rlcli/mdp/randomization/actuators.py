@@ -8,14 +8,7 @@ from typing import Any
 import mujoco
 import torch
 
-from rlcli.mdp.randomization_base import (
-    Draw,
-    DrawKeys,
-    FieldRandomization,
-    RangeKeys,
-    matching_elements,
-    require_supported,
-)
+from rlcli.mdp.randomization_base import Draw, DrawKeys, FieldRandomization, RangeKeys, require_supported, unset_simple
 from rlcli.mdp.term import ActuatorTerm, JointTerm
 from rlcli.mdp.term_helpers import column_numbers, on_host
 from rlcli.scene.joint_setup import model_actuator_kind
@@ -162,5 +155,4 @@ class RandomizeModelField(DrawKeys, FieldRandomization):
     def prepare(spec: mujoco.MjSpec, params: dict[str, Any]) -> None:
         """Clear the `simple` flag of bodies whose inertial frame changes: it fixes that frame to the body's."""
         if params["field"] in ("body_ipos", "body_iquat"):
-            for body in matching_elements(spec.bodies, params, "names", "body"):
-                body.simple = 0
+            unset_simple(spec, params, "names")

@@ -15,7 +15,7 @@ from rlcli.mdp.randomization_base import (
     OrientationRandomization,
     Randomization,
     element_names,
-    matching_elements,
+    unset_simple,
 )
 from rlcli.mdp.term import BodyTerm
 from rlcli.scene.model_fields import ModelField
@@ -58,8 +58,7 @@ class RandomizeBodyCom(AxisRandomization, BodyTerm):
     @staticmethod
     def prepare(spec: mujoco.MjSpec, params: dict[str, Any]) -> None:
         """Clear the bodies' `simple` flag, with which MuJoCo assumes the centre of mass at the frame's origin."""
-        for body in matching_elements(spec.bodies, params, "bodies", "body"):
-            body.simple = 0
+        unset_simple(spec, params, "bodies")
 
 
 @dataclass(kw_only=True, eq=False)
