@@ -14,20 +14,18 @@ A term without a formula can only be computed by its own code.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.command import CommandTerm
 from rlcli.managers.term import BoundTerm
 from rlcli.mdp import actions, observations
 from rlcli.scene.entity import Entity
 from rlcli.sim.selection import Columns
-
-if TYPE_CHECKING:
-    from rlcli.envs.vec_env import VecEnv
 
 Formula = Any
 

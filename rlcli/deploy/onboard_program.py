@@ -12,7 +12,7 @@ import numpy as np
 
 from rlcli.deploy.numpy_export import literal
 from rlcli.errors import UsageError
-from rlcli.runs.atomic_io import disk_error, write_atomic
+from rlcli.runs.atomic_io import disk_errors, write_atomic
 
 PROGRAM = "run_policy.py"
 MODEL = "model.xml"
@@ -87,12 +87,10 @@ def write_program(folder: Path, text: str) -> bool:
         MachineError: if the file cannot be written.
     """
     file = folder / PROGRAM
-    try:
+    with disk_errors(folder):
         if file.exists() or file.is_symlink():
             return file.is_file() and file.read_text(encoding="utf-8", errors="replace") == text
         write_atomic(file, text)
-    except OSError as error:
-        raise disk_error(folder, error) from error
     return True
 
 

@@ -258,7 +258,9 @@ class Checkpoint:
 
     def _shard(self, name: str, shard: Shard) -> dict[str, Tensor]:
         file = self.folder.parent / LOG_FOLDER / name / shard.file
-        columns = _tensors(_verified(file, shard.size, shard.sha256, min(_MAX_SHARD_BYTES, available_memory() // 3)), file)
+        columns = _tensors(
+            _verified(file, shard.size, shard.sha256, min(_MAX_SHARD_BYTES, available_memory() // 3)), file
+        )
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
                 raise CheckpointError(f"{file} is corrupt: '{column}' does not have the rows that the file name states")

@@ -6,9 +6,10 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from rlcli.config.dump import to_data, to_yaml
+from rlcli.config.load import Resolved
 from rlcli.errors import CheckpointError, DependencyError
 from rlcli.reporting.curves import AXES, Curve, Line, gather
 from rlcli.reporting.figures import check_drawing, picture
@@ -18,11 +19,8 @@ from rlcli.runs.index import overview
 from rlcli.runs.run import open_run
 from rlcli.runs.study import create_study, read_study, runs_of
 from rlcli.training.launch import TrainingRequest, run_record
+from rlcli.training.signals import StopRequest
 from rlcli.training.subprocesses import train_all
-
-if TYPE_CHECKING:
-    from rlcli.config.load import Resolved
-    from rlcli.training.signals import StopRequest
 
 _log = logging.getLogger(__name__)
 
