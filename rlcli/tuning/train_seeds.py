@@ -130,8 +130,8 @@ def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
     found = {name: line for name, line in lines.items() if line is not None}
     result.together = {}
     for name, line in found.items():
-        low, high = (None if end is None else float(end[-1]) for end in (line.low, line.high))
-        result.together[name] = {"iqm": float(line.middle[-1]), "low": low, "high": high, "step": int(line.x[-1])}
+        _, middle, low, high = line.last()
+        result.together[name] = {"iqm": middle, "low": low, "high": high, "step": int(line.x[-1])}
     if found:
         result.curves = write_atomic(folder / CURVES, _csv(found))
         result.picture = _picture(folder, curves)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from rlcli.managers.command import Knob
-    from rlcli.rl.acting import Act
     from rlcli.viewer.playback import Playback
 
 VIEWERS = {"native": "rlcli.viewer.native:run", "web": "rlcli.viewer.web:run"}
@@ -38,22 +37,6 @@ class Viewer(Protocol):
         Raises:
             MachineError: if this machine cannot open the viewer.
             DependencyError: if a package is missing, or its version is not supported.
-        """
-        ...
-
-
-class CheckpointSource(Protocol):
-    """Source of checkpoints for a playback."""
-
-    def steps(self) -> list[int]:
-        """Return the steps of the checkpoints that exist now, ascending."""
-        ...
-
-    def load(self, step: int) -> Act:
-        """Return the policy of a checkpoint.
-
-        Raises:
-            CheckpointError: if the checkpoint was removed, is corrupt, or belongs to another task.
         """
         ...
 

@@ -61,22 +61,19 @@ ProbeTimeout = Annotated[float, typer.Option("--probe-timeout", help="Time limit
 Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Accepted; windows open only on request.")]
 
 
-def _set_quiet(is_set: bool) -> bool:
+def _set_verbosity(option: typer.CallbackParam, is_set: bool) -> bool:
+    """Print as -q or -v says; the last of both on the command line counts."""
     if is_set:
-        console.quiet, console.verbose = True, False
-    return is_set
-
-
-def _set_verbose(is_set: bool) -> bool:
-    if is_set:
-        console.quiet, console.verbose = False, True
+        console.quiet, console.verbose = option.name == "quiet", option.name == "verbose"
     return is_set
 
 
 _COMMON: dict[str, Any] = {
     "json": typer.Option("--json", help="Print one JSON document on stdout."),
-    "quiet": typer.Option("--quiet", "-q", callback=_set_quiet, help="Print only results and errors."),
-    "verbose": typer.Option("--verbose", "-v", callback=_set_verbose, help="Print details; the last of -q, -v counts."),
+    "quiet": typer.Option("--quiet", "-q", callback=_set_verbosity, help="Print only results and errors."),
+    "verbose": typer.Option(
+        "--verbose", "-v", callback=_set_verbosity, help="Print details; the last of -q, -v counts."
+    ),
     "debug": typer.Option("--debug", help="Print the traceback of an error."),
 }
 """Options that every command has; the console holds their values."""
@@ -150,7 +147,7 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
     """
     if output is None:
         return
-    if output.suffix not in suffixes:
+    if output.suffix.lower() not in suffixes:
         raise UsageError(f"'{output}' is not a {what}", hint=f"name it *{', *'.join(suffixes)}")
     if output.is_dir():
         raise UsageError(f"-o {output} is a folder", hint="give a file")
