@@ -38,6 +38,6 @@ def screen(stream: TextIO) -> Console:
     from rich.console import Console
 
     chosen, width = colors(), None if stream.isatty() or os.environ.get("COLUMNS") else _ANY_WIDTH
-    forced = True if chosen == "always" else None
-    colored = None if chosen == "never" else "auto"
-    return Console(file=stream, highlight=False, width=width, color_system=colored, force_terminal=forced)
+    if chosen == "never":
+        return Console(file=stream, highlight=False, width=width, color_system=None)
+    return Console(file=stream, highlight=False, width=width, force_terminal=True if chosen == "always" else None)
