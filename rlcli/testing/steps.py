@@ -64,14 +64,14 @@ def random_actions(env: VecEnv, bound: float, steps: int = STEPS) -> Iterator[Te
         yield (torch.rand(env.num_envs, env.layout.action_size, generator=generator) * 2.0 - 1.0) * bound
 
 
-def extreme_actions(env: VecEnv, bound: float, steps: int = STEPS) -> Iterator[Tensor]:
+def extreme_actions(env: VecEnv, bound: float) -> Iterator[Tensor]:
     """Yield actions at the bound whose sign changes every step, but is held for two steps after each 8th step.
 
     Every second environment gets the opposite sign.
     """
     sign = torch.ones(env.num_envs, 1)
     sign[1::2] = -1.0
-    for step in range(steps):
+    for step in range(STEPS):
         action = sign * (-1.0) ** (step + step // 8) * bound
         yield action.expand(-1, env.layout.action_size).clone()
 
@@ -104,9 +104,9 @@ def record(env: VecEnv, actions: Iterator[Tensor]) -> Recording:
     return recording
 
 
-def record_outputs(env: VecEnv, actions: Iterator[Tensor], seed: int = 0) -> list[dict[str, Tensor]]:
-    """Return copies of all outputs of `reset(seed)` and of the following steps."""
-    trajectory = [{f"observation '{group}'": value.clone() for group, value in env.reset(seed=seed).items()}]
+def record_outputs(env: VecEnv, actions: Iterator[Tensor]) -> list[dict[str, Tensor]]:
+    """Return copies of all outputs of `reset(seed=0)` and of the following steps."""
+    trajectory = [{f"observation '{group}'": value.clone() for group, value in env.reset(seed=0).items()}]
     trajectory += [_copy(step_outputs(env.step(action))) for action in actions]
     return trajectory
 

@@ -336,10 +336,9 @@ class _Training:
 
 def load() -> float | None:
     """Return the load [processes], the mean over the last minute; None where the system has no such number."""
-    try:
+    with contextlib.suppress(AttributeError, OSError):
         return os.getloadavg()[0]
-    except (AttributeError, OSError):
-        return None
+    return None
 
 
 def _blocks(call: Callable[[], object], pace: Pace) -> list[float]:

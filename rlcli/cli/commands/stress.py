@@ -74,9 +74,7 @@ def command(
     if output is not None:
         options.check_output(output, "picture", FORMATS)
         check_drawing()
-    request = PolicyRequest(
-        task, words, checkpoint, policy, stochastic, num_envs, options.draw_seed(seed), config, runs_dir
-    )
+    request = PolicyRequest(task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir)
     keys = [limit.key for limit in limits]
     tested = find_policy(_resolve_run(request), lambda resolved: require_success(resolved, keys))
     reference = None if against is None else baseline(tested, against)

@@ -25,6 +25,15 @@ def choice(metavar: str, *names: str, help: str | None = None) -> Any:
     return typer.Option(autocompletion=words(*names), metavar=metavar, help=help)
 
 
+def draw_seed(seed: int) -> int:
+    """Return the seed; -1 draws one."""
+    if seed != -1:
+        return seed
+    import secrets
+
+    return secrets.randbelow(2**31)
+
+
 _TASK = typer.Argument(
     autocompletion=tasks, metavar="TASK", help="Name of a task, distribution:name, or a folder with a task.yaml."
 )
@@ -45,7 +54,7 @@ RunRef = Annotated[str, typer.Argument(autocompletion=runs, metavar="RUN", help=
 ConfigFile = Annotated[Path | None, typer.Option(metavar="FILE", help=_CONFIG)]
 Agent = Annotated[str | None, typer.Option(autocompletion=agents, metavar="NAME", help=_AGENT)]
 NumEnvs = Annotated[int | None, typer.Option(help="Sets scene.num_envs. [default: the task's]")]
-Seed = Annotated[int, typer.Option(min=-1, max=MAX_SEED, help=_SEED)]
+Seed = Annotated[int, typer.Option(min=-1, max=MAX_SEED, callback=draw_seed, help=_SEED)]
 Device = Annotated[str, choice("DEVICE", "auto", "cpu", "cuda", help="auto, cpu, cuda or cuda:N.")]
 RunName = Annotated[str | None, typer.Option(help="Text at the end of the run folder's name.")]
 MaxIterations = Annotated[int | None, typer.Option(help="Iterations of each training. [default: the agent's]")]
@@ -116,15 +125,6 @@ def budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
     if max_iterations is None and max_steps is None:
         return {}
     return {"agent.max_iterations": max_iterations, "agent.max_steps": max_steps}
-
-
-def draw_seed(seed: int) -> int:
-    """Return the seed; -1 draws one."""
-    if seed != -1:
-        return seed
-    import secrets
-
-    return secrets.randbelow(2**31)
 
 
 def video_file(video: Path | None, default: str) -> Path | None:
