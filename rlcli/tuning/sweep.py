@@ -192,11 +192,10 @@ class Sweep:
         with disk_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / _TRIAL_LOCK)
-        try:
+        with contextlib.suppress(Timeout):
             lock.acquire(timeout=0)
-        except Timeout:
-            return None
-        return lock
+            return lock
+        return None
 
     def _with_own_sampler(self, trial: FrozenTrial | optuna.Trial) -> optuna.Trial:
         """Return a trial whose sampler depends only on the trial's number; values that it already has are kept."""
