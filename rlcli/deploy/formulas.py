@@ -332,8 +332,7 @@ _OBSERVATIONS: Mapping[str, Callable[..., Formula]] = {
     **dict.fromkeys(("sensor_data", "imu_orientation", "imu_ang_vel", "imu_lin_acc"), _sensor),
     "imu_projected_gravity": lambda env, entity, sensors: op("unrotate", _sensor(env, entity, sensors), _down(entity)),
     "foot_height": lambda env, entity, sites: _site_pos(env, entity, sites, [2]),
-    "ee_pos": _site_pos,
-    "ee_frame_pos": _site_pos,
+    **dict.fromkeys(("ee_pos", "ee_frame_pos"), _site_pos),
     "ee_quat": _ee_quat,
     "ee_velocity": _ee_velocity,
     "object_position_in_robot_root_frame": _object_position,
@@ -389,6 +388,5 @@ _ACTIONS: Mapping[str, Callable[[Any, list[int]], Formula]] = {
     ),
     "RelativeJointPosition": _relative,
     "JointPositionToLimits": _to_limits,
-    "BinaryJointPosition": _binary,
-    "BinaryJointVelocity": _binary,
+    **dict.fromkeys(("BinaryJointPosition", "BinaryJointVelocity"), _binary),
 }

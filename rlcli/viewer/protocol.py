@@ -16,6 +16,13 @@ if TYPE_CHECKING:
 VIEWERS = {"native": "rlcli.viewer.native:run", "web": "rlcli.viewer.web:run"}
 """Name of a viewer -> import path of the function that runs it."""
 DEFAULT_PORT = 8080
+REQUEST_KEYS: dict[str, tuple[int, str | None]] = {
+    "pause": (32, "Space"), "step": (262, "RightArrow"), "reset": (259, "Backspace"), "slower": (45, "Minus"),
+    "faster": (61, "Equal"), "next environment": (265, "UpArrow"), "previous environment": (264, "DownArrow"),
+    "newer checkpoint": (266, "PageUp"), "older checkpoint": (267, "PageDown"), "previous command": (268, None),
+    "next command": (269, None), "raise command": (260, None), "lower command": (261, None),
+}  # fmt: skip
+"""Request of the playback -> its key: code in GLFW, name in Dear ImGui; None: the browser's viewer has no such key."""
 
 Ready = Callable[[Sequence[str], str | None], None]
 """Receives lines of instructions for the user, and the viewer's address if it has one."""
