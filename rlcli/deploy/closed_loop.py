@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -36,16 +36,14 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.evaluation.evaluate import Evaluation, evaluate
 from rlcli.random import derive
+from rlcli.registry import TaskSource
 from rlcli.rl.acting import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators
+from rlcli.runs.checkpoint import Checkpoint
 from rlcli.runs.checkpoint_manifest import deployment_differences
+from rlcli.runs.policy_ref import Choice
 from rlcli.runs.restore import require_fit
-
-if TYPE_CHECKING:
-    from rlcli.registry import TaskSource
-    from rlcli.runs.checkpoint import Checkpoint
-    from rlcli.runs.policy_ref import Choice
 
 _log = logging.getLogger(__name__)
 

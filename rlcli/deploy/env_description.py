@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,12 +14,10 @@ from rlcli.config.schema import ActionConfig, ObservationConfig
 from rlcli.config.term_signatures import params_model
 from rlcli.deploy.formulas import Formula, control_formula, given, observation_formula, op
 from rlcli.envs.direct import DirectEnv
+from rlcli.envs.managed import ManagedEnv
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, Problem
 from rlcli.managers.term import BoundTerm
-
-if TYPE_CHECKING:
-    from rlcli.envs.managed import ManagedEnv
-    from rlcli.envs.vec_env import VecEnv
 
 _INPUT = "observation/"
 """Prefix of the inputs for observation terms without a formula."""

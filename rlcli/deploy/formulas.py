@@ -14,20 +14,18 @@ A term without a formula can only be computed by its own code.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.command import CommandTerm
 from rlcli.managers.term import BoundTerm
 from rlcli.mdp import actions, observations
 from rlcli.scene.entity import Entity
 from rlcli.sim.selection import Columns
-
-if TYPE_CHECKING:
-    from rlcli.envs.vec_env import VecEnv
 
 Formula = Any
 
@@ -334,8 +332,7 @@ _OBSERVATIONS: Mapping[str, Callable[..., Formula]] = {
     **dict.fromkeys(("sensor_data", "imu_orientation", "imu_ang_vel", "imu_lin_acc"), _sensor),
     "imu_projected_gravity": lambda env, entity, sensors: op("unrotate", _sensor(env, entity, sensors), _down(entity)),
     "foot_height": lambda env, entity, sites: _site_pos(env, entity, sites, [2]),
-    "ee_pos": _site_pos,
-    "ee_frame_pos": _site_pos,
+    **dict.fromkeys(("ee_pos", "ee_frame_pos"), _site_pos),
     "ee_quat": _ee_quat,
     "ee_velocity": _ee_velocity,
     "object_position_in_robot_root_frame": _object_position,
@@ -391,6 +388,5 @@ _ACTIONS: Mapping[str, Callable[[Any, list[int]], Formula]] = {
     ),
     "RelativeJointPosition": _relative,
     "JointPositionToLimits": _to_limits,
-    "BinaryJointPosition": _binary,
-    "BinaryJointVelocity": _binary,
+    **dict.fromkeys(("BinaryJointPosition", "BinaryJointVelocity"), _binary),
 }

@@ -22,6 +22,9 @@ def metadata_of(
     task, run = manifest.get("task") or {}, checkpoint.folder.resolve().parent.parent
     normalized = graph.policy.normalizer is not None
     terms = layout.observations[spec.group]
+    described = None if deployment is None else deployment.model_dump(mode="json")
+    if described is not None:
+        described["observations"] = described["observations"][spec.group]
 
     def output(meaning: str) -> dict[str, Any]:
         return {"shape": ["batch", spec.action_size], "dtype": "float32", "meaning": meaning}
@@ -75,7 +78,7 @@ def metadata_of(
             "inside": [*(["normalizer"] if normalized else []), "action_bound"],
             "between_action_and_command": ["actions.scale", "actions.offset", "actions.clip", "actions.limits"],
         },
-        "deployment": _deployment(deployment, spec.group),
+        "deployment": described,
         "normalizer": normalized,
         "action_bound": spec.action_bound,
         "step_dt": layout.step_dt,
@@ -90,13 +93,6 @@ def metadata_of(
         "seed": manifest.get("seed"),
         "versions": {key: (manifest.get("versions") or {}).get(key) for key in ("rlcli", "torch", "mujoco")},
     }
-
-
-def _deployment(deployment: DeploymentRecord | None, group: str) -> dict[str, Any] | None:
-    if deployment is None:
-        return None
-    record = deployment.model_dump(mode="json")
-    return {**record, "observations": record["observations"][group]}
 
 
 def mjlab_properties(metadata: dict[str, Any], entity: str = "robot") -> dict[str, str]:

@@ -8,14 +8,13 @@ import json
 import pprint
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from rlcli.deploy.graph import DeployedPolicy
+from rlcli.deploy.graph import DeployedPolicy
 
 _TEMPLATE = Path(__file__).parent / "deployed" / "policy.py"
 

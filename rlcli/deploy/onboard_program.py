@@ -12,7 +12,7 @@ import numpy as np
 
 from rlcli.deploy.numpy_export import literal
 from rlcli.errors import UsageError
-from rlcli.runs.atomic_io import disk_error, write_atomic
+from rlcli.runs.atomic_io import disk_errors, write_atomic
 
 PROGRAM = "run_policy.py"
 MODEL = "model.xml"
@@ -87,12 +87,10 @@ def write_program(folder: Path, text: str) -> bool:
         MachineError: if the file cannot be written.
     """
     file = folder / PROGRAM
-    try:
+    with disk_errors(folder):
         if file.exists() or file.is_symlink():
             return file.is_file() and file.read_text(encoding="utf-8", errors="replace") == text
         write_atomic(file, text)
-    except OSError as error:
-        raise disk_error(folder, error) from error
     return True
 
 
@@ -104,21 +102,17 @@ def write_model(spec: mujoco.MjSpec, model: mujoco.MjModel, folder: Path) -> Pat
     """
     text = _model_xml(spec, model)
     file = folder / (MODEL if text is not None else "model.mjb")
-    write_atomic(file, _MARK + text if text is not None else _model_bytes(model))
-    return file
+    if text is not None:
+        return write_atomic(file, _MARK + text)
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return write_atomic(file, buffer.tobytes())
 
 
 def open_model(file: Path) -> mujoco.MjModel:
     """Return the model in a file of `write_model`."""
     read = mujoco.MjModel.from_xml_path if file.suffix == ".xml" else mujoco.MjModel.from_binary_path
     return read(str(file))
-
-
-def _model_bytes(model: mujoco.MjModel) -> bytes:
-    """Return the content of a binary model file (.mjb)."""
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()
 
 
 def _model_xml(spec: mujoco.MjSpec, model: mujoco.MjModel) -> str | None:

@@ -61,6 +61,10 @@ class Line:
     """Lower end of the 95 % interval; None for a single run."""
     high: Array | None = None
 
+    def last(self) -> tuple[float | None, ...]:
+        """Return the last x, the last value, and both ends of its interval."""
+        return tuple(None if end is None else float(end[-1]) for end in (self.x, self.middle, self.low, self.high))
+
 
 @dataclass(frozen=True, slots=True)
 class Curve:

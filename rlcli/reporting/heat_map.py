@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rlcli.errors import MachineError, UsageError
 from rlcli.evaluation.stress_params import Point, Sweep, format_value
 from rlcli.runs.atomic_io import write_atomic
 
@@ -89,23 +88,6 @@ def heat_map(
 
 def _axis(sweep: Sweep) -> Axis:
     return Axis(sweep.name, tuple(map(format_value, sweep.values)), sweep.unit)
-
-
-def check_picture(file: Path) -> None:
-    """Check that a picture can be drawn, before any episode is run.
-
-    Raises:
-        UsageError: for a file with another suffix.
-        MachineError: if its folder does not exist.
-        DependencyError: if matplotlib is not installed.
-    """
-    if file.suffix.lower() not in FORMATS:
-        raise UsageError(f"--output {file} is not a picture", hint=f"a name that ends in {' or '.join(FORMATS)}")
-    if not file.absolute().parent.is_dir():
-        raise MachineError(f"--output: there is no folder {file.absolute().parent}")
-    from rlcli.reporting.figures import check_drawing
-
-    check_drawing()
 
 
 def draw(file: Path, maps: Sequence[HeatMap]) -> None:

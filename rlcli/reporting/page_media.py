@@ -7,14 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 from rlcli.errors import CheckpointError, RlcliError
-from rlcli.evaluation.session import (
-    PolicyRequest,
-    Session,
-    evaluation_record,
-    open_session,
-    run_episodes,
-    save_evaluation,
-)
+from rlcli.evaluation import session as sessions
 from rlcli.reporting.run_page import Page, reason_of
 from rlcli.runs.eval_store import read_evaluation
 from rlcli.runs.run import Run, require_own
@@ -54,9 +47,9 @@ class PageMedia:
                 page.missing["evaluation"] = f"There is no evaluation. Run `{command}` to make one."
                 return ""
             _log.info(f"evaluating {_EPISODES} episodes")
-            summary, _ = run_episodes(self._session, _EPISODES)
-            page.evaluation = evaluation_record(self._session, summary)
-            save_evaluation(self._session, {"schema": self._schema, "command": "eval", **page.evaluation})
+            summary, _ = sessions.run_episodes(self._session, _EPISODES)
+            page.evaluation = sessions.evaluation_record(self._session, summary)
+            sessions.save_evaluation(self._session, {"schema": self._schema, "command": "eval", **page.evaluation})
         except RlcliError as error:
             page.missing["evaluation"] = f"There is no evaluation: {reason_of(error)}"
             return ""
@@ -77,8 +70,8 @@ class PageMedia:
         return "made"
 
     @cached_property
-    def _session(self) -> Session:
-        return open_session(PolicyRequest(None, checkpoint=str(self._checkpoint)))
+    def _session(self) -> sessions.Session:
+        return sessions.open_session(sessions.PolicyRequest(None, checkpoint=str(self._checkpoint)))
 
     def _record_video(self, file: Path) -> bytes | None:
         from rlcli.viewer.video_writer import check_video

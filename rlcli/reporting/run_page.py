@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
 from collections.abc import Iterator, Mapping
@@ -85,29 +86,31 @@ def gather_page(run: Run, checkpoint: Path | None) -> Page:
     record = run.record
     page = Page(str(record["task"]["name"]), run.folder.resolve().name, "", [])
     page.checkpoint = checkpoint.resolve().name if checkpoint is not None else None
-    try:
+    document = curve = None
+    with _part(page, "settings", "The configuration cannot be read", CheckpointError):
         document = run.read_config()
         page.summary = str(document.data.get("summary", ""))
         page.settings = _sections(_settings(run, document))
-    except CheckpointError as error:
-        document = None
-        page.missing["settings"] = f"The configuration cannot be read: {reason_of(error)}"
-    try:
+    with _part(page, "card", "The task cannot be described", RlcliError, ValidationError):
         page.card = _card(run, document, checkpoint)
-    except (RlcliError, ValidationError) as error:
-        page.missing["card"] = f"The task cannot be described: {reason_of(error)}"
-    curve = None
-    try:
+    with _part(page, "charts", "There are no learning curves", CheckpointError):
         (curve,), _ = gather([run])
         _add_charts(curve, page)
-    except CheckpointError as error:
-        page.missing["charts"] = f"There are no learning curves: {reason_of(error)}"
     page.facts = list(_facts(run, curve))
     if page.checkpoint is not None and page.checkpoint.isdecimal():
         page.facts.insert(0, ("Checkpoint", f"step {int(page.checkpoint):,}"))
     page.machine = list(_machine(record))
     page.commands = list(_commands(run, checkpoint))
     return page
+
+
+@contextlib.contextmanager
+def _part(page: Page, name: str, failure: str, *errors: type[Exception]) -> Iterator[None]:
+    """Context that reads a part of the page; an error becomes the reason why the part is missing."""
+    try:
+        yield
+    except errors as error:
+        page.missing[name] = f"{failure}: {reason_of(error)}"
 
 
 def _card(run: Run, document: strict_yaml.Document | None, checkpoint: Path | None) -> Card:
@@ -126,12 +129,10 @@ def _card(run: Run, document: strict_yaml.Document | None, checkpoint: Path | No
 def _layout(checkpoint: Path | None) -> dict[str, Any] | None:
     from rlcli.runs.checkpoint_manifest import LayoutRecord
 
-    if checkpoint is None:
-        return None
-    try:
-        return LayoutRecord.model_validate(open_checkpoint(checkpoint).manifest.get("layout")).model_dump()
-    except (CheckpointError, ValidationError):
-        return None
+    if checkpoint is not None:
+        with contextlib.suppress(CheckpointError, ValidationError):
+            return LayoutRecord.model_validate(open_checkpoint(checkpoint).manifest.get("layout")).model_dump()
+    return None
 
 
 def _add_charts(curve: Curve, page: Page) -> None:
@@ -140,13 +141,11 @@ def _add_charts(curve: Curve, page: Page) -> None:
     panels = choose([curve])
     if not panels:
         page.missing["charts"] = "There are no learning curves yet: no episode has ended."
-    try:
+    with _part(page, "charts", "The learning curves are not drawn", RlcliError):
         page.charts = [
             Chart(panel.title, panel_svg(panel, AXES["steps"], f"chart{position}"), legend_of(panel))
             for position, panel in enumerate(panels)
         ]
-    except RlcliError as error:
-        page.missing["charts"] = f"The learning curves are not drawn: {reason_of(error)}"
 
 
 def _facts(run: Run, curve: Curve | None) -> Iterator[tuple[str, str]]:
@@ -268,10 +267,9 @@ def reason_of(error: Exception) -> str:
 
 
 def _date(text: object) -> str:
-    try:
+    with contextlib.suppress(ValueError):
         return datetime.fromisoformat(str(text)).strftime("%Y-%m-%d %H:%M UTC")
-    except ValueError:
-        return "unknown"
+    return "unknown"
 
 
 def _duration(seconds: float) -> str:

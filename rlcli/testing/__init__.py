@@ -11,9 +11,9 @@ for finding in check_task("acrobot"):
 ```
 """
 
+from rlcli.testing.findings import Finding
 from rlcli.testing.kit import CHECKS, check_task, record_layout
 from rlcli.testing.lint import lint_task
 from rlcli.testing.lint_rules import RULES, Remark
-from rlcli.testing.task_under_test import Finding
 
 __all__ = ["CHECKS", "RULES", "Finding", "Remark", "check_task", "lint_task", "record_layout"]

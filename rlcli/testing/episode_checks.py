@@ -11,24 +11,16 @@ from torch import Tensor
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.step import StepResult
 from rlcli.envs.vec_env import VecEnv
-from rlcli.testing.task_under_test import (
-    NUM_ENVS,
+from rlcli.testing.findings import Finding, NotRunError, error_at, warning_at
+from rlcli.testing.steps import (
     EndedEpisode,
-    Finding,
-    NotRunError,
-    TaskUnderTest,
     bitwise_equal,
-    column_names,
     ended_episodes,
-    engine_state,
-    error_at,
-    expire_episodes,
     random_actions,
-    record_trajectory,
+    record_outputs,
     step_outputs,
-    task_of,
-    warning_at,
 )
+from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, column_names, engine_state, expire_episodes, task_of
 
 _ENDING = [1, 4, 5]
 """Environments whose episodes are ended while the episodes of the others continue."""
@@ -40,7 +32,7 @@ _LIMITS = (6, 9)
 def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the same seed and actions give the same trajectory, in a new environment and after reset(seed)."""
     env, other = subject.env(episode_steps=12), subject.env(episode_steps=12)
-    first, second, third = (record_trajectory(one, random_actions(one, subject.bound, 30)) for one in (env, other, env))
+    first, second, third = (record_outputs(one, random_actions(one, subject.bound, 30)) for one in (env, other, env))
     message = "differs between two new environments, one seed and one set of actions"
     hint = "draw from the selection (uniform, normal, choice) or from self.draws(env_ids) instead of torch.rand, numpy"
     findings = list(compare_trajectories(env, (first, second), message, f"{hint} or time"))

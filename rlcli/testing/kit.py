@@ -11,7 +11,8 @@ import torch
 
 from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
 from rlcli.testing import episode_checks, portability_checks, value_checks
-from rlcli.testing.task_under_test import Finding, NotRunError, TaskUnderTest, error_text, open_task
+from rlcli.testing.findings import Finding, NotRunError, error_text
+from rlcli.testing.task_under_test import TaskUnderTest, open_task
 
 Check = Callable[[TaskUnderTest], Iterable[Finding]]
 OnCheck = Callable[[str, "list[Finding] | None"], None]

@@ -14,7 +14,8 @@ from torch import Tensor
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.vec_env import VecEnv
-from rlcli.testing.task_under_test import TaskUnderTest, element_names, ended_episodes
+from rlcli.testing.steps import ended_episodes
+from rlcli.testing.task_under_test import TaskUnderTest, element_names
 
 NUM_ENVS = 16
 MAX_STEPS = 1000

@@ -17,8 +17,9 @@ from rlcli.config.layers import leaves
 from rlcli.config.schema import AgentConfig
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
+from rlcli.testing.findings import error_text
 from rlcli.testing.lint_rollouts import MAX_STEPS, SCRIPTED_AGENTS, RolloutEvidence, record_rollout
-from rlcli.testing.task_under_test import error_text, observation_parts
+from rlcli.testing.task_under_test import observation_parts
 from rlcli.testing.timestep_checks import energy_drift
 
 

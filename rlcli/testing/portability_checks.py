@@ -25,21 +25,10 @@ from rlcli.rl.rng import rng_state
 from rlcli.runs.bundle import open_bundle
 from rlcli.runs.restore import require_fit
 from rlcli.testing.episode_checks import compare_trajectories
+from rlcli.testing.findings import Finding, NotRunError, error_at, warning_at
 from rlcli.testing.host_sync import HostSyncError, HostSyncGuard
-from rlcli.testing.task_under_test import (
-    NUM_ENVS,
-    Finding,
-    NotRunError,
-    TaskUnderTest,
-    bitwise_equal,
-    element_names,
-    error_at,
-    random_actions,
-    record_trajectory,
-    step_outputs,
-    task_of,
-    warning_at,
-)
+from rlcli.testing.steps import bitwise_equal, random_actions, record_outputs, step_outputs
+from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, element_names, task_of
 
 STEPS = 16
 EPISODE = 12
@@ -52,7 +41,7 @@ def threads(subject: TaskUnderTest) -> Iterator[Finding]:
     for count in (1, 3):
         env = subject.env(episode_steps=EPISODE, flags={"sim.engine_threads": count})
         torch.manual_seed(0)
-        trajectories.append(record_trajectory(env, random_actions(env, subject.bound, STEPS)))
+        trajectories.append(record_outputs(env, random_actions(env, subject.bound, STEPS)))
     hint = "let nothing depend on engine_threads or on the number of cores"
     yield from compare_trajectories(env, trajectories, "differs between 1 and 3 engine threads", hint)
 
@@ -67,10 +56,10 @@ def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
     actions = list(random_actions(many, subject.bound, STEPS))
     torch.manual_seed(0)
     before = rng_state()
-    of_many = [{n: v[:FEW] for n, v in step.items()} for step in record_trajectory(many, (a.clone() for a in actions))]
+    of_many = [{n: v[:FEW] for n, v in step.items()} for step in record_outputs(many, (a.clone() for a in actions))]
     draws_globally = any(not bitwise_equal(state, before[name]) for name, state in rng_state().items())
     torch.manual_seed(0)
-    of_few = record_trajectory(few, (a[:FEW].clone() for a in actions))
+    of_few = record_outputs(few, (a[:FEW].clone() for a in actions))
     make, reason = warning_at, ""
     if draws_globally:
         reason = "; the task draws from torch, numpy or random, whose numbers depend on the number of environments"

@@ -1,96 +1,24 @@
-"""Task under test: small seeded environments, recorded trajectories, and one recording that several checks share."""
+"""Task under test: small seeded environments, and one recording that several checks share."""
 
 from __future__ import annotations
 
 import contextlib
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import torch
 from torch import Tensor
 
 from rlcli.config.load import Resolved, agent_names, resolve
 from rlcli.envs.direct import DirectEnv, DirectTask
 from rlcli.envs.make import make_env
-from rlcli.envs.step import StepResult
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import DependencyError, RlcliError
+from rlcli.errors import DependencyError
 from rlcli.registry import TaskSource, find_task
+from rlcli.testing.steps import Recording, random_actions, record
 
 NUM_ENVS = 8
-STEPS = 200
-"""Steps of a recording."""
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Violation of the contract: the check, the place, what was found, and what to do."""
-
-    check: str
-    severity: Literal["error", "warning"]
-    where: str
-    message: str
-    hint: str
-
-    def __str__(self) -> str:
-        """Return the finding as one line."""
-        return f"{self.severity}: {self.check}: {self.where}: {self.message}; {self.hint}"
-
-
-error_at = partial(Finding, "", "error")
-"""(where, message, hint) -> error of the running check; the kit adds the name of the check."""
-warning_at = partial(Finding, "", "warning")
-"""(where, message, hint) -> warning of the running check; the kit adds the name of the check."""
-
-
-class NotRunError(Exception):
-    """Raised by a check that does not apply to this task or this machine; the message is the reason."""
-
-
-@dataclass(slots=True)
-class Recording:
-    """Step results of an environment, with copies that show whether the tensors change later."""
-
-    env: VecEnv
-    steps: list[StepResult] = field(default_factory=list)
-    """The results themselves, not copies: the task may have changed their tensors since."""
-    obs: list[dict[str, Tensor]] = field(default_factory=list)
-    """Copies, beginning with the observations of the reset. [group -> (num_envs, d)]"""
-    late_writes: dict[str, int] = field(default_factory=dict)
-    """Name of a tensor that was changed during the next step -> number of the first such step."""
-    shared: dict[str, int] = field(default_factory=dict)
-    """Name of a tensor that shares memory with its predecessor -> number of the first such step."""
-    error: Exception | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class EndedEpisode:
-    """Episode that ended in a step."""
-
-    env_id: int
-    length: int
-    """Number of its steps."""
-    terminated: bool
-    truncated: bool
-    causes: tuple[str, ...]
-    """Names of the termination terms that ended it."""
-
-
-def ended_episodes(result: StepResult) -> list[EndedEpisode]:
-    """Return the episodes that ended in the last step of an environment; later its result is overwritten."""
-    if result.episodes is None:
-        return []
-    ended = result.episodes.ended()
-    episodes = []
-    for row, env_id in enumerate(ended.ids.tolist()):
-        flags = bool(result.terminated[env_id]), bool(result.truncated[env_id])
-        causes = tuple(name for name, fired in ended.causes.items() if bool(fired[row]))
-        episodes.append(EndedEpisode(env_id, int(ended.lengths[row]), *flags, causes))
-    return episodes
 
 
 class TaskUnderTest:
@@ -168,76 +96,6 @@ def open_task(task: str | Path, agent: str | None, overrides: Sequence[str]) -> 
     return TaskUnderTest(find_task(name), agent, overrides)
 
 
-def error_text(error: Exception) -> str:
-    """Return the message of an error as one line."""
-    message = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"
-    return " ".join(message.split())
-
-
-def random_actions(env: VecEnv, bound: float, steps: int = STEPS) -> Iterator[Tensor]:
-    """Yield uniform actions within the bound. They have a fixed seed. (num_envs, a)"""
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(steps):
-        yield (torch.rand(env.num_envs, env.layout.action_size, generator=generator) * 2.0 - 1.0) * bound
-
-
-def extreme_actions(env: VecEnv, bound: float, steps: int = STEPS) -> Iterator[Tensor]:
-    """Yield actions at the bound with alternating signs; every eighth sign is repeated: + - + - + - + - - + - + ...
-
-    Every second environment gets the opposite sign.
-    """
-    sign = torch.ones(env.num_envs, 1)
-    sign[1::2] = -1.0
-    for step in range(steps):
-        action = sign * (-1.0) ** (step + step // 8) * bound
-        yield action.expand(-1, env.layout.action_size).clone()
-
-
-def record(env: VecEnv, actions: Iterator[Tensor]) -> Recording:
-    """Step an environment until the actions end or an error is raised."""
-    recording = Recording(env)
-    try:
-        obs = env.reset(seed=0)
-        recording.obs.append(_copy(obs))
-        previous = {f"observation '{group}'": value for group, value in obs.items()}
-        copies = _copy(previous)
-        for number, action in enumerate(actions):
-            before = action.clone()
-            result = env.step(action)
-            recording.steps.append(result)
-            recording.obs.append(_copy(result.obs))
-            for name, value in previous.items():
-                if not bitwise_equal(value, copies[name]):
-                    recording.late_writes.setdefault(name, number)
-            if not bitwise_equal(action, before):
-                recording.late_writes.setdefault("the action", number)
-            outputs = step_outputs(result)
-            for name, value in outputs.items():
-                if name in previous and value.numel() and value.data_ptr() == previous[name].data_ptr():
-                    recording.shared.setdefault(name, number)
-            previous, copies = outputs, _copy(outputs)
-    except Exception as error:
-        recording.error = error
-    return recording
-
-
-def record_trajectory(env: VecEnv, actions: Iterator[Tensor], seed: int = 0) -> list[dict[str, Tensor]]:
-    """Return copies of all outputs of `reset(seed)` and of the following steps."""
-    trajectory = [{f"observation '{group}'": value.clone() for group, value in env.reset(seed=seed).items()}]
-    trajectory += [_copy(step_outputs(env.step(action))) for action in actions]
-    return trajectory
-
-
-def step_outputs(result: StepResult) -> dict[str, Tensor]:
-    """Return all tensors of a step result by name."""
-    return {
-        **{f"observation '{group}'": value for group, value in result.obs.items()},
-        "reward": result.reward,
-        "terminated": result.terminated,
-        "truncated": result.truncated,
-    }
-
-
 def expire_episodes(env: VecEnv, rows: list[int]) -> None:
     """Set the episode length of some environments to one step before the time limit."""
     env.episode_length_buf[rows] = env.max_episode_length - 1
@@ -284,12 +142,3 @@ def observation_parts(env: VecEnv, group: str) -> list[tuple[str, slice]]:
             parts += [(f"observations.{group}, column {c} ({names[c]})", slice(c, c + 1)) for c in columns]
         start = end
     return parts
-
-
-def bitwise_equal(left: Tensor, right: Tensor) -> bool:
-    """Return whether two tensors are equal bit for bit, NaN included."""
-    return left.shape == right.shape and bool(((left == right) | ((left != left) & (right != right))).all())
-
-
-def _copy(values: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: value.clone() for name, value in values.items()}

@@ -20,19 +20,9 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DivergedError, listing
 from rlcli.registry import model_file
 from rlcli.scene.untrusted_mjcf import model_roots, read_mjcf
-from rlcli.testing.task_under_test import (
-    NUM_ENVS,
-    STEPS,
-    Finding,
-    TaskUnderTest,
-    error_at,
-    extreme_actions,
-    observation_parts,
-    record,
-    step_outputs,
-    task_of,
-    warning_at,
-)
+from rlcli.testing.findings import Finding, error_at, warning_at
+from rlcli.testing.steps import STEPS, extreme_actions, record, step_outputs
+from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, observation_parts, task_of
 
 
 def names(subject: TaskUnderTest) -> Iterator[Finding]:

@@ -15,19 +15,17 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
+from rlcli.config.load import Resolved
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
 from rlcli.machine import available_cores, available_memory, resident_memory
+from rlcli.rl.trainer import Trainer
 from rlcli.training.job import threads
 from rlcli.training.setup import make_trainer
-
-if TYPE_CHECKING:
-    from rlcli.config.load import Resolved
-    from rlcli.rl.trainer import Trainer
 
 SIZES = (16, 64, 256, 1_024, 4_096, 16_384)
 """Numbers of environments that are measured."""
@@ -338,10 +336,9 @@ class _Training:
 
 def load() -> float | None:
     """Return the load [processes], the mean over the last minute; None where the system has no such number."""
-    try:
+    with contextlib.suppress(AttributeError, OSError):
         return os.getloadavg()[0]
-    except (AttributeError, OSError):
-        return None
+    return None
 
 
 def _blocks(call: Callable[[], object], pace: Pace) -> list[float]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from filelock import FileLock
 
 from rlcli.errors import CheckpointError, DependencyError, MachineError, UsageError
-from rlcli.runs.atomic_io import disk_error
+from rlcli.runs.atomic_io import disk_errors
 
 if TYPE_CHECKING:
     import optuna
@@ -55,20 +55,18 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
     name = f"rlcli/{settings['task']}/{settings['name']}"
     median = optuna.pruners.MedianPruner(n_startup_trials=4, n_warmup_steps=30)
     pruner = median if settings["pruner"] == "median" else optuna.pruners.NopPruner()
-    try:
+    with disk_errors(folder / JOURNAL):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             trials = _journal(folder, create) if storage is None else _database(storage)
         study: dict[str, Any] = {"study_name": name, "storage": trials, "pruner": pruner}
-        if not create:
-            return optuna.load_study(**study)
-        return optuna.create_study(**study, direction=settings["direction"], load_if_exists=True)
-    except KeyError:
-        raise CheckpointError(
-            f"there is no sweep '{name}' in {without_password(storage) if storage else folder}"
-        ) from None
-    except OSError as error:
-        raise disk_error(folder / JOURNAL, error) from error
+        try:
+            if not create:
+                return optuna.load_study(**study)
+            return optuna.create_study(**study, direction=settings["direction"], load_if_exists=True)
+        except KeyError:
+            where = without_password(storage) if storage else folder
+            raise CheckpointError(f"there is no sweep '{name}' in {where}") from None
 
 
 @contextlib.contextmanager
@@ -114,14 +112,14 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
         """Optuna's journal, with repair of lines that a full disk cut short and checks for damage."""
 
         def append_logs(self, logs: list[dict[str, Any]]) -> None:
-            with lock:
+            with lock, disk_errors(file):
                 try:
                     _remove_partial_line(file)
                     super().append_logs(logs)
-                except OSError as error:
+                except OSError:
                     with contextlib.suppress(OSError):
                         _remove_partial_line(file)
-                    raise disk_error(file, error) from error
+                    raise
 
         def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:  # type: ignore[override]
             try:

@@ -16,7 +16,7 @@ from rlcli.config.dump import to_yaml
 from rlcli.errors import CheckpointError, MachineError, UsageError, listing
 from rlcli.random import derive
 from rlcli.reporting.figures import check_drawing, scatter
-from rlcli.runs.atomic_io import disk_error, to_json, write_atomic
+from rlcli.runs.atomic_io import disk_error, disk_errors, to_json, write_atomic
 from rlcli.runs.run import STUDY
 from rlcli.runs.study import read_study
 from rlcli.tuning.optuna_storage import open_study, without_password
@@ -189,16 +189,13 @@ class Sweep:
 
     def _lock_trial(self, number: int) -> FileLock | None:
         folder = self.trial_folder(number)
-        try:
+        with disk_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise disk_error(folder, error) from error
         lock = FileLock(folder / _TRIAL_LOCK)
-        try:
+        with contextlib.suppress(Timeout):
             lock.acquire(timeout=0)
-        except Timeout:
-            return None
-        return lock
+            return lock
+        return None
 
     def _with_own_sampler(self, trial: FrozenTrial | optuna.Trial) -> optuna.Trial:
         """Return a trial whose sampler depends only on the trial's number; values that it already has are kept."""
@@ -236,10 +233,8 @@ def open_sweep(
         CheckpointError: if the files of the sweep are damaged.
         MachineError: if the storage cannot be reached, or the folder cannot be written.
     """
-    try:
+    with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise disk_error(folder, error) from error
     record = {"kind": "sweep", **settings, "source": dict(source)}
     with _locked(folder / _SWEEP_LOCK):
         exists = (folder / STUDY).is_file()

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rlcli.config.dump import to_data, to_yaml
 from rlcli.errors import CheckpointError, DivergedError, RlcliError, UsageError
@@ -18,12 +18,10 @@ from rlcli.runs.index import newest_rows, overview
 from rlcli.runs.run import CONFIG, Run
 from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.loggers import read_metrics
+from rlcli.training.signals import StopRequest
 from rlcli.training.subprocesses import POLL_S, start_training
+from rlcli.tuning.sweep import Sweep
 from rlcli.tuning.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
-
-if TYPE_CHECKING:
-    from rlcli.training.signals import StopRequest
-    from rlcli.tuning.sweep import Sweep
 
 _log = logging.getLogger(__name__)
 

@@ -7,22 +7,20 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rlcli.config.load import Resolved
 from rlcli.errors import DivergedError, RlcliError, UsageError, did_you_mean, listing
 from rlcli.evaluation.limits import require_success
 from rlcli.runs.index import newest_rows, overview
 from rlcli.runs.run import Run, open_run
 from rlcli.training.launch import TrainingRequest, prepare_run
+from rlcli.training.signals import StopRequest
 from rlcli.training.subprocesses import POLL_S, STOPPED, TrainingProcess, start_command, start_training
 from rlcli.tuning.extract_preset import preset_of
 from rlcli.tuning.search_space import Objective, Parameter
+from rlcli.tuning.sweep import Sweep, Trial
 from rlcli.tuning.time_to_threshold import training_s
-
-if TYPE_CHECKING:
-    from rlcli.config.load import Resolved
-    from rlcli.training.signals import StopRequest
-    from rlcli.tuning.sweep import Sweep, Trial
 
 _log = logging.getLogger(__name__)
 

@@ -6,9 +6,10 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from rlcli.config.dump import to_data, to_yaml
+from rlcli.config.load import Resolved
 from rlcli.errors import CheckpointError, DependencyError
 from rlcli.reporting.curves import AXES, Curve, Line, gather
 from rlcli.reporting.figures import check_drawing, picture
@@ -18,11 +19,8 @@ from rlcli.runs.index import overview
 from rlcli.runs.run import open_run
 from rlcli.runs.study import create_study, read_study, runs_of
 from rlcli.training.launch import TrainingRequest, run_record
+from rlcli.training.signals import StopRequest
 from rlcli.training.subprocesses import train_all
-
-if TYPE_CHECKING:
-    from rlcli.config.load import Resolved
-    from rlcli.training.signals import StopRequest
 
 _log = logging.getLogger(__name__)
 
@@ -132,8 +130,8 @@ def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
     found = {name: line for name, line in lines.items() if line is not None}
     result.together = {}
     for name, line in found.items():
-        low, high = (None if end is None else float(end[-1]) for end in (line.low, line.high))
-        result.together[name] = {"iqm": float(line.middle[-1]), "low": low, "high": high, "step": int(line.x[-1])}
+        _, middle, low, high = line.last()
+        result.together[name] = {"iqm": middle, "low": low, "high": high, "step": int(line.x[-1])}
     if found:
         result.curves = write_atomic(folder / CURVES, _csv(found))
         result.picture = _picture(folder, curves)

@@ -16,18 +16,14 @@ from rlcli.errors import MachineError
 from rlcli.viewer.env_grid import EnvGrid
 from rlcli.viewer.offscreen import free_camera
 from rlcli.viewer.playback import Playback, run_in_real_time
-from rlcli.viewer.protocol import Ready, View
+from rlcli.viewer.protocol import REQUEST_KEYS, Ready, View
 
 KEYS = (
     "Space: pause, go on. Right: one step. Backspace: new episodes. - and =: speed. Up, Down: environment."
     " PageUp, PageDown: newer, older checkpoint. Home, End: choose a command; Insert, Delete: raise, lower it."
     " Double click, then Ctrl and drag: push a body"
 )
-_REQUESTS = {
-    32: "pause", 262: "step", 259: "reset", 45: "slower", 61: "faster", 265: "next environment",
-    264: "previous environment", 266: "newer checkpoint", 267: "older checkpoint", 268: "previous command",
-    269: "next command", 260: "raise command", 261: "lower command",
-}  # fmt: skip
+_REQUESTS = {code: request for request, (code, _) in REQUEST_KEYS.items()}
 """Key code of GLFW -> request of the playback."""
 
 

@@ -7,8 +7,8 @@ of the simulation executes the requests between two steps (`advance`), so that n
 from __future__ import annotations
 
 import logging
-import queue
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,7 +22,8 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.managers.command import CommandManager
 from rlcli.rl.acting import Act
-from rlcli.viewer.protocol import CheckpointSource, View
+from rlcli.viewer.checkpoints import RunCheckpoints
+from rlcli.viewer.protocol import View
 
 _log = logging.getLogger(__name__)
 SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
@@ -47,7 +48,7 @@ class Playback:
 
     env: VecEnv
     act: Act
-    checkpoint_source: CheckpointSource | None = None
+    checkpoint_source: RunCheckpoints | None = None
     checkpoint: int | None = None
     shown: int = 0
     speed: float = 1.0
@@ -60,7 +61,7 @@ class Playback:
     steps: int = 0
     message: str = ""
     _knob: int = 0
-    _requests: queue.SimpleQueue[Callable[[], None]] = field(default_factory=queue.SimpleQueue)
+    _requests: deque[Callable[[], None]] = field(default_factory=deque)
     _obs: Tensor = field(init=False)
     _due: float = 0.0
     _single: int = 0
@@ -89,7 +90,7 @@ class Playback:
 
     def submit(self, request: Callable[[], None]) -> None:
         """Queue a call of one of the methods below; it is executed between two steps."""
-        self._requests.put(request)
+        self._requests.append(request)
 
     def requests(self) -> dict[str, Callable[[], None]]:
         """Return the requests of the viewers' keys by name."""
@@ -117,12 +118,8 @@ class Playback:
 
         A machine that is too slow falls behind real time and does not catch up later.
         """
-        while True:
-            try:
-                request = self._requests.get_nowait()
-            except queue.Empty:
-                break
-            request()
+        while self._requests:  # only this thread removes requests
+            self._requests.popleft()()
         count, self._single = self._single, 0
         if not count and self.env.is_playing():
             self._due += min(elapsed, _LAG) * self.speed / self.env.step_dt

@@ -11,12 +11,18 @@ from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from rlcli.managers.command import Knob
-    from rlcli.rl.acting import Act
     from rlcli.viewer.playback import Playback
 
 VIEWERS = {"native": "rlcli.viewer.native:run", "web": "rlcli.viewer.web:run"}
 """Name of a viewer -> import path of the function that runs it."""
 DEFAULT_PORT = 8080
+REQUEST_KEYS: dict[str, tuple[int, str | None]] = {
+    "pause": (32, "Space"), "step": (262, "RightArrow"), "reset": (259, "Backspace"), "slower": (45, "Minus"),
+    "faster": (61, "Equal"), "next environment": (265, "UpArrow"), "previous environment": (264, "DownArrow"),
+    "newer checkpoint": (266, "PageUp"), "older checkpoint": (267, "PageDown"), "previous command": (268, None),
+    "next command": (269, None), "raise command": (260, None), "lower command": (261, None),
+}  # fmt: skip
+"""Request of the playback -> its key: code in GLFW, name in Dear ImGui; None: the browser's viewer has no such key."""
 
 Ready = Callable[[Sequence[str], str | None], None]
 """Receives lines of instructions for the user, and the viewer's address if it has one."""
@@ -38,22 +44,6 @@ class Viewer(Protocol):
         Raises:
             MachineError: if this machine cannot open the viewer.
             DependencyError: if a package is missing, or its version is not supported.
-        """
-        ...
-
-
-class CheckpointSource(Protocol):
-    """Source of checkpoints for a playback."""
-
-    def steps(self) -> list[int]:
-        """Return the steps of the checkpoints that exist now, ascending."""
-        ...
-
-    def load(self, step: int) -> Act:
-        """Return the policy of a checkpoint.
-
-        Raises:
-            CheckpointError: if the checkpoint was removed, is corrupt, or belongs to another task.
         """
         ...
 

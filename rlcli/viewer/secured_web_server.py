@@ -20,6 +20,7 @@ import sys
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import mujoco
 
@@ -108,15 +109,10 @@ def secured_server(studio: SimpleNamespace, listener: socket.socket) -> Iterator
         (viewer, "_print_url_banner", lambda *_: None),
         (viewer, "print", lambda *_, **__: None),
     ]
-    before = [(module, name, getattr(module, name, None)) for module, name, _ in replacements]
-    for module, name, value in replacements:
-        setattr(module, name, value)
-    with _quiet():
-        try:
-            yield
-        finally:
-            for module, name, value in before:
-                delattr(module, name) if value is None else setattr(module, name, value)
+    with _quiet(), contextlib.ExitStack() as stack:
+        for module, name, value in replacements:
+            stack.enter_context(mock.patch.object(module, name, value, create=True))
+        yield
 
 
 def verify_refusals(port: int) -> None:
@@ -138,14 +134,12 @@ def verify_refusals(port: int) -> None:
 
 
 def _status(port: int, headers: dict[str, str]) -> int:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
-    try:
-        connection.request("GET", "/", headers=headers)
-        return connection.getresponse().status
-    except (OSError, http.client.HTTPException) as error:
-        raise incompatible_viewer(f"its server does not answer: {error}") from None
-    finally:
-        connection.close()
+    with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
+        try:
+            connection.request("GET", "/", headers=headers)
+            return connection.getresponse().status
+        except (OSError, http.client.HTTPException) as error:
+            raise incompatible_viewer(f"its server does not answer: {error}") from None
 
 
 def _serve_with_checks(server: Any, port: int) -> Any:

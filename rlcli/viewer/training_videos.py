@@ -5,16 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rlcli.envs.observers import StepObserver
+from rlcli.envs.vec_env import VecEnv
 from rlcli.rl.acting import trained_policy
+from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators, undisturbed
 from rlcli.viewer.record_video import record_episode
-
-if TYPE_CHECKING:
-    from rlcli.envs.vec_env import VecEnv
-    from rlcli.rl.policy import Policy
 
 _log = logging.getLogger(__name__)
 

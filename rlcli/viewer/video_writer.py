@@ -6,11 +6,10 @@ import contextlib
 import importlib.util
 import shutil
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import DependencyError, MachineError, UsageError
-from rlcli.runs.atomic_io import disk_error
+from rlcli.runs.atomic_io import disk_errors
 
 if TYPE_CHECKING:
     import numpy as np
@@ -82,22 +81,17 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
             # H.264 needs an even width and height: macro blocks of 2 pixels keep the size closest
             settings = {"fps": self.fps, "codec": "libx264", "quality": 7, "macro_block_size": 2}
             settings["ffmpeg_log_level"] = "error"
-        try:
+        with disk_errors(file):
             file.parent.mkdir(parents=True, exist_ok=True)
             self._temporary.unlink(missing_ok=True)  # the writer would follow a symbolic link
             self._writer: Any = imageio.get_writer(self._temporary, **settings)
-        except OSError as error:
-            raise disk_error(file, error) from error
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
-            self._writer.close()
-            if kind is None and self.frames:
-                self._temporary.replace(self.file)
-        except OSError as failure:
-            raise disk_error(self.file, failure) from failure
+            with disk_errors(self.file):
+                self._writer.close()
+                if kind is None and self.frames:
+                    self._temporary.replace(self.file)
         finally:
             self._temporary.unlink(missing_ok=True)
 

@@ -17,17 +17,11 @@ from mujoco.studio.app import inputs
 from mujoco.studio.dear_imgui import dear_imgui as imgui
 
 from rlcli.viewer.playback import SPEEDS, Playback
-from rlcli.viewer.protocol import View
+from rlcli.viewer.protocol import REQUEST_KEYS, View
 
 TITLE = "Options"
 """Title of the window that MuJoCo's viewer docks to the left."""
 _SPEEDS = ["1/8 x", "1/4 x", "1/2 x", "real time", "2 x", "4 x", "8 x"]
-_REQUESTS = {
-    "Space": "pause", "RightArrow": "step", "Backspace": "reset", "Minus": "slower", "Equal": "faster",
-    "UpArrow": "next environment", "DownArrow": "previous environment", "PageUp": "newer checkpoint",
-    "PageDown": "older checkpoint",
-}  # fmt: skip
-"""Name of a key in Dear ImGui -> request of the playback."""
 _LAST = 0
 """Priority of handlers that run after those of MuJoCo."""
 
@@ -189,8 +183,8 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
     def _keys(self) -> None:
         if imgui.GetIO().WantCaptureKeyboard:
             return
-        for key, request in _REQUESTS.items():
-            if imgui.IsKeyChordPressed(getattr(imgui.Key, key)):
+        for request, (_, key) in REQUEST_KEYS.items():
+            if key is not None and imgui.IsKeyChordPressed(getattr(imgui.Key, key)):
                 self._playback.submit(self._playback.requests()[request])
                 return
         is_free_camera = self._ux.camera_index == ux.FREE_CAMERA_IDX

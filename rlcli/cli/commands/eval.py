@@ -55,10 +55,8 @@ def command(
     from rlcli.evaluation import session as sessions
     from rlcli.evaluation.limits import failures, read_limits, require_success
 
-    limits = read_limits(fail_under, fail_over)
-    request = sessions.PolicyRequest(
-        task, overrides or [], checkpoint, policy, stochastic, num_envs, options.draw_seed(seed), config, runs_dir
-    )
+    limits, words = read_limits(fail_under, fail_over), overrides or []
+    request = sessions.PolicyRequest(task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir)
     if compare:
         if checkpoint is not None or policy != "trained" or record is not None:
             raise UsageError("--compare takes policies as arguments only", hint="rlcli eval --compare RUN1 RUN2")

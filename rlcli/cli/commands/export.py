@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rlcli.cli.ui.completion import words
 from rlcli.cli.ui.console import console
-from rlcli.cli.ui.options import CheckpointRef, RunsDir, TaskOfPolicy
+from rlcli.cli.ui.options import CheckpointRef, RunsDir, TaskOfPolicy, choice
 from rlcli.errors import UsageError, listing
 
 if TYPE_CHECKING:
@@ -25,10 +24,7 @@ _MAX_KEYS = 10
 def command(
     task: TaskOfPolicy = None,
     checkpoint: CheckpointRef = None,
-    format_: Annotated[
-        str,
-        typer.Option("--format", autocompletion=words("onnx", "torch", "numpy", "bundle"), metavar="FORMAT"),
-    ] = "onnx",
+    format: Annotated[str, choice("FORMAT", "onnx", "torch", "numpy", "bundle")] = "onnx",
     output: Annotated[Path | None, typer.Option()] = None,
     verify: Annotated[bool, typer.Option("--verify")] = False,
     episodes: Annotated[int, typer.Option(min=1)] = 64,
@@ -37,7 +33,7 @@ def command(
     """Export a trained policy to a file for a robot, or to a bundle for rlcli.
 
     Options:
-        format_: onnx, torch (a torch.export program), numpy, or bundle (a folder for rlcli).
+        format: onnx, torch (a torch.export program), numpy, or bundle (a folder for rlcli).
         output: File to write, or folder of a bundle. [default: exports/policy.onnx, .pt2, .py or policy in the run]
         verify: Run the exported file in plain MuJoCo and compare it with the run's evaluation; also write the model
             and run_policy.py beside the file.
@@ -55,23 +51,23 @@ def command(
 
     if task is None and checkpoint is None:
         raise UsageError("no task or checkpoint given", hint="rlcli export TASK, or --checkpoint RUN|latest")
-    check_target(format_, output)
-    if format_ == BUNDLE and verify:
+    check_target(format, output)
+    if format == BUNDLE and verify:
         raise UsageError("--verify needs a format that runs without rlcli", hint="--format onnx, torch or numpy")
-    choice = _find(checkpoint, runs_dir or default_runs_dir(), task)
-    file = output or _default_file(choice, format_)
-    console.info(f"checkpoint {choice.folder} ({choice.why})")
-    saved = open_checkpoint(choice.folder)
-    if format_ == BUNDLE:
-        _export_bundle(saved, choice.run, file)
+    chosen = _find(checkpoint, runs_dir or default_runs_dir(), task)
+    file = output or _default_file(chosen, format)
+    console.info(f"checkpoint {chosen.folder} ({chosen.why})")
+    saved = open_checkpoint(chosen.folder)
+    if format == BUNDLE:
+        _export_bundle(saved, chosen.run, file)
         return
-    reference = _open_reference(choice, saved, file, task) if verify else None
-    done = export(saved, file, format_, None if reference is None else reference.deployment)
+    reference = _open_reference(chosen, saved, file, task) if verify else None
+    done = export(saved, file, format, None if reference is None else reference.deployment)
     console.info(f"equal to the policy on {done.observations} observations: difference <= {done.max_difference:.1e}")
-    verdict = None if reference is None else _verify(reference, saved, done.file, format_, episodes)
+    verdict = None if reference is None else _verify(reference, saved, done.file, format, episodes)
     entries = {"observations": done.observations, "max_difference": done.max_difference, "metadata": done.metadata}
     verified = None if verdict is None else verdict.record()
-    _report(choice.folder, format_, done.file, done.file.stat().st_size, **entries, verified=verified)
+    _report(chosen.folder, format, done.file, done.file.stat().st_size, **entries, verified=verified)
     if verdict is not None and not verdict.holds:
         raise typer.Exit(9)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
@@ -38,7 +37,8 @@ def command(
     built_in = {entry.name for entry in entries if entry.distribution == OWN}
     details = cached_details(entries)
     if pattern:
-        entries = [entry for entry in entries if _matches(entry, details, pattern.lower())]
+        texts = ((entry, f"{entry.name} {details.get(entry.qualified, Details()).summary}") for entry in entries)
+        entries = [entry for entry, text in texts if pattern.lower() in text.lower()]
     if probe_all:
         details.update(probe(entries, timeout))
     rows = [(entry, details.get(entry.qualified, Details())) for entry in entries]
@@ -58,10 +58,6 @@ def command(
         tasks=[_record(entry, known, ambiguous=entry.name in shared - built_in) for entry, known in rows],
         broken=[{"distribution": bad.distribution, "reason": bad.reason} for bad in broken],
     )
-
-
-def _matches(entry: Entry, details: Mapping[str, Details], pattern: str) -> bool:
-    return pattern in f"{entry.name} {details.get(entry.qualified, Details()).summary}".lower()
 
 
 def _record(entry: Entry, known: Details, *, ambiguous: bool) -> dict[str, Any]:

@@ -91,7 +91,7 @@ def _draw(file: Path, curves: list[Curve], panels: list[Panel], x: str) -> None:
     from rlcli.runs.atomic_io import write_atomic
 
     note = _note(curves)
-    write_atomic(file, picture(panels, AXES[x], file.suffix, title=_title(curves), note=note))
+    write_atomic(file, picture(panels, AXES[x], file.suffix.lower(), title=_title(curves), note=note))
     for curve in curves:
         seeds = ", ".join(map(str, curve.seeds))
         console.info(f"{curve.label}: seed{'s' * (len(curve.seeds) > 1)} {seeds}")
@@ -134,14 +134,7 @@ def _record(curve: Curve, axis: str) -> dict[str, Any]:
     ends = {}
     for name in curve.names():
         line = curve.line(name, axis)
-        if line is None:
-            continue
-        known = line.low is not None and line.high is not None
-        ends[name] = {
-            "x": float(line.x[-1]),
-            "value": float(line.middle[-1]),
-            "low": float(line.low[-1]) if known else None,  # type: ignore[index]
-            "high": float(line.high[-1]) if known else None,  # type: ignore[index]
-        }
+        if line is not None:
+            ends[name] = dict(zip(("x", "value", "low", "high"), line.last(), strict=True))
     runs = [{"folder": str(h.run.folder), "seed": h.run.record["seed"]} for h in curve.histories]
     return {"label": curve.label, "runs": runs, "last": ends}

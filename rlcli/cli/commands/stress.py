@@ -64,17 +64,17 @@ def command(
     """
     from rlcli.evaluation.limits import read_limits, require_success
     from rlcli.evaluation.session import PolicyRequest, baseline, find_policy, split_overrides
-    from rlcli.reporting.heat_map import check_picture, draw
+    from rlcli.reporting.figures import check_drawing
+    from rlcli.reporting.heat_map import FORMATS, draw
 
     task, words = split_overrides(subject, overrides or [])
     if task is None and checkpoint is None:
         raise UsageError("no run, task or checkpoint given", hint="rlcli stress latest --sweep body_mass=0.5:2")
     sweeps, limits = _read_sweeps(sweep, points), read_limits(fail_under)
     if output is not None:
-        check_picture(output)
-    request = PolicyRequest(
-        task, words, checkpoint, policy, stochastic, num_envs, options.draw_seed(seed), config, runs_dir
-    )
+        options.check_output(output, "picture", FORMATS)
+        check_drawing()
+    request = PolicyRequest(task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir)
     keys = [limit.key for limit in limits]
     tested = find_policy(_resolve_run(request), lambda resolved: require_success(resolved, keys))
     reference = None if against is None else baseline(tested, against)

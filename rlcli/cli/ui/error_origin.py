@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sysconfig
+import traceback
 from pathlib import Path
 from types import FrameType
 
@@ -15,17 +16,14 @@ from rlcli.registry import OWN, TASKS, TRAINERS, catalog, is_framework
 def error_of_task(error: BaseException) -> TaskError | None:
     """Return a TaskError for an exception from the code of a task or plugin; None for any other."""
     packages = _packages()
-    traceback, found = error.__traceback__, None
-    while traceback is not None:
-        if _is_task_code(traceback.tb_frame, packages):
-            found = traceback
-        traceback = traceback.tb_next
-    if found is None:
+    found = [each for each in traceback.walk_tb(error.__traceback__) if _is_task_code(each[0], packages)]
+    if not found:
         return None
-    code = found.tb_frame.f_code
+    frame, line = found[-1]
+    code = frame.f_code
     message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return TaskError(
-        f"{code.co_filename}:{found.tb_lineno}: {code.co_name}: {message}",
+        f"{code.co_filename}:{line}: {code.co_name}: {message}",
         hint="the task's own code raised this error; --debug shows the traceback",
     )
 

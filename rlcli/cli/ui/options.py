@@ -25,6 +25,15 @@ def choice(metavar: str, *names: str, help: str | None = None) -> Any:
     return typer.Option(autocompletion=words(*names), metavar=metavar, help=help)
 
 
+def draw_seed(seed: int) -> int:
+    """Return the seed; -1 draws one."""
+    if seed != -1:
+        return seed
+    import secrets
+
+    return secrets.randbelow(2**31)
+
+
 _TASK = typer.Argument(
     autocompletion=tasks, metavar="TASK", help="Name of a task, distribution:name, or a folder with a task.yaml."
 )
@@ -45,7 +54,7 @@ RunRef = Annotated[str, typer.Argument(autocompletion=runs, metavar="RUN", help=
 ConfigFile = Annotated[Path | None, typer.Option(metavar="FILE", help=_CONFIG)]
 Agent = Annotated[str | None, typer.Option(autocompletion=agents, metavar="NAME", help=_AGENT)]
 NumEnvs = Annotated[int | None, typer.Option(help="Sets scene.num_envs. [default: the task's]")]
-Seed = Annotated[int, typer.Option(min=-1, max=MAX_SEED, help=_SEED)]
+Seed = Annotated[int, typer.Option(min=-1, max=MAX_SEED, callback=draw_seed, help=_SEED)]
 Device = Annotated[str, choice("DEVICE", "auto", "cpu", "cuda", help="auto, cpu, cuda or cuda:N.")]
 RunName = Annotated[str | None, typer.Option(help="Text at the end of the run folder's name.")]
 MaxIterations = Annotated[int | None, typer.Option(help="Iterations of each training. [default: the agent's]")]
@@ -61,22 +70,19 @@ ProbeTimeout = Annotated[float, typer.Option("--probe-timeout", help="Time limit
 Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Accepted; windows open only on request.")]
 
 
-def _set_quiet(is_set: bool) -> bool:
+def _set_verbosity(option: typer.CallbackParam, is_set: bool) -> bool:
+    """Print as -q or -v says; the last of both on the command line counts."""
     if is_set:
-        console.quiet, console.verbose = True, False
-    return is_set
-
-
-def _set_verbose(is_set: bool) -> bool:
-    if is_set:
-        console.quiet, console.verbose = False, True
+        console.quiet, console.verbose = option.name == "quiet", option.name == "verbose"
     return is_set
 
 
 _COMMON: dict[str, Any] = {
     "json": typer.Option("--json", help="Print one JSON document on stdout."),
-    "quiet": typer.Option("--quiet", "-q", callback=_set_quiet, help="Print only results and errors."),
-    "verbose": typer.Option("--verbose", "-v", callback=_set_verbose, help="Print details; the last of -q, -v counts."),
+    "quiet": typer.Option("--quiet", "-q", callback=_set_verbosity, help="Print only results and errors."),
+    "verbose": typer.Option(
+        "--verbose", "-v", callback=_set_verbosity, help="Print details; the last of -q, -v counts."
+    ),
     "debug": typer.Option("--debug", help="Print the traceback of an error."),
 }
 """Options that every command has; the console holds their values."""
@@ -121,15 +127,6 @@ def budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
     return {"agent.max_iterations": max_iterations, "agent.max_steps": max_steps}
 
 
-def draw_seed(seed: int) -> int:
-    """Return the seed; -1 draws one."""
-    if seed != -1:
-        return seed
-    import secrets
-
-    return secrets.randbelow(2**31)
-
-
 def video_file(video: Path | None, default: str) -> Path | None:
     """Return the file of --video, the default one if the option has no value; check that it can be written."""
     if video is None:
@@ -150,7 +147,7 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
     """
     if output is None:
         return
-    if output.suffix not in suffixes:
+    if output.suffix.lower() not in suffixes:
         raise UsageError(f"'{output}' is not a {what}", hint=f"name it *{', *'.join(suffixes)}")
     if output.is_dir():
         raise UsageError(f"-o {output} is a folder", hint="give a file")

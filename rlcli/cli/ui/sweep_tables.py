@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.tables import cell
 from rlcli.errors import Stopped
-
-if TYPE_CHECKING:
-    from rlcli.tuning.sweep import Sweep
-    from rlcli.tuning.sweep_compare import Comparison, Training
+from rlcli.tuning.sweep import PRESET, Sweep
+from rlcli.tuning.sweep_compare import ARMS, Comparison, Training
 
 
 def print_sweep(sweep: Sweep) -> None:
     """Print the trials and the best one, as a table and as a JSON document."""
-    from rlcli.tuning.sweep import PRESET
-
     settings, best = sweep.settings, sweep.best()
     rows, documents = [], {}
     for trial in sweep.trials():
@@ -50,8 +44,6 @@ def print_comparison(comparison: Comparison) -> None:
     Raises:
         Stopped: after the table, if a signal stopped the comparison.
     """
-    from rlcli.tuning.sweep_compare import ARMS
-
     rows = [
         [str(seed), *(cell for arm in ARMS for cell in _times(comparison.training(seed, arm)))]
         for seed in comparison.seeds

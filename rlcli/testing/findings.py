@@ -1,0 +1,40 @@
+"""Findings of the contract checks, and the exception of a check that does not apply."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+from rlcli.errors import RlcliError
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Violation of the contract: the check, the place, what was found, and what to do."""
+
+    check: str
+    severity: Literal["error", "warning"]
+    where: str
+    message: str
+    hint: str
+
+    def __str__(self) -> str:
+        """Return the finding as one line."""
+        return f"{self.severity}: {self.check}: {self.where}: {self.message}; {self.hint}"
+
+
+error_at = partial(Finding, "", "error")
+"""(where, message, hint) -> error of the running check; the kit adds the name of the check."""
+warning_at = partial(Finding, "", "warning")
+"""(where, message, hint) -> warning of the running check; the kit adds the name of the check."""
+
+
+class NotRunError(Exception):
+    """Raised by a check that does not apply to this task or this machine; the message is the reason."""
+
+
+def error_text(error: Exception) -> str:
+    """Return the message of an error as one line."""
+    message = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"
+    return " ".join(message.split())
