@@ -1,4 +1,4 @@
-"""Top-level keys of a task file that belong to another framework's format."""
+"""Top-level keys of other frameworks in a task file: they move into `foreign`, by format."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ __all__ = ["grid"]
 
 @dataclass(frozen=True, slots=True)
 class Simulation:
-    """Parts of an environment that are built from its compiled scene; `VecEnv` describes them."""
+    """Parts of an environment that are built from its compiled scene; for their meaning see `VecEnv`."""
 
     engine: Engine
     data: SimData

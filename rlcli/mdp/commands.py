@@ -1,4 +1,4 @@
-"""Command terms. Each keeps what the policy has to do in `command`, (num_envs, k)."""
+"""Command terms: goals for the policy, such as a target velocity. `command` is the present goal, (num_envs, k)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ranges of numbers as tensors. A range that a curriculum changes is a tensor already, and is read at each use."""
+"""Ranges as tensors: fixed ranges are converted once, those that a curriculum changes are read at each use."""
 
 from __future__ import annotations
 

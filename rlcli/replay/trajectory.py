@@ -248,7 +248,7 @@ class Header(_Strict):
                 raise ValueError("it does not hold the end of one episode")
             first, steps_before = self.worlds[0].first, self.episodes[0].kept - 1
             if first < steps_before or first % max(1, steps_before):
-                raise ValueError("the engine calls do not fit the episode's steps")
+                raise ValueError("the number of recorded engine calls does not fit the number of steps")
         elif self.failure is not None or bool(self.worlds) != (self.kind == "crash"):
             raise ValueError(f"it is not a {self.kind}")
         return self

@@ -59,7 +59,7 @@ def check_formula(value: Any) -> None:
     if not isinstance(of, list) or (count is not None and len(of) != count) or not of:
         raise ValueError(f"'{value['op']}' takes {count or 'some'} values")
     if own and not (isinstance(value["key"], str) and all(_are_numbers(value[key]) for key in "ab") and value["b"]):
-        raise ValueError("a filter has weights b and a, and a key")
+        raise ValueError("a filter must have the coefficients b and a, and a key")
     for part in of:
         check_formula(part)
 

@@ -119,7 +119,7 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
     except Exception as error:
         raise CheckpointError(f"{where} is corrupt or holds more than tensors: {one_line(error, 300)}") from None
     if not isinstance(saved, Mapping):
-        raise CheckpointError(f"{where} holds no named tensors")
+        raise CheckpointError(f"{where} is not a mapping of names to tensors")
     return saved
 
 

@@ -30,7 +30,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class PatchSite:
-    """Size, resolution and difficulty of a patch."""
+    """Size, resolution and difficulty of one patch of the terrain."""
 
     size: tuple[float, float]
     """Extent along x and y [m]."""

@@ -81,7 +81,7 @@ class TerminationTermCfg(ManagerTermBaseCfg):
 
 @configclass
 class EventTermCfg(ManagerTermBaseCfg):
-    """An event."""
+    """Configuration of an event term: a function for startup, resets or intervals, with its parameters."""
 
     mode: str = MISSING
     interval_range_s: Any = None

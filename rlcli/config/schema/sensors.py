@@ -81,7 +81,7 @@ class RaySensorConfig(StrictModel):
         if any(x or y or z >= 0.0 for x, y, z in directions) or self.alignment == "base":
             raise ValueError("lookup needs rays straight down: directions [0, 0, -1], alignment yaw or world")
         if self.sees != "ground":
-            raise ValueError("lookup needs rays that see only the ground: sees: ground")
+            raise ValueError("lookup needs rays that see only the ground; set sees: ground, or remove lookup")
         return self
 
 

@@ -77,9 +77,9 @@ class EventConfig(TermConfig):
             raise ValueError("interval_range_s belongs to mode interval, and mode interval needs it")
 
         if self.global_time and self.mode != "interval":
-            raise ValueError("global_time belongs to mode interval")
+            raise ValueError("global_time belongs to mode interval; remove it or set mode: interval")
         if self.min_steps_between and self.mode != "reset":
-            raise ValueError("min_steps_between belongs to mode reset")
+            raise ValueError("min_steps_between belongs to mode reset; remove it or set mode: reset")
         return self
 
 
