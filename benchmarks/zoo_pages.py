@@ -171,10 +171,10 @@ def index(zoo: Path, found: list[Any]) -> str:
         "```",
         "",
         "A success rate is the share of successful episodes; `error_vel_xy` [m/s] and `error_vel_yaw` [rad/s] are mean",
-        "errors of velocity commands; `speed` is in m/s. The page of a task defines its success. Several values are those",
-        "of several seeds. Tier A: the required result is reached within the time limit. Tier B: it is a lower level,",
-        "reached with one seed. *Manager-based* tasks are [lists of terms](../../tutorials/first-task.md), *direct* tasks",
-        "are [one Python class](../../tutorials/direct-task.md).",
+        "errors of velocity commands; `speed` is in m/s. The page of a task defines its success. Several values are",
+        "those of several seeds. Tier A: the required result is reached within the time limit. Tier B: it is a lower",
+        "level, reached with one seed. *Manager-based* tasks are [lists of terms](../../tutorials/first-task.md),",
+        "*direct* tasks are [one Python class](../../tutorials/direct-task.md).",
         "",
         "| task | what the policy does | observations, actions | machine, minutes of the limit | result (required) |",
         "| --- | --- | --- | --- | --- |",
@@ -195,7 +195,7 @@ def index(zoo: Path, found: list[Any]) -> str:
         )
     lines += [
         "",
-        "- `make learn-TASK` trains a task and compares the result with the required one, which is in [zoo.yaml](zoo.yaml).",
+        "- `make learn-TASK` trains a task and compares the result with the required one in [zoo.yaml](zoo.yaml).",
         "- [Scores of other libraries](peers.md) compares results on Gymnasium's tasks.",
     ]
     return "\n".join(lines) + "\n"

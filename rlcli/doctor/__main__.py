@@ -126,7 +126,9 @@ def _render_image(backend: str) -> dict[str, Any]:
     canvas.free()
     context.free()
     if int(image.max()) - int(image.min()) < 16:
-        raise MachineError("rendering works, but the image is empty")
+        raise MachineError(
+            "rendering runs without an error, but the image is empty; try another MUJOCO_GL: egl, osmesa or glfw"
+        )
     return {"backend": backend, "brightest": int(image.max())}
 
 

@@ -1,6 +1,6 @@
 """Numbers of the configuration that a curriculum changes: each is a tensor that the code reads at each use.
 
-A curriculum can so change a weight, a range or a limit on the device, within a captured step.
+So a curriculum can change a weight, a range or a limit on the GPU, also when the step is a captured CUDA graph.
 """
 
 from __future__ import annotations

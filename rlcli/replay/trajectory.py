@@ -326,7 +326,7 @@ def read_trajectory(file: Path) -> Trajectory:
     """
     try:
         if file.exists() and not file.is_file():
-            raise ValueError("it is not a plain file")  # reading a pipe would block
+            raise ValueError("it is not a regular file")  # reading a pipe would block
         with safe_open(file, "pt") as opened:
             data = json.loads((opened.metadata() or {}).get("rlcli", "{}"))
             if not isinstance(data, dict) or "format" not in data:

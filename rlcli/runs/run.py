@@ -64,7 +64,7 @@ class Run:
         """Read the resolved configuration.
 
         Raises:
-            CheckpointError: if it is missing, corrupt, or not a plain file.
+            CheckpointError: if it is missing, corrupt, or not a regular file.
         """
         try:
             return strict_yaml.load(read_file(self.config, strict_yaml.MAX_BYTES))
@@ -169,7 +169,7 @@ def open_run(folder: Path) -> Run:
             refuse_links(folder / inner)
     for part in (folder / CONFIG, folder / "metrics.jsonl"):
         if part.exists() and not part.is_file():
-            raise CheckpointError(f"{part} is not a plain file")  # reading a pipe would block
+            raise CheckpointError(f"{part} is not a regular file")  # reading a pipe would block
     check_json(RunRecord, record, folder / RECORD)
     return Run(folder, record)
 
@@ -247,7 +247,7 @@ def require_own(run: Run, *parts: str) -> None:
             if stat.S_ISDIR(mode):
                 pending += path.iterdir()
             elif not stat.S_ISREG(mode):
-                raise OSError(errno.EINVAL, "it is not a plain file")
+                raise OSError(errno.EINVAL, "it is not a regular file")
             if count > _MAX_FILES:
                 raise OSError(errno.EFBIG, f"the run holds more than {_MAX_FILES} files")
         except FileNotFoundError:

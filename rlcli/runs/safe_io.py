@@ -73,7 +73,7 @@ def read_file(file: Path, limit: int, *, size: int | None = None) -> bytes:
         size: the size that the file must have [bytes]; None: any.
 
     Raises:
-        CheckpointError: if it is a link, not a plain file, too large or of another size, or cannot be read.
+        CheckpointError: if it is a link, not a regular file, too large or of another size, or cannot be read.
         FileNotFoundError: if it does not exist.
     """
     handle, status = _open(file)
@@ -97,7 +97,7 @@ def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
     """Read the last bytes of a plain file that may be growing; return them and whether they are the whole file.
 
     Raises:
-        CheckpointError: if it is a link, not a plain file, or cannot be read.
+        CheckpointError: if it is a link, not a regular file, or cannot be read.
         FileNotFoundError: if it does not exist.
     """
     handle, status = _open(file)
@@ -127,12 +127,12 @@ def _open(file: Path) -> tuple[int, os.stat_result]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         if getattr(error, "errno", None) in _NOT_A_FILE:
-            reason = "it is not a plain file"
+            reason = "it is not a regular file"
         raise CheckpointError(f"{file} cannot be read: {reason}") from None
     status = os.fstat(handle)
     if not stat.S_ISREG(status.st_mode):
         os.close(handle)
-        raise CheckpointError(f"{file} is not a plain file")
+        raise CheckpointError(f"{file} is not a regular file")
     return handle, status
 
 

@@ -205,7 +205,7 @@ class _MjcfScan:
 
     def _check_asset(self, path: Path, file: Path, line: int) -> None:
         if not path.is_file():
-            raise BadModel(f"{file}:{line}: '{path}' is not a plain file")
+            raise BadModel(f"{file}:{line}: '{path}' is not a regular file")
         size = path.stat().st_size
         if size > _MAX_ASSET:
             raise BadModel(f"{file}:{line}: '{path}' is larger than {_MAX_ASSET:,} bytes")

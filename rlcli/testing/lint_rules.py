@@ -25,7 +25,7 @@ from rlcli.testing.timestep_checks import energy_drift
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """Obstacle to learning in a task."""
+    """Finding of a lint rule: a property of a task that makes learning hard."""
 
     rule: str
     severity: Literal["error", "warning"]
@@ -120,7 +120,7 @@ DOMINANT = 0.99
 
 
 def dominant_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that no reward term is so large under every agent that the others have no effect."""
+    """Report a reward term that is so large, with every kind of action, that the other terms have no effect."""
     active = _weighted_terms(evidence)
     shares: dict[str, list[float]] = {name: [] for name in active}
     for rollout in evidence.rollouts:

@@ -194,7 +194,7 @@ def test_fifo_as_configuration_does_not_block(tmp_path):
     run = write_run(tmp_path, rows=learning())
     run.config.unlink()
     os.mkfifo(run.config)
-    with pytest.raises(CheckpointError, match="not a plain file"):
+    with pytest.raises(CheckpointError, match="not a regular file"):
         gather([run])
 
 

@@ -51,7 +51,7 @@ def test_read_file_refuses_a_link_that_appears_after_the_check(file, monkeypatch
     link = file.with_name("link")
     link.symlink_to(file)
     monkeypatch.setattr(type(file), "is_symlink", lambda self: False)
-    with pytest.raises(CheckpointError, match="link cannot be read: it is not a plain file"):
+    with pytest.raises(CheckpointError, match="link cannot be read: it is not a regular file"):
         read_file(link, 100)
 
 
@@ -64,7 +64,7 @@ def test_read_file_refuses_special_files_without_blocking(tmp_path, kind):
         os.mkfifo(odd)
     else:
         odd = type(odd)("/dev/zero")
-    with pytest.raises(CheckpointError, match="is not a plain file"):
+    with pytest.raises(CheckpointError, match="is not a regular file"):
         read_file(odd, 100)
 
 

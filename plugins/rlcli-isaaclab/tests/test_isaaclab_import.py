@@ -220,7 +220,7 @@ def test_pipe_and_endless_file_are_not_read(tmp_path, capsys):
     os.mkfifo(pipe)
     with sparse.open("wb") as file:
         file.truncate(2**40)
-    for file, why in ((pipe, "not a plain file"), (sparse, "larger than")):
+    for file, why in ((pipe, "not a regular file"), (sparse, "larger than")):
         assert main(["import", "isaaclab", str(file), "-o", str(tmp_path / "out")]) == 3
         assert why in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -186,7 +186,8 @@ class Randomizer:
             known = [".".join(p) for p in self.active_domain_randomizations]
             name = ".".join(path)
             raise TaskError(
-                f"'{name}' is not randomized", hint=did_you_mean(name, known) or f"randomized: {listing(known)}"
+                f"the YAML has no randomization of '{name}'",
+                hint=did_you_mean(name, known) or f"randomized: {listing(known)}",
             )
         return path
 

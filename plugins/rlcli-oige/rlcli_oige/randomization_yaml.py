@@ -110,7 +110,7 @@ class Gate:
 
 
 def gates(block: Mapping[str, Any]) -> list[Gate]:
-    """Return the gates of a block that passed `check`, without the ignored ones."""
+    """Return the gates (`on_startup`, `on_reset`, `on_interval`) of a checked block, without the ignored ones."""
     found = []
     for at, params in _entries(block):
         path = at[1:-1]

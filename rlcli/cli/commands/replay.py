@@ -97,7 +97,9 @@ def _print_calls(trajectory: Trajectory, result: Replay) -> None:
         place = f"environment {difference.env} differs first after engine call {difference.step}"
         text = f"{place} in {_values(difference, 'dumped')}"
         changed = "MuJoCo or the machine" if result.same_model else "the task's model"
-        console.info(f"{changed} has changed since the file was written (MuJoCo {header.mujoco})")
+        console.info(
+            f"{changed} has changed since the file was written with MuJoCo {header.mujoco}; the replay may differ"
+        )
         values = {"env": difference.env, "call": difference.step, "field": difference.field}
         for name in ("recorded", "replayed"):
             values[name] = [repr(value) for value in getattr(difference, name)]

@@ -258,7 +258,7 @@ class Sb3Trainer(BaseTrainer):
             raise DivergedError(f"{message} the losses are finite", hint=LEARNER_HINT)
 
     def _rollout_dependencies(self) -> list[tuple[str, Tensor]]:
-        """Return the named tensors that a rollout depends on."""
+        """Return the tensors that a rollout depends on, by name: normaliser and weights."""
         return [*moments([("observation", self.normalizer)]), *self._weights()]
 
     def _weights(self) -> list[tuple[str, Tensor]]:

@@ -169,9 +169,9 @@ BROKEN = {
     "no task": (lambda run: (run / "run.json").write_text("{}"), "missing key 'task'"),
     "a link out": (lambda run: (run / "config.yaml").replace(run.parent / "c") and (run / "config.yaml").symlink_to(
         run.parent / "c"), "is a link"),
-    "a pipe": (lambda run: ((run / "run.json").unlink(), os.mkfifo(run / "run.json")), "not a plain file"),
+    "a pipe": (lambda run: ((run / "run.json").unlink(), os.mkfifo(run / "run.json")), "not a regular file"),
     "metrics that are a pipe": (lambda run: ((run / "metrics.jsonl").unlink(), os.mkfifo(run / "metrics.jsonl")),
-                                "not a plain file"),
+                                "not a regular file"),
     "no config": (lambda run: (run / "config.yaml").unlink(), "no config.yaml"),
     "a state of its own": (lambda run: _edit(run, state="\x1b[31mfine"), "fine"),
 }  # fmt: skip
