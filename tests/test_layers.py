@@ -38,6 +38,8 @@ LIGHT = [
     "scaffold.py",
     "cli",
     "rl/trainer.py",
+    "envs/observers.py",
+    "training/signals.py",
     "rl/sb3/config.py",
     "rl/ppo/config.py",
     "rl/distributed.py",

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-from rlcli.envs.step import StepRecord
-from rlcli.sim.divergence_report import Divergence
+if TYPE_CHECKING:  # the start of a training imports this module before torch
+    from rlcli.envs.step import StepRecord
+    from rlcli.sim.divergence_report import Divergence
 
 
 class StepObserver:
