@@ -46,7 +46,7 @@ def open_scene(resolved: Resolved) -> Scene:
     return Scene(config.scene, config.sim, source.root, installed=source.distribution is not None)
 
 
-def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: int, shared_streams: int) -> Simulation:
+def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: int, streams: Tensor) -> Simulation:
     """Compile a scene and build its simulation, in the default state.
 
     Args:
@@ -54,7 +54,7 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
         binder: collects the names that do not resolve.
         device: device of the engine.
         seed: seed of the terrain's draws.
-        shared_streams: see `VecEnv`.
+        streams: number of the random stream of each environment. (num_envs,) int64
 
     Raises:
         ConfigError: if there is no model in which further names could be looked up.
@@ -67,7 +67,6 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
     scene.spec.visual.global_.offwidth = task.viewer.width
     scene.spec.visual.global_.offheight = task.viewer.height
     engine = open_engine(scene.compile(), task.scene.num_envs, task.sim, device=str(device))
-    engine.shared_streams = shared_streams
     data = SimData(engine)
     entities = _make_entities(scene, binder, engine, data)
     actuators = _make_actuators(entities, binder)
@@ -79,7 +78,7 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
     origins = torch.zeros(task.scene.num_envs, 3, device=device)
     terrain = None
     if task.scene.terrain is not None and scene.ground is not None:
-        terrain = Terrain(scene.ground, task.scene.terrain, origins, seed, shared_streams)
+        terrain = Terrain(scene.ground, task.scene.terrain, origins, seed, streams.numpy(force=True))
     return Simulation(engine, data, entities, actuators, sensors, default_state, origins, terrain)
 
 

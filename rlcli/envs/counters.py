@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from rlcli.envs.shard import Shard
 from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.sim.engine import Engine
 from rlcli.sim.selection import Field, Selection, in_place
@@ -17,11 +18,14 @@ from rlcli.sim.tensor_state import TensorState
 class EpisodeCounters(TensorState):
     """Counters of all environments. Each is also a field: the form that selections read and write fastest."""
 
-    def __init__(self, num_envs: int, device: torch.device) -> None:
-        self.ids = torch.arange(num_envs, device=device)
-        self.lengths = torch.zeros(num_envs, dtype=torch.int64, device=device)
-        # -1: the first reset of a new environment begins episode 0, like a reset with a seed
-        self.indices = torch.full((num_envs,), -1, dtype=torch.int64, device=device)
+    def __init__(self, shard: Shard, device: torch.device) -> None:
+        num_envs = shard.count
+        self.ids = torch.arange(shard.first, shard.first + num_envs, device=device)
+        """Numbers of the environments among those of all shards. (num_envs,) int64"""
+        memory = shard.counters
+        self.lengths, self.indices = torch.empty(2, num_envs, dtype=torch.int64, device=device) if memory is None else memory
+        self.lengths.zero_()
+        self.indices.fill_(-1)  # the first reset of a new environment begins episode 0, like a reset with a seed
         self.success_steps = torch.zeros(num_envs, device=device)
         """Number of consecutive steps in which the success condition holds. (num_envs,)"""
         self.common_step = torch.zeros((), dtype=torch.int64, device=device)

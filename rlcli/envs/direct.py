@@ -139,8 +139,8 @@ class DirectTask:
         """
         ids, episodes = env_ids.cpu().numpy(), self.env.episode_index.cpu().numpy()
         device = None if self.device.type == "cpu" else self.device
-        streams = self.env.engine.shared_streams
-        return IdSelection(ids, self.env.seed, episodes[ids], stream(f"direct.{name}"), device, streams)
+        key = stream(f"direct.{name}")
+        return IdSelection(ids, self.env.seed, episodes[ids], key, device, self.env.stream_ids)
 
     def selection(self, mask: Tensor, name: str) -> Selection | None:
         """Return the environments where `mask` (num_envs,) holds, to draw in the middle of an episode; None for none.
@@ -238,14 +238,14 @@ class DirectEnv(VecEnv):
         """Return the task's `extras`, by name."""
         return self.task.extras
 
-    def _task_metrics(self) -> dict[str, float]:
-        """Return the task's `extras`: numbers, and means of tensors."""
+    def metric_values(self) -> dict[str, Tensor]:
+        """Return the task's `extras`: numbers and tensors."""
         found = {}
         for name, value in self._extras().items():
             if isinstance(value, Tensor) and value.numel():
-                found[f"Task/{name}"] = float(value.float().mean())
+                found[f"Task/{name}"] = value
             elif isinstance(value, int | float):
-                found[f"Task/{name}"] = float(value)
+                found[f"Task/{name}"] = torch.tensor(float(value), dtype=torch.float64)
         return found
 
     def step_metrics(self) -> dict[str, Tensor]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from rlcli.config.load import Resolved, resolve
 from rlcli.config.python_task import source_of
 from rlcli.config.schema import TaskConfig
+from rlcli.envs.shard import Shard
 from rlcli.envs.vec_env import VecEnv
 from rlcli.machine import restore_garbage_collection
 from rlcli.registry import load_object
@@ -22,6 +23,7 @@ def make_env(
     device: str = "cpu",
     root: Path | None = None,
     shared_streams: int = 0,
+    shard: Shard | None = None,
 ) -> VecEnv:
     """Return the environment of a task, in the task's own workflow.
 
@@ -31,6 +33,7 @@ def make_env(
         device: device of the engine and of all tensors.
         root: folder of the models of a `TaskConfig`; by default the working directory.
         shared_streams: see `VecEnv`.
+        shard: see `VecEnv`.
     """
     restore_garbage_collection()  # garbage collection was delayed while large libraries were imported
     resolved = task if isinstance(task, Resolved) else resolve(source_of(task, root))
@@ -38,5 +41,5 @@ def make_env(
         env_class = resolved.format.load(resolved.format.spec.environment)
     else:
         env_class = load_object(_MANAGED if resolved.source.task is None else _DIRECT)
-    env: VecEnv = env_class(resolved, seed=seed, device=device, shared_streams=shared_streams)
+    env: VecEnv = env_class(resolved, seed=seed, device=device, shared_streams=shared_streams, shard=shard)
     return env

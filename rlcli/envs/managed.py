@@ -82,7 +82,7 @@ class ManagedEnv(VecEnv):
         self.observation_manager = ObservationManager(
             self._observations, configs, n, self.step_dt, device, select_all, tunable, watch
         )
-        self.curriculum_manager = CurriculumManager(bound["curriculum"], tunable, device)
+        self.curriculum_manager = CurriculumManager(bound["curriculum"], n, tunable, device)
 
     def stateful_objects(self) -> list[Any]:
         """Return the class terms."""
@@ -181,7 +181,7 @@ class ManagedEnv(VecEnv):
 
     def _before_full_reset(self) -> None:
         self.curriculum_manager.advance(self._counters.common_step)  # a reset with a seed sets the step to 0
-        self.event_manager.before_full_reset(self._select_all())
+        self.event_manager.before_full_reset(self._select_all_by_step())
 
     def _episode_metrics(self, ended: Selection) -> dict[str, Tensor]:
         return self.command_manager.episode(ended)
@@ -226,7 +226,7 @@ class ManagedEnv(VecEnv):
     def _restore_observations(self) -> dict[str, Tensor]:
         return self.observation_manager.recompute_last()
 
-    def _task_metrics(self) -> dict[str, float]:
+    def metric_values(self) -> dict[str, Tensor]:
         """Return the last values of the curriculum terms."""
         return self.curriculum_manager.values()
 

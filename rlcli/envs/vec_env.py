@@ -18,12 +18,14 @@ from rlcli.envs.build import build_simulation, grid, open_scene
 from rlcli.envs.counters import EpisodeCounters
 from rlcli.envs.divergence import DivergenceGuard
 from rlcli.envs.observers import Observers
+from rlcli.envs.shard import Shard
 from rlcli.envs.state import load_state, save_state
 from rlcli.envs.step import Episodes, StepRecord, StepResult
 from rlcli.envs.workflow import Workflow
 from rlcli.machine import require_device
 from rlcli.managers.term import Binder
 from rlcli.sim.selection import Field, Selection
+from rlcli.sim.tensor_state import means
 
 
 class VecEnv(Workflow):
@@ -37,19 +39,29 @@ class VecEnv(Workflow):
         device: device of the engine and of all tensors.
         shared_streams: environments i and i % shared_streams draw the same random numbers; 0: every environment has its
             own stream.
+        shard: the part of the task's environments that this object has; None: all of them.
 
     Raises:
         ConfigError: with everything that does not fit the compiled model.
         DeviceError: for a device that does not exist.
     """
 
-    def __init__(self, resolved: Resolved, *, seed: int = 42, device: str = "cpu", shared_streams: int = 0) -> None:
+    def __init__(
+        self,
+        resolved: Resolved,
+        *,
+        seed: int = 42,
+        device: str = "cpu",
+        shared_streams: int = 0,
+        shard: Shard | None = None,
+    ) -> None:
         require_device(device)
         self.resolved, self.config, self.seed = resolved, resolved.task, seed
         self.device = torch.device(device)
         self.step_dt, self.physics_dt = self.config.step_dt, self.config.sim.dt
         self.max_episode_length = self.config.max_episode_length
         self.num_envs = self.config.scene.num_envs
+        self.shard = shard or Shard(0, self.num_envs, self.num_envs)
         self.final_obs_of = "finished"
         self.seconds = {"physics": 0.0, "step": 0.0}
         self.observers = Observers()
@@ -57,7 +69,7 @@ class VecEnv(Workflow):
         """Called instead of the engine to step the simulations; it must write their states and derived fields."""
         self._playing = True
         self._last_obs: dict[str, Tensor] = {}
-        self._counters = EpisodeCounters(self.num_envs, self.device)
+        self._counters = EpisodeCounters(self.shard, self.device)
         self.episode_length_buf = self._counters.lengths
         """Steps of the running episode. (num_envs,) int64"""
         self.episode_index = self._counters.indices
@@ -70,7 +82,14 @@ class VecEnv(Workflow):
         self._binder = Binder(self, self.resolved)
         scene = open_scene(self.resolved)
         self._prepare_scene(scene)
-        built = build_simulation(scene, self._binder, self.device, self.seed, shared_streams)
+        distinct = shared_streams or self.shard.total
+        streams = self._counters.ids % distinct
+        self.stream_ids = streams.numpy(force=True) if shared_streams or self.shard.first else None
+        """Number of each environment's random stream; None: the number of its row. (num_envs,)"""
+        built = build_simulation(scene, self._binder, self.device, self.seed, streams)
+        built.engine.shared_streams = shared_streams
+        if built.engine.replayable is not None:
+            built.engine.replayable.stream_ids = self.stream_ids
         self.spec, self.views = scene.spec, scene.views
         self.engine, self.sim, self.entities = built.engine, built.data, built.entities
         self.actuators = built.actuators
@@ -82,8 +101,7 @@ class VecEnv(Workflow):
         self.terrain = built.terrain
         self.origins = built.origins
         """Start position of each environment in its world: zeros without a terrain. (num_envs, 3) [m]"""
-        distinct = shared_streams or self.num_envs
-        self.env_origins = grid(distinct, self.config.scene.env_spacing).to(self.device)[self._counters.ids % distinct]
+        self.env_origins = grid(distinct, self.config.scene.env_spacing).to(self.device)[streams]
         self._counters.attach(self.engine)
         self._bind_terms()
         success = self._binder.success()
@@ -143,7 +161,7 @@ class VecEnv(Workflow):
         for before_step in self.observers.before_step:
             before_step()
         start = time.perf_counter()
-        action = self._checked(action, restart)
+        action = self.check_action(action, self._action_shape, restart)
         self._apply_action(action)
         diverged = self._simulate()
         for after_physics in self.observers.after_physics:
@@ -164,9 +182,15 @@ class VecEnv(Workflow):
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
 
-    def _checked(self, action: Tensor, restart: Tensor | None) -> Tensor:
-        if action.shape != self._action_shape:
-            raise ValueError(f"action has shape {tuple(action.shape)}, expected {self._action_shape}")
+    def check_action(self, action: Tensor, shape: tuple[int, int], restart: Tensor | None) -> Tensor:
+        """Return an action with zeros where an environment restarts.
+
+        Raises:
+            ValueError: for another shape.
+            DivergedError: for a number that is not finite.
+        """
+        if action.shape != shape:
+            raise ValueError(f"action has shape {tuple(action.shape)}, expected {shape}")
         self.engine.use_torch_stream()
         if restart is not None:
             action = action.masked_fill(restart[:, None], 0.0)
@@ -254,6 +278,11 @@ class VecEnv(Workflow):
         """Return whether a mask holds anywhere; True on a GPU, where reading the mask would force a host sync."""
         return self.engine.asynchronous or len(mask.nonzero()[0]) > 0
 
+    @property
+    def local(self) -> VecEnv:
+        """The environment of this process, with terms and managers: this object, if no other process steps a part."""
+        return self
+
     def compute_success(self) -> Tensor | None:
         """Return where the success condition holds in the current state; None without one. (num_envs,) bool"""
         success = self._counters.success
@@ -298,7 +327,11 @@ class VecEnv(Workflow):
 
     def extras(self) -> dict[str, float]:
         """Return further numbers to log: the task's values of the last step, and new divergences by cause."""
-        return {**self._task_metrics(), **self._guard.metrics()}
+        return {**means(self.metric_values()), **self.divergence_metrics()}
+
+    def divergence_metrics(self) -> dict[str, float]:
+        """Return `Sim/diverged/CAUSE` -> number of environments that have diverged since the last call."""
+        return self._guard.metrics()
 
     def close(self) -> None:
         """Close the engine and the sensors that render."""

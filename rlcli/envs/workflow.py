@@ -95,8 +95,8 @@ class Workflow(ABC):
         """Return the observations of a state that has just been loaded."""
         return self._compute_observations()
 
-    def _task_metrics(self) -> dict[str, float]:
-        """Return the task's own numbers to log, of the last step."""
+    def metric_values(self) -> dict[str, Tensor]:
+        """Return the task's own numbers of the last step, whose means are logged. (num_envs, ...) or any shape"""
         return {}
 
     @abstractmethod

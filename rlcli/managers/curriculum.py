@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
 from rlcli.managers.term import BoundTerm
 from rlcli.managers.tunable import TunableValues
 from rlcli.sim.selection import Selection
-from rlcli.sim.tensor_state import TensorState
+from rlcli.sim.tensor_state import TensorState, mean_of
 
 
 class CurriculumManager(TensorState):
@@ -20,12 +22,12 @@ class CurriculumManager(TensorState):
     or (num_envs,); its mean is logged.
     """
 
-    def __init__(self, terms: list[BoundTerm], tunable: TunableValues, device: torch.device) -> None:
+    def __init__(self, terms: list[BoundTerm], num_envs: int, tunable: TunableValues, device: torch.device) -> None:
         self.terms = terms
         self._tunable = tunable
         self._scheduled = [term for term in terms if hasattr(term.instance, "advance")]
         self._per_episode = [term for term in terms if not hasattr(term.instance, "advance")]
-        self._values = {term.name: torch.full((), torch.nan, device=device) for term in terms}
+        self._values = {term.name: torch.full((num_envs,), torch.nan, device=device) for term in terms}
 
     def advance(self, step: Tensor) -> None:
         """Advance the schedules to a step. step () int64"""
@@ -37,17 +39,26 @@ class CurriculumManager(TensorState):
         for term in self._per_episode:
             self._store(term, term.call(ended.stream(term.stream)))
 
-    def values(self) -> dict[str, float]:
-        """Return the last value of each term, by its metric name."""
-        return {f"Curriculum/{name}": float(value) for name, value in self._values.items()}
+    def values(self) -> dict[str, Tensor]:
+        """Return the last values of each term, by its metric name. (num_envs,)"""
+        return {f"Curriculum/{name}": value for name, value in self._values.items()}
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tunable values, and the last logged values."""
-        logged = {f"value.{name}": value for name, value in self._values.items()}
-        return {**logged, **{f"live.{path}": value for path, value in self._tunable.tensors().items()}}
+        """Return the tunable values."""
+        return {f"live.{path}": value for path, value in self._tunable.tensors().items()}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of the tunable values, and the means of the logged values."""
+        return {**super().state_dict(), **{f"value.{name}": mean_of(value) for name, value in self._values.items()}}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore the state returned by `state_dict()`."""
+        super().load_state_dict(state)
+        for name, value in self._values.items():
+            value.copy_(state[f"value.{name}"])
 
     def _store(self, term: BoundTerm, value: Tensor | float | None) -> None:
         if isinstance(value, Tensor):
-            self._values[term.name].copy_(value.float().mean() if value.dim() else value)
+            self._values[term.name].copy_(value if value.dim() < 2 else value.float().mean())
         elif value is not None:
             self._values[term.name].fill_(value)

@@ -63,11 +63,14 @@ class EventManager(TensorState):
         self._derive_constants(self._startup, all_envs)
 
     def before_full_reset(self, all_envs: Selection) -> None:
-        """Forget when reset events fired, and draw the global timers, before all environments are reset."""
+        """Forget when reset events fired, and draw the global timers, before all environments are reset.
+
+        The draws of `all_envs` are keyed by the step.
+        """
         self._fired_at.fill_(_NEVER)
         for term, left in self._intervals:
             if _is_global(term):
-                all_envs.write(left, self._draw(term, all_envs, _FIRST)[:1])
+                all_envs.write(left, self._draw(term, all_envs, _FIRST))
 
     def reset(self, selection: Selection, step: Tensor) -> None:
         """Fire the reset events of new episodes at a `step` of training, and start their interval timers."""
@@ -95,14 +98,12 @@ class EventManager(TensorState):
         for instance in self._updating:
             instance.update(select, running)
         for term, left in self._intervals:
-            is_global = _is_global(term)
-            left -= 1 if is_global else running
+            left -= 1 if _is_global(term) else running
             due = select(left <= 0)
             if due is not None:
                 term.call(due.stream(term.stream))
                 self._derive_constants([term], due)
-                steps = self._draw(term, due, _NEXT)
-                due.write(left, steps[:1] if is_global else steps)
+                due.write(left, self._draw(term, due, _NEXT))
                 fired(due)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -119,7 +120,9 @@ class EventManager(TensorState):
 
     def _draw(self, term: BoundTerm, selection: Selection, timer: np.uint64) -> Tensor:
         low, high = term.config.interval_range_s  # type: ignore[attr-defined]
-        steps = selection.stream(term.stream ^ timer).uniform(low, high).double() / self._step_dt
+        stream = selection.stream(term.stream ^ timer)
+        drawn = stream.uniform_of_first(low, high) if _is_global(term) else stream.uniform(low, high)
+        steps = drawn.double() / self._step_dt
         return (steps * (1.0 - 1e-6)).ceil_().long()  # the slack absorbs rounding: 0.1 s at 0.02 s are 5 steps
 
 

@@ -26,6 +26,7 @@ _COSMETIC = frozenset(("summary", "viewer"))
 _COSMETIC_KEYS = frozenset(
     [
         ("sim", "engine_threads"),
+        ("scene", "workers"),
         ("sim", "render_interval"),
         ("scene", "env_spacing"),
         ("agents", "default"),

@@ -138,17 +138,17 @@ class Terrain:
         config: configuration of the terrain.
         origins: start positions of the environments; this object updates them. (num_envs, 3) [m]
         seed: seed of the start levels.
-        shared_streams: environments i and i % shared_streams have the same start; 0: every environment has its own.
+        streams: number of the random stream of each environment; equal numbers have the same start. (num_envs,)
     """
 
     def __init__(
-        self, ground: Ground, config: TerrainConfig, origins: Tensor, seed: int, shared_streams: int = 0
+        self, ground: Ground, config: TerrainConfig, origins: Tensor, seed: int, streams: NDArray[np.int64]
     ) -> None:
         device, count = origins.device, len(origins)
         self.origins = torch.from_numpy(ground.origins).to(device)
         """Start position on each patch. (rows, columns, 3) [m]"""
-        self._names = np.arange(count) % (shared_streams or max(1, count))
-        self.types = torch.from_numpy(self._names).to(device) % self.origins.shape[1]
+        self._streams = streams
+        self.types = torch.from_numpy(streams).to(device) % self.origins.shape[1]
         """Column of each environment. (num_envs,) int64"""
         self.levels = torch.zeros(count, dtype=torch.int64, device=device)
         """Row of each environment. (num_envs,) int64"""
@@ -167,7 +167,7 @@ class Terrain:
 
     def start(self, seed: int) -> None:
         """Move every environment to its start level, which depends only on the seed and its number."""
-        keys = random.row_keys(seed, self._names, np.zeros_like(self._names))
+        keys = random.row_keys(seed, self._streams, np.zeros_like(self._streams))
         self.levels.copy_(torch.from_numpy(random.integers(keys, _START, 0, 1, self._start_levels)[:, 0]))
         self._env_origins.copy_(self.origins[self.levels, self.types])
 

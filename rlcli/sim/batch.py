@@ -52,6 +52,8 @@ class BatchEngine(BatchState):
         threads = config.engine_threads or available_cores()
         super().__init__(model, num_envs, threads, persistent=config.external_forces)
         self.shared_streams = 0
+        self.stream_ids: NDArray[np.int64] | None = None
+        """Number of each world's random stream; None: the number of the world. (num_envs,)"""
         self.device = torch.device("cpu")
         self.divergence_causes: dict[str, int] = {}
         self.described_divergences: list[report.Divergence] = []
@@ -241,7 +243,7 @@ class BatchEngine(BatchState):
         ids = np.asarray(mask).nonzero()[0]
         if not len(ids):
             return None
-        return IdSelection(ids, seed, np.asarray(counters)[ids], shared_streams=self.shared_streams)
+        return IdSelection(ids, seed, np.asarray(counters)[ids], stream_ids=self.stream_ids)
 
     def rays(
         self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None

@@ -153,6 +153,11 @@ class ReplayableEngine(Engine, Protocol):
     """Whether `set_constants` has been called."""
     state_layout: StateLayout
     history: StateHistory
+    step_stage: int
+    """Stage (mjtStage) that is computed after the last physics step of a call, for the bound fields."""
+
+    stream_ids: NDArray[np.int64] | None
+    """Number of each world's random stream; None: the number of the world. (num_envs,)"""
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
         """Record the last calls of `step`: `calls` of them, or as many as fit into `memory` bytes."""

@@ -51,6 +51,10 @@ class MaskSelection:
             return self._uniform(0.0, 1.0, shape).mul_(high - low).add_(low)
         return self._uniform(low, high, shape)
 
+    def uniform_of_first(self, low: float, high: float) -> Tensor:
+        """Draw one uniform number for all environments: the number that environment 0 draws. (1,)"""
+        return self._uniform(low, high, ())[:1]
+
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Draw Gaussian numbers. (num_envs, *shape)"""
         return self._draw(warp_kernels.draw_normal, shape, 2).mul_(std).add_(mean)

@@ -57,6 +57,9 @@ class Selection(Protocol):
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Draw uniform numbers in [low, high). (rows, *shape)"""
 
+    def uniform_of_first(self, low: float, high: float) -> Tensor:
+        """Draw one uniform number for all environments: the number that environment 0 draws. (1,)"""
+
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Draw Gaussian numbers. (rows, *shape)"""
 
@@ -129,8 +132,7 @@ class IdSelection:
         counters: number of each row's random sequence, usually its episode. (rows,)
         stream_key: the stream to draw from, a result of `rlcli.random.stream`.
         device: device of the random numbers; None: the CPU.
-        shared_streams: environments i and i % shared_streams draw the same random numbers; 0: every environment has
-            its own stream.
+        stream_ids: number of each environment's random stream; None: its id. (num_envs,)
     """
 
     ids: NDArray[np.int64]
@@ -138,7 +140,7 @@ class IdSelection:
     counters: NDArray[np.int64]
     stream_key: np.uint64 = DEFAULT_STREAM
     device: torch.device | None = None
-    shared_streams: int = 0
+    stream_ids: NDArray[np.int64] | None = None
     _keys: random.Keys | None = field(default=None, init=False)
     _drawn: int = field(default=0, init=False)
 
@@ -151,6 +153,11 @@ class IdSelection:
         """Draw uniform numbers in [low, high). (rows, *shape)"""
         lowest, highest = _on_host(low), _on_host(high)
         return self._scaled(random.uniform(*self._next(math.prod(shape))), highest - lowest, lowest, shape)
+
+    def uniform_of_first(self, low: float, high: float) -> Tensor:
+        """Draw one uniform number for all environments: the number that environment 0 draws. (1,)"""
+        first = np.zeros(1, np.int64)
+        return IdSelection(first, self.seed, self.counters[:1], self.stream_key, self.device).uniform(low, high)
 
     def normal(self, mean: float | Tensor, std: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Draw Gaussian numbers. (rows, *shape)"""
@@ -206,7 +213,7 @@ class IdSelection:
         return other
 
     def _with(self, ids: NDArray[np.int64], counters: NDArray[np.int64], stream_key: np.uint64) -> IdSelection:
-        return IdSelection(ids, self.seed, counters, stream_key, self.device, self.shared_streams)
+        return IdSelection(ids, self.seed, counters, stream_key, self.device, self.stream_ids)
 
     def _scaled(
         self, drawn: NDArray[Any], scale: float | NDArray[Any], offset: float | NDArray[Any], shape: tuple[int, ...]
@@ -226,8 +233,8 @@ class IdSelection:
 
     def _row_keys(self) -> random.Keys:
         if self._keys is None:
-            names = self.ids % self.shared_streams if self.shared_streams else self.ids
-            self._keys = random.row_keys(self.seed, names, self.counters)
+            streams = self.ids if self.stream_ids is None else self.stream_ids[self.ids]
+            self._keys = random.row_keys(self.seed, streams, self.counters)
         return self._keys
 
     def _next(self, count: int) -> tuple[random.Keys, np.uint64, int, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 
@@ -22,6 +23,17 @@ class TensorState:
         """Restore the state returned by `state_dict()`."""
         for name, tensor in self.tensors().items():
             tensor.copy_(state[name])
+
+
+def mean_of(values: Tensor) -> Tensor:
+    """Return the mean of some values; equal values have themselves as their mean, without a rounding error. ()"""
+    values = values.flatten().float()
+    return torch.where((values == values[0]).all(), values[0], values.mean())
+
+
+def means(values: Mapping[str, Tensor]) -> dict[str, float]:
+    """Return the means of some tensors as numbers."""
+    return {name: float(mean_of(value)) if value.dim() else float(value) for name, value in values.items()}
 
 
 def substate(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

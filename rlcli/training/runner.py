@@ -137,7 +137,7 @@ def _open_writer(job: Job, env: VecEnv) -> CheckpointWriter:
     """Open the writer of checkpoints and the recorder of failed episodes."""
     run, agent = job.run, job.resolved.agent
     assert agent is not None
-    manifest = manifest_entries(run, agent.trainer, env.layout, describe(env))
+    manifest = manifest_entries(run, agent.trainer, env.layout, describe(env.local))
     keep = Keep() if job.stages else Keep.from_settings(agent.keep_last, agent.keep_every, agent.save_interval)
     cases = None
     if job.writes and not job.stages:

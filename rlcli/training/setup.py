@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from rlcli.envs.make import make_env
+from rlcli.envs.sharding.choice import make_training_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, RlcliError, one_line
 from rlcli.random import derive
@@ -61,7 +61,7 @@ def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int)
     assert resolved.trainer is not None
     ranks = distributed.current()
     seed_generators(ranks.seed(derive(seed, "task"), "task"))  # a task may draw random numbers while it is built
-    env = make_env(resolved, seed=ranks.seed(seed, "environments"), device=device)
+    env = make_training_env(resolved, seed=ranks.seed(seed, "environments"), device=device)
     try:
         make: Callable[..., Trainer] = load_object(resolved.trainer.trainer)
         return make(env, resolved.agent, seed=seed, device=device, torch_threads=torch_threads), env

@@ -209,7 +209,7 @@ class Randomizer:
         numbers = ids.cpu().numpy()
         counters = env.episode_index.cpu().numpy()[numbers] if step is None else np.full(len(numbers), step)
         device = None if env.device.type == "cpu" else env.device
-        rows = IdSelection(numbers, env.seed, counters, stream(f"oige.{gate.name}"), device, env.engine.shared_streams)
+        rows = IdSelection(numbers, env.seed, counters, stream(f"oige.{gate.name}"), device, env.stream_ids)
         low, high = self._bounds(gate, size)
         if gate.distribution == "gaussian":
             sample = rows.normal(0.0, 1.0, (size,)) * high + low

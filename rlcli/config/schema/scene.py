@@ -215,6 +215,9 @@ class SceneConfig(StrictModel):
 
     num_envs: Annotated[int, Field(ge=1, le=1 << 24)] = 1024
     """Number of environments that are simulated in parallel."""
+    workers: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = "auto"
+    """Number of processes that step the environments of a training on a CPU. No result depends on it. auto: as many as
+    pay for this number of environments and cores, and one for a task with code of its own."""
     env_spacing: NotNegative = 4.0
     """Distance between environments in viewers [m]. In the physics each environment is a world with its own origin."""
     ground: GroundConfig | None = GroundConfig()

@@ -1,0 +1,45 @@
+"""Part of the environments of a task that one process steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """Consecutive environments, among all environments of a task."""
+
+    first: int
+    """Number of the first environment."""
+    count: int
+    """Number of environments."""
+    total: int
+    """Number of environments of all shards."""
+    counters: Tensor | None = field(default=None, compare=False)
+    """Memory for the lengths and the numbers of this shard's running episodes; None: new memory. (2, count) int64"""
+
+    @property
+    def rows(self) -> slice:
+        """Rows of this shard's environments in a tensor of all environments."""
+        return slice(self.first, self.first + self.count)
+
+
+def split(total: int, shards: int) -> list[Shard]:
+    """Split environments into shards of nearly equal size, the smallest first.
+
+    With several shards the first and the last differ in size: a tensor with one row per environment is then recognised
+    by its shape (`rlcli.envs.sharding.state`).
+
+    Raises:
+        ValueError: for fewer than two environments per shard.
+    """
+    if shards > 1 and total < 2 * shards:
+        raise ValueError(f"{total} environments cannot be split into {shards} shards of at least two")
+    sizes = [total // shards + (number >= shards - total % shards) for number in range(shards)]
+    if shards > 1 and sizes[0] == sizes[-1]:
+        sizes[0], sizes[-1] = sizes[0] - 1, sizes[-1] + 1
+    return [Shard(sum(sizes[:number]), size, sum(sizes)) for number, size in enumerate(sizes)]

@@ -1,0 +1,54 @@
+"""Tensors in memory that processes share."""
+
+from __future__ import annotations
+
+import math
+import mmap
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_ALIGNMENT = 64
+"""Alignment of each tensor [bytes]: a cache line, so that two processes never write to the same line by accident."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArraySpec:
+    """Shape and type of a shared tensor."""
+
+    shape: tuple[int, ...]
+    dtype: torch.dtype
+
+    @property
+    def size(self) -> int:
+        """Size with padding [bytes]."""
+        used = math.prod(self.shape) * self.dtype.itemsize
+        return -(-used // _ALIGNMENT) * _ALIGNMENT
+
+
+def create_shared_file() -> int:
+    """Create a file in memory without a name and return its descriptor; it disappears with the last process."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("rlcli")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
+
+
+def map_tensors(descriptor: int, specs: Mapping[str, ArraySpec]) -> dict[str, Tensor]:
+    """Return tensors in the memory of a shared file. The same specs give the same tensors in every process."""
+    size = max(sum(spec.size for spec in specs.values()), _ALIGNMENT)
+    if os.fstat(descriptor).st_size < size:
+        os.ftruncate(descriptor, size)
+    memory, offset, tensors = mmap.mmap(descriptor, size), 0, {}
+    for name, spec in specs.items():
+        count = math.prod(spec.shape)
+        if count:
+            tensors[name] = torch.frombuffer(memory, dtype=spec.dtype, count=count, offset=offset).view(spec.shape)
+        else:
+            tensors[name] = torch.zeros(spec.shape, dtype=spec.dtype)
+        offset += spec.size
+    return tensors

@@ -1,0 +1,83 @@
+"""Messages between the main process and a worker, over a pair of sockets."""
+
+from __future__ import annotations
+
+import pickle
+import socket
+import struct
+import time
+from typing import Any
+
+_HEADER = struct.Struct("=2sq")
+"""Kind of the message, and size of its pickled content [bytes]."""
+SPIN_S = 50e-6
+"""Time for which a receiver polls before it sleeps: to wake a sleeping process takes about as long [s]."""
+
+
+class ChannelClosedError(Exception):
+    """The other process has ended."""
+
+
+class Channel:
+    """One end of a connection. A message has a kind, one or two bytes, and a content that is pickled unless it is None.
+
+    Both ends belong to the same user and the same command: nothing else can connect.
+
+    Args:
+        connection: a stream socket.
+        spin_s: time to poll for a message before sleeping [s].
+    """
+
+    def __init__(self, connection: socket.socket, spin_s: float) -> None:
+        self._socket, self._spin_s = connection, spin_s
+        self._socket.setblocking(True)
+
+    def send(self, kind: bytes, content: Any = None) -> None:
+        """Send a message.
+
+        Raises:
+            ChannelClosedError: if the other process has ended.
+        """
+        body = b"" if content is None else pickle.dumps(content, protocol=pickle.HIGHEST_PROTOCOL)
+        try:
+            self._socket.sendall(_HEADER.pack(kind, len(body)) + body)
+        except OSError as error:
+            raise ChannelClosedError from error
+
+    def receive(self) -> tuple[bytes, Any]:
+        """Wait for a message; return its kind and content.
+
+        Raises:
+            ChannelClosedError: if the other process has ended.
+        """
+        kind, size = _HEADER.unpack(self._first_bytes(_HEADER.size))
+        return kind.rstrip(b"\0"), pickle.loads(self._read(size)) if size else None
+
+    def close(self) -> None:
+        """Close this end."""
+        self._socket.close()
+
+    def _first_bytes(self, size: int) -> bytes:
+        """Return the first bytes of a message; poll for a short time, then sleep."""
+        end = time.perf_counter() + self._spin_s
+        while time.perf_counter() < end:
+            try:
+                data = self._socket.recv(size, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                continue
+            except OSError as error:
+                raise ChannelClosedError from error
+            return data if len(data) == size else data + self._read(size - len(data), ended=not data)
+        return self._read(size)
+
+    def _read(self, size: int, ended: bool = False) -> bytes:
+        buffer, done = bytearray(size), 0
+        while done < size:
+            try:
+                count = 0 if ended else self._socket.recv_into(memoryview(buffer)[done:])
+            except OSError as error:
+                raise ChannelClosedError from error
+            if count == 0:
+                raise ChannelClosedError
+            done += count
+        return bytes(buffer)

@@ -1,0 +1,76 @@
+"""Number of worker processes of an environment, and `make_training_env`."""
+
+from __future__ import annotations
+
+import os
+from typing import cast
+
+from rlcli.config.load import Resolved
+from rlcli.config.schema import CameraSensorConfig
+from rlcli.envs.make import make_env
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import ConfigError
+from rlcli.machine import available_cores
+
+ENVS_PER_WORKER = 256
+"""Smallest number of environments for which a further process pays: below it, its fixed cost per step outweighs it."""
+_TESTED = ("rlcli", "rlcli-gymnasium", "rlcli-menagerie")
+"""Distributions whose tasks are tested with several workers."""
+
+
+def make_training_env(resolved: Resolved, *, seed: int, device: str) -> VecEnv:
+    """Return the environment of a training, in as many processes as `scene.workers` says.
+
+    Raises:
+        ConfigError: if the task cannot run in several processes.
+    """
+    workers = number_of_workers(resolved, device)
+    if workers == 1:
+        return make_env(resolved, seed=seed, device=device)
+    from rlcli.envs.sharding.env import ShardedEnv
+
+    return cast(VecEnv, ShardedEnv(resolved, workers=workers, seed=seed))
+
+
+def number_of_workers(resolved: Resolved, device: str) -> int:
+    """Return the number of processes that step the environments of a task.
+
+    Raises:
+        ConfigError: for a number that the task or the machine does not allow.
+    """
+    scene = resolved.task.scene
+    if scene.workers == 1:
+        return 1
+    reason = _reason_for_one(resolved, device)
+    if scene.workers == "auto":
+        cores = resolved.task.sim.engine_threads or available_cores()
+        if reason is not None or not _environments_are_independent(resolved):
+            return 1
+        return max(1, min(cores, scene.num_envs // ENVS_PER_WORKER))
+    if reason is None and scene.num_envs < 2 * scene.workers:
+        reason = f"{scene.num_envs} environments are too few; each worker needs two"
+    if reason is not None:
+        problem = resolved.problem(("scene", "workers"), f"{scene.workers} workers cannot step it: {reason}", "set it to 1")
+        raise ConfigError([problem])
+    return scene.workers
+
+
+def _reason_for_one(resolved: Resolved, device: str) -> str | None:
+    """Return why several processes cannot step a task; None: they can."""
+    task = resolved.task
+    if device.partition(":")[0] != "cpu" or task.sim.engine == "warp":
+        return "a GPU steps all environments at once"
+    if os.name == "nt":
+        return "it needs Linux or macOS"
+    for name, term in task.curriculum.items():
+        if term is not None and term.func in resolved.vocabulary.own:
+            return f"curriculum '{name}' is a function of the task, and may use all environments"
+    return None
+
+
+def _environments_are_independent(resolved: Resolved) -> bool:
+    """Return whether all code that steps the environments is known to treat each of them by itself."""
+    if any(isinstance(sensor, CameraSensorConfig) for sensor in resolved.task.scene.sensors.values()):
+        return False  # a renderer for each process would need several times the memory
+    has_own_code = resolved.source.task is not None or bool(resolved.vocabulary.own)
+    return not has_own_code or resolved.source.distribution in _TESTED

@@ -1,0 +1,374 @@
+"""Environment whose parts are stepped by several processes at the same time."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rlcli.config.load import Resolved
+from rlcli.envs.layout import Layout
+from rlcli.envs.make import make_env
+from rlcli.envs.observers import Observers
+from rlcli.envs.shard import Shard, split
+from rlcli.envs.sharding import worker
+from rlcli.envs.sharding.arrays import map_tensors
+from rlcli.envs.sharding.engine import ShardedEngine, sums
+from rlcli.envs.sharding.runner import (
+    SLOTS,
+    Columns,
+    Needs,
+    ShardRunner,
+    Stage,
+    array_specs,
+    counter_specs,
+    read_episodes,
+)
+from rlcli.envs.sharding.state import join, join_states, split_state
+from rlcli.envs.sharding.worker import Job
+from rlcli.envs.sharding.workers import Worker, Workers
+from rlcli.envs.step import Episodes, StepRecord, StepResult
+from rlcli.envs.vec_env import VecEnv
+from rlcli.machine import available_cores
+from rlcli.sim.divergence_report import MAX_DESCRIBED
+from rlcli.sim.tensor_state import mean_of, means
+
+
+class ShardedEnv:
+    """Environments of a task in shards: this process steps the first one, and each worker process another.
+
+    It has the public interface of `VecEnv`, and all its results are bit-identical to those of one process. Entities,
+    managers and terms are not part of it; `local` has those of the first shard.
+
+    Args:
+        resolved: a validated configuration.
+        workers: number of processes that step environments, with this one.
+        seed: seed of every random draw of the environment.
+        shared_streams: see `VecEnv`.
+
+    Raises:
+        ConfigError: with everything that does not fit the compiled model.
+        MachineError: if a worker process ends.
+    """
+
+    def __init__(self, resolved: Resolved, *, workers: int, seed: int = 42, shared_streams: int = 0) -> None:
+        total = resolved.task.scene.num_envs
+        self._shards = split(total, workers)
+        parts = _resolved_parts(resolved, self._shards)
+        generator_state = torch.get_rng_state()
+        numbered = list(enumerate(zip(parts, self._shards, strict=True)))[1:]
+        jobs = [Job(part, seed, shared_streams, shard, number, generator_state) for number, (part, shard) in numbered]
+        self._workers = Workers(jobs)
+        try:
+            counters = map_tensors(self._workers.arrays, counter_specs(total))["counters"]
+            first = replace(self._shards[0], counters=counters[:, self._shards[0].rows])
+            self.local = make_env(parts[0], seed=seed, shared_streams=shared_streams, shard=first)
+            self._workers.replies()
+            specs = array_specs(self.local, total, workers)
+            self._workers.request(worker.MAP, specs)
+            self._arrays = map_tensors(self._workers.arrays, specs)
+            self._workers.replies()
+        except BaseException:
+            self._workers.close()
+            raise
+        self._runner = ShardRunner(self.local, 0, self._arrays, self._reach)
+        self._command = self._arrays["command"].numpy()
+        self._columns: list[Columns | None] = [None] * workers
+        self._slot = 0
+        self._episodes: Episodes | None = None
+        self._waiting: dict[Worker, tuple[Stage, Any]] = {}
+        """Workers that wait for the others at a stage of the step, and what they sent."""
+        self._stage: Stage | None = None
+        """Stage whose observers run."""
+        self._is_broken = False
+        self._playing = True
+        self.resolved, self.config = resolved, resolved.task
+        self.num_envs, self.device = total, self.local.device
+        self.step_dt, self.physics_dt = self.local.step_dt, self.local.physics_dt
+        self.max_episode_length = self.local.max_episode_length
+        self.layout: Layout = self.local.layout
+        self.final_obs_of = "finished"
+        self.seconds = {"physics": 0.0, "step": 0.0}
+        self.observers = Observers()
+        self.episode_length_buf, self.episode_index = counters
+        """Steps of the running episodes, and numbers of the episodes before them. (num_envs,) int64 each"""
+        self.engine = ShardedEngine(self, total)
+        self._last_obs: dict[str, Tensor] = {}
+
+    # --- the interface of VecEnv ---
+
+    def reset(self, seed: int | None = None, *, episode: int = 0) -> dict[str, Tensor]:
+        """Start a new episode everywhere, and return observations by group; see `VecEnv.reset`."""
+        self._begin()
+        with self._in_step():
+            self._workers.request(worker.RESET, (seed, episode))
+            self._runner.reset(seed, episode)
+        return self._obs()
+
+    def step(self, action: Tensor, restart: Tensor | None = None) -> StepResult:
+        """Apply one action in every environment; see `VecEnv.step`."""
+        if not self._playing:
+            raise RuntimeError("the environment is paused")
+        for before_step in self.observers.before_step:
+            before_step()
+        start = time.perf_counter()
+        arrays = self._arrays
+        self.local.check_action(action, (self.num_envs, self.layout.action_size), restart)
+        arrays["action"].copy_(action)
+        if restart is not None:
+            arrays["restart"].copy_(restart)
+        self._begin()
+        self._command[2:4] = self.final_obs_of == "truncated", restart is not None
+        with self._in_step():
+            self._workers.request(worker.STEP)
+            self._runner.step()
+        slot = self._slot
+        final_obs = None
+        if bool(arrays["counts"][:, 1].any()):
+            final_obs = {group: arrays[f"final.{group}"] for group in self.layout.observations}
+        reward, terminated, truncated = (arrays[name][slot] for name in ("reward", "terminated", "truncated"))
+        if not self.observers.on_step:
+            self._read_episodes()
+        obs = self._obs()
+        self.seconds["physics"] = float(arrays["seconds"][:, 0].mean())
+        self.seconds["step"] += time.perf_counter() - start
+        return StepResult(obs, reward, terminated, truncated, final_obs, self._episodes)
+
+    def compute_success(self) -> Tensor | None:
+        """Return where the success condition holds in the current state; None without one. (num_envs,) bool"""
+        parts = self.call_all(_success)
+        return None if parts[0] is None else torch.cat(parts)
+
+    def check(self) -> None:
+        """Do nothing: a CPU raises errors in the step."""
+
+    def extras(self) -> dict[str, float]:
+        """Return further numbers to log: the task's values of the last step, and new divergences by cause."""
+        return {**means(self._metric_values()), **sums(self.call_all(_divergence_metrics))}
+
+    def step_metrics(self) -> dict[str, Tensor]:
+        """Return the task's own numbers to log; see `VecEnv.step_metrics`. (num_envs,) each"""
+        parts = self.call_all(_step_metrics)
+        return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of everything that the next steps depend on; the same as that of one process."""
+        state = join_states(self.call_all(_state))
+        # the only values of all environments: the means that curriculum terms log
+        logged = {f"workflow.curriculum.value.{name[11:]}": value for name, value in self._metric_values().items()}
+        return state | {name: mean_of(value) for name, value in logged.items() if name in state}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Restore the state returned by `state_dict()`, of any number of processes; see `VecEnv.load_state_dict`."""
+        shapes = self.call_all(_state_shapes)
+        present = {name: [part[name] for part in shapes] for name in shapes[0]}
+        own, *others = split_state(state, present, self._shards)
+        self._begin()
+        with self._in_step():
+            for process, part in zip(self._workers, others, strict=True):
+                process.send(worker.LOAD, part)
+            self._runner.load(own)
+        return self._obs()
+
+    @property
+    def seed(self) -> int:
+        """Seed of every random draw."""
+        return self.local.seed
+
+    @property
+    def common_step(self) -> int:
+        """Number of steps since the start, the same in all environments."""
+        return self.local.common_step
+
+    @property
+    def causes(self) -> dict[str, int]:
+        """Number of diverged simulations by cause."""
+        return sums(self.call_all(_causes))
+
+    @property
+    def divergences(self) -> int:
+        """Number of simulations that diverged since the start."""
+        return sum(self.causes.values())
+
+    @property
+    def calls_per_step(self) -> int:
+        """Number of engine calls in an environment step."""
+        return self.local.calls_per_step
+
+    @property
+    def reward_names(self) -> list[str]:
+        """Names of the reward terms."""
+        return self.local.reward_names
+
+    @property
+    def default_state(self) -> dict[str, Tensor]:
+        """Joint state at the start of episodes, before reset events."""
+        return self.local.default_state
+
+    def unsaved_state(self) -> list[str]:
+        """Return the state that `state_dict` cannot contain."""
+        return self.local.unsaved_state()
+
+    def episode_dependencies(self) -> list[str]:
+        """Return the parts of the configuration that make an episode depend on earlier ones."""
+        return self.local.episode_dependencies()
+
+    def is_playing(self) -> bool:
+        """Return False while paused; then no step can run."""
+        return self._playing
+
+    def pause(self, paused: bool = True) -> None:
+        """Pause, or continue with `paused=False`."""
+        self._playing = not paused
+
+    def close(self) -> None:
+        """End the worker processes, and close the engine and the sensors."""
+        self._workers.close()
+        self.local.close()
+
+    # --- calls of functions in the processes of the shards ---
+
+    def call_all(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+        """Return `function(env, *arguments)` of every shard, in order. The function is one of a module."""
+        self._require_whole()
+        self._workers.request(worker.CALL, (function, arguments))
+        own = function(self.local, *arguments)
+        return [own, *(value for (value,) in self._workers.replies())]
+
+    def call_one(self, env: int, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Return `function(env, row, *arguments)` of the shard that has an environment, with its row there."""
+        self._require_whole()
+        number = next(n for n, shard in enumerate(self._shards) if env < shard.first + shard.count)
+        row = env - self._shards[number].first
+        if number == 0:
+            return function(self.local, row, *arguments)
+        process = list(self._workers)[number - 1]
+        process.send(worker.CALL, (function, (row, *arguments)))
+        return process.receive()[1][0]
+
+    # --- a step in all processes ---
+
+    def _begin(self) -> None:
+        """Choose the memory of the next result, and tell the shards for which observers to stop."""
+        self._require_whole()
+        self._slot = (self._slot + 1) % SLOTS
+        self._command[:2] = self._slot, Needs.of(self.observers).value
+
+    @contextlib.contextmanager
+    def _in_step(self) -> Iterator[None]:
+        """Mark the environment as broken if an error or a signal interrupts the processes in the middle of a step."""
+        self._is_broken = True
+        yield
+        self._is_broken = False
+
+    def _require_whole(self) -> None:
+        if self._is_broken and not self._stage:
+            raise RuntimeError("a step was interrupted, so that the environment cannot be used any more")
+
+    def _reach(self, stage: Stage, content: Any) -> None:
+        """Let all shards reach a stage at which the first shard is; run the observers of it and of earlier stages."""
+        while True:
+            for process in self._workers:
+                if process not in self._waiting:
+                    kind, reached = process.receive()
+                    self._waiting[process] = Stage(kind[1]), reached
+            now = min([stage, *(reached for reached, _ in self._waiting.values())])
+            contents = [content if stage == now else None]
+            contents += [self._waiting[p][1] if self._waiting[p][0] == now else None for p in self._workers]
+            self._stage = now
+            self._observe(now, contents)
+            self._stage = None
+            if now == Stage.DONE:
+                self._waiting.clear()
+                return
+            for process in [p for p, (reached, _) in self._waiting.items() if reached == now]:
+                process.send(worker.CONTINUE)
+                del self._waiting[process]
+            if now == stage:
+                return
+
+    def _observe(self, stage: Stage, contents: Sequence[Any]) -> None:
+        """Run the observers of a stage. `contents` has what each shard sent; None for a shard that is not there."""
+        if stage in (Stage.ON_STEP, Stage.DONE):
+            for number, columns in enumerate(contents):
+                self._columns[number] = columns or self._columns[number]
+        if stage == Stage.ON_STEP:
+            self._read_episodes()
+            arrays = self._arrays
+            reward = arrays["reward"][self._slot]
+            self.observers.run_on_step(
+                StepRecord(self._last_obs, arrays["action"], reward, arrays["reward_terms"], self._episodes)
+            )
+        elif stage == Stage.AFTER_PHYSICS:
+            for after_physics in self.observers.after_physics:
+                after_physics()
+        elif stage in (Stage.DIVERGED, Stage.QUARANTINED):
+            found = [divergence for content in contents for divergence in content or ()]
+            self.observers.run_on_divergence(found[:MAX_DESCRIBED], pending=stage == Stage.QUARANTINED)
+
+    def _read_episodes(self) -> None:
+        self._episodes = read_episodes(self._arrays, self._shards, self._columns)
+
+    def _obs(self) -> dict[str, Tensor]:
+        self._last_obs = {group: self._arrays[f"obs.{group}"][self._slot] for group in self.layout.observations}
+        return self._last_obs
+
+    def _metric_values(self) -> dict[str, Tensor]:
+        parts = self.call_all(_metric_values)
+        return {name: self._joined_metric([part[name] for part in parts]) for name in parts[0]}
+
+    def _joined_metric(self, parts: Sequence[Tensor]) -> Tensor:
+        """Return the values of all environments; for a number that each shard computes, the mean over environments."""
+        if parts[0].dim():
+            return join(parts)
+        counts = torch.tensor([shard.count for shard in self._shards], dtype=torch.float64)
+        values = torch.stack([part.double() for part in parts])
+        return values[0] if bool((values == values[0]).all()) else (values * counts).sum() / self.num_envs
+
+
+def _resolved_parts(resolved: Resolved, shards: Sequence[Shard]) -> list[Resolved]:
+    """Return the configuration of each shard, with its number of environments and its share of the engine's threads."""
+    task = resolved.task
+    threads, count = task.sim.engine_threads or available_cores(), len(shards)
+    parts = []
+    for number, shard in enumerate(shards):
+        share = max(1, threads // count + (number < threads % count))
+        update = {
+            "scene": task.scene.model_copy(update={"num_envs": shard.count}),
+            "sim": task.sim.model_copy(update={"engine_threads": share}),
+        }
+        parts.append(replace(resolved, task=task.model_copy(update=update)))
+    return parts
+
+
+def _success(env: VecEnv) -> Tensor | None:
+    return env.compute_success()
+
+
+def _divergence_metrics(env: VecEnv) -> dict[str, float]:
+    return env.divergence_metrics()
+
+
+def _metric_values(env: VecEnv) -> dict[str, Tensor]:
+    return env.metric_values()
+
+
+def _step_metrics(env: VecEnv) -> dict[str, Tensor]:
+    return env.step_metrics()
+
+
+def _state(env: VecEnv) -> dict[str, Tensor]:
+    return env.state_dict()
+
+
+def _state_shapes(env: VecEnv) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in env.state_dict().items()}
+
+
+def _causes(env: VecEnv) -> dict[str, int]:
+    return env.causes

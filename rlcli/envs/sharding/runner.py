@@ -1,0 +1,276 @@
+"""Steps of one shard: it reads actions from shared memory and writes the results there."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.observers import Observers, StepObserver
+from rlcli.envs.shard import Shard
+from rlcli.envs.sharding.arrays import ArraySpec
+from rlcli.envs.step import Episodes, StepRecord
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import RlcliError
+from rlcli.sim.divergence_report import Divergence
+
+SLOTS = 3
+"""Number of results that are kept: those of a step hold until the step after the next one."""
+_FIXED_COLUMNS = 4
+"""Columns of a finished episode before its named ones: environment, return, length, truncated."""
+_MAX_COLUMNS = 256
+"""Largest number of columns of a finished episode, besides its reward terms."""
+
+
+class Stage(enum.IntEnum):
+    """Points of a step at which a shard can wait for the observers of the main process, in their order."""
+
+    DIVERGED = 1
+    """`on_divergence` after physics."""
+    AFTER_PHYSICS = 2
+    ON_STEP = 3
+    QUARANTINED = 4
+    """`on_divergence` for states that events or resets wrote."""
+    DONE = 5
+
+
+class Needs(enum.Flag):
+    """Observers of the main process that a step of a shard must stop for."""
+
+    AFTER_PHYSICS = enum.auto()
+    ON_DIVERGENCE = enum.auto()
+    ON_STEP = enum.auto()
+
+    @staticmethod
+    def of(observers: Observers) -> Needs:
+        """Return what some observers need."""
+        needs = Needs(0)
+        needs |= Needs.AFTER_PHYSICS if observers.after_physics else needs
+        needs |= Needs.ON_DIVERGENCE if observers.on_divergence else needs
+        return needs | Needs.ON_STEP if observers.on_step else needs
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Names of the columns of finished episodes."""
+
+    terms: tuple[str, ...]
+    causes: tuple[str, ...]
+    metrics: tuple[str, ...]
+    success: bool
+
+    @staticmethod
+    def of(episodes: Episodes) -> Columns:
+        """Return the names of some episodes' columns."""
+        terms, causes, metrics = (tuple(part) for part in (episodes.reward_terms, episodes.causes, episodes.metrics))
+        return Columns(terms, causes, metrics, episodes.success is not None)
+
+    @property
+    def count(self) -> int:
+        """Number of columns."""
+        return _FIXED_COLUMNS + len(self.terms) + len(self.causes) + len(self.metrics) + self.success
+
+
+def counter_specs(total: int) -> dict[str, ArraySpec]:
+    """Return the shared tensors that an environment needs while it is built; they come first in the file."""
+    return {"counters": ArraySpec((2, total), torch.int64)}
+
+
+def array_specs(env: VecEnv, total: int, shards: int) -> dict[str, ArraySpec]:
+    """Return the shared tensors of an environment with `total` environments in `shards` shards."""
+    layout, terms = env.layout, len(env.reward_names)
+    sizes = {group: layout.size(group) for group in layout.observations}
+    floats, flags = torch.float32, torch.bool
+    return {
+        **counter_specs(total),
+        "command": ArraySpec((8,), torch.int64),
+        "action": ArraySpec((total, layout.action_size), floats),
+        "restart": ArraySpec((total,), flags),
+        **{f"obs.{group}": ArraySpec((SLOTS, total, size), floats) for group, size in sizes.items()},
+        **{f"final.{group}": ArraySpec((total, size), floats) for group, size in sizes.items()},
+        "reward": ArraySpec((SLOTS, total), floats),
+        "terminated": ArraySpec((SLOTS, total), flags),
+        "truncated": ArraySpec((SLOTS, total), flags),
+        "reward_terms": ArraySpec((terms, total), floats),
+        "episodes": ArraySpec((_MAX_COLUMNS + terms, total), torch.float64),
+        "counts": ArraySpec((shards, 8), torch.int64),
+        "seconds": ArraySpec((shards, 8), torch.float64),
+    }
+
+
+class ShardRunner:
+    """Runner of the steps of one shard.
+
+    Args:
+        env: the environments of the shard.
+        number: number of the shard.
+        arrays: the shared tensors.
+        stop: called with a stage and its content at each stage that an observer of the main process needs, and at the
+            end. It returns when the shard may continue.
+    """
+
+    def __init__(
+        self, env: VecEnv, number: int, arrays: Mapping[str, Tensor], stop: Callable[[Stage, Any], None]
+    ) -> None:
+        self.env, self.stop = env, stop
+        rows, groups = env.shard.rows, list(env.layout.observations)
+        self._action, self._restart = arrays["action"][rows], arrays["restart"][rows]
+        self._obs = [{group: arrays[f"obs.{group}"][slot, rows] for group in groups} for slot in range(SLOTS)]
+        self._final = {group: arrays[f"final.{group}"][rows] for group in groups}
+        self._reward, self._terminated, self._truncated = (
+            [arrays[name][slot, rows] for slot in range(SLOTS)] for name in ("reward", "terminated", "truncated")
+        )
+        self._reward_terms, self._episodes = arrays["reward_terms"][:, rows], arrays["episodes"][:, rows]
+        self._command = arrays["command"].numpy()
+        self._counts, self._seconds = arrays["counts"][number].numpy(), arrays["seconds"][number].numpy()
+        self._stops = {
+            Needs.AFTER_PHYSICS: _StopAfterPhysics(self),
+            Needs.ON_DIVERGENCE: _StopOnDivergence(self),
+            Needs.ON_STEP: _StopOnStep(self),
+        }
+        self._needs = Needs(0)
+        self._columns: Columns | None = None
+        self._new_columns: Columns | None = None
+        self._slot = 0
+
+    def step(self) -> None:
+        """Step the shard with its actions, and publish the result."""
+        self._slot, needs, only_truncated, restarts = self._command[:4].tolist()
+        self._observe(Needs(needs))
+        self.env.final_obs_of = "truncated" if only_truncated else "finished"
+        result = self.env.step(self._action, self._restart if restarts else None)
+        if Needs.ON_STEP not in self._needs:
+            self._reward[self._slot].copy_(result.reward)
+            self._publish_episodes(result.episodes)
+        self._terminated[self._slot].copy_(result.terminated)
+        self._truncated[self._slot].copy_(result.truncated)
+        self._counts[1] = result.final_obs is not None
+        if result.final_obs is not None:
+            for group, values in result.final_obs.items():
+                self._final[group].copy_(values)
+        self._end(result.obs)
+
+    def reset(self, seed: int | None, episode: int) -> None:
+        """Start a new episode in every environment of the shard, and publish the observations."""
+        self._slot, needs = self._command[:2].tolist()
+        self._observe(Needs(needs))
+        self._end(self.env.reset(seed, episode=episode))
+
+    def load(self, state: Mapping[str, Tensor]) -> None:
+        """Restore a state of the shard, and publish the observations."""
+        self._slot, needs = self._command[:2].tolist()
+        self._observe(Needs(needs))
+        self._end(self.env.load_state_dict(state))
+
+    def publish_record(self, record: StepRecord) -> Columns | None:
+        """Publish what observers read. Return the names of the columns of finished episodes if they have changed."""
+        self._reward[self._slot].copy_(record.reward)
+        self._reward_terms.copy_(record.reward_terms)
+        self._publish_episodes(record.episodes)
+        return self._take_columns()
+
+    def _end(self, obs: Mapping[str, Tensor]) -> None:
+        for group, values in obs.items():
+            self._obs[self._slot][group].copy_(values)
+        self._seconds[0], self._seconds[1] = self.env.seconds["physics"], self.env.seconds["step"]
+        self.stop(Stage.DONE, self._take_columns())
+
+    def _observe(self, needs: Needs) -> None:
+        """Stop at the stages that the observers of the main process need from now on."""
+        for need in needs ^ self._needs:
+            change = self.env.observers.add if need in needs else self.env.observers.remove
+            change(self._stops[need])
+        self._needs = needs
+
+    def _publish_episodes(self, episodes: Episodes | None) -> None:
+        self._counts[0] = count = 0 if episodes is None else len(episodes.ids)
+        if episodes is None:
+            return
+        columns = Columns.of(episodes)
+        if columns != self._columns:
+            if columns.count > len(self._episodes):
+                raise RlcliError(
+                    f"the task has {columns.count} metrics, causes and reward terms of episodes; several workers allow"
+                    f" {len(self._episodes)}",
+                    hint="set scene.workers: 1",
+                )
+            self._columns = self._new_columns = columns
+        named = [*episodes.reward_terms.values(), *episodes.causes.values(), *episodes.metrics.values()]
+        fixed = [episodes.ids, episodes.returns, episodes.lengths, episodes.truncated]
+        values = [*fixed, *named, *([] if episodes.success is None else [episodes.success])]
+        for row, value in zip(self._episodes[:, :count], values, strict=False):
+            row.copy_(value)
+
+    def _take_columns(self) -> Columns | None:
+        columns, self._new_columns = self._new_columns, None
+        return columns
+
+
+class _StopAfterPhysics(StepObserver):
+    def __init__(self, runner: ShardRunner) -> None:
+        self._runner = runner
+
+    def after_physics(self) -> None:
+        self._runner.stop(Stage.AFTER_PHYSICS, None)
+
+
+class _StopOnDivergence(StepObserver):
+    def __init__(self, runner: ShardRunner) -> None:
+        self._runner = runner
+
+    def on_divergence(self, found: list[Divergence], pending: bool) -> None:
+        first = self._runner.env.shard.first
+        renumbered = [replace(divergence, env=divergence.env + first) for divergence in found]
+        self._runner.stop(Stage.QUARANTINED if pending else Stage.DIVERGED, renumbered)
+
+
+class _StopOnStep(StepObserver):
+    def __init__(self, runner: ShardRunner) -> None:
+        self._runner = runner
+
+    def on_step(self, record: StepRecord) -> None:
+        self._runner.stop(Stage.ON_STEP, self._runner.publish_record(record))
+
+
+def read_episodes(arrays: Mapping[str, Tensor], shards: Sequence[Shard], columns: Sequence[Columns | None]) -> Episodes | None:
+    """Return the finished episodes of all shards in the order of their environments; None if there are none.
+
+    Args:
+        arrays: the shared tensors.
+        shards: the shards.
+        columns: names of the columns of each shard.
+    """
+    counts = arrays["counts"][:, 0].tolist()
+    ended = [(shard, names, n) for shard, names, n in zip(shards, columns, counts, strict=True) if n and names]
+    if not ended:
+        return None
+    # a simulation that diverged adds a cause in its shard alone
+    widest = max((names for _, names, _ in ended), key=lambda names: len(names.causes))
+    parts = []
+    for shard, names, n in ended:
+        part = arrays["episodes"][: names.count, shard.first : shard.first + n]
+        if names.causes != widest.causes:
+            part = _with_causes(part, names, widest)
+        parts.append(part)
+    table = iter(torch.cat(parts, dim=1).unbind())
+    ids, returns, lengths, truncated = (next(table) for _ in range(_FIXED_COLUMNS))
+    terms = {name: next(table).float() for name in widest.terms}
+    causes = {name: next(table).bool() for name in widest.causes}
+    metrics = {name: next(table).float() for name in widest.metrics}
+    success = next(table).bool() if widest.success else None
+    return Episodes(
+        ids.long(), returns.float(), lengths.long(), terms, causes, truncated.bool(), success, metrics
+    )
+
+
+def _with_causes(part: Tensor, names: Columns, widest: Columns) -> Tensor:
+    """Return a shard's columns with a column of zeros for each cause that only another shard has."""
+    begin = _FIXED_COLUMNS + len(names.terms)
+    own = dict(zip(names.causes, part[begin:], strict=False))
+    none = torch.zeros_like(part[0])
+    causes = [own.get(name, none) for name in widest.causes]
+    return torch.stack([*part[:begin], *causes, *part[begin + len(names.causes) :]])

@@ -1,0 +1,160 @@
+"""Worker process: it steps one shard until the main process closes the connection or ends."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
+from rlcli.errors import RlcliError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rlcli.config.load import Resolved
+    from rlcli.envs.shard import Shard
+    from rlcli.envs.sharding.arrays import ArraySpec
+    from rlcli.envs.sharding.runner import Stage
+    from rlcli.envs.vec_env import VecEnv
+
+BUILD, MAP, STEP, RESET, LOAD, CALL, CONTINUE = b"b", b"m", b"s", b"r", b"l", b"c", b"g"
+"""Messages of the main process."""
+READY, STOPPED, VALUE, ERROR = b"y", b"t", b"v", b"e"
+"""Messages of a worker: the shard is built; it stopped at a stage; the value of a call; an error."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Everything from which a worker builds its shard."""
+
+    resolved: Resolved
+    seed: int
+    shared_streams: int
+    shard: Shard
+    number: int
+    generator_state: Tensor
+    """State of torch's global generator at the start: a task may draw from it while it is built."""
+
+
+def main(connection: int, arrays: int) -> None:
+    """Serve the main process through two file descriptors: a socket, and the file of the shared tensors."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1"):  # the main process decides when its workers end
+        signal.signal(getattr(signal, name), signal.SIG_IGN)
+    channel = Channel(socket.socket(fileno=connection), SPIN_S)
+    try:
+        _serve(channel, arrays)
+    except ChannelClosedError:  # the main process has ended, or has closed the environment
+        os._exit(0)  # without waiting for the engine's threads
+
+
+def _serve(channel: Channel, arrays: int) -> None:
+    import torch  # imported while the main process builds its own shard
+
+    import rlcli.envs.managed
+    import rlcli.envs.sharding.runner  # noqa: F401
+
+    torch.set_num_threads(1)
+    worker = _Worker(channel, arrays)
+    with torch.no_grad():
+        while True:
+            kind, content = channel.receive()
+            try:
+                worker.do(kind, content)
+            except ChannelClosedError:
+                raise
+            except BaseException as error:
+                channel.send(ERROR, _PortableError.of(error))
+
+
+class _Worker:
+    def __init__(self, channel: Channel, arrays: int) -> None:
+        self._channel, self._arrays = channel, arrays
+        self._env: VecEnv | None = None
+
+    def do(self, kind: bytes, content: Any) -> None:
+        """Do what a message requests, and reply."""
+        if kind == STEP:
+            self._runner.step()
+        elif kind == RESET:
+            self._runner.reset(*content)
+        elif kind == LOAD:
+            self._runner.load(content)
+        elif kind == CALL:
+            self._call(content)
+        elif kind == BUILD:
+            self._build(pickle.loads(content))
+            self._channel.send(READY)
+        else:
+            self._map(content)
+            self._channel.send(READY)
+
+    def _build(self, job: Job) -> None:
+        import torch
+
+        from rlcli.envs.make import make_env
+
+        from rlcli.envs.sharding.arrays import map_tensors
+        from rlcli.envs.sharding.runner import counter_specs
+
+        torch.set_rng_state(job.generator_state)
+        counters = map_tensors(self._arrays, counter_specs(job.shard.total))["counters"]
+        shard = replace(job.shard, counters=counters[:, job.shard.rows])
+        self._number = job.number
+        self._env = make_env(job.resolved, seed=job.seed, shared_streams=job.shared_streams, shard=shard)
+
+    def _map(self, specs: Mapping[str, ArraySpec]) -> None:
+        from rlcli.envs.sharding.arrays import map_tensors
+        from rlcli.envs.sharding.runner import ShardRunner
+
+        assert self._env is not None
+        self._runner = ShardRunner(self._env, self._number, map_tensors(self._arrays, specs), self._stop)
+
+    def _stop(self, stage: Stage, content: Any) -> None:
+        """Report a stage; serve calls until the main process continues the step."""
+        from rlcli.envs.sharding.runner import Stage
+
+        self._channel.send(STOPPED + bytes([stage]), content)
+        while stage != Stage.DONE:
+            kind, call = self._channel.receive()
+            if kind == CONTINUE:
+                return
+            self._call(call)
+
+    def _call(self, content: tuple[Any, tuple[Any, ...]]) -> None:
+        function, arguments = content
+        self._channel.send(VALUE, (function(self._env, *arguments),))
+
+
+@dataclass(frozen=True, slots=True)
+class _PortableError:
+    """An exception in a form that can be pickled."""
+
+    kind: type[BaseException]
+    arguments: tuple[Any, ...]
+    attributes: dict[str, Any]
+    trace: str
+
+    @staticmethod
+    def of(error: BaseException) -> _PortableError:
+        """Return the portable form of an exception; one of a task's own class becomes a RuntimeError."""
+        trace = "".join(traceback.format_exception(error))
+        if isinstance(error, RlcliError):
+            return _PortableError(type(error), error.args, dict(error.__dict__), trace)
+        if type(error).__module__ == "builtins":
+            return _PortableError(type(error), tuple(map(str, error.args)), {}, trace)
+        return _PortableError(RuntimeError, (f"{type(error).__name__}: {error}",), {}, trace)
+
+    def rebuild(self) -> BaseException:
+        """Return the exception; one that is a bug has the worker's traceback as a note."""
+        error = self.kind.__new__(self.kind)
+        error.args = self.arguments
+        error.__dict__.update(self.attributes)
+        if not isinstance(error, RlcliError):
+            error.add_note(f"in a worker process:\n{self.trace}")
+        return error

@@ -1,0 +1,162 @@
+"""Worker processes of an environment, as the main process sees them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import weakref
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from rlcli.envs.sharding import worker
+from rlcli.envs.sharding.arrays import create_shared_file
+from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
+from rlcli.envs.sharding.worker import Job
+from rlcli.errors import MachineError
+
+_CODE = (
+    "import sys, json; sys.path[:] = json.loads(sys.argv[3]);"
+    " from rlcli.envs.sharding.worker import main; main(int(sys.argv[1]), int(sys.argv[2]))"
+)
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_CLOSE_S = 5.0
+"""Time after which a worker that does not end is killed [s]."""
+
+
+class Worker:
+    """One worker process.
+
+    Args:
+        number: number of its shard.
+        arrays: descriptor of the file of the shared tensors.
+    """
+
+    def __init__(self, number: int, arrays: int) -> None:
+        self.number = number
+        ours, theirs = socket.socketpair()
+        # -P: no file of the current folder is imported
+        command = [sys.executable, "-P", "-c", _CODE, str(theirs.fileno()), str(arrays), _search_path()]
+        with theirs:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=2,  # standard output has the results of the command
+                pass_fds=(theirs.fileno(), arrays),
+                env={**os.environ, **_ONE_THREAD},
+            )
+        self._channel = Channel(ours, SPIN_S)
+
+    def send(self, kind: bytes, content: Any = None) -> None:
+        """Send a message.
+
+        Raises:
+            MachineError: if the process has ended.
+        """
+        try:
+            self._channel.send(kind, content)
+        except ChannelClosedError:
+            raise self._ended() from None
+
+    def receive(self) -> tuple[bytes, Any]:
+        """Wait for a message.
+
+        Raises:
+            MachineError: if the process has ended.
+            BaseException: an error of the worker.
+        """
+        try:
+            kind, content = self._channel.receive()
+        except ChannelClosedError:
+            raise self._ended() from None
+        if kind == worker.ERROR:
+            raise content.rebuild()
+        return kind, content
+
+    def hang_up(self) -> None:
+        """Close the connection; the process then ends."""
+        self._channel.close()
+
+    def wait(self) -> None:
+        """Wait for the end of the process; after `_CLOSE_S` kill it."""
+        try:
+            self._process.wait(_CLOSE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _ended(self) -> MachineError:
+        """Return the error for a process that has ended."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_CLOSE_S)
+        code = self._process.returncode
+        how = "closed its connection" if code is None else f"ended with exit code {code}"
+        if code is not None and code < 0:
+            how = f"was ended by {signal.Signals(-code).name}"
+        hint = "if memory is full, lower scene.num_envs or scene.workers; then resume the run"
+        return MachineError(f"worker process {self.number} of the environment (pid {self._process.pid}) {how}", hint=hint)
+
+
+class Workers:
+    """All worker processes of an environment; they end with this object.
+
+    Args:
+        jobs: what each process builds; the processes start at once and build while the caller builds its own shard.
+    """
+
+    def __init__(self, jobs: Sequence[Job]) -> None:
+        self.arrays = create_shared_file()
+        self._workers: list[Worker] = []
+        self.close = weakref.finalize(self, _close, self._workers, self.arrays)
+        try:
+            for job in jobs:
+                self._workers.append(Worker(job.number, self.arrays))
+            for process, job in zip(self._workers, jobs, strict=True):
+                process.send(worker.BUILD, pickle.dumps(job))
+        except BaseException:
+            self.close()
+            raise
+
+    def __iter__(self) -> Iterator[Worker]:
+        return iter(self._workers)
+
+    def request(self, kind: bytes, content: Any = None) -> None:
+        """Send a message to every worker."""
+        for process in self._workers:
+            process.send(kind, content)
+
+    def replies(self) -> list[Any]:
+        """Wait for a reply of every worker; return their contents.
+
+        Raises:
+            MachineError: if a process has ended.
+            BaseException: the first error of a worker, after all have replied.
+        """
+        contents, first_error = [], None
+        for process in self._workers:
+            try:
+                contents.append(process.receive()[1])
+            except BaseException as error:
+                first_error = first_error or error
+        if first_error is not None:
+            raise first_error
+        return contents
+
+
+def _close(workers: list[Worker], arrays: int) -> None:
+    for process in workers:
+        process.hang_up()
+    for process in workers:
+        process.wait()
+    workers.clear()
+    os.close(arrays)
+
+
+def _search_path() -> str:
+    """Return the folders from which this process imports, without the current folder."""
+    return json.dumps([entry for entry in sys.path if entry])
