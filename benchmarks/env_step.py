@@ -25,7 +25,7 @@ from machine import describe
 from mujoco.batch import Batch
 
 from rlcli.config.load import resolve
-from rlcli.envs.make import make_env
+from rlcli.envs.sharding.choice import make_training_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.registry import find_task
 
@@ -85,9 +85,12 @@ def env_block(env: VecEnv, actions: torch.Tensor, steps: int) -> float:
     return time.perf_counter() - begin
 
 
-def measure(task: str, num_envs: int, repeats: int, seconds: float) -> dict[str, float | int | str]:
+def measure(
+    task: str, num_envs: int, repeats: int, seconds: float, workers: int | str = "auto"
+) -> dict[str, float | int | str]:
     """Return one row of the table."""
-    env = make_env(resolve(find_task(task), flags={"scene.num_envs": num_envs}), seed=0)
+    resolved = resolve(find_task(task), flags={"scene.num_envs": num_envs, "scene.workers": workers})
+    env = make_training_env(resolved, seed=0, device="cpu")
     env.final_obs_of = "truncated"  # what a trainer asks for
     env.reset(seed=0)
     generator = torch.Generator().manual_seed(0)
@@ -106,9 +109,11 @@ def measure(task: str, num_envs: int, repeats: int, seconds: float) -> dict[str,
         without.append((bare_physics.block(steps, NONE) if stage != NONE else bare) / full)
         rates.append(steps * num_envs / full)
         bares.append(steps * num_envs / bare)
+    env.close()
     return {
         "task": task,
         "num_envs": num_envs,
+        "workers": env.workers,
         "ratio": statistics.median(ratios),
         "ratio_min": min(ratios),
         "ratio_max": max(ratios),
@@ -126,20 +131,25 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--seconds", type=float, default=0.5, help="length of a block")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--workers", nargs="+", default=["auto"], help="processes that step environments")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    rows = [measure(t, n, options.repeats, options.seconds) for t in options.tasks for n in options.num_envs]
+    cases = [(task, n, workers) for task in options.tasks for n in options.num_envs for workers in options.workers]
+    rows = []
+    for task, n, workers in cases:
+        count = workers if workers == "auto" else int(workers)
+        rows.append(measure(task, n, options.repeats, options.seconds, count))
     if options.json:
         print(json.dumps({"machine": describe(), "rows": rows}, indent=2))
         return
     print(describe())
-    print(f"{'task':18}{'envs':>6}{'of bare Batch':>15}{'min .. max':>16}", end="")
+    print(f"{'task':18}{'envs':>6}{'workers':>8}{'of bare Batch':>15}{'min .. max':>16}", end="")
     print(f"{'of stage NONE':>15}{'physics':>9}{'env steps/s':>14}{'bare':>12}")
     for row in rows:
         spread = f"{row['ratio_min']:.3f} .. {row['ratio_max']:.3f}"
         rates = f"{row['physics']:>9.3f}{row['env_steps_per_s']:>14,.0f}{row['bare_steps_per_s']:>12,.0f}"
         print(
-            f"{row['task']:18}{row['num_envs']:>6}{row['ratio']:>15.3f}{spread:>16}{row['ratio_stage_none']:>15.3f}{rates}"
+            f"{row['task']:18}{row['num_envs']:>6}{row['workers']:>8}{row['ratio']:>15.3f}{spread:>16}{row['ratio_stage_none']:>15.3f}{rates}"
         )
 
 

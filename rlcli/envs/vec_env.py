@@ -283,6 +283,11 @@ class VecEnv(Workflow):
         """The environment of this process, with terms and managers: this object, if no other process steps a part."""
         return self
 
+    @property
+    def workers(self) -> int:
+        """Number of processes that step the environments."""
+        return 1
+
     def compute_success(self) -> Tensor | None:
         """Return where the success condition holds in the current state; None without one. (num_envs,) bool"""
         success = self._counters.success

@@ -139,6 +139,11 @@ class ShardedEnv:
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, self._episodes)
 
+    @property
+    def workers(self) -> int:
+        """Number of processes that step the environments."""
+        return len(self._shards)
+
     def compute_success(self) -> Tensor | None:
         """Return where the success condition holds in the current state; None without one. (num_envs,) bool"""
         parts = self.call_all(_success)
