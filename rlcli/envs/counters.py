@@ -23,7 +23,9 @@ class EpisodeCounters(TensorState):
         self.ids = torch.arange(shard.first, shard.first + num_envs, device=device)
         """Numbers of the environments among those of all shards. (num_envs,) int64"""
         memory = shard.counters
-        self.lengths, self.indices = torch.empty(2, num_envs, dtype=torch.int64, device=device) if memory is None else memory
+        self.lengths, self.indices = (
+            torch.empty(2, num_envs, dtype=torch.int64, device=device) if memory is None else memory
+        )
         self.lengths.zero_()
         self.indices.fill_(-1)  # the first reset of a new environment begins episode 0, like a reset with a seed
         self.success_steps = torch.zeros(num_envs, device=device)

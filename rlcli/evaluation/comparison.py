@@ -17,7 +17,15 @@ if TYPE_CHECKING:
     from rlcli.evaluation.evaluate import Evaluation
 
 METRICS = ("success", "return", "length")
-_WITHOUT_EFFECT = (("scene", "num_envs"), ("scene", "workers"), ("sim", "engine_threads"), ("viewer",), ("play",), ("agents",), ("summary",))
+_WITHOUT_EFFECT = (
+    ("scene", "num_envs"),
+    ("scene", "workers"),
+    ("sim", "engine_threads"),
+    ("viewer",),
+    ("play",),
+    ("agents",),
+    ("summary",),
+)
 """Settings that may differ between the tasks: they do not affect episodes."""
 _MISSING = "nothing"
 

@@ -50,7 +50,9 @@ def number_of_workers(resolved: Resolved, device: str) -> int:
     if reason is None and scene.num_envs < 2 * scene.workers:
         reason = f"{scene.num_envs} environments are too few; each worker needs two"
     if reason is not None:
-        problem = resolved.problem(("scene", "workers"), f"{scene.workers} workers cannot step it: {reason}", "set it to 1")
+        problem = resolved.problem(
+            ("scene", "workers"), f"{scene.workers} workers cannot step it: {reason}", "set it to 1"
+        )
         raise ConfigError([problem])
     return scene.workers
 

@@ -236,7 +236,9 @@ class _StopOnStep(StepObserver):
         self._runner.stop(Stage.ON_STEP, self._runner.publish_record(record))
 
 
-def read_episodes(arrays: Mapping[str, Tensor], shards: Sequence[Shard], columns: Sequence[Columns | None]) -> Episodes | None:
+def read_episodes(
+    arrays: Mapping[str, Tensor], shards: Sequence[Shard], columns: Sequence[Columns | None]
+) -> Episodes | None:
     """Return the finished episodes of all shards in the order of their environments; None if there are none.
 
     Args:
@@ -262,9 +264,7 @@ def read_episodes(arrays: Mapping[str, Tensor], shards: Sequence[Shard], columns
     causes = {name: next(table).bool() for name in widest.causes}
     metrics = {name: next(table).float() for name in widest.metrics}
     success = next(table).bool() if widest.success else None
-    return Episodes(
-        ids.long(), returns.float(), lengths.long(), terms, causes, truncated.bool(), success, metrics
-    )
+    return Episodes(ids.long(), returns.float(), lengths.long(), terms, causes, truncated.bool(), success, metrics)
 
 
 def _with_causes(part: Tensor, names: Columns, widest: Columns) -> Tensor:

@@ -26,7 +26,9 @@ def join_states(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     return {name: join([state[name] for state in states]) for name in states[0]}
 
 
-def split_state(state: Mapping[str, Tensor], present: Mapping[str, Sequence[torch.Size]], shards: Sequence[Shard]) -> list[dict[str, Tensor]]:
+def split_state(
+    state: Mapping[str, Tensor], present: Mapping[str, Sequence[torch.Size]], shards: Sequence[Shard]
+) -> list[dict[str, Tensor]]:
     """Split a joined state into one state for each shard.
 
     Args:

@@ -99,7 +99,9 @@ class Worker:
         if code is not None and code < 0:
             how = f"was ended by {signal.Signals(-code).name}"
         hint = "if memory is full, lower scene.num_envs or scene.workers; then resume the run"
-        return MachineError(f"worker process {self.number} of the environment (pid {self._process.pid}) {how}", hint=hint)
+        return MachineError(
+            f"worker process {self.number} of the environment (pid {self._process.pid}) {how}", hint=hint
+        )
 
 
 class Workers:
