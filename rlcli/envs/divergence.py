@@ -127,9 +127,13 @@ class DivergenceGuard:
         first = int(rows.nonzero()[0, 0])
         column = int(bad[first].nonzero()[0, 0]) if bad.dim() > 1 else 0
         name = f" in column {columns[column]}" if column < len(columns) else ""
+        shard, among = env.shard, f"{len(rows)} environments"
+        if shard.count != shard.total and len(rows) == shard.count:
+            among = f"the environments {shard.first} to {shard.rows.stop - 1}"
+            first += shard.first
         raise DivergedError(
-            f"{what} is not finite in {int(rows.sum())} of {env.num_envs} environments, first in environment"
-            f" {first}{name} (step {env.common_step})"
+            f"{what} is not finite in {int(rows.sum())} of {among}, first in environment {first}{name}"
+            f" (step {env.common_step})"
         )
 
     def _restore_diverged(self, selection: Selection) -> None:

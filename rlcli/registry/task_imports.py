@@ -8,13 +8,16 @@ import importlib
 import importlib.util
 import operator
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
 from rlcli.registry.aliases import aliases_resolved
 from rlcli.registry.imports import contain_side_effects
+
+_imported: dict[tuple[Path, str], None] = {}
+"""Imported task files, in order, with the name of the function that imported them."""
 
 
 def load_object(reference: str) -> Any:
@@ -46,6 +49,7 @@ def load_module(name: str) -> Any:
             except BaseException:
                 del sys.modules[alias]
                 raise
+            _imported[file.resolve(), load_module.__name__] = None
         return sys.modules[alias]
 
 
@@ -61,10 +65,22 @@ def import_file(file: Path) -> Any:
         name = _package(top)
         inner = file.parent.relative_to(top).parts + (() if file.stem == "__init__" else (file.stem,))
         sys.path.append(str(top))
+        _imported[file, import_file.__name__] = None
         try:
             return importlib.import_module(".".join((name, *inner)))
         finally:
             sys.path.remove(str(top))
+
+
+def imported_files() -> list[tuple[Path, str]]:
+    """Return the task files that this process has imported, for `import_again` in another process."""
+    return list(_imported)
+
+
+def import_again(files: Sequence[tuple[Path, str]]) -> None:
+    """Import the files that another process has imported, under the same module names."""
+    for file, how in files:
+        load_module(str(file)) if how == load_module.__name__ else import_file(file)
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import pickle
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -34,7 +35,9 @@ from rlcli.envs.sharding.worker import Job
 from rlcli.envs.sharding.workers import Worker, Workers
 from rlcli.envs.step import Episodes, StepRecord, StepResult
 from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import ConfigError, one_line
 from rlcli.machine import available_cores
+from rlcli.registry.task_imports import imported_files
 from rlcli.sim.divergence_report import MAX_DESCRIBED
 from rlcli.sim.tensor_state import mean_of, means
 
@@ -60,10 +63,12 @@ class ShardedEnv:
         total = resolved.task.scene.num_envs
         self._shards = split(total, workers)
         parts = _resolved_parts(resolved, self._shards)
-        generator_state = torch.get_rng_state()
-        numbered = list(enumerate(zip(parts, self._shards, strict=True)))[1:]
-        jobs = [Job(part, seed, shared_streams, shard, number, generator_state) for number, (part, shard) in numbered]
-        self._workers = Workers(jobs)
+        state, files = torch.get_rng_state(), imported_files()
+        jobs = [
+            Job(_pickled(part), seed, shared_streams, shard, number, files, state)
+            for number, (part, shard) in enumerate(zip(parts, self._shards, strict=True))
+        ]
+        self._workers = Workers(jobs[1:])
         try:
             counters = map_tensors(self._workers.arrays, counter_specs(total))["counters"]
             first = replace(self._shards[0], counters=counters[:, self._shards[0].rows])
@@ -349,6 +354,20 @@ def _resolved_parts(resolved: Resolved, shards: Sequence[Shard]) -> list[Resolve
         }
         parts.append(replace(resolved, task=task.model_copy(update=update)))
     return parts
+
+
+def _pickled(resolved: Resolved) -> bytes:
+    """Return a configuration in the form in which a worker receives it.
+
+    Raises:
+        ConfigError: if the configuration has functions or classes that no module has.
+    """
+    try:
+        return pickle.dumps(resolved)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        message = f"the configuration cannot be sent to worker processes: {one_line(error)}"
+        hint = "set it to 1, or define the functions and classes of the task in a module"
+        raise ConfigError([resolved.problem(("scene", "workers"), message, hint)]) from None
 
 
 def _success(env: VecEnv) -> Tensor | None:

@@ -9,6 +9,7 @@ import socket
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
@@ -33,11 +34,14 @@ READY, STOPPED, VALUE, ERROR = b"y", b"t", b"v", b"e"
 class Job:
     """Everything from which a worker builds its shard."""
 
-    resolved: Resolved
+    resolved: bytes
+    """The configuration, pickled."""
     seed: int
     shared_streams: int
     shard: Shard
     number: int
+    files: list[tuple[Path, str]]
+    """Task files that the main process has imported; `resolved` may contain their functions and classes."""
     generator_state: Tensor
     """State of torch's global generator at the start: a task may draw from it while it is built."""
 
@@ -88,7 +92,7 @@ class _Worker:
         elif kind == CALL:
             self._call(content)
         elif kind == BUILD:
-            self._build(pickle.loads(content))
+            self._build(content)
             self._channel.send(READY)
         else:
             self._map(content)
@@ -101,12 +105,15 @@ class _Worker:
 
         from rlcli.envs.sharding.arrays import map_tensors
         from rlcli.envs.sharding.runner import counter_specs
+        from rlcli.registry.task_imports import import_again
 
         torch.set_rng_state(job.generator_state)
         counters = map_tensors(self._arrays, counter_specs(job.shard.total))["counters"]
         shard = replace(job.shard, counters=counters[:, job.shard.rows])
         self._number = job.number
-        self._env = make_env(job.resolved, seed=job.seed, shared_streams=job.shared_streams, shard=shard)
+        import_again(job.files)
+        resolved: Resolved = pickle.loads(job.resolved)
+        self._env = make_env(resolved, seed=job.seed, shared_streams=job.shared_streams, shard=shard)
 
     def _map(self, specs: Mapping[str, ArraySpec]) -> None:
         from rlcli.envs.sharding.arrays import map_tensors

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import pickle
 import signal
 import socket
 import subprocess
@@ -119,7 +118,7 @@ class Workers:
             for job in jobs:
                 self._workers.append(Worker(job.number, self.arrays))
             for process, job in zip(self._workers, jobs, strict=True):
-                process.send(worker.BUILD, pickle.dumps(job))
+                process.send(worker.BUILD, job)
         except BaseException:
             self.close()
             raise
