@@ -23,11 +23,11 @@ class EpisodeCounters(TensorState):
         self.ids = torch.arange(shard.first, shard.first + num_envs, device=device)
         """Numbers of the environments among those of all shards. (num_envs,) int64"""
         memory = shard.counters
-        self.lengths, self.indices = (
-            torch.empty(2, num_envs, dtype=torch.int64, device=device) if memory is None else memory
-        )
-        self.lengths.zero_()
-        self.indices.fill_(-1)  # the first reset of a new environment begins episode 0, like a reset with a seed
+        if memory is None:
+            memory = torch.empty(2, num_envs, dtype=torch.int64, device=device)
+        self.lengths: Tensor = memory[0].zero_()
+        # -1: the first reset of a new environment begins episode 0, like a reset with a seed
+        self.indices: Tensor = memory[1].fill_(-1)
         self.success_steps = torch.zeros(num_envs, device=device)
         """Number of consecutive steps in which the success condition holds. (num_envs,)"""
         self.common_step = torch.zeros((), dtype=torch.int64, device=device)

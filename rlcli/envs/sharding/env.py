@@ -100,8 +100,10 @@ class ShardedEnv:
         self.final_obs_of = "finished"
         self.seconds = {"physics": 0.0, "step": 0.0}
         self.observers = Observers()
-        self.episode_length_buf, self.episode_index = counters
-        """Steps of the running episodes, and numbers of the episodes before them. (num_envs,) int64 each"""
+        self.episode_length_buf: Tensor = counters[0]
+        """Steps of the running episode. (num_envs,) int64"""
+        self.episode_index: Tensor = counters[1]
+        """Number of episodes before the running one. (num_envs,) int64"""
         self.engine = ShardedEngine(self, total)
         self._last_obs: dict[str, Tensor] = {}
 

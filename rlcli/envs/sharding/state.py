@@ -11,7 +11,7 @@ from rlcli.envs.shard import Shard
 
 
 def environment_dim(shapes: Sequence[torch.Size]) -> int | None:
-    """Return the dimension that counts environments: the one in which the shards' shapes differ; None: there is none."""
+    """Return the dimension of environments, in which the shapes of the shards differ; None: there is none."""
     return next((dim for dim, sizes in enumerate(zip(*shapes, strict=True)) if len(set(sizes)) > 1), None)
 
 

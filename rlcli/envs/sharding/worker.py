@@ -102,7 +102,6 @@ class _Worker:
         import torch
 
         from rlcli.envs.make import make_env
-
         from rlcli.envs.sharding.arrays import map_tensors
         from rlcli.envs.sharding.runner import counter_specs
         from rlcli.registry.task_imports import import_again

@@ -77,6 +77,15 @@ class Worker:
             raise content.rebuild()
         return kind, content
 
+    @property
+    def pid(self) -> int:
+        """Number of the process."""
+        return self._process.pid
+
+    def has_ended(self) -> bool:
+        """Return whether the process has ended."""
+        return self._process.poll() is not None
+
     def hang_up(self) -> None:
         """Close the connection; the process then ends."""
         self._channel.close()
