@@ -222,6 +222,10 @@ class ShardedEnv:
         """Joint state at the start of episodes, before reset events."""
         return self.local.default_state
 
+    def stateful_objects(self) -> list[Any]:
+        """Return the objects of the first shard whose attributes a step may change."""
+        return self.local.stateful_objects()
+
     def unsaved_state(self) -> list[str]:
         """Return the state that `state_dict` cannot contain."""
         return self.local.unsaved_state()
