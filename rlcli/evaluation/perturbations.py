@@ -202,9 +202,7 @@ class _Push:
             angle = 2.0 * torch.pi * direction
             push = torch.stack([angle.cos() * size, angle.sin() * size, torch.zeros_like(size)], dim=1)
             self._root.write_root_velocity(selection, linear + push, angular)
-        env.sim.on_moved(selection)
-        for sensor in env.sensors.values():
-            sensor.on_moved(selection)
+        env.on_moved(selection)
         env.sim.forward_moved()
 
 

@@ -7,6 +7,7 @@ without the task's terms.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -260,9 +261,8 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
         CheckpointError: if the states or model fields do not fit it.
     """
     header, resolved = trajectory.header, trajectory.resolved(named)
-    env = make_env(resolved)
-    model = env.engine.model
-    env.close()
+    with contextlib.closing(make_env(resolved)) as env:
+        model = env.engine.model
     worlds = []
     for number, described in enumerate(header.worlds):
         tensors = trajectory.part(f"world.{number}.")

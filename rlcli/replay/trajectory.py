@@ -21,7 +21,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import mujoco
 import safetensors.torch
@@ -33,6 +33,9 @@ from torch import Tensor
 import rlcli
 from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
+from rlcli.envs.layout import TermLayout
+from rlcli.envs.step import Episodes
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, ConfigError
 from rlcli.registry import TaskSource
 from rlcli.runs.atomic_io import disk_errors, write_atomic
@@ -40,11 +43,6 @@ from rlcli.runs.provenance import model_digest
 from rlcli.runs.restore import recorded_task
 from rlcli.runs.safe_io import check_json
 from rlcli.sim.divergence_report import MAX_DESCRIBED
-
-if TYPE_CHECKING:
-    from rlcli.envs.layout import TermLayout
-    from rlcli.envs.step import Episodes
-    from rlcli.envs.vec_env import VecEnv
 
 FORMAT = 2
 STATE_FIELDS = ("qpos", "qvel", "act", "ctrl")

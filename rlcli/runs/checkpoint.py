@@ -200,13 +200,12 @@ class Checkpoint:
         obs = tensors["trainer"].get("observations")
         if obs is not None and (obs.dim() != 2 or obs.shape[1] != values["policy"]["observation_size"]):
             raise CheckpointError(f"{self.folder}/trainer.safetensors: 'observations' has shape {tuple(obs.shape)}")
-        for part in ("policy", "trainer"):
-            file = f"{self.folder / part}.safetensors"
-            for name, value in tensors[part].items():
-                if value.is_floating_point() and not bool(value.isfinite().all()):
-                    raise CheckpointError(f"{file}: '{name}' holds values that are not finite")
-                if name.endswith(("normalizer.var", "normalizer.count")) and bool((value < 0).any()):
-                    raise CheckpointError(f"{file}: '{name}' is negative")
+        file = self.folder / "trainer.safetensors"  # `self.policy()` has checked the tensors of the policy
+        for name, value in tensors["trainer"].items():
+            if value.is_floating_point() and not bool(value.isfinite().all()):
+                raise CheckpointError(f"{file}: '{name}' holds values that are not finite")
+            if name.endswith(("normalizer.var", "normalizer.count")) and bool((value < 0).any()):
+                raise CheckpointError(f"{file}: '{name}' is negative")
         return TrainerState(tensors, values, {name: self._rows(name) for name in self.shards()})
 
     def verify(self, *, whole: bool) -> None:
@@ -280,10 +279,8 @@ def open_checkpoint(folder: Path) -> Checkpoint:
         CheckpointError: if it is missing, incomplete, corrupt or of another format.
     """
     file = folder / "manifest.json"
-    try:
-        manifest = parse_json(read_file(file, JSON_LIMIT), file)
-    except FileNotFoundError:
-        raise CheckpointError(f"{folder} is not a checkpoint: it has no manifest.json") from None
+    data = read_file(file, JSON_LIMIT, missing=f"{folder} is not a checkpoint: it has no manifest.json")
+    manifest = parse_json(data, file)
     if type(manifest.get("format")) is not int or manifest["format"] != FORMAT:
         raise CheckpointError(
             f"{folder} has checkpoint format {str(manifest.get('format'))[:40]}; this rlcli reads {FORMAT}",
@@ -311,10 +308,7 @@ def sha256(data: bytes) -> str:
 
 def _verified(file: Path, size: int, digest: str, limit: int) -> bytes:
     """Return the content of a file after a check of its size and hash."""
-    try:
-        data = read_file(file, limit, size=size)
-    except FileNotFoundError:
-        raise CheckpointError(f"{file} is missing") from None
+    data = read_file(file, limit, size=size, missing=f"{file} is missing")
     if len(data) != size or sha256(data) != digest:
         raise manifest_error(file, len(data), size)
     return data

@@ -69,16 +69,10 @@ class Overview:
         return {"run": str(values.pop("folder")), **values}
 
 
-def overviews(runs_dir: Path, task: str | None = None) -> list[Overview]:
-    """Return all runs under a folder, the newest first and broken ones last.
-
-    Args:
-        runs_dir: the folder of runs.
-        task: return only runs of this task.
-    """
+def overviews(runs_dir: Path) -> list[Overview]:
+    """Return all runs under a folder, the newest first and broken ones last."""
     found = [overview(folder) for folder in run_folders(runs_dir)]
-    chosen = [run for run in found if task is None or run.task == task]
-    return sorted(chosen, key=lambda run: (run.started or "", run.folder.name), reverse=True)
+    return sorted(found, key=lambda run: (run.started or "", run.folder.name), reverse=True)
 
 
 def overview(folder: Path) -> Overview:

@@ -7,19 +7,17 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rlcli.config.load import Resolved, resolve
+from rlcli.envs.layout import Layout
 from rlcli.errors import CheckpointError, TaskError
 from rlcli.registry import TASKS, TaskSource, find_entry, folder_task, installed_task, python_task
 from rlcli.rl.policy import Policy
 from rlcli.runs import trusted_tasks
 from rlcli.runs.checkpoint import Checkpoint
 from rlcli.runs.run import Run
-from rlcli.runs.safe_io import require_inside
-
-if TYPE_CHECKING:
-    from rlcli.envs.layout import Layout
+from rlcli.runs.safe_io import read_errors, require_inside
 
 
 def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
@@ -34,10 +32,8 @@ def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
         CheckpointError: if the run names code that the user has never named on this machine.
     """
     source = recorded_task(run.record["task"], f"the task of {run.folder}", str(run.folder), named)
-    try:
+    with read_errors(run.config):
         require_inside(run.folder, run.config)
-    except OSError as error:
-        raise CheckpointError(f"{run.config} cannot be read: {error.strerror}") from None
     return replace(source, config=run.config)
 
 

@@ -66,10 +66,9 @@ class Run:
         Raises:
             CheckpointError: if it is missing, corrupt, or not a regular file.
         """
+        text = read_file(self.config, strict_yaml.MAX_BYTES, missing=f"{self.folder} has no {CONFIG}")
         try:
-            return strict_yaml.load(read_file(self.config, strict_yaml.MAX_BYTES))
-        except FileNotFoundError:
-            raise CheckpointError(f"{self.folder} has no {CONFIG}") from None
+            return strict_yaml.load(text)
         except strict_yaml.YamlError as error:
             raise CheckpointError(f"{self.config}:{error.line}:{error.column} is corrupt: {error.message}") from None
 
@@ -159,10 +158,7 @@ def open_run(folder: Path) -> Run:
     Raises:
         CheckpointError: if the folder is not a valid run.
     """
-    try:
-        record = read_json(folder, RECORD)
-    except FileNotFoundError:
-        raise CheckpointError(f"{folder} is not a run: it has no {RECORD}") from None
+    record = read_json(folder, RECORD, missing=f"{folder} is not a run: it has no {RECORD}")
     refuse_links(folder)
     for inner in ("checkpoints", "checkpoints/logs"):
         if (folder / inner).is_dir():

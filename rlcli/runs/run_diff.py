@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.config.layers import leaves
 from rlcli.config.messages import dotted
-from rlcli.runs.config_diff import Difference, Section, Values, as_text, compare_values
+from rlcli.runs.config_diff import Difference, Section, as_text, compare_values, run_values
 from rlcli.runs.metric_rows import read_rows
 from rlcli.runs.provenance import differences
 from rlcli.runs.run import Run
@@ -40,7 +40,7 @@ def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until:
         CheckpointError: if a required file cannot be read.
     """
     parts: dict[str, Callable[[], Section]] = {
-        "configuration": lambda: compare_values(Values.of_run(left), Values.of_run(right)),
+        "configuration": lambda: compare_values(run_values(left), run_values(right)),
         "environment": lambda: _environments(left, right),
         "metrics": lambda: _metrics(left, right, until),
         "weights": lambda: _weights(left, right, until),

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from torch import Tensor
+
+from rlcli.envs.vec_env import VecEnv
 from rlcli.evaluation.evaluate import evaluate
 from rlcli.rl.acting import trained_policy
+from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators, undisturbed
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from rlcli.envs.vec_env import VecEnv
-    from rlcli.rl.policy import Policy
 
 _SUCCESS, _RETURN, _LENGTH = "Eval/success_rate", "Eval/mean_reward", "Eval/mean_episode_length"
 

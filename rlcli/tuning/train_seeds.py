@@ -35,7 +35,6 @@ class StudyView(Protocol):
 
     def poll(self) -> None:
         """Update the view if the last update is old enough."""
-        ...
 
     def __enter__(self) -> Any: ...
 
