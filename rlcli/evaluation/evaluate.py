@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.observers import StepObserver
-from rlcli.envs.step import StepRecord, StepResult
+from rlcli.envs.step import Episodes, StepRecord, StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.termination import DIVERGED
 from rlcli.replay.rerun_episode import require_end
@@ -118,7 +118,7 @@ def evaluate(
             obs = step.obs["policy"]
             on_step(step)
             if step.episodes is not None:
-                _add_episodes(result, step, quota, means)
+                _add_episodes(result, step.episodes.ended(), quota, means)
         env.check()
     after = {cause: count - before.get(cause, 0) for cause, count in env.causes.items()}
     result.diverged_by = {cause: count for cause, count in after.items() if count}
@@ -159,9 +159,7 @@ class _EpisodeMeans(StepObserver):
         return found
 
 
-def _add_episodes(result: Evaluation, step: StepResult, quota: Tensor, means: _EpisodeMeans) -> None:
-    assert step.episodes is not None
-    ended = step.episodes.ended()
+def _add_episodes(result: Evaluation, ended: Episodes, quota: Tensor, means: _EpisodeMeans) -> None:
     values = {name: column.tolist() for name, column in ended.metrics.items()} | means.finish(ended.ids)
     for row, env in enumerate(ended.ids.tolist()):
         if quota[env] <= 0:

@@ -117,8 +117,8 @@ def open_loggers(
     run: Run,
     names: Sequence[str],
     *,
-    resume: tuple[int, int] | None = None,
-    config: Mapping[str, Any] | None = None,
+    resume: tuple[int, int] | None,
+    config: Mapping[str, Any],
 ) -> list[Logger]:
     """Open the loggers of a run.
 
@@ -143,7 +143,7 @@ def open_loggers(
                 board = make(run.folder / "tb", resume_after_step=step)
                 loggers.append(FailSafeLogger(name, board, 0))
             else:
-                loggers.append(open_tracker(name, make, run, config or {}, reached))
+                loggers.append(open_tracker(name, make, run, config, reached))
     except BaseException:
         for logger in loggers:
             logger.close("failed")
