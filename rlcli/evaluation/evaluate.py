@@ -110,8 +110,7 @@ def evaluate(
     result = Evaluation()
     before = env.causes
     obs = env.reset(seed=env.seed)["policy"]
-    means = _EpisodeMeans(env)
-    with torch.no_grad(), env.observers.added(means):
+    with torch.no_grad(), env.observers.added(_EpisodeMeans(env)) as means:
         while bool((quota > 0).any()):
             require_end(env, int(env.episode_length_buf.max()))
             step = env.step(act(obs))

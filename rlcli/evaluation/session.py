@@ -252,7 +252,7 @@ def run_episodes(
         return evaluate(session.env, session.act, episodes).summary(), []
     from rlcli.replay.episode_recorder import EpisodeRecorder
 
-    with EpisodeRecorder(session.env, episodes) as recorder:
+    with session.env.observers.added(EpisodeRecorder(session.env, episodes)) as recorder:
         summary = evaluate(session.env, session.act, episodes).summary()
     files = [str(file) for file in recorder.save(record, mode)]
     _log.info(f"recorded {len(recorder.episodes)} episodes to {' and '.join(files)}")

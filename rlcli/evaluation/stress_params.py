@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rlcli.errors import UsageError, did_you_mean, listing
+from rlcli.safe_text import float_or_nan
 
 PHYSICAL = {
     "body_mass": "body_mass",
@@ -180,10 +181,7 @@ def _values(text: str, written: str, name: str, points: int, absolute: bool) -> 
 
 
 def _number(text: str, part: str) -> float:
-    try:
-        value = float(part)
-        if not math.isfinite(value):
-            raise ValueError
-    except ValueError:
-        raise UsageError(f"--sweep {text}: '{part.strip()}' is not a number") from None
+    value = float_or_nan(part)
+    if not math.isfinite(value):
+        raise UsageError(f"--sweep {text}: '{part.strip()}' is not a number")
     return value

@@ -39,13 +39,6 @@ class EpisodeRecorder(StepObserver):
         self.episodes: list[Episode] = []
         """The recorded episodes, in the order in which they ended."""
 
-    def __enter__(self) -> EpisodeRecorder:
-        self._env.observers.add(self)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._env.observers.remove(self)
-
     def before_step(self) -> None:
         """Copy the initial state of new episodes."""
         if not self._start:

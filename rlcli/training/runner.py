@@ -36,15 +36,11 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class ProgressView(Protocol):
+class ProgressView(contextlib.AbstractContextManager[Any], Protocol):
     """Context manager that displays the progress of a training."""
 
     def show(self, progress: Progress) -> None:
         """Display the progress after an iteration."""
-
-    def __enter__(self) -> Any: ...
-
-    def __exit__(self, *_: Any) -> None: ...
 
 
 def run_training(

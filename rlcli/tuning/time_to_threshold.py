@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rlcli.errors import UsageError
+from rlcli.safe_text import float_or_nan
 
 _METRICS = {"success": "Eval/success_rate", "return": "Eval/mean_reward", "length": "Eval/mean_episode_length"}
 
@@ -44,10 +45,7 @@ def read_threshold(text: str) -> Threshold:
         UsageError: for anything else.
     """
     key, _, number = text.partition("=")
-    try:
-        value = float(number)
-    except ValueError:
-        value = math.nan
+    value = float_or_nan(number)
     if key not in _METRICS or not math.isfinite(value):
         raise UsageError(
             f"--until '{text}' is not a threshold", hint="as in --until success=0.99, return=200 or length=250"
