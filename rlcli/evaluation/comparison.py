@@ -80,9 +80,8 @@ def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyIn
             hint="rlcli eval --compare RUN1 RUN2 [...]; shipped, lqr, zero and random may follow a run",
         )
     found: dict[str, PolicyInTask] = {}
-    for name in sorted(
-        dict.fromkeys(names), key=SHIPPED.__eq__
-    ):  # `shipped` comes last: it is searched in the task of the runs
+    # `shipped` comes last: it is searched in the task of the runs
+    for name in sorted(dict.fromkeys(names), key=SHIPPED.__eq__):
         if name not in without_run:
             task = next(iter(found.values())).resolved.source.name if name == SHIPPED and found else None
             found[name] = find_policy(replace(request, task=task, checkpoint=name))

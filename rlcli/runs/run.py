@@ -87,14 +87,12 @@ class Run:
         try:
             self._lock.acquire()
         except Timeout:
-            self._lock = None
             raise MachineError(f"{self.folder} is being written to by another process") from None
 
     def unlock(self) -> None:
         """Release the lock."""
         if self._lock is not None:
             self._lock.release()
-            self._lock = None
 
     def discard(self) -> None:
         """Delete a run that has not started."""

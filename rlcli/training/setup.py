@@ -41,16 +41,18 @@ def build_trainer(job: Job, device: str) -> tuple[Trainer, VecEnv]:
     torch_threads = int(record.get("torch_threads") or threads(resolved)[1])
     trainer, env = make_trainer(resolved, record["seed"], device, torch_threads)
     if saved is not None and state is not None:
-        _resume(job, saved, state, trainer, env)
-        return trainer, env
-    if job.init_from is not None:
+        _load_state(saved, state, trainer, env)
+    elif job.init_from is not None:
         initial = open_checkpoint(job.init_from)
         require_fit(initial, env.layout)
         require_same_policy(initial, trainer.policy(), agent.trainer)
         _load(initial, lambda: trainer.load_weights(initial.tensors("policy")), "its weights do not fit the agent")
     if job.config is not None:
         write_atomic(job.run.config, job.config)
-    trainer.start()
+    if saved is None:
+        trainer.start()
+    elif job.writes and (dropped := drop_after(job.run.checkpoints, saved.step)):
+        _log.info("removed %s later checkpoints: the resumed run replaces them", len(dropped))
     return trainer, env
 
 
@@ -68,8 +70,8 @@ def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int)
         raise
 
 
-def _resume(job: Job, saved: Checkpoint, state: TrainerState, trainer: Trainer, env: VecEnv) -> None:
-    """Load the state of a checkpoint and remove the later checkpoints."""
+def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: VecEnv) -> None:
+    """Load the state of a checkpoint to resume from."""
     require_fit(saved, env.layout)
     _load(saved, lambda: trainer.load(state), "it cannot be resumed")
     if (trainer.iteration, trainer.env_steps) != (saved.iteration, saved.step):
@@ -77,11 +79,6 @@ def _resume(job: Job, saved: Checkpoint, state: TrainerState, trainer: Trainer, 
     processes, size = state.values.get("processes", 1), distributed.current().world_size
     if processes != size:
         _log.info("saved by %s processes, continued by %s: every environment starts a new episode", processes, size)
-    if job.config is not None:
-        write_atomic(job.run.config, job.config)
-    dropped = drop_after(job.run.checkpoints, saved.step) if job.writes else []
-    if dropped:
-        _log.info("removed %s later checkpoints: the resumed run replaces them", len(dropped))
 
 
 def _load(saved: Checkpoint, load: Callable[[], Any], failure: str) -> None:

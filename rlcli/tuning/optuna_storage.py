@@ -56,8 +56,7 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
     median = optuna.pruners.MedianPruner(n_startup_trials=4, n_warmup_steps=30)
     pruner = median if settings["pruner"] == "median" else optuna.pruners.NopPruner()
     with disk_errors(folder / JOURNAL):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             trials = _journal(folder, create) if storage is None else _database(storage)
         study: dict[str, Any] = {"study_name": name, "storage": trials, "pruner": pruner}
         try:
