@@ -72,13 +72,11 @@ def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyIn
     from rlcli.runs.policy_ref import SHIPPED
 
     without_run = [name for name in names if name in POLICIES and name != "trained"]
-    if len(names) < 2 or len(without_run) == len(names):
-        raise UsageError(
-            f"--compare needs at least two policies, found: {listing(names)}"
-            if len(names) < 2
-            else "--compare needs at least one run, whose task is used",
-            hint="rlcli eval --compare RUN1 RUN2 [...]; shipped, lqr, zero and random may follow a run",
-        )
+    usage = "rlcli eval --compare RUN1 RUN2 [...]; shipped, lqr, zero and random may follow a run"
+    if len(names) < 2:
+        raise UsageError(f"--compare needs at least two policies, found: {listing(names)}", hint=usage)
+    if len(without_run) == len(names):
+        raise UsageError("--compare needs at least one run, whose task is used", hint=usage)
     found: dict[str, PolicyInTask] = {}
     # `shipped` comes last: it is searched in the task of the runs
     for name in sorted(dict.fromkeys(names), key=SHIPPED.__eq__):

@@ -166,9 +166,8 @@ def _fit(inputs: Matrix, targets: Matrix) -> tuple[Matrix, Matrix]:
 def _without_randomness(resolved: Resolved) -> Resolved:
     """Return the task without events, curriculum and noise."""
     task = resolved.task
-    observations = {
-        name: group.model_copy(update={"enable_corruption": False}) for name, group in task.observations.items()
-    }
+    clean = {"enable_corruption": False}
+    observations = {name: group.model_copy(update=clean) for name, group in task.observations.items()}
     changes: dict[str, Any] = {"events": {}, "curriculum": {}, "observations": observations}
     return replace(resolved, task=task.model_copy(update=changes))
 

@@ -182,10 +182,8 @@ class _Push:
         env = self._env
         # columns: the step of the push, and its direction
         uniform = random.uniform(_keys(env, env.episode_index), self._stream, 0, 2)
-        push_step = torch.from_numpy(1 + (uniform[:, 0] * (env.max_episode_length // 2)).astype(np.int64)).to(
-            env.device
-        )
-        now = (env.episode_length_buf == push_step) & (self._values > 0)
+        push_step = 1 + (uniform[:, 0] * (env.max_episode_length // 2)).astype(np.int64)
+        now = (env.episode_length_buf == torch.from_numpy(push_step).to(env.device)) & (self._values > 0)
         selection = env.engine.select(now, env.seed, env.episode_index) if bool(now.any()) else None
         if selection is None:
             return

@@ -182,9 +182,8 @@ def run_points(
                 values = torch.tensor([point or unchanged for point in batch], dtype=torch.float64)
                 act = Perturbations(env, sweeps, values.repeat_interleave(size, dim=0)).around(act)
             found = evaluate(env, act, episodes, groups=len(batch))
-        results += [
-            found.part(number * size, (number + 1) * size).in_environment_order() for number in range(len(batch))
-        ]
+        parts = (found.part(first, first + size) for first in range(0, size * len(batch), size))
+        results += [part.in_environment_order() for part in parts]
     return results
 
 

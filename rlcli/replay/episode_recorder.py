@@ -97,9 +97,8 @@ class EpisodeRecorder(StepObserver):
             prefix, steps = f"episode.{number}.", slice(e.begin, e.begin + e.length)
             first = self._first[e.env, e.begin]
             for name in STATE_FIELDS:
-                tensors[prefix + name] = torch.stack(
-                    [first[name], *(after[name][e.env] for after in self._after[steps])]
-                )
+                states = [first[name], *(after[name][e.env] for after in self._after[steps])]
+                tensors[prefix + name] = torch.stack(states)
             tensors |= {prefix + name: values for name, values in first.items() if name.startswith("model.")}
             tensors[f"{prefix}actions"] = actions[steps, e.env]
             tensors[f"{prefix}rewards"] = torch.stack(self._rewards[steps])[:, e.env]

@@ -128,9 +128,8 @@ class FailureRecorder(StepObserver):
         self._written: set[str] = set()
         self._failed = ""
         self._read_folder(step)
-        engine.record_calls(
-            slots * env.calls_per_step, max(0, memory - sum(ring.nbytes for ring in self._rings.values()))
-        )
+        left = memory - sum(ring.nbytes for ring in self._rings.values())
+        engine.record_calls(slots * env.calls_per_step, max(0, left))
         env.observers.add(self)
 
     @property

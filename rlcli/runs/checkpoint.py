@@ -257,9 +257,8 @@ class Checkpoint:
 
     def _shard(self, name: str, shard: Shard) -> dict[str, Tensor]:
         file = self.folder.parent / LOG_FOLDER / name / shard.file
-        columns = _tensors(
-            _verified(file, shard.size, shard.sha256, min(_MAX_SHARD_BYTES, available_memory() // 3)), file
-        )
+        data = _verified(file, shard.size, shard.sha256, min(_MAX_SHARD_BYTES, available_memory() // 3))
+        columns = _tensors(data, file)
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
                 raise CheckpointError(f"{file} is corrupt: '{column}' does not have the rows that the file name states")
