@@ -63,9 +63,8 @@ def require_packages(format_: str) -> None:
             for module in ("onnx", "onnxscript", "onnxruntime"):
                 importlib.import_module(module)
     except ImportError as error:
-        raise DependencyError(
-            f"ONNX export needs onnx, onnxscript and onnxruntime: {error}", hint='pip install "rlcli[export]"'
-        ) from None
+        message = f"ONNX export needs onnx, onnxscript and onnxruntime: {error}"
+        raise DependencyError(message, hint='pip install "rlcli[export]"') from None
 
 
 def _example_inputs(graph: DeployedPolicy) -> tuple[Tensor, ...]:

@@ -176,9 +176,8 @@ def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
     """
     require_known(kind, POLICIES, "policy", "policies")
     if kind == "trained":
-        raise UsageError(
-            "--against trained: only a policy without training can be the reference", hint="lqr, zero or random"
-        )
+        message = "--against trained: only a policy without training can be the reference"
+        raise UsageError(message, hint="lqr, zero or random")
     return replace(policy, kind=kind, stochastic=False, as_trained=False)
 
 

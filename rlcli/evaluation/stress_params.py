@@ -137,10 +137,8 @@ def unknown_parameter(name: str, fields: Sequence[str]) -> UsageError:
 def _read(text: str, points: int) -> Sweep:
     found = _FORM.fullmatch(text.strip())
     if found is None:
-        raise UsageError(
-            f"--sweep '{text}' is not NAME=LOW:HIGH or NAME=A,B,C",
-            hint="for example body_mass.pole=0.5:2, action_delay=0:3, gravity=0.8,1,1.2",
-        )
+        message = f"--sweep '{text}' is not NAME=LOW:HIGH or NAME=A,B,C"
+        raise UsageError(message, hint="for example body_mass.pole=0.5:2, action_delay=0:3, gravity=0.8,1,1.2")
     name, absolute = found["name"], found["absolute"] is not None
     if name in SIGNALS and absolute:
         raise UsageError(f"--sweep {text}: {name} is always absolute [{SIGNALS[name]}]", hint="leave out abs:")

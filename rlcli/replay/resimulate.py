@@ -72,10 +72,8 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
     count = len(trajectory.header.episodes)
     if trajectory.header.kind != "recording":
         if episode is not None or filmed:
-            raise UsageError(
-                "a dump holds no whole episodes: --episode and --video need a recording",
-                hint="rlcli autopsy RUN N --video FILE.mp4 draws a case of a run",
-            )
+            message = "a dump holds no whole episodes: --episode and --video need a recording"
+            raise UsageError(message, hint="rlcli autopsy RUN N --video FILE.mp4 draws a case of a run")
         return []
     if episode is not None and episode >= count:
         raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"it has {count}, counted from 0")

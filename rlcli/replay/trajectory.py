@@ -287,9 +287,8 @@ class Trajectory:
                     replace(p, where=p.where.replace(str(config), str(self.file))) for p in error.problems
                 ) from None
         if not flags and resolved.task.scene.num_envs != self.header.num_envs:
-            raise CheckpointError(
-                f"{self.file} is corrupt: its number of environments differs from its configuration's"
-            )
+            message = f"{self.file} is corrupt: its number of environments differs from its configuration's"
+            raise CheckpointError(message)
         return resolved
 
     def mismatch_error(self, error: Exception) -> CheckpointError:
@@ -339,9 +338,8 @@ def read_trajectory(file: Path) -> Trajectory:
         header = check_json(Header, data, file)
         _check_tensors(header, tensors)
     except FileNotFoundError:
-        raise CheckpointError(
-            f"there is no recording or dump {file}", hint="rlcli eval TASK --record FILE makes a recording"
-        ) from None
+        message = f"there is no recording or dump {file}"
+        raise CheckpointError(message, hint="rlcli eval TASK --record FILE makes a recording") from None
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{file} is corrupt, or no recording or dump: {' '.join(str(error).split())}") from None
     return Trajectory(file, header, tensors)

@@ -56,10 +56,8 @@ def open_bundle(folder: Path) -> Checkpoint:
     bundle = open_checkpoint(folder)
     version = bundle.manifest.get("bundle")
     if type(version) is not int or version != BUNDLE:
-        raise CheckpointError(
-            f"{folder} has bundle version {str(version)[:40]}; this rlcli reads {BUNDLE}",
-            hint="use the rlcli version that its manifest.json names",
-        )
+        message = f"{folder} has bundle version {str(version)[:40]}; this rlcli reads {BUNDLE}"
+        raise CheckpointError(message, hint="use the rlcli version that its manifest.json names")
     check_json(_BundleRecord, bundle.manifest, folder / "manifest.json")
     return bundle
 

@@ -187,9 +187,8 @@ class Checkpoint:
         """
         missing = [part for part in PARTS if f"{part}.safetensors" not in self.manifest["files"]]
         if missing:
-            raise CheckpointError(
-                f"{self.folder} has no {missing[0]}.safetensors", hint="--init-from takes its policy into a new run"
-            )
+            message = f"{self.folder} has no {missing[0]}.safetensors"
+            raise CheckpointError(message, hint="--init-from takes its policy into a new run")
         values = self.json("state.json")
         _check_state(values, self.step, self.folder / "state.json")
         if values["policy"] != self.json("policy.json"):
@@ -281,10 +280,8 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     data = read_file(file, JSON_LIMIT, missing=f"{folder} is not a checkpoint: it has no manifest.json")
     manifest = parse_json(data, file)
     if type(manifest.get("format")) is not int or manifest["format"] != FORMAT:
-        raise CheckpointError(
-            f"{folder} has checkpoint format {str(manifest.get('format'))[:40]}; this rlcli reads {FORMAT}",
-            hint="use the rlcli version that run.json names",
-        )
+        message = f"{folder} has checkpoint format {str(manifest.get('format'))[:40]}; this rlcli reads {FORMAT}"
+        raise CheckpointError(message, hint="use the rlcli version that run.json names")
     step = check_json(_Manifest, manifest, file).step
     name = folder.name
     if name.isdecimal() and name.isascii() and len(name) >= 12 and int(name) != step:

@@ -100,10 +100,8 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
         return
     table = _table([("field", "in the checkpoint", "now"), *differing])
     names = "manifest.json" if "bundle" in checkpoint.manifest else "run.json"
-    raise CheckpointError(
-        f"{checkpoint.folder} does not fit the installed task:\n{table}",
-        hint=f"install the task's version that {names} names, or train again",
-    )
+    message = f"{checkpoint.folder} does not fit the installed task:\n{table}"
+    raise CheckpointError(message, hint=f"install the task's version that {names} names, or train again")
 
 
 def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
@@ -114,10 +112,8 @@ def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
     """
     saved = checkpoint.manifest.get("trainer")
     if saved is not None and saved != trainer:
-        raise CheckpointError(
-            f"{checkpoint.folder} is a checkpoint of trainer '{saved}', but the run's agent uses '{trainer}'",
-            hint="--init-from takes only the weights of its policy, in a new run",
-        )
+        message = f"{checkpoint.folder} is a checkpoint of trainer '{saved}', but the run's agent uses '{trainer}'"
+        raise CheckpointError(message, hint="--init-from takes only the weights of its policy, in a new run")
 
 
 def require_same_policy(checkpoint: Checkpoint, policy: Policy, trainer: str) -> None:

@@ -255,9 +255,8 @@ def _log_std(weights: Mapping[str, Tensor], names: Mapping[str, str], file: Path
     if names["log_std"] in weights:
         return weights[names["log_std"]]
     if names["std"] not in weights:
-        raise CheckpointError(
-            f"{file}: the standard deviation of actions depends on the state; such a policy cannot be imported"
-        )
+        message = f"{file}: the standard deviation of actions depends on the state; such a policy cannot be imported"
+        raise CheckpointError(message)
     return weights[names["std"]].clamp(min=_MIN_STD).log()
 
 

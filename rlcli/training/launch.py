@@ -295,10 +295,8 @@ def _trainer_device(resolved: Resolved, device: str, wanted: str) -> str:
         return device
     if wanted == "auto":
         return "cpu"
-    raise UsageError(
-        f"agent '{resolved.agent_name}' (trainer {agent.trainer}) trains on the CPU only, not on '{device}'",
-        hint="--device cpu, or an agent whose trainer uses the GPU (trainer: ppo)",
-    )
+    message = f"agent '{resolved.agent_name}' (trainer {agent.trainer}) trains on the CPU only, not on '{device}'"
+    raise UsageError(message, hint="--device cpu, or an agent whose trainer uses the GPU (trainer: ppo)")
 
 
 def _require_parallel(resolved: Resolved, gpus: int = 1) -> None:
@@ -309,10 +307,8 @@ def _require_parallel(resolved: Resolved, gpus: int = 1) -> None:
     """
     agent, trainer = resolved.require_agent()
     if (gpus > 1 or distributed.launched()) and not trainer.parallel:
-        raise UsageError(
-            f"trainer '{agent.trainer}' of agent '{resolved.agent_name}' trains in one process only",
-            hint="choose an agent with trainer ppo: --agent NAME",
-        )
+        message = f"trainer '{agent.trainer}' of agent '{resolved.agent_name}' trains in one process only"
+        raise UsageError(message, hint="choose an agent with trainer ppo: --agent NAME")
 
 
 def _require_video(video_every: int | None) -> None:

@@ -80,10 +80,8 @@ def storage_errors(storage: str | None) -> Iterator[None]:
     except Exception as error:
         if storage is None or not _is_database_error(error):
             raise
-        raise MachineError(
-            f"--storage {without_password(storage)} cannot be reached: {_first_line(error)}",
-            hint="when it is available, run the same command again to continue",
-        ) from None
+        message = f"--storage {without_password(storage)} cannot be reached: {_first_line(error)}"
+        raise MachineError(message, hint="when it is available, run the same command again to continue") from None
 
 
 def without_password(url: str) -> str:
@@ -167,10 +165,8 @@ def _database(url: str) -> optuna.storages.BaseStorage:
     except ModuleNotFoundError as error:
         raise DependencyError(f"--storage needs the driver {error.name}", hint=f"pip install {error.name}") from None
     except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError) as error:
-        raise UsageError(
-            f"--storage '{without_password(url)}' is not the URL of a database: {_first_line(error)}",
-            hint="as in postgresql+psycopg://user@host/name",
-        ) from None
+        message = f"--storage '{without_password(url)}' is not the URL of a database: {_first_line(error)}"
+        raise UsageError(message, hint="as in postgresql+psycopg://user@host/name") from None
     except (sqlalchemy.exc.SQLAlchemyError, OSError) as error:
         raise MachineError(f"--storage {without_password(url)} cannot be reached: {_first_line(error)}") from None
 

@@ -314,9 +314,8 @@ def _require_same(location: object, known: Mapping[str, Any], settings: Mapping[
     if differing:
         differences = "; ".join(f"{key}: {known.get(key)!r} there, {settings[key]!r} here" for key in differing[:3])
         where = without_password(str(location))
-        raise UsageError(
-            f"{where} is another sweep ({differences})", hint="choose another --name, or the same settings"
-        )
+        message = f"{where} is another sweep ({differences})"
+        raise UsageError(message, hint="choose another --name, or the same settings")
 
 
 def _sampler(seed: int) -> optuna.samplers.BaseSampler:
