@@ -283,9 +283,8 @@ class Trajectory:
             try:
                 resolved = resolve(replace(source, config=config), flags=flags)
             except ConfigError as error:
-                raise ConfigError(
-                    replace(p, where=p.where.replace(str(config), str(self.file))) for p in error.problems
-                ) from None
+                problems = (replace(p, where=p.where.replace(str(config), str(self.file))) for p in error.problems)
+                raise ConfigError(problems) from None
         if not flags and resolved.task.scene.num_envs != self.header.num_envs:
             message = f"{self.file} is corrupt: its number of environments differs from its configuration's"
             raise CheckpointError(message)

@@ -114,11 +114,7 @@ def check_loggers(names: Sequence[str] | None) -> list[str]:
 
 
 def open_loggers(
-    run: Run,
-    names: Sequence[str],
-    *,
-    resume: tuple[int, int] | None,
-    config: Mapping[str, Any],
+    run: Run, names: Sequence[str], *, resume: tuple[int, int] | None, config: Mapping[str, Any]
 ) -> list[Logger]:
     """Open the loggers of a run.
 

@@ -122,7 +122,7 @@ def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
         return result
     for note in notes:
         _log.warning("%s", note)
-    lines = {name: curves[0].line(metric) for name, metric in METRICS.items() if metric in curves[0].names()}
+    lines = {name: curves[0].line(metric) for name, metric in METRICS.items()}
     found = {name: line for name, line in lines.items() if line is not None}
     result.together = {}
     for name, line in found.items():
