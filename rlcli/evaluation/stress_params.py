@@ -129,9 +129,8 @@ def unknown_parameter(name: str, fields: Sequence[str]) -> UsageError:
     """Return the error for an unknown parameter; `fields` are the names of model fields."""
     own = [*PHYSICAL, *SIGNALS]
     near = did_you_mean(name, [*own, *fields])
-    return UsageError(
-        f"--sweep: there is no parameter '{name}'", hint=near or f"{listing(own)}, or a field of the model"
-    )
+    message = f"--sweep: there is no parameter '{name}'"
+    return UsageError(message, hint=near or f"{listing(own)}, or a field of the model")
 
 
 def _read(text: str, points: int) -> Sweep:

@@ -292,10 +292,8 @@ class Trajectory:
 
     def mismatch_error(self, error: Exception) -> CheckpointError:
         """Return the error for a file whose states do not fit the installed task."""
-        return CheckpointError(
-            f"{self.file} does not fit the installed task: {' '.join(str(error).split())}",
-            hint=f"install the version that made it: {self.header.task}",
-        )
+        message = f"{self.file} does not fit the installed task: {' '.join(str(error).split())}"
+        return CheckpointError(message, hint=f"install the version that made it: {self.header.task}")
 
 
 def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor]) -> None:

@@ -73,10 +73,8 @@ def _untrusted_code_error(record: Mapping[str, Any], what: str, run: str | None)
     code = trusted_tasks.named_code(record)
     name = shlex.quote(code if os.sep in code or "/" in code else f"./{code}")
     allow = f"--task {name}" if run is None else f"rlcli play {name} --checkpoint {shlex.quote(run)}"
-    return CheckpointError(
-        f"{what} is not loaded: it names code that you have not used on this machine, {code}",
-        hint=f"if you trust that code, or have it elsewhere, name it once: {allow}",
-    )
+    message = f"{what} is not loaded: it names code that you have not used on this machine, {code}"
+    return CheckpointError(message, hint=f"if you trust that code, or have it elsewhere, name it once: {allow}")
 
 
 def resolve_run(

@@ -106,10 +106,8 @@ def read_file(file: Path, limit: int, *, size: int | None = None, missing: str |
 
 def manifest_error(file: Path, found: int, size: int) -> CheckpointError:
     """Return the error for a file of `found` bytes whose size or hash differs from the manifest."""
-    return CheckpointError(
-        f"{file} is corrupt: it does not match the manifest ({found} of {size} bytes)",
-        hint="choose an older checkpoint with RUN@step:N",
-    )
+    message = f"{file} is corrupt: it does not match the manifest ({found} of {size} bytes)"
+    return CheckpointError(message, hint="choose an older checkpoint with RUN@step:N")
 
 
 def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
