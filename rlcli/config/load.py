@@ -8,7 +8,7 @@ with its file and line.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -53,19 +53,25 @@ class Resolved:
         """Return a problem at a path of this configuration."""
         return Problem(self.place(path), messages.dotted(path), message, hint)
 
-    def require_agent(self) -> None:
-        """Check that the configuration has an agent, which training needs.
+    def with_num_envs(self, count: int) -> Resolved:
+        """Return the configuration with another number of environments."""
+        scene = self.task.scene.model_copy(update={"num_envs": count})
+        return replace(self, task=self.task.model_copy(update={"scene": scene}))
+
+    def require_agent(self) -> tuple[AgentConfig, TrainerSpec]:
+        """Return the agent and its trainer, which training needs.
 
         Raises:
             ConfigError: if the task has no agent, or several agents and no default.
         """
-        if self.agent is None:
+        if self.agent is None or self.trainer is None:
             names = agent_names(self.layers)
             message = "this task has no agent to train"
             hint = "add agents: {default: NAME, NAME: {trainer: sb3, ...}}"
             if names:
                 message, hint = "no default among the agents", f"--agent {' or '.join(names)}"
             raise ConfigError([self.problem(("agents",), message, hint)])
+        return self.agent, self.trainer
 
 
 def resolve(

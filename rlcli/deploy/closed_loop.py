@@ -384,10 +384,9 @@ class _PlainMujocoRunner:
     def _require_same_sizes(self, model: mujoco.MjModel) -> None:
         own = self._engine.model
         for name in ("nq", "nv", "nu", "na", "nbody", "nsensordata"):
-            if getattr(model, name) != getattr(own, name):
-                raise CheckpointError(
-                    f"the written model has {name} = {getattr(model, name)}, the run's model has {getattr(own, name)}"
-                )
+            written, wanted = getattr(model, name), getattr(own, name)
+            if written != wanted:
+                raise CheckpointError(f"the written model has {name} = {written}, the run's model has {wanted}")
 
 
 def _metadata_error(error: Exception) -> CheckpointError:

@@ -29,9 +29,8 @@ def describe(env: VecEnv) -> dict[str, Any]:
     Raises:
         ConfigError: if the terms of a direct task's `in_terms` do not fit the task.
     """
-    observations, controls = (
-        _describe_direct(env) if isinstance(env, DirectEnv) else _describe_managed(env)  # type: ignore[arg-type]
-    )
+    parts = _describe_direct(env) if isinstance(env, DirectEnv) else _describe_managed(env)  # type: ignore[arg-type]
+    observations, controls = parts
     commands = getattr(env, "command_manager", None)
     return {
         "joints": _joints(env),

@@ -174,9 +174,8 @@ def _temporary_file(file: Path) -> Iterator[Path]:
         made = []
         sync_folder(file.parent)
     except OSError as error:
-        raise MachineError(
-            f"cannot write {file}: {error.strerror or error}", hint="choose another path with --output FILE"
-        ) from error
+        message = f"cannot write {file}: {error.strerror or error}"
+        raise MachineError(message, hint="choose another path with --output FILE") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)

@@ -63,9 +63,8 @@ def require_packages(format_: str) -> None:
             for module in ("onnx", "onnxscript", "onnxruntime"):
                 importlib.import_module(module)
     except ImportError as error:
-        raise DependencyError(
-            f"ONNX export needs onnx, onnxscript and onnxruntime: {error}", hint='pip install "rlcli[export]"'
-        ) from None
+        message = f"ONNX export needs onnx, onnxscript and onnxruntime: {error}"
+        raise DependencyError(message, hint='pip install "rlcli[export]"') from None
 
 
 def _example_inputs(graph: DeployedPolicy) -> tuple[Tensor, ...]:
@@ -180,8 +179,7 @@ def _quiet() -> Iterator[None]:
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), contextlib.redirect_stdout(io.StringIO()):
             yield
     finally:
         logging.disable(before)

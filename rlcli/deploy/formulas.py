@@ -376,9 +376,8 @@ def _to_limits(action: Any, columns: list[int]) -> Formula:
 
 
 def _binary(action: Any, columns: list[int]) -> Formula:
-    return op(
-        "below", given("action", columns), [float(action.threshold)], numbers(action._close), numbers(action._open)
-    )
+    closed, opened = numbers(action._close), numbers(action._open)
+    return op("below", given("action", columns), [float(action.threshold)], closed, opened)
 
 
 _ACTIONS: Mapping[str, Callable[[Any, list[int]], Formula]] = {

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
+from collections.abc import Sequence
 from typing import Any
 
 from rlcli.deploy.graph import DeployedPolicy
 from rlcli.runs.checkpoint import Checkpoint
-from rlcli.runs.checkpoint_manifest import DeploymentRecord, LayoutRecord
+from rlcli.runs.checkpoint_manifest import ActionColumns, DeploymentRecord, LayoutRecord, ObservationColumns
 from rlcli.runs.run import RECORD
 
 SCHEMA = 2
@@ -61,17 +61,10 @@ def metadata_of(
             for part, state in (("h", "hidden states"), ("c", "cell states"))
             if spec.memory
         ],
-        "observations": [
-            {**term.model_dump(mode="json"), "columns": columns}
-            for term, columns in zip(terms, _columns(terms), strict=True)
-        ],
+        "observations": _with_columns(terms),
         "actions": [
-            {
-                **term.model_dump(mode="json"),
-                "columns": columns,
-                "command": "actuator" if term.scale is not None else "task",
-            }
-            for term, columns in zip(layout.actions, _columns(layout.actions), strict=True)
+            {**term, "command": "actuator" if term["scale"] is not None else "task"}
+            for term in _with_columns(layout.actions)
         ],
         "applied": {
             "before_obs": ["observations.modifiers", "observations.clip", "observations.scale", "observations.history"],
@@ -139,6 +132,10 @@ def _entry(value: object) -> str:
     return f"{value:.9g}" if isinstance(value, float) else str(value)
 
 
-def _columns(terms: list[Any]) -> list[list[int]]:
-    ends = itertools.accumulate((term.size for term in terms), initial=0)
-    return [list(pair) for pair in itertools.pairwise(ends)]
+def _with_columns(terms: Sequence[ObservationColumns | ActionColumns]) -> list[dict[str, Any]]:
+    """Return the entries of terms, each with its first column and the column after its last."""
+    entries, begin = [], 0
+    for term in terms:
+        entries.append({**term.model_dump(mode="json"), "columns": [begin, begin + term.size]})
+        begin += term.size
+    return entries

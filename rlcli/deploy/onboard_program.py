@@ -60,9 +60,8 @@ def check_overwrites(policy: Path) -> None:
         UsageError: if the policy has the program's name, or the folder has a model that export did not write.
     """
     if policy.name == PROGRAM:
-        raise UsageError(
-            f"--verify writes its program to {PROGRAM}, so the policy needs another name", hint="--output FILE"
-        )
+        message = f"--verify writes its program to {PROGRAM}, so the policy needs another name"
+        raise UsageError(message, hint="--output FILE")
     model = policy.with_name(MODEL)
     try:
         with model.open("rb") as file:
@@ -72,10 +71,8 @@ def check_overwrites(policy: Path) -> None:
     except OSError:  # a folder, or no permission
         is_exported = False
     if not is_exported:
-        raise UsageError(
-            f"--verify would overwrite {model}, which export has not written",
-            hint="give an --output in an empty folder",
-        )
+        message = f"--verify would overwrite {model}, which export has not written"
+        raise UsageError(message, hint="give an --output in an empty folder")
 
 
 def write_program(folder: Path, text: str) -> bool:

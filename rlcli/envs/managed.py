@@ -204,7 +204,7 @@ class ManagedEnv(VecEnv):
             return
         running = (self.episode_length_buf > 0).long()  # 0 where the episode has just begun
         self.command_manager.compute(self._select_by_step, running)
-        self.event_manager.interval(self._select_by_step, running, self._after_interval_event)
+        self.event_manager.interval(self._select_by_step, running, self.on_moved)
 
     def _select_all_by_step(self) -> Selection:
         selection = self._select_by_step(self._all_envs)
@@ -214,11 +214,6 @@ class ManagedEnv(VecEnv):
     def _select_by_step(self, mask: Tensor) -> Selection | None:
         """Return a selection whose draws are keyed by the step."""
         return self.engine.select(mask, self.seed, self._counters.common_step.expand(self.num_envs).contiguous())
-
-    def _after_interval_event(self, selection: Selection) -> None:
-        self.sim.on_moved(selection)
-        for sensor in self.sensors.values():
-            sensor.on_moved(selection)
 
     def _compute_observations(self) -> dict[str, Tensor]:
         return self.observation_manager.compute()

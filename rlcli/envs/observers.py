@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:  # the start of a training imports this module before torch
     from rlcli.envs.step import StepRecord
@@ -37,6 +37,9 @@ class StepObserver:
         """Run after rewards and terminations are computed, before any reset."""
 
 
+_Observer = TypeVar("_Observer", bound=StepObserver)
+
+
 class Observers:
     """Observers of one environment, with the methods that they override, in the order of `add`."""
 
@@ -52,11 +55,11 @@ class Observers:
         self._set(tuple(other for other in self._observers if other is not observer))
 
     @contextmanager
-    def added(self, observer: StepObserver) -> Iterator[None]:
+    def added(self, observer: _Observer) -> Iterator[_Observer]:
         """Add an observer for the duration of a `with` block."""
         self.add(observer)
         try:
-            yield
+            yield observer
         finally:
             self.remove(observer)
 

@@ -258,6 +258,12 @@ class VecEnv(Workflow):
         for sensor in self.sensors.values():
             sensor.reset(selection)
 
+    def on_moved(self, selection: Selection) -> None:
+        """Note that a state was written between two steps: what derives from it is computed again."""
+        self.sim.on_moved(selection)
+        for sensor in self.sensors.values():
+            sensor.on_moved(selection)
+
     def _observe(self) -> dict[str, Tensor]:
         """Update commands and events, and return the observations of the resulting state."""
         self._update_commands_and_events()

@@ -80,17 +80,14 @@ def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyIn
     from rlcli.runs.policy_ref import SHIPPED
 
     without_run = [name for name in names if name in POLICIES and name != "trained"]
-    if len(names) < 2 or len(without_run) == len(names):
-        raise UsageError(
-            f"--compare needs at least two policies, found: {listing(names)}"
-            if len(names) < 2
-            else "--compare needs at least one run, whose task is used",
-            hint="rlcli eval --compare RUN1 RUN2 [...]; shipped, lqr, zero and random may follow a run",
-        )
+    usage = "rlcli eval --compare RUN1 RUN2 [...]; shipped, lqr, zero and random may follow a run"
+    if len(names) < 2:
+        raise UsageError(f"--compare needs at least two policies, found: {listing(names)}", hint=usage)
+    if len(without_run) == len(names):
+        raise UsageError("--compare needs at least one run, whose task is used", hint=usage)
     found: dict[str, PolicyInTask] = {}
-    for name in sorted(
-        dict.fromkeys(names), key=SHIPPED.__eq__
-    ):  # `shipped` comes last: it is searched in the task of the runs
+    # `shipped` comes last: it is searched in the task of the runs
+    for name in sorted(dict.fromkeys(names), key=SHIPPED.__eq__):
         if name not in without_run:
             task = next(iter(found.values())).resolved.source.name if name == SHIPPED and found else None
             found[name] = find_policy(replace(request, task=task, checkpoint=name))

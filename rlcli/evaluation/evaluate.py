@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.observers import StepObserver
-from rlcli.envs.step import StepRecord, StepResult
+from rlcli.envs.step import Episodes, StepRecord, StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.termination import DIVERGED
 from rlcli.replay.rerun_episode import require_end
@@ -110,15 +110,14 @@ def evaluate(
     result = Evaluation()
     before = env.causes
     obs = env.reset(seed=env.seed)["policy"]
-    means = _EpisodeMeans(env)
-    with torch.no_grad(), env.observers.added(means):
+    with torch.no_grad(), env.observers.added(_EpisodeMeans(env)) as means:
         while bool((quota > 0).any()):
             require_end(env, int(env.episode_length_buf.max()))
             step = env.step(act(obs))
             obs = step.obs["policy"]
             on_step(step)
             if step.episodes is not None:
-                _add_episodes(result, step, quota, means)
+                _add_episodes(result, step.episodes.ended(), quota, means)
         env.check()
     after = {cause: count - before.get(cause, 0) for cause, count in env.causes.items()}
     result.diverged_by = {cause: count for cause, count in after.items() if count}
@@ -159,9 +158,7 @@ class _EpisodeMeans(StepObserver):
         return found
 
 
-def _add_episodes(result: Evaluation, step: StepResult, quota: Tensor, means: _EpisodeMeans) -> None:
-    assert step.episodes is not None
-    ended = step.episodes.ended()
+def _add_episodes(result: Evaluation, ended: Episodes, quota: Tensor, means: _EpisodeMeans) -> None:
     values = {name: column.tolist() for name, column in ended.metrics.items()} | means.finish(ended.ids)
     for row, env in enumerate(ended.ids.tolist()):
         if quota[env] <= 0:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import UsageError, did_you_mean, listing
+from rlcli.safe_text import float_or_nan
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
@@ -119,10 +120,7 @@ def mean_or_rate(entry: Mapping[str, Any]) -> Any:
 
 def _parse(text: str, is_minimum: bool) -> Limit:
     key, _, number = text.partition("=")
-    try:
-        limit = Limit(key, float(number), is_minimum)
-    except ValueError:
-        limit = Limit(key, math.nan, is_minimum)
+    limit = Limit(key, float_or_nan(number), is_minimum)
     if not math.isfinite(limit.value) or not _is_key(limit):
         end = "lower" if is_minimum else "upper"
         raise UsageError(

@@ -7,6 +7,7 @@ an equilibrium, if the observations do not determine the state, or if no linear 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -72,8 +73,7 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
     """
     if resolved.task.success is None:
         raise _no_regulator(resolved, "the task defines no success, so its target state is unknown")
-    env = make_env(_without_randomness(resolved, 1))
-    try:
+    with contextlib.closing(make_env(_without_randomness(resolved.with_num_envs(1)))) as env:
         model = env.engine.model
         if model.nq != model.nv:
             raise _no_regulator(
@@ -82,13 +82,8 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
         if model.na:
             raise _no_regulator(resolved, "its actuators have internal states")
         count = 2 * model.nv + env.layout.action_size
-    finally:
-        env.close()
-    env = make_env(_without_randomness(resolved, 2 + 16 * count))
-    try:
+    with contextlib.closing(make_env(_without_randomness(resolved.with_num_envs(2 + 16 * count)))) as env:
         states, after, observed, rest = _sample_steps(env, resolved)
-    finally:
-        env.close()
     dynamics, residual = _fit(states, after)
     if residual.max() > _MAX_RESIDUAL:
         raise _no_regulator(resolved, "position, velocity and action do not determine the next state linearly")
@@ -144,9 +139,7 @@ def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matr
     both = torch.from_numpy(np.concatenate([np.zeros((2, drawn.shape[1])), drawn, -drawn])).to(env.device)
     qpos.copy_(middle + both[:, :nv])
     qvel.copy_(both[:, nv : 2 * nv])
-    env.sim.on_moved(all_envs)
-    for sensor in env.sensors.values():
-        sensor.on_moved(all_envs)
+    env.on_moved(all_envs)
     env.sim.forward_moved()
     step = env.step(both[:, 2 * nv :].float())
     if bool((step.terminated | step.truncated).any()):
@@ -170,14 +163,12 @@ def _fit(inputs: Matrix, targets: Matrix) -> tuple[Matrix, Matrix]:
     return found, residual / np.maximum(np.sqrt(np.square(targets).mean(axis=0)), 1e-9)
 
 
-def _without_randomness(resolved: Resolved, count: int) -> Resolved:
-    """Return the task with `count` environments and without events, curriculum and noise."""
+def _without_randomness(resolved: Resolved) -> Resolved:
+    """Return the task without events, curriculum and noise."""
     task = resolved.task
-    observations = {
-        name: group.model_copy(update={"enable_corruption": False}) for name, group in task.observations.items()
-    }
-    scene = task.scene.model_copy(update={"num_envs": count})
-    changes: dict[str, Any] = {"scene": scene, "events": {}, "curriculum": {}, "observations": observations}
+    clean = {"enable_corruption": False}
+    observations = {name: group.model_copy(update=clean) for name, group in task.observations.items()}
+    changes: dict[str, Any] = {"events": {}, "curriculum": {}, "observations": observations}
     return replace(resolved, task=task.model_copy(update=changes))
 
 

@@ -182,10 +182,8 @@ class _Push:
         env = self._env
         # columns: the step of the push, and its direction
         uniform = random.uniform(_keys(env, env.episode_index), self._stream, 0, 2)
-        push_step = torch.from_numpy(1 + (uniform[:, 0] * (env.max_episode_length // 2)).astype(np.int64)).to(
-            env.device
-        )
-        now = (env.episode_length_buf == push_step) & (self._values > 0)
+        push_step = 1 + (uniform[:, 0] * (env.max_episode_length // 2)).astype(np.int64)
+        now = (env.episode_length_buf == torch.from_numpy(push_step).to(env.device)) & (self._values > 0)
         selection = env.engine.select(now, env.seed, env.episode_index) if bool(now.any()) else None
         if selection is None:
             return
@@ -202,9 +200,7 @@ class _Push:
             angle = 2.0 * torch.pi * direction
             push = torch.stack([angle.cos() * size, angle.sin() * size, torch.zeros_like(size)], dim=1)
             self._root.write_root_velocity(selection, linear + push, angular)
-        env.sim.on_moved(selection)
-        for sensor in env.sensors.values():
-            sensor.on_moved(selection)
+        env.on_moved(selection)
         env.sim.forward_moved()
 
 

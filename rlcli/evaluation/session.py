@@ -176,9 +176,8 @@ def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
     """
     require_known(kind, POLICIES, "policy", "policies")
     if kind == "trained":
-        raise UsageError(
-            "--against trained: only a policy without training can be the reference", hint="lqr, zero or random"
-        )
+        message = "--against trained: only a policy without training can be the reference"
+        raise UsageError(message, hint="lqr, zero or random")
     return replace(policy, kind=kind, stochastic=False, as_trained=False)
 
 
@@ -252,7 +251,7 @@ def run_episodes(
         return evaluate(session.env, session.act, episodes).summary(), []
     from rlcli.replay.episode_recorder import EpisodeRecorder
 
-    with EpisodeRecorder(session.env, episodes) as recorder:
+    with session.env.observers.added(EpisodeRecorder(session.env, episodes)) as recorder:
         summary = evaluate(session.env, session.act, episodes).summary()
     files = [str(file) for file in recorder.save(record, mode)]
     _log.info(f"recorded {len(recorder.episodes)} episodes to {' and '.join(files)}")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -173,19 +174,16 @@ def run_points(
     for start in range(0, len(points), at_once):
         batch = points[start : start + at_once]
         seed_generators(derive(seed, "task"))  # some tasks draw from torch's, numpy's or Python's generator
-        env = make_env(with_envs(resolved, size * len(batch)), seed=derive(seed, "evaluation"), shared_streams=size)
-        try:
+        batched, env_seed = resolved.with_num_envs(size * len(batch)), derive(seed, "evaluation")
+        with contextlib.closing(make_env(batched, seed=env_seed, shared_streams=size)) as env:
             act = actor(env)
             if sweeps:
                 unchanged = (math.nan,) * len(sweeps)
                 values = torch.tensor([point or unchanged for point in batch], dtype=torch.float64)
                 act = Perturbations(env, sweeps, values.repeat_interleave(size, dim=0)).around(act)
             found = evaluate(env, act, episodes, groups=len(batch))
-        finally:
-            env.close()
-        results += [
-            found.part(number * size, (number + 1) * size).in_environment_order() for number in range(len(batch))
-        ]
+        parts = (found.part(first, first + size) for first in range(0, size * len(batch), size))
+        results += [part.in_environment_order() for part in parts]
     return results
 
 
@@ -205,10 +203,6 @@ def score(summary: Summary) -> tuple[float, float]:
 
 def one_each(resolved: Resolved, episodes: int) -> Resolved:
     """Return the task with one environment for each episode, unless the user has set the number."""
-    return resolved if "scene.num_envs" in explicit_values(resolved) else with_envs(resolved, min(episodes, MAX_ENVS))
-
-
-def with_envs(resolved: Resolved, count: int) -> Resolved:
-    """Return the task with this number of environments."""
-    scene = resolved.task.scene.model_copy(update={"num_envs": count})
-    return replace(resolved, task=resolved.task.model_copy(update={"scene": scene}))
+    if "scene.num_envs" in explicit_values(resolved):
+        return resolved
+    return resolved.with_num_envs(min(episodes, MAX_ENVS))

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rlcli.errors import UsageError, did_you_mean, listing
+from rlcli.safe_text import float_or_nan
 
 PHYSICAL = {
     "body_mass": "body_mass",
@@ -128,18 +129,15 @@ def unknown_parameter(name: str, fields: Sequence[str]) -> UsageError:
     """Return the error for an unknown parameter; `fields` are the names of model fields."""
     own = [*PHYSICAL, *SIGNALS]
     near = did_you_mean(name, [*own, *fields])
-    return UsageError(
-        f"--sweep: there is no parameter '{name}'", hint=near or f"{listing(own)}, or a field of the model"
-    )
+    message = f"--sweep: there is no parameter '{name}'"
+    return UsageError(message, hint=near or f"{listing(own)}, or a field of the model")
 
 
 def _read(text: str, points: int) -> Sweep:
     found = _FORM.fullmatch(text.strip())
     if found is None:
-        raise UsageError(
-            f"--sweep '{text}' is not NAME=LOW:HIGH or NAME=A,B,C",
-            hint="for example body_mass.pole=0.5:2, action_delay=0:3, gravity=0.8,1,1.2",
-        )
+        message = f"--sweep '{text}' is not NAME=LOW:HIGH or NAME=A,B,C"
+        raise UsageError(message, hint="for example body_mass.pole=0.5:2, action_delay=0:3, gravity=0.8,1,1.2")
     name, absolute = found["name"], found["absolute"] is not None
     if name in SIGNALS and absolute:
         raise UsageError(f"--sweep {text}: {name} is always absolute [{SIGNALS[name]}]", hint="leave out abs:")
@@ -180,10 +178,7 @@ def _values(text: str, written: str, name: str, points: int, absolute: bool) -> 
 
 
 def _number(text: str, part: str) -> float:
-    try:
-        value = float(part)
-        if not math.isfinite(value):
-            raise ValueError
-    except ValueError:
-        raise UsageError(f"--sweep {text}: '{part.strip()}' is not a number") from None
+    value = float_or_nan(part)
+    if not math.isfinite(value):
+        raise UsageError(f"--sweep {text}: '{part.strip()}' is not a number")
     return value

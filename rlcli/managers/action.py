@@ -45,7 +45,6 @@ class ActionTerm(Protocol):
 
     def process(self, action: Tensor) -> None:
         """Write the controls for this step's columns. action (num_envs, size)"""
-        ...
 
 
 class ActionManager(TensorState):

@@ -43,11 +43,9 @@ class CommandTerm(Protocol):
 
     def resample(self, selection: Selection) -> None:
         """Draw new commands for the selected environments."""
-        ...
 
     def update(self) -> None:
         """Update the command from the state (a heading, a frame); called once a step, after resampling."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,12 +91,10 @@ class TermEnv(Protocol):
     @property
     def entities(self) -> Mapping[str, Entity]:
         """Entities of the scene by name."""
-        ...
 
     @property
     def sensors(self) -> Mapping[str, Sensor]:
         """Sensors of the scene by name."""
-        ...
 
 
 class Binder:

@@ -93,9 +93,8 @@ def trace_calls(env: VecEnv, divergence: Divergence, pending: bool = False) -> C
     calls, final = engine.recorded_calls(number), engine.state_row(number)
     if pending:
         calls = [*calls, Call(final, env.config.decimation)]
-    own_model = {
-        name: torch.from_numpy(np.atleast_1d(values)) for name, values in engine.own_model_fields(number).items()
-    }
+    fields = engine.own_model_fields(number)
+    own_model = {name: torch.from_numpy(np.atleast_1d(values)) for name, values in fields.items()}
     return CallTrace(divergence, calls, final, own_model, 1 if pending else env.calls_per_step, pending)
 
 

@@ -39,13 +39,6 @@ class EpisodeRecorder(StepObserver):
         self.episodes: list[Episode] = []
         """The recorded episodes, in the order in which they ended."""
 
-    def __enter__(self) -> EpisodeRecorder:
-        self._env.observers.add(self)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._env.observers.remove(self)
-
     def before_step(self) -> None:
         """Copy the initial state of new episodes."""
         if not self._start:
@@ -104,9 +97,8 @@ class EpisodeRecorder(StepObserver):
             prefix, steps = f"episode.{number}.", slice(e.begin, e.begin + e.length)
             first = self._first[e.env, e.begin]
             for name in STATE_FIELDS:
-                tensors[prefix + name] = torch.stack(
-                    [first[name], *(after[name][e.env] for after in self._after[steps])]
-                )
+                states = [first[name], *(after[name][e.env] for after in self._after[steps])]
+                tensors[prefix + name] = torch.stack(states)
             tensors |= {prefix + name: values for name, values in first.items() if name.startswith("model.")}
             tensors[f"{prefix}actions"] = actions[steps, e.env]
             tensors[f"{prefix}rewards"] = torch.stack(self._rewards[steps])[:, e.env]

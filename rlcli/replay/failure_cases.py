@@ -18,7 +18,7 @@ from rlcli.replay.resimulate import Staged, stage
 from rlcli.replay.trajectory import Episode, Failure, Trajectory, World, read_trajectory
 from rlcli.runs.atomic_io import finite_json
 from rlcli.runs.run import Run
-from rlcli.runs.safe_io import refuse_links, require_inside
+from rlcli.runs.safe_io import read_errors, refuse_links, require_inside
 
 _log = logging.getLogger(__name__)
 FOLDER = "autopsy"
@@ -122,10 +122,8 @@ def list_failure_cases(run: Run) -> list[FailureCase]:
     folder = run.folder / FOLDER
     if not folder.is_dir():
         return []
-    try:
+    with read_errors(folder):
         require_inside(run.folder, folder)
-    except OSError as error:
-        raise CheckpointError(f"{folder} cannot be read: {error.strerror}") from None
     refuse_links(folder)
     cases = []
     for file in sorted(file for file in folder.iterdir() if FILE_NAME.fullmatch(file.name))[:_MAX_FILES]:

@@ -56,6 +56,9 @@ _RETURNS_FILE = "recent.json"
 _MIN_SPREAD = 1e-3
 """Smallest interquartile range, as a share of the quartiles: returns with three equal digits are not unusual."""
 
+_Key = tuple[FailureKind, *tuple[str, ...]]
+"""Kind of an episode, and the causes of its end: of episodes with an equal key one is kept in an iteration."""
+
 
 @dataclass(frozen=True, slots=True)
 class KeptEpisode:
@@ -114,7 +117,7 @@ class FailureRecorder(StepObserver):
         }
         self._step = 0
         self._diverging: dict[int, CallTrace] = {}
-        self._pending: dict[tuple[str, ...], KeptEpisode] = {}
+        self._pending: dict[_Key, KeptEpisode] = {}
         """(kind, causes) -> the recorded episode of this iteration."""
         self._returns: list[NDArray[np.float32]] = []
         self._recent = np.zeros(0)
@@ -125,9 +128,8 @@ class FailureRecorder(StepObserver):
         self._written: set[str] = set()
         self._failed = ""
         self._read_folder(step)
-        engine.record_calls(
-            slots * env.calls_per_step, max(0, memory - sum(ring.nbytes for ring in self._rings.values()))
-        )
+        left = memory - sum(ring.nbytes for ring in self._rings.values())
+        engine.record_calls(slots * env.calls_per_step, max(0, left))
         env.observers.add(self)
 
     @property
@@ -228,7 +230,7 @@ class FailureRecorder(StepObserver):
             for row, env in enumerate(ended.ids.tolist() if self._diverging else ()):
                 trace = self._diverging.get(env)
                 if trace is not None and ("diverged", trace.divergence.cause) not in self._pending:
-                    self._keep_episode(("diverged", trace.divergence.cause), "diverged", 0.0, ended, row, trace)
+                    self._keep_episode(("diverged", trace.divergence.cause), 0.0, ended, row, trace)
         else:
             diverged = np.zeros(len(returns), bool)
         low, high = self._fences()
@@ -237,7 +239,7 @@ class FailureRecorder(StepObserver):
             ("high return", -returns, returns > high),
         ]
         for kind, value, mask in unusual:
-            self._keep_lowest((kind,), kind, value, mask & ~diverged, ended)
+            self._keep_lowest((kind,), value, mask & ~diverged, ended)
             rest = rest & ~mask
         rest &= ~diverged
         if not rest.any():
@@ -247,16 +249,9 @@ class FailureRecorder(StepObserver):
             code |= fired.numpy().astype(np.int64) << number % 62
         for causes in np.unique(code[rest]).tolist():
             names = [name for number, name in enumerate(ended.causes) if causes >> number % 62 & 1]
-            self._keep_lowest(("terminated", *names), "terminated", returns, rest & (code == causes), ended)
+            self._keep_lowest(("terminated", *names), returns, rest & (code == causes), ended)
 
-    def _keep_lowest(
-        self,
-        key: tuple[str, ...],
-        kind: FailureKind,
-        value: NDArray[np.float32],
-        mask: NDArray[np.bool_],
-        ended: Episodes,
-    ) -> None:
+    def _keep_lowest(self, key: _Key, value: NDArray[np.float32], mask: NDArray[np.bool_], ended: Episodes) -> None:
         """Record the episode with the lowest value where a mask holds, if it is lower than the recorded one's."""
         if not mask.any():
             return
@@ -264,12 +259,10 @@ class FailureRecorder(StepObserver):
         kept = self._pending.get(key)
         wanted = len(self._pending) < self._keep if kept is None else bool(value[row] < kept.value)
         if wanted:
-            trace = trace_calls(self._env, Divergence(int(ended.ids[row]), kind))
-            self._keep_episode(key, kind, float(value[row]), ended, row, trace)
+            trace = trace_calls(self._env, Divergence(int(ended.ids[row]), key[0]))
+            self._keep_episode(key, float(value[row]), ended, row, trace)
 
-    def _keep_episode(
-        self, key: tuple[str, ...], kind: FailureKind, value: float, ended: Episodes, row: int, trace: CallTrace
-    ) -> None:
+    def _keep_episode(self, key: _Key, value: float, ended: Episodes, row: int, trace: CallTrace) -> None:
         """Copy the last steps of an episode, as many as the ring buffers and the trace hold."""
         per_step, env = self._env.calls_per_step, trace.divergence.env
         whole = (len(trace.calls) - trace.last) // per_step
@@ -282,7 +275,7 @@ class FailureRecorder(StepObserver):
         arrays["reward_terms"] = self._rings["reward_terms"][slots, :, env]
         tensors = {f"episode.0.{name}": torch.from_numpy(values) for name, values in arrays.items()}
         episode = Episode.of(self._env, ended, row, kept=steps)
-        self._pending[key] = KeptEpisode(value, kind, episode, trace, tensors, self._engine.own_constants)
+        self._pending[key] = KeptEpisode(value, key[0], episode, trace, tensors, self._engine.own_constants)
 
     def _fences(self) -> tuple[float, float]:
         """Return the bounds beyond which a return is unusual."""

@@ -7,6 +7,7 @@ without the task's terms.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -71,10 +72,8 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
     count = len(trajectory.header.episodes)
     if trajectory.header.kind != "recording":
         if episode is not None or filmed:
-            raise UsageError(
-                "a dump holds no whole episodes: --episode and --video need a recording",
-                hint="rlcli autopsy RUN N --video FILE.mp4 draws a case of a run",
-            )
+            message = "a dump holds no whole episodes: --episode and --video need a recording"
+            raise UsageError(message, hint="rlcli autopsy RUN N --video FILE.mp4 draws a case of a run")
         return []
     if episode is not None and episode >= count:
         raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"it has {count}, counted from 0")
@@ -260,9 +259,8 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
         CheckpointError: if the states or model fields do not fit it.
     """
     header, resolved = trajectory.header, trajectory.resolved(named)
-    env = make_env(resolved)
-    model = env.engine.model
-    env.close()
+    with contextlib.closing(make_env(resolved)) as env:
+        model = env.engine.model
     worlds = []
     for number, described in enumerate(header.worlds):
         tensors = trajectory.part(f"world.{number}.")

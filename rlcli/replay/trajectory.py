@@ -21,7 +21,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import mujoco
 import safetensors.torch
@@ -33,6 +33,9 @@ from torch import Tensor
 import rlcli
 from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
+from rlcli.envs.layout import TermLayout
+from rlcli.envs.step import Episodes
+from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, ConfigError
 from rlcli.registry import TaskSource
 from rlcli.runs.atomic_io import disk_errors, write_atomic
@@ -40,11 +43,6 @@ from rlcli.runs.provenance import model_digest
 from rlcli.runs.restore import recorded_task
 from rlcli.runs.safe_io import check_json
 from rlcli.sim.divergence_report import MAX_DESCRIBED
-
-if TYPE_CHECKING:
-    from rlcli.envs.layout import TermLayout
-    from rlcli.envs.step import Episodes
-    from rlcli.envs.vec_env import VecEnv
 
 FORMAT = 2
 STATE_FIELDS = ("qpos", "qvel", "act", "ctrl")
@@ -285,21 +283,17 @@ class Trajectory:
             try:
                 resolved = resolve(replace(source, config=config), flags=flags)
             except ConfigError as error:
-                raise ConfigError(
-                    replace(p, where=p.where.replace(str(config), str(self.file))) for p in error.problems
-                ) from None
+                problems = (replace(p, where=p.where.replace(str(config), str(self.file))) for p in error.problems)
+                raise ConfigError(problems) from None
         if not flags and resolved.task.scene.num_envs != self.header.num_envs:
-            raise CheckpointError(
-                f"{self.file} is corrupt: its number of environments differs from its configuration's"
-            )
+            message = f"{self.file} is corrupt: its number of environments differs from its configuration's"
+            raise CheckpointError(message)
         return resolved
 
     def mismatch_error(self, error: Exception) -> CheckpointError:
         """Return the error for a file whose states do not fit the installed task."""
-        return CheckpointError(
-            f"{self.file} does not fit the installed task: {' '.join(str(error).split())}",
-            hint=f"install the version that made it: {self.header.task}",
-        )
+        message = f"{self.file} does not fit the installed task: {' '.join(str(error).split())}"
+        return CheckpointError(message, hint=f"install the version that made it: {self.header.task}")
 
 
 def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor]) -> None:
@@ -341,9 +335,8 @@ def read_trajectory(file: Path) -> Trajectory:
         header = check_json(Header, data, file)
         _check_tensors(header, tensors)
     except FileNotFoundError:
-        raise CheckpointError(
-            f"there is no recording or dump {file}", hint="rlcli eval TASK --record FILE makes a recording"
-        ) from None
+        message = f"there is no recording or dump {file}"
+        raise CheckpointError(message, hint="rlcli eval TASK --record FILE makes a recording") from None
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{file} is corrupt, or no recording or dump: {' '.join(str(error).split())}") from None
     return Trajectory(file, header, tensors)

@@ -139,8 +139,8 @@ def _drawing(settings: dict[str, Any]) -> Iterator[None]:
     check_drawing()
     import matplotlib as mpl
 
-    with mpl.rc_context(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # matplotlib draws a box for a letter that the font lacks
+    # matplotlib warns that it draws a box for a letter that the font lacks
+    with mpl.rc_context(), warnings.catch_warnings(action="ignore"):
         mpl.rcdefaults()  # without the user's matplotlibrc, so that the picture is the same everywhere
         mpl.rc_file(_STYLE, use_default_template=False)
         mpl.rcParams.update(settings)

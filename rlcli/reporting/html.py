@@ -13,7 +13,6 @@ from markupsafe import Markup, escape
 
 from rlcli import __version__
 from rlcli.reporting.run_page import Page
-from rlcli.reporting.task_card import Card
 from rlcli.safe_text import UNSAFE, shorten
 
 POLICY = (
@@ -30,18 +29,13 @@ _NOT_SHOWN = re.compile(f"{UNSAFE.pattern}|[\ufffe\uffff]")
 def render(page: Page) -> str:
     """Return the page as HTML."""
     video = None if page.video is None else f"data:video/mp4;base64,{base64.b64encode(page.video).decode()}"
-    template = _templates().get_template("page.html.jinja")
+    template = templates().get_template("page.html.jinja")
     return template.render(page=page, policy=POLICY, video=video, version=__version__)
 
 
-def card_html(card: Card, level: int = 2) -> str:
-    """Return only a task card as HTML; `level` is the level of its first heading."""
-    module: Any = _templates().get_template("card.html.jinja").module
-    return str(module.card(card, level))
-
-
 @functools.cache
-def _templates() -> jinja2.Environment:
+def templates() -> jinja2.Environment:
+    """Return the environment of the templates of pages."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_TEMPLATES),
         autoescape=True,

@@ -11,7 +11,7 @@ from rlcli.evaluation import session as sessions
 from rlcli.reporting.run_page import Page, reason_of
 from rlcli.runs.eval_store import read_evaluation
 from rlcli.runs.run import Run, require_own
-from rlcli.runs.safe_io import read_file, require_inside
+from rlcli.runs.safe_io import read_errors, read_file, require_inside
 
 _log = logging.getLogger(__name__)
 
@@ -105,12 +105,11 @@ class PageMedia:
             CheckpointError: if it is not an MP4, is outside the run's folder, or is too large for a page.
         """
         try:
-            require_inside(self._run.folder, file)
-            data = read_file(file, _MAX_VIDEO_BYTES)
+            with read_errors(file):
+                require_inside(self._run.folder, file)
+                data = read_file(file, _MAX_VIDEO_BYTES)
         except FileNotFoundError:
             return None
-        except OSError as error:
-            raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
         if data[4:8] != b"ftyp":
             raise CheckpointError(f"{file} is not an MP4")
         return data

@@ -271,18 +271,12 @@ def _sensors(task: TaskConfig) -> Table:
 
 def _actuators(task: TaskConfig) -> Table:
     """Return the table of actuator models; MuJoCo's own actuators are in the MJCF and are left out."""
-    rows = [
-        (
-            name,
-            actuator.kind,
-            text_of(actuator.joints),
-            text_of(actuator.model_dump(exclude={"kind", "joints"}, exclude_none=True)),
-        )
-        for entity in task.scene.entities.values()
-        for name, actuator in entity.actuators.items()
-    ]
-    columns = _columns("Name", "Kind", "Joints", "Settings")
-    return Table("Actuators", "", columns, tuple(rows))
+    rows = []
+    for entity in task.scene.entities.values():
+        for name, actuator in entity.actuators.items():
+            settings = actuator.model_dump(exclude={"kind", "joints"}, exclude_none=True)
+            rows.append((name, actuator.kind, text_of(actuator.joints), text_of(settings)))
+    return Table("Actuators", "", _columns("Name", "Kind", "Joints", "Settings"), tuple(rows))
 
 
 # --- direct tasks ---

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from rlcli.config.schema import AgentConfig
@@ -33,9 +34,6 @@ class Budget:
 
 def remaining_budget(config: AgentConfig, trainer: Trainer) -> float:
     """Return the share of an agent's budget that is left, 1 to 0. It does not change during an iteration."""
-    spent = [0.0]
-    if config.max_iterations is not None:
-        spent.append(trainer.iteration / config.max_iterations)
-    if config.max_steps is not None:
-        spent.append(trainer.iteration * trainer.steps_per_iteration / config.max_steps)
-    return 1.0 - min(1.0, max(spent))
+    by_iterations = trainer.iteration / (config.max_iterations or math.inf)
+    by_steps = trainer.iteration * trainer.steps_per_iteration / (config.max_steps or math.inf)
+    return 1.0 - min(1.0, max(by_iterations, by_steps))

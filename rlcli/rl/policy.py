@@ -275,9 +275,8 @@ def blank_policy(spec: Mapping[str, object]) -> Policy:
     with torch.device("meta"):
         policy = Policy(checked)
     if size_of(policy) > _MAX_BYTES:
-        raise CheckpointError(
-            f"policy.json describes a policy of {size_of(policy):,} bytes; at most {_MAX_BYTES:,} are allowed"
-        )
+        message = f"policy.json describes a policy of {size_of(policy):,} bytes; at most {_MAX_BYTES:,} are allowed"
+        raise CheckpointError(message)
     return policy
 
 

@@ -53,38 +53,29 @@ class Trainer(Protocol):
     @property
     def iteration(self) -> int:
         """Number of finished iterations."""
-        ...
 
     @property
     def steps_per_iteration(self) -> int:
         """Environment steps of an iteration, over all environments and processes."""
-        ...
 
     @property
     def env_steps(self) -> int:
         """Environment steps so far, over all environments and processes."""
-        ...
 
     def start(self) -> None:
         """Reset the environment. It is called once, before the first iteration of a run that is not resumed."""
-        ...
 
     def iterate(self) -> Report:
         """Do one iteration: collect experience, then update."""
-        ...
 
     def policy(self) -> Policy:
         """Return the current policy, with a copy of the weights."""
-        ...
 
     def state(self) -> TrainerState:
         """Return a copy of the state; the rows of its logs can be read until the end of the next iteration."""
-        ...
 
     def load(self, state: TrainerState) -> None:
         """Restore the state returned by `state()`."""
-        ...
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
         """Load the weights of a policy and nothing else (`--init-from`)."""
-        ...

@@ -23,15 +23,13 @@ def write_atomic(file: Path, content: bytes | str) -> Path:
     data = content.encode() if isinstance(content, str) else content
     temporary = file.with_name(f".{file.name}.tmp-{os.getpid()}")
     try:
-        temporary.unlink(missing_ok=True)  # open() would follow a link of this name
-        write_synced(temporary, data)
-        os.replace(temporary, file)
-    except BaseException as error:
+        with disk_errors(file):
+            temporary.unlink(missing_ok=True)  # open() would follow a link of this name
+            write_synced(temporary, data)
+            os.replace(temporary, file)
+    finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise disk_error(file, error) from error
-        raise
     return file
 
 

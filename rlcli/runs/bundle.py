@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import safetensors.torch
+import torch
 from pydantic import Field
 
 from rlcli.errors import CheckpointError, UsageError, VerdictError
@@ -55,10 +56,8 @@ def open_bundle(folder: Path) -> Checkpoint:
     bundle = open_checkpoint(folder)
     version = bundle.manifest.get("bundle")
     if type(version) is not int or version != BUNDLE:
-        raise CheckpointError(
-            f"{folder} has bundle version {str(version)[:40]}; this rlcli reads {BUNDLE}",
-            hint="use the rlcli version that its manifest.json names",
-        )
+        message = f"{folder} has bundle version {str(version)[:40]}; this rlcli reads {BUNDLE}"
+        raise CheckpointError(message, hint="use the rlcli version that its manifest.json names")
     check_json(_BundleRecord, bundle.manifest, folder / "manifest.json")
     return bundle
 
@@ -148,11 +147,8 @@ def _write_folder(output: Path, contents: Mapping[str, bytes], checkpoint: Check
 
 def _require_same_policy(checkpoint: Checkpoint, fresh: Path, output: Path) -> None:
     before, after = checkpoint.policy(), open_bundle(fresh).policy()
-    written = after.state_dict()
-    same = before.spec == after.spec and all(
-        bool((value == written[name]).all()) for name, value in before.state_dict().items()
-    )
-    if not same:
+    pairs = zip(before.state_dict().values(), after.state_dict().values(), strict=True)
+    if before.spec != after.spec or not all(torch.equal(value, written) for value, written in pairs):
         raise VerdictError(f"{output} is not kept: it does not read back as the checkpoint's policy")
 
 

@@ -187,9 +187,8 @@ class Checkpoint:
         """
         missing = [part for part in PARTS if f"{part}.safetensors" not in self.manifest["files"]]
         if missing:
-            raise CheckpointError(
-                f"{self.folder} has no {missing[0]}.safetensors", hint="--init-from takes its policy into a new run"
-            )
+            message = f"{self.folder} has no {missing[0]}.safetensors"
+            raise CheckpointError(message, hint="--init-from takes its policy into a new run")
         values = self.json("state.json")
         _check_state(values, self.step, self.folder / "state.json")
         if values["policy"] != self.json("policy.json"):
@@ -200,13 +199,12 @@ class Checkpoint:
         obs = tensors["trainer"].get("observations")
         if obs is not None and (obs.dim() != 2 or obs.shape[1] != values["policy"]["observation_size"]):
             raise CheckpointError(f"{self.folder}/trainer.safetensors: 'observations' has shape {tuple(obs.shape)}")
-        for part in ("policy", "trainer"):
-            file = f"{self.folder / part}.safetensors"
-            for name, value in tensors[part].items():
-                if value.is_floating_point() and not bool(value.isfinite().all()):
-                    raise CheckpointError(f"{file}: '{name}' holds values that are not finite")
-                if name.endswith(("normalizer.var", "normalizer.count")) and bool((value < 0).any()):
-                    raise CheckpointError(f"{file}: '{name}' is negative")
+        file = self.folder / "trainer.safetensors"  # `self.policy()` has checked the tensors of the policy
+        for name, value in tensors["trainer"].items():
+            if value.is_floating_point() and not bool(value.isfinite().all()):
+                raise CheckpointError(f"{file}: '{name}' holds values that are not finite")
+            if name.endswith(("normalizer.var", "normalizer.count")) and bool((value < 0).any()):
+                raise CheckpointError(f"{file}: '{name}' is negative")
         return TrainerState(tensors, values, {name: self._rows(name) for name in self.shards()})
 
     def verify(self, *, whole: bool) -> None:
@@ -258,9 +256,8 @@ class Checkpoint:
 
     def _shard(self, name: str, shard: Shard) -> dict[str, Tensor]:
         file = self.folder.parent / LOG_FOLDER / name / shard.file
-        columns = _tensors(
-            _verified(file, shard.size, shard.sha256, min(_MAX_SHARD_BYTES, available_memory() // 3)), file
-        )
+        data = _verified(file, shard.size, shard.sha256, min(_MAX_SHARD_BYTES, available_memory() // 3))
+        columns = _tensors(data, file)
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
                 raise CheckpointError(f"{file} is corrupt: '{column}' does not have the rows that the file name states")
@@ -280,15 +277,11 @@ def open_checkpoint(folder: Path) -> Checkpoint:
         CheckpointError: if it is missing, incomplete, corrupt or of another format.
     """
     file = folder / "manifest.json"
-    try:
-        manifest = parse_json(read_file(file, JSON_LIMIT), file)
-    except FileNotFoundError:
-        raise CheckpointError(f"{folder} is not a checkpoint: it has no manifest.json") from None
+    data = read_file(file, JSON_LIMIT, missing=f"{folder} is not a checkpoint: it has no manifest.json")
+    manifest = parse_json(data, file)
     if type(manifest.get("format")) is not int or manifest["format"] != FORMAT:
-        raise CheckpointError(
-            f"{folder} has checkpoint format {str(manifest.get('format'))[:40]}; this rlcli reads {FORMAT}",
-            hint="use the rlcli version that run.json names",
-        )
+        message = f"{folder} has checkpoint format {str(manifest.get('format'))[:40]}; this rlcli reads {FORMAT}"
+        raise CheckpointError(message, hint="use the rlcli version that run.json names")
     step = check_json(_Manifest, manifest, file).step
     name = folder.name
     if name.isdecimal() and name.isascii() and len(name) >= 12 and int(name) != step:
@@ -311,10 +304,7 @@ def sha256(data: bytes) -> str:
 
 def _verified(file: Path, size: int, digest: str, limit: int) -> bytes:
     """Return the content of a file after a check of its size and hash."""
-    try:
-        data = read_file(file, limit, size=size)
-    except FileNotFoundError:
-        raise CheckpointError(f"{file} is missing") from None
+    data = read_file(file, limit, size=size, missing=f"{file} is missing")
     if len(data) != size or sha256(data) != digest:
         raise manifest_error(file, len(data), size)
     return data

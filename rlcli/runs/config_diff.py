@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.config.layers import leaves
 from rlcli.config.messages import dotted
+from rlcli.config.strict_yaml import Path
 from rlcli.runs.run import Run
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
-    from rlcli.config.strict_yaml import Path
 
 CATEGORIES = ("physics", "MDP", "agent", "cosmetic")
 """Categories of keys. physics: the simulation between two actions. MDP: observations, rewards, random draws, and the
@@ -62,58 +62,46 @@ class Section:
     differences: list[Difference] = field(default_factory=list)
 
 
-@dataclass(frozen=True, slots=True)
-class Values:
-    """The values of a configuration by path, each with the place where it was written."""
+Values = dict[Path, tuple[Any, str | None]]
+"""The values of a configuration by path, each with the place where it was written."""
 
-    values: Mapping[Path, tuple[Any, str | None]]
 
-    @classmethod
-    def of_run(cls, run: Run) -> Values:
-        """Return the configuration and the seed with which a run was trained.
+def run_values(run: Run) -> Values:
+    """Return the configuration and the seed with which a run was trained.
 
-        Raises:
-            CheckpointError: if the run's configuration cannot be read.
-        """
-        document = run.read_config()
-        given = run.record.get("given", {})
+    Raises:
+        CheckpointError: if the run's configuration cannot be read.
+    """
+    document = run.read_config()
+    given = run.record.get("given", {})
 
-        def written_at(path: Path) -> str:
-            line, column = document.marks.get(path, (0, 0))
-            return str(given.get(dotted(path)) or f"{run.config.name}:{line}:{column}")
+    def written_at(path: Path) -> str:
+        line, column = document.marks.get(path, (0, 0))
+        return str(given.get(dotted(path)) or f"{run.config.name}:{line}:{column}")
 
-        found: dict[Path, tuple[Any, str | None]] = {("seed",): (run.record["seed"], "run.json")}
-        for path, value in leaves(document.data):
-            found[_override_path(path, document.data)] = value, written_at(path)
-        return cls(found)
+    found: Values = {("seed",): (run.record["seed"], "run.json")}
+    for path, value in leaves(document.data):
+        found[_override_path(path, document.data)] = value, written_at(path)
+    return found
 
-    @classmethod
-    def of_task(cls, resolved: Resolved) -> Values:
-        """Return the configuration of a task with its chosen agent and all defaults."""
-        from rlcli.config.dump import origins, to_data
 
-        data, places = to_data(resolved), origins(resolved)
-        return cls({_override_path(path, data): (value, places.get(dotted(path))) for path, value in leaves(data)})
+def task_values(resolved: Resolved) -> Values:
+    """Return the configuration of a task with its chosen agent and all defaults. A task has no seed."""
+    from rlcli.config.dump import origins, to_data
 
-    def without_seed(self) -> Values:
-        """Return the values without the seed, to compare them with a task, which has none."""
-        return Values({path: value for path, value in self.values.items() if path != ("seed",)})
-
-    @property
-    def observes_images(self) -> bool:
-        """Whether the policy observes images: then colours and lights are a part of the task."""
-        return any(path[-1] == "kind" and value == "camera" for path, (value, _) in self.values.items())
+    data, places = to_data(resolved), origins(resolved)
+    return {_override_path(path, data): (value, places.get(dotted(path))) for path, value in leaves(data)}
 
 
 def compare_values(left: Values, right: Values) -> Section:
     """Return every key in which two configurations differ, physics first."""
-    one, other = left.values, right.values
-    images = left.observes_images or right.observes_images
     absent = (None, None)
-    keys = list(dict.fromkeys([*one, *other]))
+    keys = list(dict.fromkeys([*left, *right]))
+    pairs = {path: (left.get(path, absent), right.get(path, absent)) for path in keys}
+    # if the policy observes images, colours and lights are a part of the task
+    images = any(path[-1] == "kind" and "camera" in (one[0], other[0]) for path, (one, other) in pairs.items())
     found = []
-    for path in keys:
-        (value, place), (twin, there) = one.get(path, absent), other.get(path, absent)
+    for path, ((value, place), (twin, there)) in pairs.items():
         if as_text(value) != as_text(twin) and not (value in _EMPTY and twin in _EMPTY):
             kind = category(path, observes_images=images)
             found.append(Difference(dotted(path), value, twin, place, there, kind))

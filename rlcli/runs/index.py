@@ -69,16 +69,10 @@ class Overview:
         return {"run": str(values.pop("folder")), **values}
 
 
-def overviews(runs_dir: Path, task: str | None = None) -> list[Overview]:
-    """Return all runs under a folder, the newest first and broken ones last.
-
-    Args:
-        runs_dir: the folder of runs.
-        task: return only runs of this task.
-    """
+def overviews(runs_dir: Path) -> list[Overview]:
+    """Return all runs under a folder, the newest first and broken ones last."""
     found = [overview(folder) for folder in run_folders(runs_dir)]
-    chosen = [run for run in found if task is None or run.task == task]
-    return sorted(chosen, key=lambda run: (run.started or "", run.folder.name), reverse=True)
+    return sorted(found, key=lambda run: (run.started or "", run.folder.name), reverse=True)
 
 
 def overview(folder: Path) -> Overview:
@@ -151,14 +145,19 @@ def newest_rows(run: Run) -> list[dict[str, Any]]:
 def _rows_backwards(run: Run) -> Iterator[dict[str, Any]]:
     """Yield the newest rows, the newest first; corrupt lines are skipped."""
     for size in (_TAIL_BYTES, 2 * _MAX_ROW_BYTES):
-        try:
-            data, whole = read_tail(run.metrics, size)
-        except (OSError, CheckpointError):
-            return
+        data, whole = _tail(run, size)
         lines = data.split(b"\n")[0 if whole else 1 : -1]  # the text after the last newline is still being written
         if lines:
             break
     yield from (row for line in lines[: -_MAX_ROWS - 1 : -1] if (row := _row(line)) is not None)
+
+
+def _tail(run: Run, limit: int) -> tuple[bytes, bool]:
+    """Return the end of `metrics.jsonl` and whether it is the whole file; nothing if it cannot be read."""
+    try:
+        return read_tail(run.metrics, limit)
+    except (OSError, CheckpointError):
+        return b"", True
 
 
 def _is_new(folder: Path) -> bool:
@@ -179,10 +178,7 @@ def _row(line: bytes) -> dict[str, Any] | None:
 
 def _row_at(run: Run, step: int) -> dict[str, Any]:
     """Return the row of one step; an empty one if there is none."""
-    try:
-        data, _ = read_tail(run.metrics, _MAX_SEARCH_BYTES)
-    except (OSError, CheckpointError):
-        return {}
+    data, _ = _tail(run, _MAX_SEARCH_BYTES)
     at = data.find(f'"step": {step},'.encode())
     line = b"" if at < 0 else data[data.rfind(b"\n", 0, at) + 1 : data.find(b"\n", at)]
     return _row(line) or {}

@@ -8,8 +8,10 @@ from typing import Any
 
 from rlcli.errors import CheckpointError
 from rlcli.runs.run import Run
+from rlcli.runs.safe_io import read_errors
 
-_LONGEST_LINE = 2**20
+LONGEST_LINE = 2**20
+"""Longest line of `metrics.jsonl`, which has the metrics of one iteration [bytes]."""
 _MOST_BYTES = 2**30
 _LARGEST = 1e300
 """Larger numbers are ignored: an integer with many digits cannot become a float."""
@@ -27,12 +29,12 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
     """
     size = 0
     try:
-        with run.metrics.open("rb") as file:
-            for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b""), start=1):
+        with read_errors(run.metrics), run.metrics.open("rb") as file:
+            for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), start=1):
                 size += len(line)
                 if size > _MOST_BYTES:
                     raise CheckpointError(f"{run.metrics} is too large: at most {_MOST_BYTES:,} bytes are read")
-                if not line.endswith(b"\n") and len(line) < _LONGEST_LINE:
+                if not line.endswith(b"\n") and len(line) < LONGEST_LINE:
                     return
                 row = parse_row(line)
                 if row is not None:
@@ -43,8 +45,6 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
                     return
     except FileNotFoundError:
         return
-    except OSError as error:
-        raise CheckpointError(f"{run.metrics} cannot be read: {error.strerror or error}") from None
 
 
 def parse_row(line: bytes) -> dict[str, Any] | None:

@@ -51,10 +51,8 @@ class Choice:
         if named is not None:
             return named
         if not record.get("distribution"):
-            raise CheckpointError(
-                f"{self.folder} is a policy for '{record['name']}', which was not an installed task",
-                hint=f"name the task's folder: rlcli play FOLDER --checkpoint {self.folder}",
-            )
+            message = f"{self.folder} is a policy for '{record['name']}', which was not an installed task"
+            raise CheckpointError(message, hint=f"name the task's folder: rlcli play FOLDER --checkpoint {self.folder}")
         return recorded_task(record, f"the task of {self.folder}")
 
 

@@ -7,19 +7,17 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rlcli.config.load import Resolved, resolve
+from rlcli.envs.layout import Layout
 from rlcli.errors import CheckpointError, TaskError
 from rlcli.registry import TASKS, TaskSource, find_entry, folder_task, installed_task, python_task
 from rlcli.rl.policy import Policy
 from rlcli.runs import trusted_tasks
 from rlcli.runs.checkpoint import Checkpoint
 from rlcli.runs.run import Run
-from rlcli.runs.safe_io import require_inside
-
-if TYPE_CHECKING:
-    from rlcli.envs.layout import Layout
+from rlcli.runs.safe_io import read_errors, require_inside
 
 
 def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
@@ -34,10 +32,8 @@ def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
         CheckpointError: if the run names code that the user has never named on this machine.
     """
     source = recorded_task(run.record["task"], f"the task of {run.folder}", str(run.folder), named)
-    try:
+    with read_errors(run.config):
         require_inside(run.folder, run.config)
-    except OSError as error:
-        raise CheckpointError(f"{run.config} cannot be read: {error.strerror}") from None
     return replace(source, config=run.config)
 
 
@@ -77,10 +73,8 @@ def _untrusted_code_error(record: Mapping[str, Any], what: str, run: str | None)
     code = trusted_tasks.named_code(record)
     name = shlex.quote(code if os.sep in code or "/" in code else f"./{code}")
     allow = f"--task {name}" if run is None else f"rlcli play {name} --checkpoint {shlex.quote(run)}"
-    return CheckpointError(
-        f"{what} is not loaded: it names code that you have not used on this machine, {code}",
-        hint=f"if you trust that code, or have it elsewhere, name it once: {allow}",
-    )
+    message = f"{what} is not loaded: it names code that you have not used on this machine, {code}"
+    return CheckpointError(message, hint=f"if you trust that code, or have it elsewhere, name it once: {allow}")
 
 
 def resolve_run(
@@ -104,10 +98,8 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
         return
     table = _table([("field", "in the checkpoint", "now"), *differing])
     names = "manifest.json" if "bundle" in checkpoint.manifest else "run.json"
-    raise CheckpointError(
-        f"{checkpoint.folder} does not fit the installed task:\n{table}",
-        hint=f"install the task's version that {names} names, or train again",
-    )
+    message = f"{checkpoint.folder} does not fit the installed task:\n{table}"
+    raise CheckpointError(message, hint=f"install the task's version that {names} names, or train again")
 
 
 def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
@@ -118,10 +110,8 @@ def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
     """
     saved = checkpoint.manifest.get("trainer")
     if saved is not None and saved != trainer:
-        raise CheckpointError(
-            f"{checkpoint.folder} is a checkpoint of trainer '{saved}', but the run's agent uses '{trainer}'",
-            hint="--init-from takes only the weights of its policy, in a new run",
-        )
+        message = f"{checkpoint.folder} is a checkpoint of trainer '{saved}', but the run's agent uses '{trainer}'"
+        raise CheckpointError(message, hint="--init-from takes only the weights of its policy, in a new run")
 
 
 def require_same_policy(checkpoint: Checkpoint, policy: Policy, trainer: str) -> None:

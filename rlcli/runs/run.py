@@ -66,10 +66,9 @@ class Run:
         Raises:
             CheckpointError: if it is missing, corrupt, or not a regular file.
         """
+        text = read_file(self.config, strict_yaml.MAX_BYTES, missing=f"{self.folder} has no {CONFIG}")
         try:
-            return strict_yaml.load(read_file(self.config, strict_yaml.MAX_BYTES))
-        except FileNotFoundError:
-            raise CheckpointError(f"{self.folder} has no {CONFIG}") from None
+            return strict_yaml.load(text)
         except strict_yaml.YamlError as error:
             raise CheckpointError(f"{self.config}:{error.line}:{error.column} is corrupt: {error.message}") from None
 
@@ -88,14 +87,12 @@ class Run:
         try:
             self._lock.acquire()
         except Timeout:
-            self._lock = None
             raise MachineError(f"{self.folder} is being written to by another process") from None
 
     def unlock(self) -> None:
         """Release the lock."""
         if self._lock is not None:
             self._lock.release()
-            self._lock = None
 
     def discard(self) -> None:
         """Delete a run that has not started."""
@@ -159,10 +156,7 @@ def open_run(folder: Path) -> Run:
     Raises:
         CheckpointError: if the folder is not a valid run.
     """
-    try:
-        record = read_json(folder, RECORD)
-    except FileNotFoundError:
-        raise CheckpointError(f"{folder} is not a run: it has no {RECORD}") from None
+    record = read_json(folder, RECORD, missing=f"{folder} is not a run: it has no {RECORD}")
     refuse_links(folder)
     for inner in ("checkpoints", "checkpoints/logs"):
         if (folder / inner).is_dir():

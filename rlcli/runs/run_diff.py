@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from itertools import takewhile, zip_longest
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import islice, takewhile, zip_longest
 from typing import TYPE_CHECKING, Any
 
 from rlcli.config.layers import leaves
 from rlcli.config.messages import dotted
-from rlcli.runs.config_diff import Difference, Section, Values, as_text, compare_values
+from rlcli.runs.config_diff import Difference, Section, as_text, compare_values, run_values
 from rlcli.runs.metric_rows import read_rows
 from rlcli.runs.provenance import differences
 from rlcli.runs.run import Run
@@ -40,7 +40,7 @@ def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until:
         CheckpointError: if a required file cannot be read.
     """
     parts: dict[str, Callable[[], Section]] = {
-        "configuration": lambda: compare_values(Values.of_run(left), Values.of_run(right)),
+        "configuration": lambda: compare_values(run_values(left), run_values(right)),
         "environment": lambda: _environments(left, right),
         "metrics": lambda: _metrics(left, right, until),
         "weights": lambda: _weights(left, right, until),
@@ -102,19 +102,21 @@ def _weights(left: Run, right: Run, until: int | None) -> Section:
     if not steps:
         return Section("weights", "no checkpoint at a step that both have")
     compared = f"checkpoints at {len(steps)} steps, to step {steps[-1]}"
+    return Section("weights", compared, list(islice(_checkpoint_differences(left, right, steps), 1)))
+
+
+def _checkpoint_differences(left: Run, right: Run, steps: Sequence[int]) -> Iterator[Difference]:
+    """Yield the differences between the checkpoints of two runs, the oldest first."""
     for step in steps:
         one, other = (_open_checkpoint(run, step) for run in (left, right))
         for part in _parts(one, other):
             equal = _digest(one, f"{part}.safetensors") == _digest(other, f"{part}.safetensors")
-            if equal and step != steps[-1]:
-                continue  # the last pair is read even if its hashes are equal: this checks the files
-            found = _compare_part(one, other, part)
-            if found is not None:
-                return Section("weights", compared, [found])
-        found = _compare_values(one, other) or (_compare_logs(one, other) if step == steps[-1] else None)
-        if found is not None:
-            return Section("weights", compared, [found])
-    return Section("weights", compared)
+            # the last pair is read even if its hashes are equal: this checks the files
+            if not equal or step == steps[-1]:
+                yield from _compare_part(one, other, part)
+        yield from _compare_values(one, other)
+        if step == steps[-1]:
+            yield from _compare_logs(one, other)
 
 
 def _parts(one: Checkpoint, other: Checkpoint) -> list[str]:
@@ -125,69 +127,63 @@ def _parts(one: Checkpoint, other: Checkpoint) -> list[str]:
     return [name.removesuffix(".safetensors") for name in ordered]
 
 
-def _compare_part(one: Checkpoint, other: Checkpoint, part: str) -> Difference | None:
+def _compare_part(one: Checkpoint, other: Checkpoint, part: str) -> Iterator[Difference]:
     file = f"{part}.safetensors"
     present = [file in saved.manifest["files"] for saved in (one, other)]
-    if not all(present):
-        return Difference(f"step {one.step}: {file}", *_presence("there", *present))
-    return _compare_tensors(one.tensors(part), other.tensors(part), f"step {one.step}: {part} ")
+    if all(present):
+        yield from _compare_tensors(one.tensors(part), other.tensors(part), f"step {one.step}: {part} ")
+    else:
+        yield Difference(f"step {one.step}: {file}", *_presence("there", *present))
 
 
-def _compare_tensors(left: Mapping[str, Tensor], right: Mapping[str, Tensor], prefix: str) -> Difference | None:
+def _compare_tensors(left: Mapping[str, Tensor], right: Mapping[str, Tensor], prefix: str) -> Iterator[Difference]:
     for name in sorted(left.keys() | right.keys()):
-        if name not in left or name not in right:
-            return Difference(f"{prefix}{name}", *_presence("there", name in left, name in right))
-        found = _compare_elements(left[name], right[name], f"{prefix}{name}")
-        if found is not None:
-            return found
-    return None
+        if name in left and name in right:
+            yield from _compare_elements(left[name], right[name], f"{prefix}{name}")
+        else:
+            yield Difference(f"{prefix}{name}", *_presence("there", name in left, name in right))
 
 
-def _compare_elements(left: Tensor, right: Tensor, where: str) -> Difference | None:
-    """Return the first element whose bits differ, or the difference of types and shapes."""
+def _compare_elements(left: Tensor, right: Tensor, where: str) -> Iterator[Difference]:
+    """Yield the first element whose bits differ, or the difference of types and shapes."""
     import torch
 
     kinds = [f"{str(value.dtype).removeprefix('torch.')} {list(value.shape)}" for value in (left, right)]
     if kinds[0] != kinds[1]:
-        return Difference(where, *kinds)
-    if not left.numel():
-        return None
-    # one row of bytes for each element: NaN equals itself, 0.0 differs from -0.0
-    bits = [value.contiguous().reshape(-1, 1).view(torch.uint8).reshape(left.numel(), -1) for value in (left, right)]
-    differ = (bits[0] != bits[1]).any(dim=1)
-    if not bool(differ.any()):
-        return None
-    first = int(differ.int().argmax())
-    index = [int(i) for i in torch.unravel_index(torch.tensor(first), left.shape)]
-    one, other = (value.reshape(-1)[first].item() for value in (left, right))
-    return Difference(f"{where}{index if index else ''}", one, other)
+        yield Difference(where, *kinds)
+    elif left.numel():
+        # one row of bytes for each element: NaN equals itself, 0.0 differs from -0.0
+        bits = [each.contiguous().reshape(-1, 1).view(torch.uint8).reshape(left.numel(), -1) for each in (left, right)]
+        differ = (bits[0] != bits[1]).any(dim=1)
+        if bool(differ.any()):
+            first = int(differ.int().argmax())
+            index = [int(i) for i in torch.unravel_index(torch.tensor(first), left.shape)]
+            one, other = (value.reshape(-1)[first].item() for value in (left, right))
+            yield Difference(f"{where}{index if index else ''}", one, other)
 
 
-def _compare_logs(one: Checkpoint, other: Checkpoint) -> Difference | None:
-    """Return the first differing element of a replay buffer; its rows may be split into files in other ways."""
+def _compare_logs(one: Checkpoint, other: Checkpoint) -> Iterator[Difference]:
+    """Yield the differing elements of replay buffers; their rows may be split into files in other ways."""
     if not one.shards() and not other.shards():
-        return None
+        return
     left, right = one.state().logs, other.state().logs
     for name in sorted(left.keys() | right.keys()):
         where = f"step {one.step}: {name}"
         rows = [None if name not in side else f"rows {side[name].first} to {side[name].stop}" for side in (left, right)]
         if rows[0] != rows[1]:
-            return Difference(where, *rows)
+            yield Difference(where, *rows)
+            continue
         for start in range(left[name].first, left[name].stop, _ROWS):
             stop = min(start + _ROWS, left[name].stop)
             columns, other_columns = left[name].read(start, stop), right[name].read(start, stop)
-            found = _compare_tensors(columns, other_columns, f"{where} from row {start}: ")
-            if found is not None:
-                return found
-    return None
+            yield from _compare_tensors(columns, other_columns, f"{where} from row {start}: ")
 
 
-def _compare_values(one: Checkpoint, other: Checkpoint) -> Difference | None:
+def _compare_values(one: Checkpoint, other: Checkpoint) -> Iterator[Difference]:
     left, right = (dict(leaves(saved.json("state.json"))) for saved in (one, other))
     path = _first_unequal(left, right, [*left, *right])
-    if path is None:
-        return None
-    return Difference(f"step {one.step}: state.json {dotted(path)}", left.get(path), right.get(path))
+    if path is not None:
+        yield Difference(f"step {one.step}: state.json {dotted(path)}", left.get(path), right.get(path))
 
 
 def _first_unequal(left: Mapping[Any, Any], right: Mapping[Any, Any], keys: Iterable[Any]) -> Any:

@@ -109,20 +109,17 @@ def find_checkpoint(
     if which == "best":
         best = run.record.get("best")
         if best not in have:
-            raise CheckpointError(
-                f"{run.folder} has no best checkpoint: it was not evaluated", hint="leave out @best for the newest"
-            )
+            message = f"{run.folder} has no best checkpoint: it was not evaluated"
+            raise CheckpointError(message, hint="leave out @best for the newest")
         return run, run.checkpoints / f"{best:012d}", "its best evaluation"
     kind, _, number = which.partition(":")
     if kind == "step" and re.fullmatch("[0-9]{1,30}", number):
         if int(number) not in have:
-            raise CheckpointError(
-                f"{run.folder} has no checkpoint at step {number}", hint=f"steps: {listing(map(str, have))}"
-            )
+            message = f"{run.folder} has no checkpoint at step {number}"
+            raise CheckpointError(message, hint=f"steps: {listing(map(str, have))}")
         return run, run.checkpoints / f"{int(number):012d}", "as named"
-    raise CheckpointError(
-        f"'{reference}' does not name a checkpoint", hint="RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest"
-    )
+    message = f"'{reference}' does not name a checkpoint"
+    raise CheckpointError(message, hint="RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest")
 
 
 def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Path, str]:
@@ -160,10 +157,8 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
             return open_run(candidate), "as named"
         if os.path.isfile(candidate / STUDY):
             inside = sorted(file.parent.name for file in candidate.glob(f"*/{RECORD}"))
-            raise CheckpointError(
-                f"{candidate} is a study of several runs",
-                hint=f"name one: {listing(str(candidate / n) for n in inside)}",
-            )
+            message = f"{candidate} is a study of several runs"
+            raise CheckpointError(message, hint=f"name one: {listing(str(candidate / n) for n in inside)}")
     matches = [run for run in list_runs(runs_dir, None) if run.folder.name == reference]
     if len(matches) == 1:
         return matches[0], "as named"

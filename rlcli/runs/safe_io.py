@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import math
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, NoReturn, TypeVar
 
@@ -64,19 +66,36 @@ def check_json(kind: type[Model], value: object, file: Path, *keys: str, hint: s
         raise CheckpointError(f"{file} is corrupt: {at + ': ' if at else ''}{problem.message}", hint=hint) from None
 
 
-def read_file(file: Path, limit: int, *, size: int | None = None) -> bytes:
+@contextlib.contextmanager
+def read_errors(file: Path) -> Iterator[None]:
+    """Turn an OSError inside the block into a CheckpointError that names the file, but for a FileNotFoundError."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
+
+
+def read_file(file: Path, limit: int, *, size: int | None = None, missing: str | None = None) -> bytes:
     """Read the content of a plain file, only once: later checks must use these bytes, since the file may change.
 
     Args:
         file: the file.
         limit: largest size [bytes]; a larger file is not read at all.
         size: the size that the file must have [bytes]; None: any.
+        missing: message of the error if the file does not exist; None: a FileNotFoundError.
 
     Raises:
         CheckpointError: if it is a link, not a regular file, too large or of another size, or cannot be read.
         FileNotFoundError: if it does not exist.
     """
-    handle, status = _open(file)
+    try:
+        handle, status = _open(file)
+    except FileNotFoundError:
+        if missing is None:
+            raise
+        raise CheckpointError(missing) from None
     with os.fdopen(handle, "rb") as opened:
         if size is not None and status.st_size != size:
             raise manifest_error(file, status.st_size, size)
@@ -87,10 +106,8 @@ def read_file(file: Path, limit: int, *, size: int | None = None) -> bytes:
 
 def manifest_error(file: Path, found: int, size: int) -> CheckpointError:
     """Return the error for a file of `found` bytes whose size or hash differs from the manifest."""
-    return CheckpointError(
-        f"{file} is corrupt: it does not match the manifest ({found} of {size} bytes)",
-        hint="choose an older checkpoint with RUN@step:N",
-    )
+    message = f"{file} is corrupt: it does not match the manifest ({found} of {size} bytes)"
+    return CheckpointError(message, hint="choose an older checkpoint with RUN@step:N")
 
 
 def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
@@ -161,21 +178,23 @@ def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:
     return value
 
 
-def read_json(folder: Path, name: str, limit: int = JSON_LIMIT) -> dict[str, Any]:
+def read_json(folder: Path, name: str, limit: int = JSON_LIMIT, *, missing: str | None = None) -> dict[str, Any]:
     """Read a JSON object from a file in a folder; a link to a file outside the folder is refused.
+
+    Args:
+        folder: the folder.
+        name: path of the file in it.
+        limit: largest size [bytes].
+        missing: message of the error if the file does not exist; None: a FileNotFoundError.
 
     Raises:
         CheckpointError: if the file cannot be read, or is not a JSON object.
         FileNotFoundError: if it does not exist.
     """
     file = folder / name
-    try:
+    with read_errors(file):
         require_inside(folder, file)
-        return parse_json(read_file(file, limit), file)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
+        return parse_json(read_file(file, limit, missing=missing), file)
 
 
 def require_inside(folder: Path, file: Path) -> None:

@@ -77,10 +77,7 @@ def read_study(folder: Path, kind: str = "seeds") -> dict[str, Any]:
     Raises:
         CheckpointError: if the folder is not a study of this kind, or its record is malformed.
     """
-    try:
-        record = read_json(folder, STUDY, _LIMIT)
-    except FileNotFoundError:
-        raise CheckpointError(f"{folder} is not a study: it has no {STUDY}") from None
+    record = read_json(folder, STUDY, _LIMIT, missing=f"{folder} is not a study: it has no {STUDY}")
     check_json(_StudyRecord, record, folder / STUDY)
     if record["kind"] != kind:
         raise CheckpointError(f"{folder} is a study of {record['kind']}, not of {kind}")

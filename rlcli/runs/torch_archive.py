@@ -42,10 +42,8 @@ VEC_NORMALIZE_HINT = (
 
 def read_archive_file(file: Path) -> bytes:
     """Read a whole file of at most 4 GiB and a quarter of the memory."""
-    try:
-        return read_file(file.resolve(), min(_MAX_BYTES, available_memory() // 4))
-    except FileNotFoundError:
-        raise CheckpointError(f"there is no file {file}") from None
+    limit = min(_MAX_BYTES, available_memory() // 4)
+    return read_file(file.resolve(), limit, missing=f"there is no file {file}")
 
 
 def read_member(file: Path, name: str) -> bytes:

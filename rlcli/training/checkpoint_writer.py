@@ -10,21 +10,19 @@ import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import safetensors.torch
 from torch import Tensor
 
+from rlcli.envs.layout import Layout
 from rlcli.errors import CheckpointError
 from rlcli.replay.failure_cases import FOLDER
 from rlcli.replay.failure_recorder import FailureBatch, FailureRecorder
 from rlcli.rl.trainer import Rows, TrainerState
-from rlcli.runs.atomic_io import disk_error, sync_folder, to_json, write_atomic, write_synced
+from rlcli.runs.atomic_io import disk_errors, sync_folder, to_json, write_atomic, write_synced
 from rlcli.runs.checkpoint import FORMAT, LOG_FOLDER, Checkpoint, Shard, open_checkpoint, sha256, steps
-
-if TYPE_CHECKING:
-    from rlcli.envs.layout import Layout
-    from rlcli.runs.run import Run
+from rlcli.runs.run import Run
 
 _SHARD_BYTES = 64 << 20
 """Largest size of a file with rows of a log [bytes]."""
@@ -161,11 +159,9 @@ class CheckpointWriter:
         for start, stop, columns in parts:
             data = safetensors.torch.save({column: value.contiguous() for column, value in columns.items()})
             shard = Shard(start=start, stop=stop, size=len(data), sha256=sha256(data))
-            try:
+            with disk_errors(folder):
                 for path in (folder.parent, folder):  # not `parents=True`: a deleted run must not be created again
                     path.mkdir(exist_ok=True)
-            except OSError as error:
-                raise disk_error(folder, error) from error
             write_atomic(folder / shard.file, data)
             shards.append(shard)
         if parts:
@@ -217,22 +213,20 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
         files[name] = {"size": len(data), "sha256": sha256(data)}
 
     try:
-        temporary.mkdir()
-        put("policy.json", to_json(state.values["policy"]).encode())
-        put("state.json", to_json(state.values).encode())
-        for part, tensors in state.tensors.items():
-            contiguous = {name: value.detach().contiguous() for name, value in tensors.items()}
-            put(f"{part}.safetensors", safetensors.torch.save(contiguous))
-        manifest = {"format": FORMAT, "step": step, **extra, "files": files}
-        write_synced(temporary / "manifest.json", to_json(manifest).encode())
-        sync_folder(temporary)
-        os.rename(temporary, target)
-        sync_folder(checkpoints)
-    except BaseException as error:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise disk_error(target, error) from error
-        raise
+        with disk_errors(target):
+            temporary.mkdir()
+            put("policy.json", to_json(state.values["policy"]).encode())
+            put("state.json", to_json(state.values).encode())
+            for part, tensors in state.tensors.items():
+                contiguous = {name: value.detach().contiguous() for name, value in tensors.items()}
+                put(f"{part}.safetensors", safetensors.torch.save(contiguous))
+            manifest = {"format": FORMAT, "step": step, **extra, "files": files}
+            write_synced(temporary / "manifest.json", to_json(manifest).encode())
+            sync_folder(temporary)
+            os.rename(temporary, target)
+            sync_folder(checkpoints)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)  # it is left after an error only
     write_atomic(checkpoints / "latest", target.name + "\n")
     return target
 

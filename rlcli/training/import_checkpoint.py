@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import safetensors.torch
 import torch
@@ -14,6 +15,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from rlcli.config.dump import to_data, to_yaml
+from rlcli.config.load import Resolved
 from rlcli.deploy.env_description import describe
 from rlcli.envs.make import make_env
 from rlcli.errors import CheckpointError, one_line
@@ -25,9 +27,6 @@ from rlcli.runs.provenance import environment_record
 from rlcli.runs.run import create_run
 from rlcli.runs.torch_archive import VEC_NORMALIZE_HINT, read_archive_file, read_member, read_tensors
 from rlcli.training.checkpoint_writer import manifest_entries, write_checkpoint
-
-if TYPE_CHECKING:
-    from rlcli.config.load import Resolved
 
 _NORMALIZER_EPS = 1e-2
 """Number that RSL-RL adds to the standard deviation of observations."""
@@ -147,11 +146,8 @@ def create_imported_run(
         CheckpointError: if the policy does not fit the task, with a table of the differences.
         MachineError: if the run cannot be written.
     """
-    task = resolved.task
-    one = task.model_copy(update={"scene": task.scene.model_copy(update={"num_envs": 1})})
-    env = make_env(replace(resolved, task=one), seed=0)
-    layout, deployment = env.layout, describe(env)
-    env.close()
+    with contextlib.closing(make_env(resolved.with_num_envs(1), seed=0)) as env:
+        layout, deployment = env.layout, describe(env)
     sizes = {"observation_size": layout.size("policy"), "action_size": layout.action_size}
     differing = [(key, str(imported.spec[key]), str(size)) for key, size in sizes.items() if imported.spec[key] != size]
     if differing:
@@ -161,7 +157,6 @@ def create_imported_run(
             f"the policy in {record['imported']['file']} does not fit {resolved.source.name}:\n{table}",
             hint="observations and actions must have the same columns in the same order; see rlcli show TASK",
         )
-    assert resolved.agent is not None
     entries = {
         "seed": 0,
         "device": "cpu",
@@ -260,9 +255,8 @@ def _log_std(weights: Mapping[str, Tensor], names: Mapping[str, str], file: Path
     if names["log_std"] in weights:
         return weights[names["log_std"]]
     if names["std"] not in weights:
-        raise CheckpointError(
-            f"{file}: the standard deviation of actions depends on the state; such a policy cannot be imported"
-        )
+        message = f"{file}: the standard deviation of actions depends on the state; such a policy cannot be imported"
+        raise CheckpointError(message)
     return weights[names["std"]].clamp(min=_MIN_STD).log()
 
 

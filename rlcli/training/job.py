@@ -71,6 +71,6 @@ class TrainingResult:
 
 def threads(resolved: Resolved) -> tuple[int, int]:
     """Return the number of threads of the engine, and of torch in the update."""
-    assert resolved.agent is not None
+    agent, _ = resolved.require_agent()
     cores = available_cores()
-    return resolved.task.sim.engine_threads or cores, resolved.agent.torch_threads or min(4, cores)
+    return resolved.task.sim.engine_threads or cores, agent.torch_threads or min(4, cores)

@@ -290,16 +290,13 @@ def _trainer_device(resolved: Resolved, device: str, wanted: str) -> str:
     Raises:
         UsageError: if the trainer cannot use the device that the user gave.
     """
-    assert resolved.agent is not None
-    assert resolved.trainer is not None
-    if device == "cpu" or resolved.trainer.gpu:
+    agent, trainer = resolved.require_agent()
+    if device == "cpu" or trainer.gpu:
         return device
     if wanted == "auto":
         return "cpu"
-    raise UsageError(
-        f"agent '{resolved.agent_name}' (trainer {resolved.agent.trainer}) trains on the CPU only, not on '{device}'",
-        hint="--device cpu, or an agent whose trainer uses the GPU (trainer: ppo)",
-    )
+    message = f"agent '{resolved.agent_name}' (trainer {agent.trainer}) trains on the CPU only, not on '{device}'"
+    raise UsageError(message, hint="--device cpu, or an agent whose trainer uses the GPU (trainer: ppo)")
 
 
 def _require_parallel(resolved: Resolved, gpus: int = 1) -> None:
@@ -308,14 +305,10 @@ def _require_parallel(resolved: Resolved, gpus: int = 1) -> None:
     Raises:
         UsageError: if the trainer does not support several processes.
     """
-    resolved.require_agent()
-    assert resolved.agent is not None
-    assert resolved.trainer is not None
-    if (gpus > 1 or distributed.launched()) and not resolved.trainer.parallel:
-        raise UsageError(
-            f"trainer '{resolved.agent.trainer}' of agent '{resolved.agent_name}' trains in one process only",
-            hint="choose an agent with trainer ppo: --agent NAME",
-        )
+    agent, trainer = resolved.require_agent()
+    if (gpus > 1 or distributed.launched()) and not trainer.parallel:
+        message = f"trainer '{agent.trainer}' of agent '{resolved.agent_name}' trains in one process only"
+        raise UsageError(message, hint="choose an agent with trainer ppo: --agent NAME")
 
 
 def _require_video(video_every: int | None) -> None:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import DependencyError, require_known
 from rlcli.registry import load_object
-from rlcli.runs.atomic_io import disk_error, write_atomic
+from rlcli.runs.atomic_io import disk_errors, write_atomic
+from rlcli.runs.metric_rows import LONGEST_LINE, parse_row
 from rlcli.runs.run import Run
 
 if TYPE_CHECKING:
@@ -39,8 +40,6 @@ LOGGERS = {
     "trackio": LoggerKind("trackio", "rlcli.training.trackers:Trackio", "trackio"),
 }
 """Name for `--logger` -> logger; `none` means no logger."""
-_LONGEST_LINE = 1024**2
-"""Longest line of `metrics.jsonl`, which has the metrics of one iteration [bytes]."""
 
 
 class JsonLines:
@@ -53,21 +52,17 @@ class JsonLines:
 
     def __init__(self, file: Path, *, resume_after: int | None = None) -> None:
         self._path = file
-        try:
+        with disk_errors(file):
             if resume_after is not None and file.exists():
                 rows = [row for row in read_metrics(file) if row["iteration"] <= resume_after]
                 write_atomic(file, "".join(json.dumps(row) + "\n" for row in rows))
             self._file = file.open("a", encoding="utf-8", buffering=1)
-        except OSError as error:
-            raise disk_error(file, error) from error
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
         """Append one line."""
-        try:
+        with disk_errors(self._path):
             finite = {name: value for name, value in metrics.items() if math.isfinite(value)}
             self._file.write(json.dumps({"iteration": iteration, "step": step, **finite}) + "\n")
-        except OSError as error:
-            raise disk_error(self._path, error) from error
 
     def close(self, state: str = "finished") -> None:
         """Close the file."""
@@ -85,13 +80,11 @@ class TensorBoard:
     def __init__(self, folder: Path, *, resume_after_step: int | None = None) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        try:
+        with disk_errors(folder):
             if resume_after_step is not None:
                 for file in sorted(folder.glob("events.out.tfevents.*")):
                     _remove_events_after(file, resume_after_step)
             self._writer: Any = SummaryWriter(str(folder))
-        except OSError as error:
-            raise disk_error(folder, error) from error
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
         """Add scalars at the environment step."""
@@ -121,11 +114,7 @@ def check_loggers(names: Sequence[str] | None) -> list[str]:
 
 
 def open_loggers(
-    run: Run,
-    names: Sequence[str],
-    *,
-    resume: tuple[int, int] | None = None,
-    config: Mapping[str, Any] | None = None,
+    run: Run, names: Sequence[str], *, resume: tuple[int, int] | None, config: Mapping[str, Any]
 ) -> list[Logger]:
     """Open the loggers of a run.
 
@@ -150,7 +139,7 @@ def open_loggers(
                 board = make(run.folder / "tb", resume_after_step=step)
                 loggers.append(FailSafeLogger(name, board, 0))
             else:
-                loggers.append(open_tracker(name, make, run, config or {}, reached))
+                loggers.append(open_tracker(name, make, run, config, reached))
     except BaseException:
         for logger in loggers:
             logger.close("failed")
@@ -162,12 +151,9 @@ def read_metrics(file: Path) -> list[dict[str, Any]]:
     """Return the rows of a metrics file before the first damaged row; a killed process may leave an incomplete row."""
     rows = []
     with file.open("rb") as lines:
-        for line in iter(lambda: lines.readline(_LONGEST_LINE), b""):
-            try:
-                row = json.loads(line)
-            except (ValueError, RecursionError):
-                break
-            if not isinstance(row, dict) or not all(type(row.get(key)) is int for key in ("iteration", "step")):
+        for line in iter(lambda: lines.readline(LONGEST_LINE), b""):
+            row = parse_row(line)
+            if row is None:
                 break
             rows.append(row)
     return rows

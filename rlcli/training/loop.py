@@ -212,7 +212,5 @@ def _require_stable(diverged: float, trainer: Trainer) -> None:
     """
     share = diverged / trainer.steps_per_iteration
     if share > DIVERGED_SHARE:
-        raise DivergedError(
-            f"the simulation diverged in {share:.1%} of the environment steps of iteration {trainer.iteration}",
-            hint="lower sim.dt, limit actuator efforts, add joint damping or armature",
-        )
+        message = f"the simulation diverged in {share:.1%} of the environment steps of iteration {trainer.iteration}"
+        raise DivergedError(message, hint="lower sim.dt, limit actuator efforts, add joint damping or armature")

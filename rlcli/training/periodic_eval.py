@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from torch import Tensor
+
+from rlcli.envs.vec_env import VecEnv
 from rlcli.evaluation.evaluate import evaluate
 from rlcli.rl.acting import trained_policy
+from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators, undisturbed
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from rlcli.envs.vec_env import VecEnv
-    from rlcli.rl.policy import Policy
 
 _SUCCESS, _RETURN, _LENGTH = "Eval/success_rate", "Eval/mean_reward", "Eval/mean_episode_length"
 
@@ -58,9 +56,8 @@ class PeriodicEval:
                 self._env = self._make_env()
                 self._env.reset(seed=self._env.seed)
                 self._initial_state = self._env.state_dict()
-            self._env.load_state_dict(
-                self._initial_state
-            )  # also resets curricula, so that each evaluation has the same episodes
+            # also resets curricula, so that each evaluation has the same episodes
+            self._env.load_state_dict(self._initial_state)
             seed_generators(self._env.seed)
             summary = evaluate(self._env, trained_policy(self._env, policy()), self._episodes).summary()
         metrics = {_RETURN: summary["return"]["mean"], _LENGTH: summary["length"]["mean"]}
@@ -71,11 +68,6 @@ class PeriodicEval:
         better = _score(metrics) > self._best
         self._best = max(self._best, _score(metrics))
         return better
-
-    def close(self) -> None:
-        """Close the environment."""
-        if self._env is not None:
-            self._env.close()
 
 
 def _score(metrics: Mapping[str, Any]) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from rlcli.random import derive
 from rlcli.replay.crash_dump import CrashDumper
 from rlcli.replay.failure_recorder import open_failure_recorder
 from rlcli.rl.budget import Budget
+from rlcli.rl.trainer import Trainer
 from rlcli.runs.checkpoint import steps
 from rlcli.runs.provenance import built_record, differences, environment_record
 from rlcli.runs.restore import resolve_run
@@ -29,23 +30,17 @@ from rlcli.training.progress import Progress
 from rlcli.training.signals import StopRequest
 
 if TYPE_CHECKING:
-    from rlcli.rl.trainer import Trainer
     from rlcli.training.trackers import Logger
     from rlcli.viewer.training_videos import TrainingVideos
 
 _log = logging.getLogger(__name__)
 
 
-class ProgressView(Protocol):
+class ProgressView(contextlib.AbstractContextManager[Any], Protocol):
     """Context manager that displays the progress of a training."""
 
     def show(self, progress: Progress) -> None:
         """Display the progress after an iteration."""
-        ...
-
-    def __enter__(self) -> Any: ...
-
-    def __exit__(self, *_: Any) -> None: ...
 
 
 def run_training(
@@ -87,8 +82,7 @@ def run_training(
 
 def _train(job: Job, trainer: Trainer, env: VecEnv, stop: StopRequest, view: ProgressView) -> None:
     """Open loggers and checkpoints, run the loop, and record in the run how it ended."""
-    run, agent = job.run, job.resolved.agent
-    assert agent is not None
+    run, (agent, _) = job.run, job.resolved.require_agent()
     budgets = [Budget(end, None) for end in job.stages] or [Budget(agent.max_iterations, agent.max_steps)]
     writer = _open_writer(job, env)
     loggers: list[Logger] = []
@@ -135,8 +129,7 @@ def _train(job: Job, trainer: Trainer, env: VecEnv, stop: StopRequest, view: Pro
 
 def _open_writer(job: Job, env: VecEnv) -> CheckpointWriter:
     """Open the writer of checkpoints and the recorder of failed episodes."""
-    run, agent = job.run, job.resolved.agent
-    assert agent is not None
+    run, (agent, _) = job.run, job.resolved.require_agent()
     manifest = manifest_entries(run, agent.trainer, env.layout, describe(env.local))
     keep = Keep() if job.stages else Keep.from_settings(agent.keep_last, agent.keep_every, agent.save_interval)
     cases = None
@@ -189,8 +182,7 @@ def _make_play_env(job: Job, purpose: str, flags: dict[str, Any]) -> VecEnv:
 
 def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest) -> PeriodicEval | None:
     """Return the evaluation between iterations, if the agent has one; only the rank that writes the run evaluates."""
-    run, agent = job.run, job.resolved.agent
-    assert agent is not None
+    run, (agent, _) = job.run, job.resolved.require_agent()
     if agent.eval_interval is None or not job.writes:
         return None
     num_envs = min(agent.eval_episodes, job.resolved.task.scene.num_envs)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rlcli.config.load import Resolved
 from rlcli.envs.sharding.choice import make_training_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, RlcliError, one_line
@@ -13,15 +14,12 @@ from rlcli.random import derive
 from rlcli.registry import load_object
 from rlcli.rl import distributed
 from rlcli.rl.rng import seed_generators
+from rlcli.rl.trainer import Trainer, TrainerState
 from rlcli.runs.atomic_io import write_atomic
 from rlcli.runs.checkpoint import Checkpoint, open_checkpoint
 from rlcli.runs.restore import require_fit, require_same_policy, require_trainer
 from rlcli.training.checkpoint_writer import drop_after
 from rlcli.training.job import Job, threads
-
-if TYPE_CHECKING:
-    from rlcli.config.load import Resolved
-    from rlcli.rl.trainer import Trainer, TrainerState
 
 _log = logging.getLogger(__name__)
 
@@ -35,43 +33,45 @@ def build_trainer(job: Job, device: str) -> tuple[Trainer, VecEnv]:
         CheckpointError: if a checkpoint does not fit.
     """
     resolved, record, saved = job.resolved, job.run.record, job.resume_from
-    assert resolved.agent is not None
+    agent, _ = resolved.require_agent()
     state = None
     if saved is not None:  # read and check the untrusted files before anything is built
-        require_trainer(saved, resolved.agent.trainer)
+        require_trainer(saved, agent.trainer)
         state = saved.state()
     torch_threads = int(record.get("torch_threads") or threads(resolved)[1])
     trainer, env = make_trainer(resolved, record["seed"], device, torch_threads)
     if saved is not None and state is not None:
-        _resume(job, saved, state, trainer, env)
-        return trainer, env
-    if job.init_from is not None:
+        _load_state(saved, state, trainer, env)
+    elif job.init_from is not None:
         initial = open_checkpoint(job.init_from)
         require_fit(initial, env.layout)
-        require_same_policy(initial, trainer.policy(), resolved.agent.trainer)
+        require_same_policy(initial, trainer.policy(), agent.trainer)
         _load(initial, lambda: trainer.load_weights(initial.tensors("policy")), "its weights do not fit the agent")
     if job.config is not None:
         write_atomic(job.run.config, job.config)
-    trainer.start()
+    if saved is None:
+        trainer.start()
+    elif job.writes and (dropped := drop_after(job.run.checkpoints, saved.step)):
+        _log.info("removed %s later checkpoints: the resumed run replaces them", len(dropped))
     return trainer, env
 
 
 def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int) -> tuple[Trainer, VecEnv]:
     """Make the environment and the trainer of a configuration. Every rank has other seeds for its environments."""
-    assert resolved.trainer is not None
+    agent, spec = resolved.require_agent()
     ranks = distributed.current()
     seed_generators(ranks.seed(derive(seed, "task"), "task"))  # a task may draw random numbers while it is built
     env = make_training_env(resolved, seed=ranks.seed(seed, "environments"), device=device)
     try:
-        make: Callable[..., Trainer] = load_object(resolved.trainer.trainer)
-        return make(env, resolved.agent, seed=seed, device=device, torch_threads=torch_threads), env
+        make: Callable[..., Trainer] = load_object(spec.trainer)
+        return make(env, agent, seed=seed, device=device, torch_threads=torch_threads), env
     except BaseException:
         env.close()
         raise
 
 
-def _resume(job: Job, saved: Checkpoint, state: TrainerState, trainer: Trainer, env: VecEnv) -> None:
-    """Load the state of a checkpoint and remove the later checkpoints."""
+def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: VecEnv) -> None:
+    """Load the state of a checkpoint to resume from."""
     require_fit(saved, env.layout)
     _load(saved, lambda: trainer.load(state), "it cannot be resumed")
     if (trainer.iteration, trainer.env_steps) != (saved.iteration, saved.step):
@@ -79,11 +79,6 @@ def _resume(job: Job, saved: Checkpoint, state: TrainerState, trainer: Trainer, 
     processes, size = state.values.get("processes", 1), distributed.current().world_size
     if processes != size:
         _log.info("saved by %s processes, continued by %s: every environment starts a new episode", processes, size)
-    if job.config is not None:
-        write_atomic(job.run.config, job.config)
-    dropped = drop_after(job.run.checkpoints, saved.step) if job.writes else []
-    if dropped:
-        _log.info("removed %s later checkpoints: the resumed run replaces them", len(dropped))
 
 
 def _load(saved: Checkpoint, load: Callable[[], Any], failure: str) -> None:

@@ -14,12 +14,10 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rlcli.errors import RlcliError
-
-if TYPE_CHECKING:
-    from rlcli.training.signals import StopRequest
+from rlcli.training.signals import StopRequest
 
 _log = logging.getLogger(__name__)
 

@@ -42,11 +42,9 @@ class Logger(Protocol):
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
         """Record one iteration."""
-        ...
 
     def close(self, state: str) -> None:
         """Flush and close, with the state of the run: finished, stopped, diverged or failed."""
-        ...
 
 
 class Tracker(Logger, Protocol):

@@ -160,8 +160,7 @@ class Bench:
         self.findings = Findings()
         self._resolve, self._pace, self._announce, self._show = resolve, pace, announce, show
         present = resolve({})
-        agent = present.agent
-        assert agent is not None
+        agent, _ = present.require_agent()
         self.horizon_key = next((key for key in HORIZONS if isinstance(getattr(agent, key, None), int)), None)
         engine, update = threads(present)
         horizon = None if self.horizon_key is None else int(getattr(agent, self.horizon_key))

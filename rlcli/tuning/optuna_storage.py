@@ -56,8 +56,7 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
     median = optuna.pruners.MedianPruner(n_startup_trials=4, n_warmup_steps=30)
     pruner = median if settings["pruner"] == "median" else optuna.pruners.NopPruner()
     with disk_errors(folder / JOURNAL):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             trials = _journal(folder, create) if storage is None else _database(storage)
         study: dict[str, Any] = {"study_name": name, "storage": trials, "pruner": pruner}
         try:
@@ -81,10 +80,8 @@ def storage_errors(storage: str | None) -> Iterator[None]:
     except Exception as error:
         if storage is None or not _is_database_error(error):
             raise
-        raise MachineError(
-            f"--storage {without_password(storage)} cannot be reached: {_first_line(error)}",
-            hint="when it is available, run the same command again to continue",
-        ) from None
+        message = f"--storage {without_password(storage)} cannot be reached: {_first_line(error)}"
+        raise MachineError(message, hint="when it is available, run the same command again to continue") from None
 
 
 def without_password(url: str) -> str:
@@ -168,10 +165,8 @@ def _database(url: str) -> optuna.storages.BaseStorage:
     except ModuleNotFoundError as error:
         raise DependencyError(f"--storage needs the driver {error.name}", hint=f"pip install {error.name}") from None
     except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError) as error:
-        raise UsageError(
-            f"--storage '{without_password(url)}' is not the URL of a database: {_first_line(error)}",
-            hint="as in postgresql+psycopg://user@host/name",
-        ) from None
+        message = f"--storage '{without_password(url)}' is not the URL of a database: {_first_line(error)}"
+        raise UsageError(message, hint="as in postgresql+psycopg://user@host/name") from None
     except (sqlalchemy.exc.SQLAlchemyError, OSError) as error:
         raise MachineError(f"--storage {without_password(url)} cannot be reached: {_first_line(error)}") from None
 

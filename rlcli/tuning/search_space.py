@@ -82,10 +82,8 @@ class Objective:
         entry = found.get(name) if name and isinstance(found, dict) else found
         if not isinstance(entry, dict):
             known = listing(f"{first}.{key}" for key in found) if name and isinstance(found, dict) else ""
-            raise UsageError(
-                f"--objective {self.key}: not in the results of the evaluation",
-                hint=f"there are: {known}" if known else "return, success or length",
-            )
+            message = f"--objective {self.key}: not in the results of the evaluation"
+            raise UsageError(message, hint=f"there are: {known}" if known else "return, success or length")
         value = entry["rate"] if "rate" in entry else entry["mean"]
         return math.nan if value is None else float(value)
 
@@ -143,10 +141,8 @@ def _read(text: str) -> Parameter:
     low, high = (_load(text, part.strip()) for part in span.groups()[1:])
     log = span[1] is not None
     if any(type(end) not in (int, float) or not abs(end) < _MAX_BOUND[type(end)] for end in (low, high)):
-        raise UsageError(
-            f"--param '{text}': the ends of a range must be numbers below 1e300, or whole numbers below 2**53",
-            hint=HINT,
-        )
+        message = f"--param '{text}': the ends of a range must be numbers below 1e300, or whole numbers below 2**53"
+        raise UsageError(message, hint=HINT)
     if not low < high:
         raise UsageError(f"--param '{text}' is empty: {low} is not below {high}", hint=HINT)
     if log and low <= 0:

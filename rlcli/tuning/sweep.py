@@ -55,13 +55,11 @@ class Trial:
     """Optuna's trial."""
     values: dict[str, Any]
     """Key of a parameter -> value."""
-    _lock: FileLock | None = None
+    _lock: FileLock
 
     def release(self) -> None:
         """Let another process claim the trial."""
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
+        self._lock.release()
 
 
 @dataclass(slots=True)
@@ -128,9 +126,8 @@ class Sweep:
                 lock = self._lock_trial(trial.number)
                 if lock is None:
                     continue
-                if any(
-                    other.number == trial.number for other in self.ended()
-                ):  # another process ended it before the lock was taken
+                # another process may have ended it before the lock was taken
+                if any(other.number == trial.number for other in self.ended()):
                     lock.release()
                     continue
                 return self._claim(lock, self._with_own_sampler(trial))
@@ -317,16 +314,14 @@ def _require_same(location: object, known: Mapping[str, Any], settings: Mapping[
     if differing:
         differences = "; ".join(f"{key}: {known.get(key)!r} there, {settings[key]!r} here" for key in differing[:3])
         where = without_password(str(location))
-        raise UsageError(
-            f"{where} is another sweep ({differences})", hint="choose another --name, or the same settings"
-        )
+        message = f"{where} is another sweep ({differences})"
+        raise UsageError(message, hint="choose another --name, or the same settings")
 
 
 def _sampler(seed: int) -> optuna.samplers.BaseSampler:
     import optuna
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+    with warnings.catch_warnings(action="ignore", category=optuna.exceptions.ExperimentalWarning):
         return optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True, n_startup_trials=8)
 
 

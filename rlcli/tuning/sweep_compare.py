@@ -145,9 +145,8 @@ def compare(
         changes: dict[str, list[str]] = {"default": [], "best": sweep.overrides(sweep.values(best))}
         with stop:
             for turn, seed in enumerate(seeds):
-                for arm in (
-                    ARMS if turn % 2 == 0 else ARMS[::-1]
-                ):  # alternate, so that a slow period of the machine affects both arms
+                # alternate, so that a slow period of the machine affects both arms
+                for arm in ARMS if turn % 2 == 0 else ARMS[::-1]:
                     if stop.signal is not None:
                         break
                     training = _train(comparison, replace(base, seed=seed), arm, changes[arm], stop)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rlcli.errors import UsageError
+from rlcli.safe_text import float_or_nan
 
 _METRICS = {"success": "Eval/success_rate", "return": "Eval/mean_reward", "length": "Eval/mean_episode_length"}
 
@@ -44,14 +45,10 @@ def read_threshold(text: str) -> Threshold:
         UsageError: for anything else.
     """
     key, _, number = text.partition("=")
-    try:
-        value = float(number)
-    except ValueError:
-        value = math.nan
+    value = float_or_nan(number)
     if key not in _METRICS or not math.isfinite(value):
-        raise UsageError(
-            f"--until '{text}' is not a threshold", hint="as in --until success=0.99, return=200 or length=250"
-        )
+        message = f"--until '{text}' is not a threshold"
+        raise UsageError(message, hint="as in --until success=0.99, return=200 or length=250")
     if key == "success" and not 0.0 < value <= 1.0:
         raise UsageError(f"--until '{text}': a success rate must be above 0 and at most 1")
     return Threshold(key, value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -30,16 +31,11 @@ METRICS = {"return": "Train/mean_reward", "success": "Train/success_rate"}
 """Name in tables and documents -> metric."""
 
 
-class StudyView(Protocol):
+class StudyView(AbstractContextManager[Any], Protocol):
     """Context that shows the progress of the runs of a study."""
 
     def poll(self) -> None:
         """Update the view if the last update is old enough."""
-        ...
-
-    def __enter__(self) -> Any: ...
-
-    def __exit__(self, *_: Any) -> None: ...
 
 
 @dataclass(slots=True)
@@ -126,7 +122,7 @@ def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
         return result
     for note in notes:
         _log.warning("%s", note)
-    lines = {name: curves[0].line(metric) for name, metric in METRICS.items() if metric in curves[0].names()}
+    lines = {name: curves[0].line(metric) for name, metric in METRICS.items()}
     found = {name: line for name, line in lines.items() if line is not None}
     result.together = {}
     for name, line in found.items():

@@ -45,7 +45,6 @@ class Viewer(Protocol):
             MachineError: if this machine cannot open the viewer.
             DependencyError: if a package is missing, or its version is not supported.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -65,11 +65,6 @@ class TrainingVideos(StepObserver):
             return None
         return file
 
-    def close(self) -> None:
-        """Close the environment."""
-        if self._env is not None:
-            self._env.close()
-
     def before_step(self) -> None:
         """Raise `VideoAborted` if training is being stopped."""
         if self._stopping():

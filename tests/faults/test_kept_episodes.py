@@ -105,7 +105,7 @@ def random_rollout(env, steps, seed=0, act=None):
     """Step with random actions, and return all recorded values."""
     generator = torch.Generator().manual_seed(seed)
     act = act or (lambda obs: torch.rand(env.num_envs, 4, generator=generator) * 2 - 1)
-    with EpisodeRecorder(env, 10**6) as recorder:
+    with env.observers.added(EpisodeRecorder(env, 10**6)) as recorder:
         obs = env.reset(seed=env.seed)["policy"]
         seen = []
         for _ in range(steps):

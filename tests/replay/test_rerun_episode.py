@@ -63,12 +63,12 @@ def recorded(task, tmp_path):
     """Record the episode in the whole evaluation and alone: states, actions and rewards of both."""
     env = make_task_env(task)
     whole, count = tmp_path / "whole.safetensors", ENVS * (EPISODE + 1)
-    with EpisodeRecorder(env, count) as recorder:
+    with env.observers.added(EpisodeRecorder(env, count)) as recorder:
         evaluate(env, policy(env), count)
     recorder.save(whole)
     env = make_task_env(task)
     start = start_episode(env, policy(env), ENV_ID, EPISODE)
-    with EpisodeRecorder(env, 1, env_id=ENV_ID) as recorder:
+    with env.observers.added(EpisodeRecorder(env, 1, env_id=ENV_ID)) as recorder:
         run_episode(env, policy(env), start.obs, ENV_ID)
     recorder.save(tmp_path / "one.safetensors")
     recording = read_trajectory(whole)
@@ -105,7 +105,7 @@ def test_dependent_episode_runs_earlier_ones_with_reasons(what, tmp_path):
     assert not [other for _, other in CONNECTED.values() if other != named and other in start.reasons]
     assert_same(whole, one)
     env = make_task_env(task)  # the reason matters: without the earlier episodes it is another episode
-    with EpisodeRecorder(env, 1, env_id=ENV_ID) as recorder:
+    with env.observers.added(EpisodeRecorder(env, 1, env_id=ENV_ID)) as recorder:
         run_episode(env, policy(env), env.reset(seed=SEED, episode=EPISODE)["policy"], ENV_ID)
     recorder.save(tmp_path / "other.safetensors")
     other = parts(read_trajectory(tmp_path / "other.safetensors"), 0)

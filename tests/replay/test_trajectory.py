@@ -36,7 +36,7 @@ def task(tmp_path):
 
 def recorded(task, file, episodes=9, num_envs=4):
     env = build(task, num_envs)
-    with EpisodeRecorder(env, episodes) as recorder:
+    with env.observers.added(EpisodeRecorder(env, episodes)) as recorder:
         evaluate(env, random_policy(env, 1.0, 3), episodes)
     recorder.save(file)
     return read_trajectory(file)

@@ -4,8 +4,12 @@ from html.parser import HTMLParser
 
 from rlcli.config.load import resolve
 from rlcli.registry import find_task
-from rlcli.reporting.html import card_html
+from rlcli.reporting.html import templates
 from rlcli.reporting.task_card import Card, Column, Table, task_card
+
+
+def card_html(card, level=2):
+    return str(templates().get_template("card.html.jinja").module.card(card, level))
 
 
 class Cells(HTMLParser):

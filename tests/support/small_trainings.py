@@ -186,8 +186,6 @@ def train(
         assert cases is None or cases.on_step in env.observers.on_step
         log.close()
         env.close()
-        if trials is not None:
-            trials.close()
     return record
 
 

@@ -158,4 +158,4 @@ def test_video_is_aborted_when_training_stops(cli, caplog):
     caplog.clear()  # records of the training
     assert films.record(lambda: policy, 1) is None
     assert (caplog.messages, clips(run_of("a"))) == ([], [])
-    films.close()
+    env.close()

@@ -112,15 +112,15 @@ def _task(side: Side, agent: str | None) -> Resolved | None:
 
 def _compare_configurations(one: Resolved | Run, other: Resolved | Run, left: Side, right: Side) -> bool:
     """Compare the resolved configurations, the models and the code of two tasks, or of a task and a run."""
-    from rlcli.runs.config_diff import Values, compare_files, compare_values
+    from rlcli.runs.config_diff import compare_files, compare_values, run_values, task_values
     from rlcli.runs.provenance import sources
     from rlcli.runs.run import Run
 
     values, files = [], []
     for side, opposite in ((one, other), (other, one)):
-        found = Values.of_run(side) if isinstance(side, Run) else Values.of_task(side)
+        found = run_values(side) if isinstance(side, Run) else task_values(side)
         if not isinstance(opposite, Run):  # only a run has a seed
-            found = found.without_seed()
+            found.pop(("seed",), None)
         values.append(found)
         digests = side.record.get("sources") if isinstance(side, Run) else sources(side)
         files.append({name: sha for name, sha in (digests or {}).items() if name != "rlcli"})

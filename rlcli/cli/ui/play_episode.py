@@ -83,7 +83,7 @@ def play_episode(
         frames, fps, backend = filming.writer.frames, filming.writer.fps, filming.renderer.backend
         console.info(f"{frames} frames at {fps:g} per second, drawn with {backend}")
     elif record is not None:
-        with EpisodeRecorder(session.env, 1, env_id=env_id) as recorder:
+        with session.env.observers.added(EpisodeRecorder(session.env, 1, env_id=env_id)) as recorder:
             last = run_episode(session.env, session.act, start.obs, env_id)
         recorded = [str(written) for written in recorder.save(record)]
         console.info(f"recorded to {recorded[0]}")

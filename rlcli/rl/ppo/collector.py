@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rlcli.envs.step import StepResult
 from rlcli.envs.vec_env import VecEnv
-from rlcli.rl.distributed import ProcessGroup
+from rlcli.rl import distributed
 from rlcli.rl.nan_check import moments, require_finite
 from rlcli.rl.policy import Normalizer
 from rlcli.rl.ppo.config import PpoConfig
@@ -31,22 +31,12 @@ class Collector:
         env: the environment.
         config: configuration of the agent.
         networks: actor and critic.
-        groups: observation groups of the critic.
         statistics: statistics of finished episodes.
-        process_group: processes of the run.
     """
 
-    def __init__(
-        self,
-        env: VecEnv,
-        config: PpoConfig,
-        networks: ActorCritic,
-        groups: tuple[str, ...],
-        statistics: EpisodeStatistics,
-        process_group: ProcessGroup,
-    ) -> None:
+    def __init__(self, env: VecEnv, config: PpoConfig, networks: ActorCritic, statistics: EpisodeStatistics) -> None:
         self.env, self.config, self.networks = env, config, networks
-        self.statistics, self._process_group = statistics, process_group
+        self.statistics, self.process_group = statistics, distributed.current()
         device, layout = env.device, env.layout
         self.iteration = 0
         """Number of rollouts collected so far."""
@@ -54,7 +44,7 @@ class Collector:
         """Whether tensors are checked for NaN after every stage.
 
         On a GPU, check once per iteration: each check forces a host sync."""
-        self._critic_groups = groups
+        groups = networks.critic_groups
         self._critic_reads_actor_obs = groups == ("policy",)
         obs_size, critic_size = layout.size("policy"), sum(layout.size(group) for group in groups)
 
@@ -191,7 +181,7 @@ class Collector:
                 self._update_normalizer(self.value_normalizer, column.flatten())
                 column.copy_(self.value_normalizer(column))
         if config.normalize_advantage == "batch":
-            samples.advantage.copy_(standardize(samples.advantage, self._process_group))
+            samples.advantage.copy_(standardize(samples.advantage, self.process_group))
 
     def _values(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the critic's values that GAE needs.
@@ -244,7 +234,7 @@ class Collector:
 
     def _concatenated(self, obs: Mapping[str, Tensor]) -> Tensor:
         """Return the critic's observation groups, concatenated by columns."""
-        groups = self._critic_groups
+        groups = self.networks.critic_groups
         return obs[groups[0]] if len(groups) == 1 else torch.cat([obs[group] for group in groups], dim=-1)
 
     def update_normalizers(self, obs: Mapping[str, Tensor]) -> None:
@@ -256,10 +246,10 @@ class Collector:
 
     def _update_normalizer(self, normalizer: Normalizer, values: Tensor) -> None:
         """Merge the batches of all processes into a normaliser. (n, ...)"""
-        batch, processes = values.double(), self._process_group.world_size
+        batch, processes = values.double(), self.process_group.world_size
         mean, var = batch.mean(dim=0), batch.var(dim=0, unbiased=False)
         if processes > 1:
-            mean, square = self._process_group.average_(torch.stack((mean, var + mean.square())))
+            mean, square = self.process_group.average_(torch.stack((mean, var + mean.square())))
             var = square - mean.square()  # Var(x) = E[x^2] - E[x]^2 over the batches of all processes
         normalizer.merge(mean, var, float(len(batch) * processes))
 

@@ -50,9 +50,8 @@ class CnnConfig(StrictModel):
     def _layers(self) -> CnnConfig:
         counts = [len(self.channels), len(self.kernels), len(self.strides)]
         if len(set(counts)) > 1:
-            raise ValueError(
-                f"channels, kernels and strides must have one number for each layer, found {counts} numbers"
-            )
+            message = f"channels, kernels and strides must have one number for each layer, found {counts} numbers"
+            raise ValueError(message)
         return self
 
 
@@ -181,9 +180,8 @@ class PpoConfig(AgentConfig):
         if self.schedule.startswith("adaptive") != (self.desired_kl is not None):
             raise ValueError("desired_kl must be given for an adaptive schedule, and only for it")
         if self.kl_from == "last_pass" and self.shuffle == "epoch":
-            raise ValueError(
-                "kl_from last_pass needs the same minibatches in every epoch: set shuffle to update or none"
-            )
+            message = "kl_from last_pass needs the same minibatches in every epoch: set shuffle to update or none"
+            raise ValueError(message)
         if self.cnn is not None and self.rnn is not None:
             raise ValueError("cnn and rnn cannot be combined; give the image a history to show motion")
         low, high = self.learning_rate_range

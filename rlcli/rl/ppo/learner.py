@@ -11,11 +11,9 @@ import math
 import torch
 from torch import Tensor
 
-from rlcli.rl.distributed import ProcessGroup
 from rlcli.rl.nan_check import require_finite, require_finite_learner
 from rlcli.rl.ppo.collector import Collector
 from rlcli.rl.ppo.compile import compile_update, tf32_matmul
-from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.ppo.gradient import AutogradGradient, ClosedFormGradient, MinibatchGradient, has_closed_form
 from rlcli.rl.ppo.loss import KL, METRICS, LossResult, UpdateFunctions, standardize
 from rlcli.rl.ppo.networks import adam, flatten, unroll
@@ -30,14 +28,11 @@ class Learner:
 
     Args:
         collector: the collector.
-        config: configuration of the agent.
-        process_group: processes of the run.
         torch_threads: threads of the update.
     """
 
-    def __init__(
-        self, collector: Collector, config: PpoConfig, process_group: ProcessGroup, torch_threads: int
-    ) -> None:
+    def __init__(self, collector: Collector, torch_threads: int) -> None:
+        config, process_group = collector.config, collector.process_group
         self.collector, self.config, self._process_group = collector, config, process_group
         self._networks, device = collector.networks, collector.env.device
         self._samples_per_rollout = config.num_steps * collector.env.num_envs

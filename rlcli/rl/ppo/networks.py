@@ -8,11 +8,13 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from rlcli.envs.vec_env import VecEnv
 from rlcli.rl.cnn import Vision, VisionSpec
 from rlcli.rl.mlp import Mlp
 from rlcli.rl.optimizers import Adam
 from rlcli.rl.policy import ACTIVATIONS, Lstm, Normalizer
 from rlcli.rl.ppo.config import NetworkConfig, PpoConfig
+from rlcli.rl.ppo.setup import vision_spec
 
 _POLICY = ("memory.", "vision.", "actor.")
 """Prefixes of the weights that belong to the policy."""
@@ -26,24 +28,17 @@ class ActorCritic(nn.Module):
     """Gaussian policy with a state-independent standard deviation, and a value function.
 
     Args:
-        obs_size: columns of the actor's observation.
-        critic_obs_size: columns of the critic's observation.
-        action_size: columns of the action.
+        env: the environment, which defines the columns of observations and actions.
         config: configuration of networks, initial weights and standard deviation.
-        vision: CNN over the images in the actor's observation.
-        critic_vision: CNN over the images in the critic's observation.
+        groups: observation groups of the critic.
     """
 
-    def __init__(
-        self,
-        obs_size: int,
-        critic_obs_size: int,
-        action_size: int,
-        config: PpoConfig,
-        vision: VisionSpec | None = None,
-        critic_vision: VisionSpec | None = None,
-    ) -> None:
+    def __init__(self, env: VecEnv, config: PpoConfig, groups: tuple[str, ...]) -> None:
         super().__init__()
+        layout, self.critic_groups = env.layout, groups
+        obs_size, action_size = layout.size("policy"), layout.action_size
+        critic_obs_size = sum(layout.size(group) for group in groups)
+        vision, critic_vision = vision_spec(env, config, ("policy",)), vision_spec(env, config, groups)
         cells = [config.rnn.hidden] * config.rnn.layers if config.rnn else []
         self.memory = Lstm(obs_size, cells) if cells else None
         self.vision, obs_size = _make_cnn(vision, obs_size, config.actor, config.init)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from pydantic import ValidationError
 
@@ -101,12 +103,10 @@ def compile_mode(config: PpoConfig, device: torch.device, steps_per_iteration: i
     """Return `compile` of the configuration; if it is null, whether the device is a GPU and the run long enough."""
     if config.compile is not None or device.type != "cuda":
         return config.compile or False
-    limits = []
-    if config.max_iterations is not None:
-        limits.append(config.max_iterations)
+    iterations = config.max_iterations or math.inf
     if config.max_steps is not None:
-        limits.append(config.max_steps // steps_per_iteration)
+        iterations = min(iterations, config.max_steps // steps_per_iteration)
     parts = config.num_minibatches
     if config.minibatch_size is not None:
         parts = max(1, steps_per_iteration // config.minibatch_size)
-    return min(limits) * config.num_epochs * parts >= _WORTH_COMPILING
+    return iterations * config.num_epochs * parts >= _WORTH_COMPILING

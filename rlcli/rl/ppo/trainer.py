@@ -24,7 +24,7 @@ from rlcli.rl.ppo.collector import Collector
 from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.ppo.learner import Learner
 from rlcli.rl.ppo.networks import ActorCritic
-from rlcli.rl.ppo.setup import critic_groups, policy_spec, vision_spec
+from rlcli.rl.ppo.setup import critic_groups, policy_spec
 from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.trainer import Report, TrainerState
 from rlcli.rl.trainer_base import BaseTrainer
@@ -53,18 +53,11 @@ class PpoTrainer(BaseTrainer):
 
         torch.set_num_threads(torch_threads)
         seed_generators(derive(seed, "trainer"))
-        self.networks = ActorCritic(
-            env.layout.size("policy"),
-            sum(env.layout.size(group) for group in groups),
-            env.layout.action_size,
-            config,
-            self.spec.vision,
-            vision_spec(env, config, groups),
-        ).to(self.device)
+        self.networks = ActorCritic(env, config, groups).to(self.device)
         # all ranks start with equal weights and explore with different noise
         seed_generators(self.process_group.seed(derive(seed, "exploration"), "exploration"))
-        self.collector = Collector(env, config, self.networks, groups, self.statistics, self.process_group)
-        self.learner = Learner(self.collector, config, self.process_group, torch_threads)
+        self.collector = Collector(env, config, self.networks, self.statistics)
+        self.learner = Learner(self.collector, torch_threads)
         self._collect = capture_on_gpu(self.collector.collect, self.device, env.stateful_objects())
         self._update = capture_on_gpu(self.learner.update, self.device)
 

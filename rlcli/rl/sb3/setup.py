@@ -61,10 +61,8 @@ def make_model(env: VecEnv, config: Sb3Config, seed: int, device: str) -> Any:
     if isinstance(config, PpoConfig):
         networks["optimizer_kwargs"]["eps"] = 1e-5  # as in SB3's on-policy policies
         settings["batch_size"] = config.n_steps * env.num_envs  # the buffer itself makes the minibatches
-    vec_env = Sb3VecEnv(env, config.action_bound)
-    model: Any = algorithm(
-        policy="MlpPolicy", env=vec_env, seed=seed, device=device, policy_kwargs=networks, **settings
-    )
+    settings |= {"seed": seed, "device": device, "policy_kwargs": networks}
+    model: Any = algorithm(policy="MlpPolicy", env=Sb3VecEnv(env, config.action_bound), **settings)
     model.exploration_noise = getattr(config, "exploration_noise", 0.0)
     if isinstance(config, PpoConfig):
         model.rollout_buffer.num_minibatches = config.num_minibatches
