@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from rsl_rl.env import VecEnv as RslRlBase
+from rsl_rl.env import Environment as RslRlBase
 from tensordict import TensorDict
 from torch import Tensor
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.rl.statistics import EpisodeStatistics
 
 
@@ -25,7 +25,7 @@ class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
         clip_actions: actions are clipped to +-`clip_actions`; None: no clipping.
     """
 
-    def __init__(self, env: VecEnv, clip_actions: float | None = None) -> None:
+    def __init__(self, env: Environment, clip_actions: float | None = None) -> None:
         self.unwrapped = env
         self.clip_actions = clip_actions
         self.num_envs = env.num_envs

@@ -24,6 +24,7 @@ from rlcli.envs.step import Episodes, StepRecord, StepResult
 from rlcli.envs.workflow import Workflow
 from rlcli.machine import require_device
 from rlcli.managers.term import Binder
+from rlcli.sim.engine import Engine
 from rlcli.sim.selection import Field, Selection
 from rlcli.sim.tensor_state import means
 
@@ -46,6 +47,8 @@ class VecEnv(Workflow):
         DeviceError: for a device that does not exist.
     """
 
+    engine: Engine
+
     def __init__(
         self,
         resolved: Resolved,
@@ -67,7 +70,6 @@ class VecEnv(Workflow):
         self.observers = Observers()
         self.physics_override: Callable[[], None] | None = None
         """Called instead of the engine to step the simulations; it must write their states and derived fields."""
-        self._playing = True
         self._last_obs: dict[str, Tensor] = {}
         self._counters = EpisodeCounters(self.shard, self.device)
         self.episode_length_buf = self._counters.lengths
@@ -114,13 +116,7 @@ class VecEnv(Workflow):
             self._counters.set_success(success, self.config.success.hold_s, self.step_dt)
 
     def reset(self, seed: int | None = None, *, episode: int = 0) -> dict[str, Tensor]:
-        """Start a new episode everywhere, and return observations by group. (num_envs, d) float32
-
-        Args:
-            seed: seed of every draw from now on, as in a new environment; None: the random streams continue.
-            episode: with a seed, the number of the episode that begins. The state that earlier episodes would have left
-                in the terms of `episode_dependencies` is missing then.
-        """
+        """Start a new episode everywhere, and return observations by group; see `Environment.reset`."""
         if seed is not None:
             self.seed = seed
             self.episode_index.fill_(episode)
@@ -135,7 +131,7 @@ class VecEnv(Workflow):
         return self._observe()
 
     def step(self, action: Tensor, restart: Tensor | None = None) -> StepResult:
-        """Apply one action for `decimation` physics steps.
+        """Apply one action for `decimation` physics steps; for arguments and errors see `Environment.step`.
 
         1. Observers run `before_step`; the action is checked.
         2. The action becomes controls; physics runs; diverged environments return to their last finite state.
@@ -146,15 +142,6 @@ class VecEnv(Workflow):
         7. Environments whose episode ended, and those of `restart`, are reset.
         8. Commands and interval events run; environments that they or a reset put out of bounds are quarantined.
         9. Observations are computed.
-
-        Args:
-            action: one row for each environment. (num_envs, a) float32
-            restart: environments that skip the step and return to the start of their running episode, with reward 0.
-                (num_envs,) bool
-
-        Raises:
-            DivergedError: for an action, observation or reward that is not finite. A diverged simulation is no error:
-                it ends the episode of its environment.
         """
         if not self._playing:
             raise RuntimeError("the environment is paused")
@@ -289,11 +276,6 @@ class VecEnv(Workflow):
         """The environment of this process, with terms and managers: this object, if no other process steps a part."""
         return self
 
-    @property
-    def workers(self) -> int:
-        """Number of processes that step the environments."""
-        return 1
-
     def compute_success(self) -> Tensor | None:
         """Return where the success condition holds in the current state; None without one. (num_envs,) bool"""
         success = self._counters.success
@@ -309,32 +291,14 @@ class VecEnv(Workflow):
         return int(self._counters.common_step)
 
     @property
-    def divergences(self) -> int:
-        """Number of simulations that diverged since the start."""
-        return sum(self.causes.values())
-
-    @property
     def causes(self) -> dict[str, int]:
         """Number of diverged simulations by cause: MuJoCo's warning (`BADQACC`), `FIELD not finite`, `engine error`."""
         return dict(self._guard.causes)
-
-    @property
-    def calls_per_step(self) -> int:
-        """Number of engine calls in an environment step: 1, or `decimation` with actuator models."""
-        return self.config.decimation if self.actuators else 1
 
     def compute_efforts(self) -> None:
         """Write the controls of the actuator models for the next physics step."""
         for actuator in self.actuators.values():
             actuator.compute()
-
-    def is_playing(self) -> bool:
-        """Return False while paused; then no step can run."""
-        return self._playing
-
-    def pause(self, paused: bool = True) -> None:
-        """Pause, or continue with `paused=False`."""
-        self._playing = not paused
 
     def extras(self) -> dict[str, float]:
         """Return further numbers to log: the task's values of the last step, and new divergences by cause."""
@@ -359,12 +323,7 @@ class VecEnv(Workflow):
         return save_state(self)
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Restore the state returned by `state_dict()`, and return the observations of that moment.
-
-        Raises:
-            KeyError: if a tensor is missing.
-            ValueError: if a tensor has another shape or type, because it was saved from a different environment.
-        """
+        """Restore the state returned by `state_dict()`; see `Environment.load_state_dict`."""
         load_state(self, state)
         self._last_obs = self._restore_observations()
         return self._last_obs

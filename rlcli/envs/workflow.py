@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from rlcli.envs.environment import Environment
 from rlcli.envs.layout import Layout
 from rlcli.scene.scene import Scene
 from rlcli.scene.terrain import Terrain
@@ -16,14 +17,12 @@ from rlcli.sim.markers import Marker
 from rlcli.sim.selection import Selection
 
 
-class Workflow(ABC):
+class Workflow(Environment):
     """Base class of the environment loop, with the parts that differ between managed and direct tasks.
 
     `VecEnv` calls the hooks whose names begin with an underscore; the other methods are for users of the environment.
     """
 
-    num_envs: int
-    device: torch.device
     terrain: Terrain | None
 
     # --- construction, in this order ---
@@ -114,11 +113,6 @@ class Workflow(ABC):
     def episode_dependencies(self) -> list[str]:
         """Return the parts of the configuration that make an episode depend on earlier ones; empty: none is known."""
         return ["scene.terrain"] if self.terrain is not None else []
-
-    @property
-    def reward_names(self) -> list[str]:
-        """Names of the reward terms, in the order of `StepRecord.reward_terms`; empty for a task without terms."""
-        return []
 
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the task's own numbers to log, for `StepObserver.on_step`. (num_envs,) each

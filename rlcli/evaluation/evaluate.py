@@ -10,9 +10,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from rlcli.envs.environment import Environment
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.step import Episodes, StepRecord, StepResult
-from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.termination import DIVERGED
 from rlcli.replay.rerun_episode import require_end
 from rlcli.rl.acting import Act
@@ -83,7 +83,7 @@ class Evaluation:
 
 
 def evaluate(
-    env: VecEnv,
+    env: Environment,
     act: Act,
     episodes: int,
     on_step: Callable[[StepResult], None] = lambda _: None,
@@ -135,7 +135,7 @@ def _mean_of_finite(values: list[float]) -> dict[str, float | None]:
 class _EpisodeMeans(StepObserver):
     """Observer that sums a task's metrics in each environment, for their means over finished episodes."""
 
-    def __init__(self, env: VecEnv) -> None:
+    def __init__(self, env: Environment) -> None:
         self._env = env
         self._sums: dict[str, Tensor] = {}
         self._steps: dict[str, Tensor] = {}

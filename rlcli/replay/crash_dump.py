@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rlcli.config.load import Resolved
+from rlcli.envs.environment import Environment
 from rlcli.envs.observers import StepObserver
-from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import MachineError
 from rlcli.replay.resimulate import ReplayWorld
 from rlcli.replay.trajectory import Header, World, write_trajectory
@@ -36,7 +36,7 @@ class CrashDumper(StepObserver):
         folder: folder of the dump; created with the dump.
     """
 
-    def __init__(self, env: VecEnv, folder: Path) -> None:
+    def __init__(self, env: Environment, folder: Path) -> None:
         self._env, self._folder = env, folder
         if env.engine.replayable is not None:
             env.engine.replayable.record_calls(CALLS)
@@ -62,7 +62,7 @@ class CrashDumper(StepObserver):
         _log.warning(message)
 
 
-def stop_observing_divergences(env: VecEnv, observer: StepObserver) -> None:
+def stop_observing_divergences(env: Environment, observer: StepObserver) -> None:
     """Remove an observer of divergences; without another one, the engine keeps only its last call."""
     env.observers.remove(observer)
     if not env.observers.on_divergence and env.engine.replayable is not None:
@@ -86,7 +86,7 @@ class CallTrace:
     """Whether the engine has not made the last call yet."""
 
 
-def trace_calls(env: VecEnv, divergence: Divergence, pending: bool = False) -> CallTrace:
+def trace_calls(env: Environment, divergence: Divergence, pending: bool = False) -> CallTrace:
     """Return the last engine calls of an environment, before it is restored or reset."""
     engine, number = env.engine.replayable, divergence.env
     assert engine is not None
@@ -134,7 +134,7 @@ def describe_traces(
     return worlds, tensors
 
 
-def write_dump(env: VecEnv, found: list[Divergence], pending: bool, folder: Path) -> Path:
+def write_dump(env: Environment, found: list[Divergence], pending: bool, folder: Path) -> Path:
     """Write the last engine calls of environments that diverged.
 
     Args:

@@ -25,9 +25,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from rlcli.config.schema import AutopsyConfig
+from rlcli.envs.environment import Environment
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.step import Episodes, StepRecord
-from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, RlcliError
 from rlcli.managers.termination import DIVERGED
 from rlcli.replay.crash_dump import CallTrace, describe_traces, stop_observing_divergences, trace_calls
@@ -102,7 +102,7 @@ class FailureRecorder(StepObserver):
         step: environment steps of the checkpoint from which training resumes; None: a new training.
     """
 
-    def __init__(self, env: VecEnv, config: AutopsyConfig, folder: Path, step: int | None) -> None:
+    def __init__(self, env: Environment, config: AutopsyConfig, folder: Path, step: int | None) -> None:
         engine = env.engine.replayable
         assert engine is not None
         self._env, self._engine, self._keep = env, engine, config.keep
@@ -339,7 +339,7 @@ class FailureRecorder(StepObserver):
 
 
 def open_failure_recorder(
-    env: VecEnv, config: AutopsyConfig | None, folder: Path, step: int | None
+    env: Environment, config: AutopsyConfig | None, folder: Path, step: int | None
 ) -> FailureRecorder | None:
     """Return a recorder; None if none is configured, or on a GPU, whose steps cannot be replayed."""
     return None if config is None or env.engine.replayable is None else FailureRecorder(env, config, folder, step)

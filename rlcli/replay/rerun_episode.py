@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rlcli.envs.environment import Environment
 from rlcli.envs.step import StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError
@@ -81,7 +82,7 @@ def run_episode(env: VecEnv, act: Act, obs: Tensor, env_id: int) -> StepResult:
                 return step
 
 
-def require_end(env: VecEnv, length: int) -> None:
+def require_end(env: Environment, length: int) -> None:
     """Check that a running episode of `length` steps is not much longer than the task's episodes.
 
     Raises:

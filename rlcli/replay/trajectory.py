@@ -33,9 +33,9 @@ from torch import Tensor
 import rlcli
 from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
+from rlcli.envs.environment import Environment
 from rlcli.envs.layout import TermLayout
 from rlcli.envs.step import Episodes
-from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, ConfigError
 from rlcli.registry import TaskSource
 from rlcli.runs.atomic_io import disk_errors, write_atomic
@@ -92,7 +92,7 @@ class Episode(_Strict):
     """Terminations that fired at its end."""
 
     @staticmethod
-    def of(env: VecEnv, ended: Episodes, row: int, begin: int = 0, kept: int | None = None) -> Episode:
+    def of(env: Environment, ended: Episodes, row: int, begin: int = 0, kept: int | None = None) -> Episode:
         """Return an episode that ends in the current step, before the reset; `row` is its row in `ended`."""
         number, length = int(ended.ids[row]), int(ended.lengths[row])
         return Episode(
@@ -195,7 +195,7 @@ class Header(_Strict):
     failure: Failure | None
 
     @staticmethod
-    def of(env: VecEnv) -> Header:
+    def of(env: Environment) -> Header:
         """Return the header of a recording without episodes."""
         columns = Columns(
             observations=_column_names(env.layout.observations["policy"]),

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.rl.policy import Policy
 
 Act = Callable[[Tensor], Tensor]
@@ -17,7 +17,7 @@ PATIENCE = 10
 
 
 def trained_policy(
-    env: VecEnv, policy: Policy, *, stochastic: bool = False, generator: torch.Generator | None = None
+    env: Environment, policy: Policy, *, stochastic: bool = False, generator: torch.Generator | None = None
 ) -> Act:
     """Return the action function of a policy. It resets the hidden state of an environment at each episode start.
 
@@ -40,13 +40,13 @@ def trained_policy(
     return act
 
 
-def zero_policy(env: VecEnv) -> Act:
+def zero_policy(env: Environment) -> Act:
     """Return a function that always returns the zero action."""
     action = torch.zeros(env.num_envs, env.layout.action_size, device=env.device)
     return lambda obs: action
 
 
-def random_policy(env: VecEnv, bound: float | None, seed: int) -> Act:
+def random_policy(env: Environment, bound: float | None, seed: int) -> Act:
     """Return a function that samples uniform actions in [-bound, bound], or standard Gaussian ones without a bound.
 
     Environments that share a random stream get the same actions.

@@ -10,7 +10,7 @@ from importlib import metadata
 import torch
 from torch import Tensor
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.errors import ConfigError, DependencyError
 from rlcli.rl.policy import Policy, PolicySpec
 from rlcli.rl.statistics import EpisodeStatistics
@@ -32,7 +32,7 @@ class BaseTrainer(ABC):
     spec: PolicySpec
     """Structure of the policy."""
 
-    def __init__(self, env: VecEnv, torch_threads: int) -> None:
+    def __init__(self, env: Environment, torch_threads: int) -> None:
         self.env, self.torch_threads = env, torch_threads
         env.final_obs_of = "truncated"
         self.statistics = EpisodeStatistics(env.config.episode_length_s)
@@ -73,7 +73,7 @@ def finite_values(metrics: Mapping[str, float]) -> dict[str, float]:
     return {name: value for name, value in metrics.items() if math.isfinite(value)}
 
 
-def agent_error(env: VecEnv, path: tuple[str, ...], message: str, hint: str) -> ConfigError:
+def agent_error(env: Environment, path: tuple[str, ...], message: str, hint: str) -> ConfigError:
     """Return the error for a key of the agent's configuration that does not fit the environment."""
     return ConfigError([env.resolved.problem(("agents", env.resolved.agent_name or "", *path), message, hint)])
 

@@ -18,8 +18,8 @@ from rlcli.sim.divergence_report import HISTORY_MEMORY, Call, Divergence, StateH
 from rlcli.sim.selection import Field, Groups, Selection
 
 
-class Engine(Protocol):
-    """Engine that steps `num_envs` worlds of `model`.
+class EngineView(Protocol):
+    """Part of an engine that observers, recorders and reports use.
 
     Fields are torch tensors `(num_envs, ...)` on `device`: float64 on a CPU, float32 on a GPU.
     """
@@ -28,7 +28,6 @@ class Engine(Protocol):
     device: torch.device
     model: mujoco.MjModel
     threads: int
-    warnings: dict[str, int]
     shared_streams: int
     """Worlds i and i % shared_streams draw the same random numbers; 0: every world has its own stream."""
     asynchronous: bool
@@ -37,19 +36,16 @@ class Engine(Protocol):
     """Whether `forward` computes fields of the acceleration stage; if not, `reset` sets them to 0."""
 
     @property
-    def replayable(self) -> ReplayableEngine | None:
+    def replayable(self) -> ReplayableView | None:
         """The engine itself if its calls can be stepped again bit for bit; None on a GPU."""
+
+    @property
+    def warnings(self) -> dict[str, int]:
+        """Number of MuJoCo's warnings that are no divergence, by name."""
 
     @property
     def divergence_causes(self) -> dict[str, int]:
         """Number of divergences since the start, by cause."""
-
-    @property
-    def described_divergences(self) -> list[Divergence]:
-        """First divergences of the last call of `diverged`; on an `asynchronous` engine, the first since the start."""
-
-    def use_torch_stream(self) -> None:
-        """Launch on torch's current CUDA stream from now on; called before a step."""
 
     def field(self, name: str) -> Tensor:
         """Return a live view of an MjData field: state fields are writable, derived ones (xpos, ...) are not.
@@ -58,6 +54,57 @@ class Engine(Protocol):
         accelerations (qacc, actuator_force, ...) have the values of the last substep. With
         `sim.derived_fields: substep` all derived fields have the values of the last substep.
         """
+
+    def expanded_fields(self) -> list[str]:
+        """Return the names of the model fields that have been expanded."""
+
+
+class ReplayableView(EngineView, Protocol):
+    """View of an engine whose worlds have integration states on the CPU, from which it steps again bit for bit."""
+
+    state_layout: StateLayout
+
+    @property
+    def step_stage(self) -> int:
+        """Stage (mjtStage) that is computed after the last physics step of a call, for the bound fields."""
+
+    @property
+    def own_constants(self) -> bool:
+        """Whether `set_constants` has been called."""
+
+    @property
+    def history(self) -> StateHistory:
+        """States before the last calls of `step`."""
+
+    def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
+        """Record the last calls of `step`: `calls` of them, or as many as fit into `memory` bytes."""
+
+    def recorded_calls(self, env: int) -> list[Call]:
+        """Return the recorded calls of a world in its present episode, the oldest first."""
+
+    def state_row(self, env: int) -> NDArray[np.float64]:
+        """Return a copy of a world's integration state. (nstate,)"""
+
+    def state_rows(self, envs: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return copies of the integration states of some worlds. (n, nstate)"""
+
+    def own_model_fields(self, env: int) -> dict[str, NDArray[Any]]:
+        """Return copies of the model fields of one world."""
+
+
+class Engine(EngineView, Protocol):
+    """Engine that steps `num_envs` worlds of `model`."""
+
+    @property
+    def replayable(self) -> ReplayableEngine | None:
+        """The engine itself if its calls can be stepped again bit for bit; None on a GPU."""
+
+    @property
+    def described_divergences(self) -> list[Divergence]:
+        """First divergences of the last call of `diverged`; on an `asynchronous` engine, the first since the start."""
+
+    def use_torch_stream(self) -> None:
+        """Launch on torch's current CUDA stream from now on; called before a step."""
 
     def can_expand(self, name: str) -> bool:
         """Return whether a model field may differ between worlds."""
@@ -70,9 +117,6 @@ class Engine(Protocol):
 
     def expanded(self, name: str) -> Tensor | None:
         """Return a model field that has been expanded; None if all worlds share the model's value."""
-
-    def expanded_fields(self) -> list[str]:
-        """Return the names of the model fields that have been expanded."""
 
     def set_constants(self, selection: Selection | None = None) -> None:
         """Recompute the constants that MuJoCo derives from model fields, after a write to expanded fields.
@@ -146,39 +190,17 @@ class Engine(Protocol):
         """Free threads and memory."""
 
 
-class ReplayableEngine(Engine, Protocol):
+class ReplayableEngine(Engine, ReplayableView, Protocol):
     """Engine whose worlds have integration states on the CPU, from which it steps again bit for bit."""
-
-    own_constants: bool
-    """Whether `set_constants` has been called."""
-    state_layout: StateLayout
-    history: StateHistory
-    step_stage: int
-    """Stage (mjtStage) that is computed after the last physics step of a call, for the bound fields."""
 
     stream_ids: NDArray[np.int64] | None
     """Number of each world's random stream; None: the number of the world. (num_envs,)"""
-
-    def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
-        """Record the last calls of `step`: `calls` of them, or as many as fit into `memory` bytes."""
-
-    def recorded_calls(self, env: int) -> list[Call]:
-        """Return the recorded calls of a world in its present episode, the oldest first."""
-
-    def state_row(self, env: int) -> NDArray[np.float64]:
-        """Return a copy of a world's integration state. (nstate,)"""
-
-    def state_rows(self, envs: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return copies of the integration states of some worlds. (n, nstate)"""
 
     def set_state_row(self, env: int, row: NDArray[np.float64]) -> None:
         """Set the integration state of a world; derived fields keep their values."""
 
     def copy_data(self, env: int, data: mujoco.MjData) -> None:
         """Set the integration state and the derived fields of a world to those of an MjData."""
-
-    def own_model_fields(self, env: int) -> dict[str, NDArray[Any]]:
-        """Return copies of the model fields of one world."""
 
     def load_model_field(self, name: str, values: Tensor) -> None:
         """Expand a model field and set its values, which were read from a file.

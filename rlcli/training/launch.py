@@ -21,7 +21,7 @@ from rlcli.training.job import Job, TrainingResult, threads
 from rlcli.training.loggers import check_loggers
 
 if TYPE_CHECKING:
-    from rlcli.envs.vec_env import VecEnv
+    from rlcli.envs.environment import Environment
     from rlcli.registry import TaskSource
     from rlcli.rl.trainer import Trainer
     from rlcli.training.signals import StopRequest
@@ -222,8 +222,8 @@ def resume_run(request: TrainingRequest) -> Job | TrainingResult:
 
 
 def setup_job(
-    job: Job, device: str, stop: StopRequest, check_model: Callable[[VecEnv], None] = lambda _: None
-) -> tuple[Trainer, VecEnv]:
+    job: Job, device: str, stop: StopRequest, check_model: Callable[[Environment], None] = lambda _: None
+) -> tuple[Trainer, Environment]:
     """Build the trainer and its environment, with all heavy imports; remove a new run if that fails.
 
     Args:

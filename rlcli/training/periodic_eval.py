@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.evaluation.evaluate import evaluate
 from rlcli.rl.acting import trained_policy
 from rlcli.rl.policy import Policy
@@ -31,13 +31,13 @@ class PeriodicEval:
 
     def __init__(
         self,
-        make_env: Callable[[], VecEnv],
+        make_env: Callable[[], Environment],
         episodes: int,
         interval: int,
         history: Sequence[Mapping[str, Any]] = (),
     ) -> None:
         self._make_env, self._episodes, self._interval = make_env, episodes, interval
-        self._env: VecEnv | None = None
+        self._env: Environment | None = None
         self._initial_state: Mapping[str, Tensor] = {}
         best = max(history, key=_score, default={})  # the first of equal scores
         self._best = _score(best)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from rlcli.config.dump import to_data
 from rlcli.deploy.env_description import describe
+from rlcli.envs.environment import Environment
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import DivergedError, RlcliError, Stopped
@@ -44,7 +45,7 @@ class ProgressView(contextlib.AbstractContextManager[Any], Protocol):
 
 
 def run_training(
-    job: Job, trainer: Trainer, env: VecEnv, stop: StopRequest, view: ProgressView
+    job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view: ProgressView
 ) -> TrainingResult | None:
     """Train a job until its budget is spent; record an error of the loop in the run and raise it.
 
@@ -80,7 +81,7 @@ def run_training(
     return TrainingResult(run.folder, newest, trainer.env_steps, trainer.iteration, elapsed, run.record["seed"])
 
 
-def _train(job: Job, trainer: Trainer, env: VecEnv, stop: StopRequest, view: ProgressView) -> None:
+def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view: ProgressView) -> None:
     """Open loggers and checkpoints, run the loop, and record in the run how it ended."""
     run, (agent, _) = job.run, job.resolved.require_agent()
     budgets = [Budget(end, None) for end in job.stages] or [Budget(agent.max_iterations, agent.max_steps)]
@@ -127,7 +128,7 @@ def _train(job: Job, trainer: Trainer, env: VecEnv, stop: StopRequest, view: Pro
     close("finished")
 
 
-def _open_writer(job: Job, env: VecEnv) -> CheckpointWriter:
+def _open_writer(job: Job, env: Environment) -> CheckpointWriter:
     """Open the writer of checkpoints and the recorder of failed episodes."""
     run, (agent, _) = job.run, job.resolved.require_agent()
     manifest = manifest_entries(run, agent.trainer, env.layout, describe(env.local))
@@ -139,7 +140,7 @@ def _open_writer(job: Job, env: VecEnv) -> CheckpointWriter:
     return CheckpointWriter(run.checkpoints, keep, manifest, resumed=job.resume_from, cases=cases)
 
 
-def _record_begin(job: Job, trainer: Trainer, env: VecEnv, budget: Budget) -> None:
+def _record_begin(job: Job, trainer: Trainer, env: Environment, budget: Budget) -> None:
     """Write the start of the training into run.json, and whether the run can be resumed with the same bits."""
     unsaved = env.unsaved_state()
     if unsaved:
@@ -149,7 +150,7 @@ def _record_begin(job: Job, trainer: Trainer, env: VecEnv, budget: Budget) -> No
     job.run.update(resumes_exactly=exact, **_provenance(job, trainer, env))
 
 
-def _provenance(job: Job, trainer: Trainer, env: VecEnv) -> dict[str, Any]:
+def _provenance(job: Job, trainer: Trainer, env: Environment) -> dict[str, Any]:
     """Return run.json's entries on the compiled model and the machine; for a resumed run, only changed entries."""
     record, device = job.run.record, str(env.device)
     built = built_record(env.engine.model, device)
@@ -187,7 +188,7 @@ def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest) -> Per
         return None
     num_envs = min(agent.eval_episodes, job.resolved.task.scene.num_envs)
 
-    def make() -> VecEnv:
+    def make() -> Environment:
         env = _make_play_env(job, "evaluation", {"scene.num_envs": num_envs})
         env.observers.add(stop)
         return env
@@ -221,7 +222,7 @@ def _end_state(error: BaseException) -> tuple[str, str | None]:
     return "diverged" if isinstance(error, DivergedError) else "failed", " ".join(message.split())[:500]
 
 
-def _warn_of_physics(env: VecEnv) -> None:
+def _warn_of_physics(env: Environment) -> None:
     """Log MuJoCo's warnings of the whole training, with advice."""
     advice = {
         "contact_full": "contacts were dropped; enlarge <size memory=...> in the MJCF",

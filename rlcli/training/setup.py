@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 from rlcli.config.load import Resolved
+from rlcli.envs.environment import Environment
 from rlcli.envs.sharding.choice import make_training_env
-from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, RlcliError, one_line
 from rlcli.random import derive
 from rlcli.registry import load_object
@@ -24,7 +24,7 @@ from rlcli.training.job import Job, threads
 _log = logging.getLogger(__name__)
 
 
-def build_trainer(job: Job, device: str) -> tuple[Trainer, VecEnv]:
+def build_trainer(job: Job, device: str) -> tuple[Trainer, Environment]:
     """Build the trainer and its environment; start the trainer, or load the checkpoint to resume from.
 
     The changed configuration of a resumed run is written only after everything that may fail.
@@ -56,7 +56,7 @@ def build_trainer(job: Job, device: str) -> tuple[Trainer, VecEnv]:
     return trainer, env
 
 
-def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int) -> tuple[Trainer, VecEnv]:
+def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int) -> tuple[Trainer, Environment]:
     """Make the environment and the trainer of a configuration. Every rank has other seeds for its environments."""
     agent, spec = resolved.require_agent()
     ranks = distributed.current()
@@ -70,7 +70,7 @@ def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int)
         raise
 
 
-def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: VecEnv) -> None:
+def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: Environment) -> None:
     """Load the state of a checkpoint to resume from."""
     require_fit(saved, env.layout)
     _load(saved, lambda: trainer.load(state), "it cannot be resumed")

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.errors import ConfigError
 from rlcli.random import derive
 from rlcli.rl.nan_check import require_finite_learner
@@ -47,7 +47,7 @@ class RlGamesTrainer(BaseTrainer):
 
     agent: Any
 
-    def __init__(self, env: VecEnv, config: RlGamesConfig, *, seed: int, device: str, torch_threads: int) -> None:
+    def __init__(self, env: Environment, config: RlGamesConfig, *, seed: int, device: str, torch_threads: int) -> None:
         super().__init__(env, torch_threads)
         self.config = config
         self.iteration, self.env_steps = 0, 0

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli_rl_games.base import RlGamesTrainer
 from rlcli_rl_games.config import RlGamesConfig, SacConfig
 from rlcli_rl_games.ppo import PpoTrainer
 from rlcli_rl_games.sac import SacTrainer
 
 
-def make_trainer(env: VecEnv, config: RlGamesConfig, *, seed: int, device: str, torch_threads: int) -> RlGamesTrainer:
+def make_trainer(
+    env: Environment, config: RlGamesConfig, *, seed: int, device: str, torch_threads: int
+) -> RlGamesTrainer:
     """Return the trainer of an agent."""
     trainer = SacTrainer if isinstance(config, SacConfig) else PpoTrainer
     return trainer(env, config, seed=seed, device=device, torch_threads=torch_threads)

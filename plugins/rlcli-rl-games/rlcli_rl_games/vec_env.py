@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rlcli.envs.environment import Environment
 from rlcli.envs.step import StepResult
-from rlcli.envs.vec_env import VecEnv
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli_rl_games.library import IVecEnv, gym
 
@@ -27,7 +27,7 @@ class RlGamesVecEnv(IVecEnv):
     """
 
     def __init__(
-        self, env: VecEnv, statistics: EpisodeStatistics, *, central: bool, time_outs: bool, threads: int
+        self, env: Environment, statistics: EpisodeStatistics, *, central: bool, time_outs: bool, threads: int
     ) -> None:
         self.env, self.central, self.time_outs, self.threads = env, central, time_outs, threads
         self.statistics = statistics

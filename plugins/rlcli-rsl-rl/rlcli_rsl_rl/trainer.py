@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.random import derive
 from rlcli.registry import is_offered, load_object
 from rlcli.rl.nan_check import require_finite_learner
@@ -52,7 +52,7 @@ class RslRlTrainer(BaseTrainer):
         torch_threads: threads of the update; the rollout runs torch on one thread, since two thread pools compete.
     """
 
-    def __init__(self, env: VecEnv, config: RunnerConfig, *, seed: int, device: str, torch_threads: int) -> None:
+    def __init__(self, env: Environment, config: RunnerConfig, *, seed: int, device: str, torch_threads: int) -> None:
         super().__init__(env, torch_threads)
         self.config = config
         self.iteration, self.env_steps = 0, 0
@@ -244,7 +244,7 @@ class RslRlTrainer(BaseTrainer):
         return tensors
 
 
-def _policy_spec(env: VecEnv, config: RunnerConfig) -> PolicySpec:
+def _policy_spec(env: Environment, config: RunnerConfig) -> PolicySpec:
     """Return the structure of the trained policy."""
     actor, _ = config.networks
     memory = config.memory or []
@@ -261,7 +261,7 @@ def _policy_spec(env: VecEnv, config: RunnerConfig) -> PolicySpec:
     )
 
 
-def _groups(env: VecEnv, config: RunnerConfig) -> dict[str, list[str]]:
+def _groups(env: Environment, config: RunnerConfig) -> dict[str, list[str]]:
     """Return the observation groups of the task for each observation set of RSL-RL.
 
     Raises:
@@ -287,7 +287,7 @@ def _groups(env: VecEnv, config: RunnerConfig) -> dict[str, list[str]]:
     return sets
 
 
-def _require_batch(env: VecEnv, config: RunnerConfig) -> None:
+def _require_batch(env: Environment, config: RunnerConfig) -> None:
     parts = config.algorithm.num_mini_batches
     # minibatches of recurrent networks consist of whole environments, others of single samples
     whole = config.num_steps_per_env if config.memory is not None else 1
@@ -299,7 +299,7 @@ def _require_batch(env: VecEnv, config: RunnerConfig) -> None:
         raise agent_error(env, at, message, "use more environments, more num_steps_per_env, or fewer minibatches")
 
 
-def _settings(env: VecEnv, config: RunnerConfig, groups: dict[str, list[str]]) -> dict[str, Any]:
+def _settings(env: Environment, config: RunnerConfig, groups: dict[str, list[str]]) -> dict[str, Any]:
     """Return the settings in the form of RSL-RL 5."""
     algorithm: dict[str, Any] = config.algorithm.model_dump(exclude={"class_name", "rnd_cfg", "symmetry_cfg"})
     algorithm["class_name"] = PPO
@@ -332,7 +332,7 @@ def _network(config: Any) -> dict[str, Any]:
     return settings
 
 
-def _mirror(env: VecEnv, reference: str) -> Any:
+def _mirror(env: Environment, reference: str) -> Any:
     """Load the function that mirrors observations and actions."""
     module, _, name = reference.rpartition(":")
     if not module:

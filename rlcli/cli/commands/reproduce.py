@@ -12,7 +12,7 @@ from rlcli.cli.ui.options import RunRef, RunsDir
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rlcli.envs.vec_env import VecEnv
+    from rlcli.envs.environment import Environment
     from rlcli.runs.run import Run
 
 Row = tuple[str, Any, Any]
@@ -82,7 +82,7 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
     now = environment_record(resolved, engine, int(original.record.get("torch_threads") or min(4, available_cores())))
     rows = changed_entries(original, now)
 
-    def check_model(env: VecEnv) -> None:
+    def check_model(env: Environment) -> None:
         more = changed_entries(original, built_record(env.engine.model, "cpu"))
         rows.extend(more)
         _require(more, force)

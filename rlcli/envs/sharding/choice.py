@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-from typing import cast
 
 from rlcli.config.load import Resolved
 from rlcli.config.schema import CameraSensorConfig
+from rlcli.envs.environment import Environment
 from rlcli.envs.make import make_env
-from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError
 from rlcli.machine import available_cores
 
@@ -18,7 +17,7 @@ _TESTED = ("rlcli", "rlcli-gymnasium", "rlcli-menagerie")
 """Distributions whose tasks are tested with several workers."""
 
 
-def make_training_env(resolved: Resolved, *, seed: int, device: str) -> VecEnv:
+def make_training_env(resolved: Resolved, *, seed: int, device: str) -> Environment:
     """Return the environment of a training, in as many processes as `scene.workers` says.
 
     Raises:
@@ -29,7 +28,7 @@ def make_training_env(resolved: Resolved, *, seed: int, device: str) -> VecEnv:
         return make_env(resolved, seed=seed, device=device)
     from rlcli.envs.sharding.env import ShardedEnv
 
-    return cast(VecEnv, ShardedEnv(resolved, workers=workers, seed=seed))
+    return ShardedEnv(resolved, workers=workers, seed=seed)
 
 
 def number_of_workers(resolved: Resolved, device: str) -> int:

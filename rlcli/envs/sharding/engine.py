@@ -22,7 +22,9 @@ N = TypeVar("N", int, float)
 class Shards(Protocol):
     """Calls of functions in the processes that have the shards."""
 
-    local: VecEnv
+    @property
+    def local(self) -> VecEnv:
+        """The environment of the first shard."""
 
     def call_all(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
         """Return `function(env, *arguments)` of every shard, in order."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rlcli.config.load import Resolved
-from rlcli.envs.layout import Layout
+from rlcli.envs.environment import Environment
 from rlcli.envs.make import make_env
 from rlcli.envs.observers import Observers
 from rlcli.envs.shard import Shard, split
@@ -42,11 +42,11 @@ from rlcli.sim.divergence_report import MAX_DESCRIBED
 from rlcli.sim.tensor_state import mean_of, means
 
 
-class ShardedEnv:
+class ShardedEnv(Environment):
     """Environments of a task in shards: this process steps the first one, and each worker process another.
 
-    It has the public interface of `VecEnv`, and all its results are bit-identical to those of one process. Entities,
-    managers and terms are not part of it; `local` has those of the first shard.
+    All results are bit-identical to those of one process. `local` has the entities, managers and terms of the first
+    shard.
 
     Args:
         resolved: a validated configuration.
@@ -72,7 +72,7 @@ class ShardedEnv:
         try:
             counters = map_tensors(self._workers.arrays, counter_specs(total))["counters"]
             first = replace(self._shards[0], counters=counters[:, self._shards[0].rows])
-            self.local = make_env(parts[0], seed=seed, shared_streams=shared_streams, shard=first)
+            self._local = make_env(parts[0], seed=seed, shared_streams=shared_streams, shard=first)
             self._workers.replies()
             specs = array_specs(self.local, total, workers)
             self._workers.request(worker.MAP, specs)
@@ -91,26 +91,29 @@ class ShardedEnv:
         self._stage: Stage | None = None
         """Stage whose observers run."""
         self._is_broken = False
-        self._playing = True
-        self.resolved, self.config = resolved, resolved.task
+        self.resolved, self.config, self.seed = resolved, resolved.task, seed
         self.num_envs, self.device = total, self.local.device
         self.step_dt, self.physics_dt = self.local.step_dt, self.local.physics_dt
         self.max_episode_length = self.local.max_episode_length
-        self.layout: Layout = self.local.layout
+        self.layout, self.default_state = self.local.layout, self.local.default_state
         self.final_obs_of = "finished"
         self.seconds = {"physics": 0.0, "step": 0.0}
         self.observers = Observers()
-        self.episode_length_buf: Tensor = counters[0]
-        """Steps of the running episode. (num_envs,) int64"""
-        self.episode_index: Tensor = counters[1]
-        """Number of episodes before the running one. (num_envs,) int64"""
+        self.episode_length_buf = counters[0]
+        self.episode_index = counters[1]
         self.engine = ShardedEngine(self, total)
         self._last_obs: dict[str, Tensor] = {}
 
     # --- the interface of VecEnv ---
 
+    @property
+    def local(self) -> VecEnv:
+        """The environment of the first shard."""
+        return self._local
+
     def reset(self, seed: int | None = None, *, episode: int = 0) -> dict[str, Tensor]:
-        """Start a new episode everywhere, and return observations by group; see `VecEnv.reset`."""
+        """Start a new episode everywhere, and return observations by group; see `Environment.reset`."""
+        self.seed = self.seed if seed is None else seed
         self._begin()
         with self._in_step():
             self._workers.request(worker.RESET, (seed, episode))
@@ -118,7 +121,7 @@ class ShardedEnv:
         return self._obs()
 
     def step(self, action: Tensor, restart: Tensor | None = None) -> StepResult:
-        """Apply one action in every environment; see `VecEnv.step`."""
+        """Apply one action in every environment; see `Environment.step`."""
         if not self._playing:
             raise RuntimeError("the environment is paused")
         for before_step in self.observers.before_step:
@@ -164,7 +167,7 @@ class ShardedEnv:
         return {**means(self._metric_values()), **sums(self.call_all(_divergence_metrics))}
 
     def step_metrics(self) -> dict[str, Tensor]:
-        """Return the task's own numbers to log; see `VecEnv.step_metrics`. (num_envs,) each"""
+        """Return the task's own numbers to log; see `Environment.step_metrics`. (num_envs,) each"""
         parts = self.call_all(_step_metrics)
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
@@ -176,7 +179,7 @@ class ShardedEnv:
         return state | {name: mean_of(value) for name, value in logged.items() if name in state}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Restore the state returned by `state_dict()`, of any number of processes; see `VecEnv.load_state_dict`."""
+        """Restore the state returned by `state_dict()`, of any number of processes."""
         shapes = self.call_all(_state_shapes)
         present = {name: [part[name] for part in shapes] for name in shapes[0]}
         own, *others = split_state(state, present, self._shards)
@@ -185,12 +188,8 @@ class ShardedEnv:
             for process, part in zip(self._workers, others, strict=True):
                 process.send(worker.LOAD, part)
             self._runner.load(own)
+        self.seed = self.local.seed
         return self._obs()
-
-    @property
-    def seed(self) -> int:
-        """Seed of every random draw."""
-        return self.local.seed
 
     @property
     def common_step(self) -> int:
@@ -203,24 +202,9 @@ class ShardedEnv:
         return sums(self.call_all(_causes))
 
     @property
-    def divergences(self) -> int:
-        """Number of simulations that diverged since the start."""
-        return sum(self.causes.values())
-
-    @property
-    def calls_per_step(self) -> int:
-        """Number of engine calls in an environment step."""
-        return self.local.calls_per_step
-
-    @property
     def reward_names(self) -> list[str]:
         """Names of the reward terms."""
         return self.local.reward_names
-
-    @property
-    def default_state(self) -> dict[str, Tensor]:
-        """Joint state at the start of episodes, before reset events."""
-        return self.local.default_state
 
     def stateful_objects(self) -> list[Any]:
         """Return the objects of the first shard whose attributes a step may change."""
@@ -233,14 +217,6 @@ class ShardedEnv:
     def episode_dependencies(self) -> list[str]:
         """Return the parts of the configuration that make an episode depend on earlier ones."""
         return self.local.episode_dependencies()
-
-    def is_playing(self) -> bool:
-        """Return False while paused; then no step can run."""
-        return self._playing
-
-    def pause(self, paused: bool = True) -> None:
-        """Pause, or continue with `paused=False`."""
-        self._playing = not paused
 
     def close(self) -> None:
         """End the worker processes, and close the engine and the sensors."""

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from rlcli.envs.environment import Environment
 from rlcli.envs.step import StepResult
-from rlcli.envs.vec_env import VecEnv
 from rlcli.rl import distributed
 from rlcli.rl.nan_check import moments, require_finite
 from rlcli.rl.policy import Normalizer
@@ -34,7 +34,9 @@ class Collector:
         statistics: statistics of finished episodes.
     """
 
-    def __init__(self, env: VecEnv, config: PpoConfig, networks: ActorCritic, statistics: EpisodeStatistics) -> None:
+    def __init__(
+        self, env: Environment, config: PpoConfig, networks: ActorCritic, statistics: EpisodeStatistics
+    ) -> None:
         self.env, self.config, self.networks = env, config, networks
         self.statistics, self.process_group = statistics, distributed.current()
         device, layout = env.device, env.layout

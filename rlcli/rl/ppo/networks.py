@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.rl.cnn import Vision, VisionSpec
 from rlcli.rl.mlp import Mlp
 from rlcli.rl.optimizers import Adam
@@ -33,7 +33,7 @@ class ActorCritic(nn.Module):
         groups: observation groups of the critic.
     """
 
-    def __init__(self, env: VecEnv, config: PpoConfig, groups: tuple[str, ...]) -> None:
+    def __init__(self, env: Environment, config: PpoConfig, groups: tuple[str, ...]) -> None:
         super().__init__()
         layout, self.critic_groups = env.layout, groups
         obs_size, action_size = layout.size("policy"), layout.action_size

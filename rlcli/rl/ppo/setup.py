@@ -7,7 +7,7 @@ import math
 import torch
 from pydantic import ValidationError
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.rl.cnn import VisionSpec
 from rlcli.rl.policy import PolicySpec
 from rlcli.rl.ppo.config import PpoConfig
@@ -17,7 +17,7 @@ _WORTH_COMPILING = 40_000
 """Number of minibatches in a run from which compiling saves time on a GPU (docs/explanation/benchmarks.md)."""
 
 
-def policy_spec(env: VecEnv, config: PpoConfig) -> PolicySpec:
+def policy_spec(env: Environment, config: PpoConfig) -> PolicySpec:
     """Return the structure of the trained policy."""
     vision = vision_spec(env, config, ("policy",))
     if config.cnn is not None and vision is None:
@@ -36,7 +36,7 @@ def policy_spec(env: VecEnv, config: PpoConfig) -> PolicySpec:
     )
 
 
-def vision_spec(env: VecEnv, config: PpoConfig, groups: tuple[str, ...]) -> VisionSpec | None:
+def vision_spec(env: Environment, config: PpoConfig, groups: tuple[str, ...]) -> VisionSpec | None:
     """Return the CNN over the images in concatenated observation groups; None without images or without a CNN.
 
     Raises:
@@ -60,7 +60,7 @@ def vision_spec(env: VecEnv, config: PpoConfig, groups: tuple[str, ...]) -> Visi
         raise agent_error(env, ("cnn",), message, hint) from None
 
 
-def critic_groups(env: VecEnv, config: PpoConfig) -> tuple[str, ...]:
+def critic_groups(env: Environment, config: PpoConfig) -> tuple[str, ...]:
     """Return the observation groups of the critic.
 
     Raises:
@@ -75,7 +75,7 @@ def critic_groups(env: VecEnv, config: PpoConfig) -> tuple[str, ...]:
     return groups
 
 
-def minibatch_sizes(env: VecEnv, config: PpoConfig, total: int) -> list[int]:
+def minibatch_sizes(env: Environment, config: PpoConfig, total: int) -> list[int]:
     """Return the number of samples of each minibatch.
 
     Raises:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl import distributed
@@ -42,7 +42,7 @@ class PpoTrainer(BaseTrainer):
         torch_threads: threads of torch in the update; see `BaseTrainer`.
     """
 
-    def __init__(self, env: VecEnv, config: PpoConfig, *, seed: int, device: str, torch_threads: int) -> None:
+    def __init__(self, env: Environment, config: PpoConfig, *, seed: int, device: str, torch_threads: int) -> None:
         super().__init__(env, torch_threads)
         self.config, self.device = config, torch.device(device)
         self.process_group = distributed.current()

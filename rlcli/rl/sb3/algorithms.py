@@ -11,7 +11,7 @@ import torch
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from torch import Tensor
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.rl.policy import Normalizer
 from rlcli.rl.sb3.buffers import TorchReplayBuffer, TorchRolloutBuffer
 from rlcli.rl.statistics import EpisodeStatistics
@@ -20,7 +20,7 @@ from rlcli.rl.statistics import EpisodeStatistics
 class _Collecting:
     """Attributes of both kinds of algorithms, which the trainer sets after it has built the model."""
 
-    source: VecEnv
+    source: Environment
     statistics: EpisodeStatistics
     normalizer: Normalizer | None
     reward_scale: float

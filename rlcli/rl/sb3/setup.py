@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.rl.optimizers import Adam
 from rlcli.rl.policy import ACTIVATIONS, PolicySpec
 from rlcli.rl.sb3.algorithms import FastA2C, FastDDPG, FastPPO, FastSAC, FastTD3
@@ -26,7 +26,7 @@ _ALGORITHMS: dict[str, tuple[type, str, set[str]]] = {
 """Algorithm -> class, kind of the policy, and settings that SB3's constructor has under the same names."""
 
 
-def policy_spec(env: VecEnv, config: Sb3Config) -> PolicySpec:
+def policy_spec(env: Environment, config: Sb3Config) -> PolicySpec:
     """Return the structure of the trained policy."""
     return PolicySpec(
         kind=_ALGORITHMS[config.algorithm][1],  # type: ignore[arg-type]
@@ -39,7 +39,7 @@ def policy_spec(env: VecEnv, config: Sb3Config) -> PolicySpec:
     )
 
 
-def make_model(env: VecEnv, config: Sb3Config, seed: int, device: str) -> Any:
+def make_model(env: Environment, config: Sb3Config, seed: int, device: str) -> Any:
     """Return SB3's algorithm.
 
     Raises:
@@ -69,7 +69,7 @@ def make_model(env: VecEnv, config: Sb3Config, seed: int, device: str) -> Any:
     return model
 
 
-def _require_batch(env: VecEnv, config: OnPolicyConfig) -> None:
+def _require_batch(env: Environment, config: OnPolicyConfig) -> None:
     """Check that a rollout has enough samples for its minibatches and for normalised advantages."""
     total = config.n_steps * env.num_envs
     rollout = f"a rollout holds n_steps x num_envs = {config.n_steps} x {env.num_envs} = {total} samples"

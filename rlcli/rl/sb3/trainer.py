@@ -11,7 +11,7 @@ import torch
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
-from rlcli.envs.vec_env import VecEnv
+from rlcli.envs.environment import Environment
 from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl.budget import remaining_budget
@@ -56,7 +56,7 @@ class Sb3Trainer(BaseTrainer):
         torch_threads: threads of torch in the update; see `BaseTrainer`.
     """
 
-    def __init__(self, env: VecEnv, config: Sb3Config, *, seed: int, device: str, torch_threads: int) -> None:
+    def __init__(self, env: Environment, config: Sb3Config, *, seed: int, device: str, torch_threads: int) -> None:
         super().__init__(env, torch_threads)
         self.config = config
         self.iteration = 0

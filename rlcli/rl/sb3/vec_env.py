@@ -10,8 +10,8 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv as Sb3Base
 
+from rlcli.envs.environment import Environment
 from rlcli.envs.step import StepResult
-from rlcli.envs.vec_env import VecEnv
 
 UNBOUNDED = 1e6
 """Action bound for unbounded actions: SB3 requires a finite bound."""
@@ -25,7 +25,7 @@ class Sb3VecEnv(Sb3Base):
         action_bound: the action space is [-action_bound, action_bound]; None: unbounded.
     """
 
-    def __init__(self, env: VecEnv, action_bound: float | None = 1.0) -> None:
+    def __init__(self, env: Environment, action_bound: float | None = 1.0) -> None:
         self.env = env
         bound = UNBOUNDED if action_bound is None else action_bound
         super().__init__(

@@ -1,0 +1,167 @@
+"""Interface of environments for trainers, evaluations and recorders."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from rlcli.config.load import Resolved
+from rlcli.config.schema import TaskConfig
+from rlcli.envs.layout import Layout
+from rlcli.envs.observers import Observers
+from rlcli.envs.step import StepResult
+from rlcli.sim.engine import EngineView
+
+if TYPE_CHECKING:
+    from rlcli.envs.vec_env import VecEnv
+
+
+class Environment(ABC):
+    """`num_envs` copies of a task that are stepped together, in one process (`VecEnv`) or in several (`ShardedEnv`)."""
+
+    resolved: Resolved
+    config: TaskConfig
+    seed: int
+    """Seed of every random draw."""
+    device: torch.device
+    num_envs: int
+    step_dt: float
+    """Control period [s]."""
+    physics_dt: float
+    """Period of a physics step [s]."""
+    max_episode_length: int
+    """Number of steps after which an episode times out."""
+    layout: Layout
+    """Layout of the observation and action columns."""
+    final_obs_of: str
+    """Episodes whose last observations a step returns: `finished`, or only `truncated` ones."""
+    seconds: dict[str, float]
+    """Time spent in steps, and in their physics, since the start [s]."""
+    observers: Observers
+    episode_length_buf: Tensor
+    """Steps of the running episode. (num_envs,) int64"""
+    episode_index: Tensor
+    """Number of episodes before the running one; random streams are keyed by it. (num_envs,) int64"""
+    default_state: dict[str, Tensor]
+    """Joint state at the start of episodes, before reset events. qpos (nq,), qvel (nv,)"""
+    engine: EngineView
+    _playing = True
+
+    @property
+    @abstractmethod
+    def local(self) -> VecEnv:
+        """The environment that this process steps, with its terms and managers: all of it, or a part."""
+
+    @property
+    def workers(self) -> int:
+        """Number of processes that step the environments."""
+        return 1
+
+    @abstractmethod
+    def reset(self, seed: int | None = None, *, episode: int = 0) -> dict[str, Tensor]:
+        """Start a new episode everywhere, and return observations by group. (num_envs, d) float32
+
+        Args:
+            seed: seed of every draw from now on, as in a new environment; None: the random streams continue.
+            episode: with a seed, the number of the episode that begins. The state that earlier episodes would have left
+                in the terms of `episode_dependencies` is missing then.
+        """
+
+    @abstractmethod
+    def step(self, action: Tensor, restart: Tensor | None = None) -> StepResult:
+        """Apply one action for `decimation` physics steps.
+
+        Args:
+            action: one row for each environment. (num_envs, a) float32
+            restart: environments that skip the step and return to the start of their running episode, with reward 0.
+                (num_envs,) bool
+
+        Raises:
+            DivergedError: for an action, observation or reward that is not finite. A diverged simulation is no error:
+                it ends the episode of its environment.
+        """
+
+    @abstractmethod
+    def compute_success(self) -> Tensor | None:
+        """Return where the success condition holds in the current state; None without one. (num_envs,) bool"""
+
+    @abstractmethod
+    def check(self) -> None:
+        """Raise the `DivergedError` of the steps since the last call; a CPU raises it in the step."""
+
+    @property
+    @abstractmethod
+    def common_step(self) -> int:
+        """Number of steps since the start, the same in all environments."""
+
+    @property
+    @abstractmethod
+    def causes(self) -> dict[str, int]:
+        """Number of diverged simulations by cause: MuJoCo's warning (`BADQACC`), `FIELD not finite`, `engine error`."""
+
+    @property
+    def divergences(self) -> int:
+        """Number of simulations that diverged since the start."""
+        return sum(self.causes.values())
+
+    @property
+    def calls_per_step(self) -> int:
+        """Number of engine calls in an environment step: 1, or `decimation` with actuator models."""
+        return self.config.decimation if self.local.actuators else 1
+
+    @property
+    def reward_names(self) -> list[str]:
+        """Names of the reward terms, in the order of `StepRecord.reward_terms`; empty for a task without terms."""
+        return []
+
+    @abstractmethod
+    def extras(self) -> dict[str, float]:
+        """Return further numbers to log: the task's values of the last step, and new divergences by cause."""
+
+    @abstractmethod
+    def step_metrics(self) -> dict[str, Tensor]:
+        """Return the task's own numbers to log, for `StepObserver.on_step`. (num_envs,) each
+
+        They are of the state before resets. `Episodes.metrics` has the metrics of commands, as means over episodes.
+        """
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of everything that the next steps depend on, at a step boundary."""
+
+    @abstractmethod
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Restore the state returned by `state_dict()`, and return the observations of that moment.
+
+        Raises:
+            KeyError: if a tensor is missing.
+            ValueError: if a tensor has another shape or type, because it was saved from a different environment.
+        """
+
+    @abstractmethod
+    def unsaved_state(self) -> list[str]:
+        """Return the state that `state_dict` cannot contain; empty: a resumed run continues exactly."""
+
+    @abstractmethod
+    def stateful_objects(self) -> list[Any]:
+        """Return the objects whose attributes a step may change: class terms, a direct task."""
+
+    @abstractmethod
+    def episode_dependencies(self) -> list[str]:
+        """Return the parts of the configuration that make an episode depend on earlier ones; empty: none is known."""
+
+    def is_playing(self) -> bool:
+        """Return False while paused; then no step can run."""
+        return self._playing
+
+    def pause(self, paused: bool = True) -> None:
+        """Pause, or continue with `paused=False`."""
+        self._playing = not paused
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the engine, the sensors that render, and the worker processes."""
