@@ -1,6 +1,7 @@
 """Output of `show`: YAML that reads back as the same configuration, origins, and a JSON Schema."""
 
 import copy
+import functools
 
 import jsonschema
 import pytest
@@ -143,8 +144,9 @@ def test_origins_cover_every_value(task):
     assert strict_yaml.load(text).data == to_data(resolved)
 
 
-def validator(source):
-    schema = json_schema(*extensions(source))
+@functools.cache
+def validator(name):
+    schema = json_schema(*extensions(find_task(name)))
     jsonschema.Draft202012Validator.check_schema(schema)
     return jsonschema.Draft202012Validator(schema)
 
@@ -152,7 +154,7 @@ def validator(source):
 @pytest.mark.parametrize("name", ["ant-direct", "cartpole", "cartpole-direct"])
 def test_json_schema_accepts_built_in_tasks(name):
     source = find_task(name)
-    check = validator(source)
+    check = validator(name)
     written = strict_yaml.load(source.config.read_bytes()).data
     assert list(check.iter_errors(written)) == []
     assert list(check.iter_errors(to_data(resolve(source)))) == []
@@ -174,12 +176,13 @@ def test_json_schema_accepts_built_in_tasks(name):
 )
 def test_json_schema_refuses_invalid_values(path, value):
     source = find_task("cartpole")
+    check = validator("cartpole")
     data = copy.deepcopy(strict_yaml.load(source.config.read_bytes()).data)
     target = data
     for step in path[:-1]:
         target = target[step]
     target[path[-1]] = value
-    assert list(validator(source).iter_errors(data))
+    assert list(check.iter_errors(data))
 
 
 def test_json_schema_contains_own_terms_and_params(task):
