@@ -273,7 +273,7 @@ CASES = {"chosen": st.lists(st.booleans(), min_size=N, max_size=N), "warm_up": s
          "seed": st.integers(0, 10_000)}  # fmt: skip
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(**CASES)
 def test_partial_reset_keeps_other_envs_bit_identical(crowd, chosen, warm_up, seed):
     check_partial_reset(crowd, chosen, warm_up, seed)
