@@ -27,8 +27,8 @@ def test_index_of_built_in_tasks_is_up_to_date():
     assert json.loads(file.read_text()) == json.loads(fresh), f"run: {' '.join(command[1:])} > {file}"
 
 
-def test_built_in_tasks_have_details(cli):
-    found = rows(cli("list-tasks", "--json"))
+def test_built_in_tasks_have_details(command):
+    found = rows(command("list-tasks", "--json"))
     cartpole = found["cartpole"]
     assert cartpole["workflow"] == "managed"
     assert (cartpole["observation_size"], cartpole["action_size"], cartpole["agent"]) == (4, 1, "sb3-ppo")
@@ -62,13 +62,13 @@ def test_light_commands_are_fast_with_twenty_plugins(plugins, spec, cli, argumen
     assert min(times) < 3 * bound_s
 
 
-def test_pattern_filters_names_and_summaries(cli):
-    everything = rows(cli("list-tasks", "--json"))
+def test_pattern_filters_names_and_summaries(command):
+    everything = rows(command("list-tasks", "--json"))
     wanted = [name for name, row in everything.items() if "direct" in f"{name} {row['summary']}".lower()]
     assert "cartpole-direct" in wanted
     assert "cartpole" not in wanted
-    assert list(rows(cli("list-tasks", "DIRECT", "--json"))) == wanted
-    assert rows(cli("list-tasks", "no such thing", "--json")) == {}
+    assert list(rows(command("list-tasks", "DIRECT", "--json"))) == wanted
+    assert rows(command("list-tasks", "no such thing", "--json")) == {}
 
 
 @pytest.mark.parametrize(
@@ -79,24 +79,24 @@ def test_pattern_filters_names_and_summaries(cli):
         ("zzz", "rlcli list-tasks shows all"),
     ],
 )
-def test_pattern_without_match_gives_hint(cli, pattern, advice):
-    done = cli("list-tasks", pattern)
+def test_pattern_without_match_gives_hint(command, pattern, advice):
+    done = command("list-tasks", pattern)
     assert (done.returncode, done.stdout) == (0, "")
     assert done.stderr.startswith(f"no task's name or summary contains '{pattern}'; {advice}")
-    assert json.loads(cli("list-tasks", pattern, "--json").stdout)["tasks"] == []
+    assert json.loads(command("list-tasks", pattern, "--json").stdout)["tasks"] == []
 
 
-def test_shared_names_show_their_distribution(plugins, spec, cli):
+def test_shared_names_show_their_distribution(plugins, spec, command):
     plugins("a", spec, task="walk")
     plugins("b", spec, task="walk")
-    done = cli("list-tasks")
+    done = command("list-tasks")
     assert "a:walk" in done.stdout
     assert "b:walk" in done.stdout
 
 
-def test_unreadable_distribution_is_warning_and_json_row(plugins, cli):
+def test_unreadable_distribution_is_warning_and_json_row(plugins, command):
     plugins("bad", entry_points="[rlcli.tasks]\nnonsense\n")
-    done = cli("list-tasks", "--json")
+    done = command("list-tasks", "--json")
     assert "bad-1.0.dist-info" in done.stderr
     assert json.loads(done.stdout)["broken"][0]["distribution"] == "bad-1.0.dist-info"
     assert "cartpole" in rows(done)
@@ -144,19 +144,19 @@ def test_new_plugin_version_invalidates_cache(plugins, spec, tmp_path):
     assert _key(entry) != before
 
 
-def test_status_shows_state_and_policy(plugins, spec, cli):
+def test_status_shows_state_and_policy(plugins, spec, command):
     details = {"summary": "Fine.", "workflow": "direct", "observation_size": 3, "action_size": 1}
     index = json.dumps({"good-task": {**details, "policy": True}})
     plugins("good", spec, files={"index.json": index})
     plugins("plain", spec)
-    done = cli("list-tasks")
+    done = command("list-tasks")
     head, *lines = done.stdout.splitlines()
     assert head.split()[2:8] == ["WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "STATUS"]
     shown = {line.split()[0]: line for line in lines}
     assert "  ok, policy  " in shown["good-task"]
     assert "  ok, policy  " in shown["cartpole"]
     assert "  ?  " in shown["plain-task"]
-    found = rows(cli("list-tasks", "--json"))
+    found = rows(command("list-tasks", "--json"))
     assert [found[name]["status"] for name in ("good-task", "cartpole", "plain-task")] == ["ok, policy"] * 2 + ["?"]
     assert (found["cartpole"]["policy"], found["ant-direct"]["policy"]) == (True, found["ant-direct"]["status"] != "ok")
 
