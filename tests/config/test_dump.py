@@ -8,6 +8,7 @@ import pytest
 import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from support.fault_sizes import amount
 from support.small_task import TASK
 
 from rlcli.config import strict_yaml
@@ -68,7 +69,7 @@ def equal_with_types(a, b):
     return type(a) is type(b) and a == b
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=amount(120, 300), deadline=None)
 @given(_DATA)
 @example({"a": 1e-05, "b": 1e22, "c": -0.0, "d": 5e-324, "e": 1.7976931348623157e308, "f": 1.0})
 @example({"<<": "<<"})
@@ -94,7 +95,7 @@ def test_to_yaml_round_trips_built_in_task(name, play, tmp_path):
         assert to_data(again) == to_data(first)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=amount(10, 25), deadline=None)
 @given(summary=_TEXT, weight=st.floats(-1e30, 1e30), joint=_TEXT.filter(bool))
 @example(summary="on", weight=1e-05, joint="1e-3")
 @example(summary="", weight=1e22, joint="null")
@@ -147,7 +148,12 @@ def test_origins_cover_every_value(task):
 @functools.cache
 def validator(name):
     schema = json_schema(*extensions(find_task(name)))
-    jsonschema.Draft202012Validator.check_schema(schema)
+    unchecked = dict(schema)
+    if name != "cartpole":  # a check of the parts that all tasks share takes seconds
+        checked = validator("cartpole").schema
+        for group in ("properties", "$defs"):
+            unchecked[group] = {key: part for key, part in schema[group].items() if checked[group].get(key) != part}
+    jsonschema.Draft202012Validator.check_schema(unchecked)
     return jsonschema.Draft202012Validator(schema)
 
 

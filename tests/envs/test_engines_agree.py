@@ -86,7 +86,7 @@ def test_engines_agree_through_terminations(task):
     states = [env.reset(seed=5) for env in (host, device)]
     assert torch.equal(states[0]["policy"].isfinite(), states[1]["policy"].isfinite())
     causes = 0
-    for i, action in enumerate(actions(50, N, 1)):
+    for i, action in enumerate(actions(30, N, 1)):
         push = torch.where(torch.arange(N)[:, None] < N // 2, 4.0 + action, 0.1 * action)
         results = [env.step(push) for env in (host, device)]
         assert_same_step(*results, 1e-3, f"step {i}")

@@ -102,14 +102,14 @@ def test_unreadable_distribution_is_warning_and_json_row(plugins, command):
     assert "cartpole" in rows(done)
 
 
-def test_probe_fills_cache_and_reports_broken_tasks(plugins, spec, cli):
+def test_probe_fills_cache_and_reports_broken_tasks(plugins, spec, cli, command):
     plugins("good", "print('hello')\n" + spec, files={"task.yaml": TASK.format(summary="Slide."), "model.xml": MODEL})
     plugins("exits", "import sys\nsys.exit(3)\n")
     plugins("crashes", "import os\nos._exit(7)\n")
     plugins("killed", "import os, signal\nos.kill(os.getpid(), signal.SIGKILL)\n")
     plugins("raises", "raise ValueError('out of cheese')\n")
     plugins("invalid", spec, files={"task.yaml": "decimation: -2\n"})
-    assert rows(cli("list-tasks", "--json"))["good-task"]["workflow"] is None
+    assert rows(command("list-tasks", "--json"))["good-task"]["workflow"] is None
     found = rows(cli("list-tasks", "task", "--probe", "--json"))
     good = found["good-task"]
     assert (good["summary"], good["workflow"], good["num_envs"]) == ("Slide.", "managed", 5)
@@ -119,9 +119,9 @@ def test_probe_fills_cache_and_reports_broken_tasks(plugins, spec, cli):
     assert found["killed-task"]["broken"] == "crashed (SIGKILL)"
     assert "out of cheese" in found["raises-task"]["broken"]
     assert found["invalid-task"]["broken"].endswith("task.yaml:1:1: missing key 'sim' (and 6 more)")
-    again = rows(cli("list-tasks", "--json"))
+    again = rows(command("list-tasks", "--json"))
     assert {name: again[name] for name in found} == found
-    assert "broken: ended the process (exit 7)" in cli("list-tasks").stdout
+    assert "broken: ended the process (exit 7)" in command("list-tasks").stdout
 
 
 def test_probe_stops_hanging_task(plugins, cli):
@@ -172,11 +172,11 @@ def test_plugin_may_ship_details(plugins, spec, cli):
     "index",
     ["", "[]", "{", '{"good-task": 3}', '{"good-task": {"summary": ["x"]}}', '{"good-task": {"num_envs": "x"}}'],
 )
-def test_invalid_details_are_ignored(plugins, spec, cli, index, tmp_path):
+def test_invalid_details_are_ignored(plugins, spec, command, index, tmp_path):
     plugins("good", spec, files={"index.json": index})
     (tmp_path / "cache" / "rlcli").mkdir(parents=True)
     (tmp_path / "cache" / "rlcli" / "tasks.json").write_text(index)
-    done = cli("list-tasks")
+    done = command("list-tasks")
     assert done.returncode == 0
     assert "good-task" in done.stdout
 
@@ -203,8 +203,8 @@ def test_broken_plugin_exits_with_4_without_traceback(plugins, cli, source):
     assert cli("show", "cartpole").returncode == 0
 
 
-def test_broken_probe_result_wins_over_shipped_details(plugins, cli):
+def test_broken_probe_result_wins_over_shipped_details(plugins, cli, command):
     plugins("bad", "raise ValueError('out of cheese')\n", files={"index.json": '{"bad-task": {"summary": "Fine."}}'})
-    assert rows(cli("list-tasks", "--json"))["bad-task"]["broken"] is None
+    assert rows(command("list-tasks", "--json"))["bad-task"]["broken"] is None
     assert "out of cheese" in rows(cli("list-tasks", "bad", "--probe", "--json"))["bad-task"]["broken"]
-    assert "out of cheese" in rows(cli("list-tasks", "--json"))["bad-task"]["broken"]
+    assert "out of cheese" in rows(command("list-tasks", "--json"))["bad-task"]["broken"]
