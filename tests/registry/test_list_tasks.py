@@ -1,9 +1,9 @@
 """`list-tasks` and its cache: details of installed tasks without importing them."""
 
 import json
+import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -50,15 +50,20 @@ def test_list_tasks_imports_no_plugin_and_no_heavy_module(plugins, cli):
     assert "--probe shows more" in done.stdout
 
 
+def cpu_time_of_children():
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 @pytest.mark.parametrize(("arguments", "bound_s"), [(["list-tasks"], 0.35), (["--help"], 0.25)])
 def test_light_commands_are_fast_with_twenty_plugins(plugins, spec, cli, arguments, bound_s):
     for number in range(20):
         plugins(f"plug{number}", spec)
     times = []
     for _ in range(3):
-        start = time.perf_counter()
+        start = cpu_time_of_children()
         assert cli(*arguments).returncode == 0
-        times.append(time.perf_counter() - start)
+        times.append(cpu_time_of_children() - start)
     assert min(times) < 3 * bound_s
 
 
