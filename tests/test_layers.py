@@ -1,6 +1,7 @@
 """The structure of the package: order of its folders, no import circles, short modules, light imports."""
 
 import ast
+import functools
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
@@ -67,18 +68,29 @@ PLUGIN_FILES = sorted(file for file in PLUGINS.glob("*/rlcli_*/**/*.py"))
 """Modules of the plugins' packages, without their tests."""
 
 
+def statements(tree):
+    """Yield every statement of a module, also those inside of functions. TYPE_CHECKING blocks are skipped."""
+    waiting = [tree]
+    while waiting:
+        node = waiting.pop(0)
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.expr):
+                continue  # an expression contains no import
+            if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+                continue
+            waiting.append(child)
+            yield child
+
+
+@functools.cache
 def imports(file, *, everywhere=True):
-    """Yield (line, module) of each import in a file, or only of top-level ones. TYPE_CHECKING blocks are skipped."""
+    """Return (line, module) of each import in a file, or only of top-level ones. TYPE_CHECKING blocks are skipped."""
+    return list(_imports(file, everywhere))
+
+
+def _imports(file, everywhere):
     tree = ast.parse(file.read_text(encoding="utf-8"))
-    skipped = {
-        id(inner)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-        for inner in ast.walk(node)
-    }
-    for node in ast.walk(tree) if everywhere else tree.body:
-        if id(node) in skipped:
-            continue
+    for node in statements(tree) if everywhere else tree.body:
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):

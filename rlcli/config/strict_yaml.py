@@ -7,6 +7,7 @@ with its position: duplicate keys, anchors, tags, merge keys, a second document,
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from dataclasses import dataclass, field
@@ -100,6 +101,19 @@ def _after(before: str) -> Mark:
 
 
 def _parse(text: str) -> tuple[Any, dict[Path, Mark]]:
+    """Return the value of a text and its positions. Both are copies that the caller may change."""
+    value, marks = _parse_cached(text)
+    return _copy(value), dict(marks)
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _copy(item) for key, item in value.items()}
+    return [_copy(item) for item in value] if isinstance(value, list) else value
+
+
+@functools.lru_cache(maxsize=8)  # a command reads the same file several times: for its format, then as a task
+def _parse_cached(text: str) -> tuple[Any, dict[Path, Mark]]:
     try:
         return _Reader().read(text)
     except yaml.MarkedYAMLError as error:

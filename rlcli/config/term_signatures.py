@@ -195,6 +195,18 @@ def params_model(signature: Signature, section: str) -> type[schema.TermConfig]:
     Raises:
         SignatureError: if the function cannot be a term of this section.
     """
+    if builtin_terms(section).get(signature.name) is signature:
+        return _builtin_params_model(signature.name, section)
+    return _params_model(signature, section)
+
+
+@functools.cache
+def _builtin_params_model(name: str, section: str) -> type[schema.TermConfig]:
+    """Return the model of a built-in term. It is cached because building a model takes several milliseconds."""
+    return _params_model(builtin_terms(section)[name], section)
+
+
+def _params_model(signature: Signature, section: str) -> type[schema.TermConfig]:
     if signature.error:
         raise SignatureError(signature.error)
     reserved = (*SECTIONS[section].model_fields, "params")

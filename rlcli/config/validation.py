@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -223,7 +224,7 @@ class TaskCheck:
             if not self._is_mapping(data, path):
                 return None, None
         spec, model = self._trainer(at, data)
-        self.locations = messages.key_locations({"": TaskConfig, "agent": model})
+        self.locations = _key_locations("agent", model)
         config = self._validate(model, data, at)
         return spec, config if isinstance(config, AgentConfig) else None
 
@@ -260,7 +261,7 @@ class TaskCheck:
 
     def task(self) -> TaskConfig | None:
         """Return the validated task; None if there are problems."""
-        self.locations = self.locations or messages.key_locations({"": TaskConfig, "agents.NAME": AgentConfig})
+        self.locations = self.locations or _key_locations("agents.NAME", AgentConfig)
         self.read_terms()
         data = {key: value for key, value in self.layers.data.items() if key not in PATCHES}
         unknown = {key: value for key, value in data.items() if key not in TaskConfig.model_fields}
@@ -423,6 +424,12 @@ def _filled(task: TaskConfig, terms: Mapping[Path, TermConfig | None], params: d
 def _kept_terms(terms: Mapping[Path, TermConfig | None], at: Path, names: Iterable[str]) -> dict[str, TermConfig]:
     found = {name: terms.get((*at, name)) for name in names}
     return {name: term for name, term in found.items() if term is not None}
+
+
+@functools.lru_cache(maxsize=16)
+def _key_locations(prefix: str, agent: type[BaseModel]) -> messages.KeyLocations:
+    """Return where each key of a task and of its agent belongs. `prefix` is the path of the agent."""
+    return messages.key_locations({"": TaskConfig, prefix: agent})
 
 
 def _not_python(error: SyntaxError) -> Problem:

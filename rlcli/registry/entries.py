@@ -69,8 +69,7 @@ def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], l
     for distribution in metadata.distributions():
         folder = Path(str(getattr(distribution, "_path", "?"))).name
         try:
-            text = distribution.read_text("entry_points.txt") or ""
-            if group not in text:
+            if group not in _entry_points_text(distribution):
                 continue  # true for most distributions: reading their metadata would be slow
             name, version = _name_and_version(distribution)
             if wanted is not None and _normalized(name) not in wanted:
@@ -83,8 +82,16 @@ def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], l
     return sorted(entries.values(), key=lambda e: (e.name, e.distribution)), list(broken.values())
 
 
+def _entry_points_text(distribution: metadata.Distribution) -> str:
+    folder = getattr(distribution, "_path", None)
+    if isinstance(folder, Path) and not os.path.exists(f"{folder}/entry_points.txt"):
+        return ""
+    return distribution.read_text("entry_points.txt") or ""
+
+
 def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
-    name, version = distribution.metadata["Name"], distribution.version
+    content = distribution.metadata  # parsed anew by each access
+    name, version = content["Name"], content["Version"]
     if not name or not version:
         raise ValueError("its METADATA has no Name or no Version; reinstall the package")
     return name, version

@@ -4,6 +4,7 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.fault_sizes import amount
 from support.small_task import TASK
 
 from rlcli.config.layers import parse_override
@@ -152,7 +153,7 @@ _VALUES = {
 }
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=amount(30, 60), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_override_equals_edited_yaml(task, data):
     from rlcli.config.dump import to_yaml

@@ -4,6 +4,7 @@ import copy
 import random
 
 import pytest
+from support.fault_sizes import amount
 
 from rlcli.config import strict_yaml
 from rlcli.config.dump import to_yaml
@@ -74,15 +75,15 @@ def test_mutated_task_gives_configuration_or_problems(name, tmp_path):
     if source.task_file:
         (tmp_path / "task.py").write_text(source.task_file.read_text().replace("CartpoleTask", "Task"))
     folder = folder_task(tmp_path)
-    accepted = 0
-    for _ in range(100):
+    accepted, count = 0, amount(50, 100)
+    for _ in range(count):
         data = copy.deepcopy(original)
         mutate(data, draw)
         folder.config.write_text(to_yaml(data), encoding="utf-8")
         problems = problems_of(folder, play=draw.random() < 0.5)
         assert all(str(folder.config) in problem.where for problem in problems or []), problems
         accepted += problems is None
-    assert 0 < accepted < 100
+    assert 0 < accepted < count
 
 
 def test_any_override_gives_configuration_or_problems():
@@ -90,10 +91,10 @@ def test_any_override_gives_configuration_or_problems():
     source = find_task("cartpole")
     original = strict_yaml.load(source.config.read_bytes()).data
     paths = [p for p in nodes(original) if p]
-    refused = 0
-    for _ in range(80):
+    refused, count = 0, amount(40, 80)
+    for _ in range(count):
         path = draw.choice(paths)
         path = (*path[: draw.randint(1, len(path))], *draw.choices(["x", 0, "func"], k=draw.randint(0, 1)))
         value = to_yaml({"v": draw.choice(VALUES)}).strip().removeprefix("v:").strip()
         refused += problems_of(source, overrides=[f"{'.'.join(map(str, path))}={value}"]) is not None
-    assert 0 < refused < 80
+    assert 0 < refused < count

@@ -61,8 +61,10 @@ def contacts(env):
 def test_engines_find_same_contacts_on_hand():
     """Contacts of two boxes differ: the engines report other points. So the palm consists of round bars."""
     host, device = pair("hand-reorient")
-    for action in actions(15, N, 16):
+    for number, action in enumerate(actions(15, N, 16)):
         host.step(0.7 * action)
+        if number % 3 != 2:
+            continue  # a step on Warp's CPU device takes half a second
         follow(device, host)
         device.engine.step(1)
         for world, found in enumerate(contacts(device)):

@@ -62,13 +62,15 @@ def rollout(task, *overrides, shared_streams=0, steps=50):
 
 @pytest.mark.parametrize("engine", ["batch", "warp"])
 def test_shared_streams_repeat_those_of_fewer_envs(noisy, engine):
-    steps = 50 if engine == "batch" else 22
-    setting = f"sim.engine={engine}"
-    folded = rollout(noisy, setting, shared_streams=2, steps=steps)
+    steps = 50 if engine == "batch" else 12
+    settings = (f"sim.engine={engine}", "episode_length_s=0.1")
+    folded = rollout(noisy, *settings, shared_streams=2, steps=steps)
     torch.testing.assert_close(folded[:, 0:2], folded[:, 2:4], rtol=0, atol=0)
     torch.testing.assert_close(folded[:, 0:2], folded[:, 4:6], rtol=0, atol=0)
     assert not torch.equal(folded[:, 0], folded[:, 1])
-    torch.testing.assert_close(rollout(noisy, setting, "scene.num_envs=2", steps=steps), folded[:, 0:2], rtol=0, atol=0)
+    torch.testing.assert_close(
+        rollout(noisy, *settings, "scene.num_envs=2", steps=steps), folded[:, 0:2], rtol=0, atol=0
+    )
 
 
 def test_without_shared_streams_envs_differ(noisy):

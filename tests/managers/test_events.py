@@ -8,6 +8,7 @@ import torch
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.fault_sizes import amount
 from support.worlds import CRITTER_TASK, PENDULUM_TASK, actions, build, critter, dump, edited, pendulum
 
 from rlcli.config.load import resolve
@@ -273,7 +274,7 @@ CASES = {"chosen": st.lists(st.booleans(), min_size=N, max_size=N), "warm_up": s
          "seed": st.integers(0, 10_000)}  # fmt: skip
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=amount(60, 500), deadline=None)
 @given(**CASES)
 def test_partial_reset_keeps_other_envs_bit_identical(crowd, chosen, warm_up, seed):
     check_partial_reset(crowd, chosen, warm_up, seed)

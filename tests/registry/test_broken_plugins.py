@@ -46,10 +46,10 @@ def test_broken_plugins_are_at_least_24():
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_list_tasks_works_beside_broken_plugin(broken_plugins, cli, name):
+def test_list_tasks_works_beside_broken_plugin(broken_plugins, command, name):
     broken_plugins(name)
-    check_listed(document(cli("list-tasks", "--json")), [name])
-    listed = cli("list-tasks")
+    check_listed(document(command("list-tasks", "--json")), [name])
+    listed = command("list-tasks")
     assert (listed.returncode, "Traceback" in listed.stderr) == (0, False)
     assert "good-task" in listed.stdout
     assert BROKEN[name].foreign or name.replace("-", "_") in (listed.stdout + listed.stderr).replace("-", "_")

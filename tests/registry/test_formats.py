@@ -8,6 +8,7 @@ import textwrap
 
 import pytest
 
+END = "exit code:"
 HIDDEN = ("rlcli-oige", "rlcli-isaaclab")
 CORE = f"""
 import importlib.metadata, sys
@@ -18,10 +19,12 @@ class Absent:
         if name.partition(".")[0] in {tuple(name.replace("-", "_") for name in HIDDEN)!r}:
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 sys.meta_path.insert(0, Absent())
+import json
 from rlcli.cli.app import main
-sys.exit(main(sys.argv[1:]))
+for words in json.loads(sys.argv[1]):
+    print("\\n{END}", main(words), flush=True)
 """
-"""Program that runs `rlcli` as if neither format plugin were installed."""
+"""Program that runs commands of `rlcli` as if neither format plugin were installed."""
 
 OIGE = "name: Arm\nphysics_engine: physx\nenv: {numEnvs: 4}\nsim: {dt: 0.01}\nmjcf: {Arm: arm.xml}\n"
 IMPORTED = """
@@ -39,20 +42,23 @@ class ArmEnvCfg(ManagerBasedRLEnvCfg):
 """
 
 
-@pytest.fixture
-def core(tmp_path):
-    """core(words...) -> the finished process of `rlcli` without the format plugins."""
+def core(folder, *commands):
+    """Run commands of `rlcli` in one process without the format plugins; return (exit code, stdout) of each."""
+    words = json.dumps([list(map(str, command)) for command in commands])
+    done = subprocess.run([sys.executable, "-c", CORE, words], cwd=folder, capture_output=True, text=True, timeout=120)
+    found, out = [], []
+    for line in done.stdout.splitlines():
+        if line.startswith(END):
+            found.append((int(line.removeprefix(END)), "\n".join(out)))
+            out = []
+        else:
+            out.append(line)
+    assert len(found) == len(commands), done.stderr
+    return found
 
-    def run(*words):
-        command = [sys.executable, "-c", CORE, *map(str, words)]
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
 
-    return run
-
-
-@pytest.fixture
-def folders(tmp_path):
-    """Folders with tasks of each known format, in every layout."""
+def write_tasks(folder):
+    """Write tasks of each known format, in every layout."""
     files = {
         "own/Arm.yaml": OIGE,
         "package/cfg/task/Arm.yaml": OIGE,
@@ -60,53 +66,60 @@ def folders(tmp_path):
         "lab/arm_env_cfg.py": ISAACLAB,
     }
     for name, text in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text)
-    return tmp_path
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
 
 
-@pytest.mark.parametrize(
-    ("target", "plugin"),
-    [
-        ("./own", "rlcli-oige"),
-        ("./own/Arm.yaml", "rlcli-oige"),
-        ("./package", "rlcli-oige"),
-        ("./imported", "rlcli-oige"),
-        ("./lab", "rlcli-isaaclab"),
-        ("./lab/arm_env_cfg.py:ArmEnvCfg", "rlcli-isaaclab"),
-    ],
-)
-@pytest.mark.parametrize("command", ["validate", "train"])
-def test_task_of_missing_format_gives_pip_command(core, folders, target, plugin, command):
-    done = core(command, target, "--json")
-    assert done.returncode == 7, done.stderr
-    error = json.loads(done.stdout)["error"]
+TARGETS = {
+    "./own": "rlcli-oige",
+    "./own/Arm.yaml": "rlcli-oige",
+    "./package": "rlcli-oige",
+    "./imported": "rlcli-oige",
+    "./lab": "rlcli-isaaclab",
+    "./lab/arm_env_cfg.py:ArmEnvCfg": "rlcli-isaaclab",
+}
+COMMANDS = [(command, target, "--json") for command in ("validate", "train") for target in TARGETS]
+
+
+@pytest.fixture(scope="module")
+def refused(tmp_path_factory):
+    """Result of each of `COMMANDS`."""
+    return dict(zip(COMMANDS, core(write_tasks(tmp_path_factory.mktemp("tasks")), *COMMANDS), strict=True))
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: "-".join(command[:2]))
+def test_task_of_missing_format_gives_pip_command(refused, command):
+    code, out = refused[command]
+    error = json.loads(out)["error"]
+    assert code == 7
     assert "is not installed" in error["message"]
-    assert error["hint"] == f"pip install {plugin}"
+    assert error["hint"] == f"pip install {TARGETS[command[1]]}"
 
 
-def test_missing_importer_gives_pip_command(core):
-    done = core("import", "isaaclab", "env.yaml", "--model", "robot=robot.xml")
-    assert done.returncode == 7, done.stderr
-    assert "pip install rlcli-isaaclab" in done.stderr
-    assert "isaaclab" not in core("import", "--help").stdout
+def test_missing_importer_gives_pip_command(tmp_path):
+    importing = ("import", "isaaclab", "env.yaml", "--model", "robot=robot.xml", "--json")
+    (code, out), (_, text) = core(tmp_path, importing, ("import", "--help"))
+    assert code == 7
+    assert "pip install rlcli-isaaclab" in out
+    assert "isaaclab" not in text
 
 
-def test_other_tasks_work_without_format_plugins(core, tmp_path):
-    assert core("validate", "cartpole").returncode == 0
-    assert "format" not in core("show", "cartpole").stdout
+def test_other_tasks_work_without_format_plugins(tmp_path):
     wrong = tmp_path / "wrong"
     wrong.mkdir()
-    assert core("validate", "./wrong").returncode == 4
+    checked, shown, refused = core(tmp_path, ("validate", "cartpole"), ("show", "cartpole"), ("validate", "./wrong"))
+    assert [code for code, _ in (checked, shown, refused)] == [0, 0, 4]
+    assert "format" not in shown[1]
     # runs of every task that were saved before have the key, empty
-    (wrong / "task.yaml").write_text(core("show", "cartpole").stdout + "\noige: {}\n")
-    assert core("validate", "./wrong").returncode == 0
+    (wrong / "task.yaml").write_text(shown[1] + "\noige: {}\n")
+    assert core(tmp_path, ("validate", "./wrong"))[0][0] == 0
 
 
-def test_excluded_format_plugins_are_not_used(folders):
+def test_excluded_format_plugins_are_not_used(tmp_path):
     command = [sys.executable, "-m", "rlcli", "validate", "./own"]
     env = {**os.environ, "RLCLI_PLUGINS": "none"}
-    done = subprocess.run(command, cwd=folders, env=env, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=write_tasks(tmp_path), env=env, capture_output=True, text=True)
     assert done.returncode == 7, done.stderr
 
 

@@ -1,9 +1,9 @@
 """`list-tasks` and its cache: details of installed tasks without importing them."""
 
 import json
+import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -27,8 +27,8 @@ def test_index_of_built_in_tasks_is_up_to_date():
     assert json.loads(file.read_text()) == json.loads(fresh), f"run: {' '.join(command[1:])} > {file}"
 
 
-def test_built_in_tasks_have_details(cli):
-    found = rows(cli("list-tasks", "--json"))
+def test_built_in_tasks_have_details(command):
+    found = rows(command("list-tasks", "--json"))
     cartpole = found["cartpole"]
     assert cartpole["workflow"] == "managed"
     assert (cartpole["observation_size"], cartpole["action_size"], cartpole["agent"]) == (4, 1, "sb3-ppo")
@@ -50,25 +50,30 @@ def test_list_tasks_imports_no_plugin_and_no_heavy_module(plugins, cli):
     assert "--probe shows more" in done.stdout
 
 
+def cpu_time_of_children():
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 @pytest.mark.parametrize(("arguments", "bound_s"), [(["list-tasks"], 0.35), (["--help"], 0.25)])
 def test_light_commands_are_fast_with_twenty_plugins(plugins, spec, cli, arguments, bound_s):
     for number in range(20):
         plugins(f"plug{number}", spec)
     times = []
     for _ in range(3):
-        start = time.perf_counter()
+        start = cpu_time_of_children()
         assert cli(*arguments).returncode == 0
-        times.append(time.perf_counter() - start)
+        times.append(cpu_time_of_children() - start)
     assert min(times) < 3 * bound_s
 
 
-def test_pattern_filters_names_and_summaries(cli):
-    everything = rows(cli("list-tasks", "--json"))
+def test_pattern_filters_names_and_summaries(command):
+    everything = rows(command("list-tasks", "--json"))
     wanted = [name for name, row in everything.items() if "direct" in f"{name} {row['summary']}".lower()]
     assert "cartpole-direct" in wanted
     assert "cartpole" not in wanted
-    assert list(rows(cli("list-tasks", "DIRECT", "--json"))) == wanted
-    assert rows(cli("list-tasks", "no such thing", "--json")) == {}
+    assert list(rows(command("list-tasks", "DIRECT", "--json"))) == wanted
+    assert rows(command("list-tasks", "no such thing", "--json")) == {}
 
 
 @pytest.mark.parametrize(
@@ -79,37 +84,37 @@ def test_pattern_filters_names_and_summaries(cli):
         ("zzz", "rlcli list-tasks shows all"),
     ],
 )
-def test_pattern_without_match_gives_hint(cli, pattern, advice):
-    done = cli("list-tasks", pattern)
+def test_pattern_without_match_gives_hint(command, pattern, advice):
+    done = command("list-tasks", pattern)
     assert (done.returncode, done.stdout) == (0, "")
     assert done.stderr.startswith(f"no task's name or summary contains '{pattern}'; {advice}")
-    assert json.loads(cli("list-tasks", pattern, "--json").stdout)["tasks"] == []
+    assert json.loads(command("list-tasks", pattern, "--json").stdout)["tasks"] == []
 
 
-def test_shared_names_show_their_distribution(plugins, spec, cli):
+def test_shared_names_show_their_distribution(plugins, spec, command):
     plugins("a", spec, task="walk")
     plugins("b", spec, task="walk")
-    done = cli("list-tasks")
+    done = command("list-tasks")
     assert "a:walk" in done.stdout
     assert "b:walk" in done.stdout
 
 
-def test_unreadable_distribution_is_warning_and_json_row(plugins, cli):
+def test_unreadable_distribution_is_warning_and_json_row(plugins, command):
     plugins("bad", entry_points="[rlcli.tasks]\nnonsense\n")
-    done = cli("list-tasks", "--json")
+    done = command("list-tasks", "--json")
     assert "bad-1.0.dist-info" in done.stderr
     assert json.loads(done.stdout)["broken"][0]["distribution"] == "bad-1.0.dist-info"
     assert "cartpole" in rows(done)
 
 
-def test_probe_fills_cache_and_reports_broken_tasks(plugins, spec, cli):
+def test_probe_fills_cache_and_reports_broken_tasks(plugins, spec, cli, command):
     plugins("good", "print('hello')\n" + spec, files={"task.yaml": TASK.format(summary="Slide."), "model.xml": MODEL})
     plugins("exits", "import sys\nsys.exit(3)\n")
     plugins("crashes", "import os\nos._exit(7)\n")
     plugins("killed", "import os, signal\nos.kill(os.getpid(), signal.SIGKILL)\n")
     plugins("raises", "raise ValueError('out of cheese')\n")
     plugins("invalid", spec, files={"task.yaml": "decimation: -2\n"})
-    assert rows(cli("list-tasks", "--json"))["good-task"]["workflow"] is None
+    assert rows(command("list-tasks", "--json"))["good-task"]["workflow"] is None
     found = rows(cli("list-tasks", "task", "--probe", "--json"))
     good = found["good-task"]
     assert (good["summary"], good["workflow"], good["num_envs"]) == ("Slide.", "managed", 5)
@@ -119,9 +124,9 @@ def test_probe_fills_cache_and_reports_broken_tasks(plugins, spec, cli):
     assert found["killed-task"]["broken"] == "crashed (SIGKILL)"
     assert "out of cheese" in found["raises-task"]["broken"]
     assert found["invalid-task"]["broken"].endswith("task.yaml:1:1: missing key 'sim' (and 6 more)")
-    again = rows(cli("list-tasks", "--json"))
+    again = rows(command("list-tasks", "--json"))
     assert {name: again[name] for name in found} == found
-    assert "broken: ended the process (exit 7)" in cli("list-tasks").stdout
+    assert "broken: ended the process (exit 7)" in command("list-tasks").stdout
 
 
 def test_probe_stops_hanging_task(plugins, cli):
@@ -144,19 +149,19 @@ def test_new_plugin_version_invalidates_cache(plugins, spec, tmp_path):
     assert _key(entry) != before
 
 
-def test_status_shows_state_and_policy(plugins, spec, cli):
+def test_status_shows_state_and_policy(plugins, spec, command):
     details = {"summary": "Fine.", "workflow": "direct", "observation_size": 3, "action_size": 1}
     index = json.dumps({"good-task": {**details, "policy": True}})
     plugins("good", spec, files={"index.json": index})
     plugins("plain", spec)
-    done = cli("list-tasks")
+    done = command("list-tasks")
     head, *lines = done.stdout.splitlines()
     assert head.split()[2:8] == ["WORKFLOW", "OBS", "ACT", "ENVS", "AGENT", "STATUS"]
     shown = {line.split()[0]: line for line in lines}
     assert "  ok, policy  " in shown["good-task"]
     assert "  ok, policy  " in shown["cartpole"]
     assert "  ?  " in shown["plain-task"]
-    found = rows(cli("list-tasks", "--json"))
+    found = rows(command("list-tasks", "--json"))
     assert [found[name]["status"] for name in ("good-task", "cartpole", "plain-task")] == ["ok, policy"] * 2 + ["?"]
     assert (found["cartpole"]["policy"], found["ant-direct"]["policy"]) == (True, found["ant-direct"]["status"] != "ok")
 
@@ -172,11 +177,11 @@ def test_plugin_may_ship_details(plugins, spec, cli):
     "index",
     ["", "[]", "{", '{"good-task": 3}', '{"good-task": {"summary": ["x"]}}', '{"good-task": {"num_envs": "x"}}'],
 )
-def test_invalid_details_are_ignored(plugins, spec, cli, index, tmp_path):
+def test_invalid_details_are_ignored(plugins, spec, command, index, tmp_path):
     plugins("good", spec, files={"index.json": index})
     (tmp_path / "cache" / "rlcli").mkdir(parents=True)
     (tmp_path / "cache" / "rlcli" / "tasks.json").write_text(index)
-    done = cli("list-tasks")
+    done = command("list-tasks")
     assert done.returncode == 0
     assert "good-task" in done.stdout
 
@@ -203,8 +208,8 @@ def test_broken_plugin_exits_with_4_without_traceback(plugins, cli, source):
     assert cli("show", "cartpole").returncode == 0
 
 
-def test_broken_probe_result_wins_over_shipped_details(plugins, cli):
+def test_broken_probe_result_wins_over_shipped_details(plugins, cli, command):
     plugins("bad", "raise ValueError('out of cheese')\n", files={"index.json": '{"bad-task": {"summary": "Fine."}}'})
-    assert rows(cli("list-tasks", "--json"))["bad-task"]["broken"] is None
+    assert rows(command("list-tasks", "--json"))["bad-task"]["broken"] is None
     assert "out of cheese" in rows(cli("list-tasks", "bad", "--probe", "--json"))["bad-task"]["broken"]
-    assert "out of cheese" in rows(cli("list-tasks", "--json"))["bad-task"]["broken"]
+    assert "out of cheese" in rows(command("list-tasks", "--json"))["bad-task"]["broken"]

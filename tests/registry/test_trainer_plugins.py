@@ -13,13 +13,13 @@ POINTS = "[rlcli.trainers]\n%s = %s:SPEC\n"
 
 
 @pytest.fixture
-def mine(tmp_path, cli):
-    """mine(command, settings, words...) runs a command with an agent that has these settings."""
+def mine(tmp_path, command):
+    """mine(action, settings, words...) runs a command with an agent that has these settings."""
 
-    def run(command, settings, *words, **environment):
+    def run(action, settings, *words, **environment):
         file = tmp_path / "agents.yaml"
         file.write_text(f"agents: {{mine: {settings}}}\n")
-        return cli(command, "cartpole", "--config", str(file), "--agent", "mine", *words, **environment)
+        return command(action, "cartpole", "--config", str(file), "--agent", "mine", *words, **environment)
 
     return run
 
@@ -45,12 +45,12 @@ def test_ambiguous_trainer_is_reported_and_can_be_qualified(two, mine):
     assert chosen.returncode == 0, chosen.stderr
 
 
-def test_ambiguous_trainer_does_not_affect_other_agents(two, cli):
-    done = cli(
+def test_ambiguous_trainer_does_not_affect_other_agents(two, command):
+    done = command(
         "train", "cartpole", "--agent", "ppo", "--num-envs", "2", "--max-iterations", "1", "--device", "cpu", "-q"
     )
     assert done.returncode == 0, done.stderr
-    assert cli("list-tasks").returncode == 0
+    assert command("list-tasks").returncode == 0
 
 
 def test_trainer_with_newer_api_is_refused_in_train(plugins, mine):
@@ -84,11 +84,11 @@ def test_unknown_trainer_is_config_error(mine):
     assert "pip" not in done.stderr
 
 
-def test_built_in_tasks_train_without_trainer_plugins(cli):
+def test_built_in_tasks_train_without_trainer_plugins(command):
     for task in ("cartpole", "cartpole-direct"):
-        done = cli("train", task, "--num-envs", "2", "--max-iterations", "1", "-q", RLCLI_PLUGINS="rlcli")
+        done = command("train", task, "--num-envs", "2", "--max-iterations", "1", "-q", RLCLI_PLUGINS="rlcli")
         assert done.returncode == 0, done.stderr
-        checked = cli("validate", task, RLCLI_PLUGINS="rlcli")
+        checked = command("validate", task, RLCLI_PLUGINS="rlcli")
         assert checked.returncode == 0, checked.stderr
         assert "not checked" in checked.stderr + checked.stdout or "not installed" in checked.stderr + checked.stdout
 

@@ -1,4 +1,7 @@
-"""Number of cases in fault tests: a sample in `make test`, all in `make test-faults`, more with `-long`."""
+"""Number of cases in tests with many: a sample in `make test`, all in `make test-all` and `make test-faults`.
+
+`make test-faults-long` runs still more.
+"""
 
 import os
 from collections.abc import Sequence

@@ -4,9 +4,12 @@ import os
 import subprocess
 import sys
 import textwrap
+from types import SimpleNamespace
 
 import pytest
+import torch
 
+from rlcli.cli.app import main
 from support.broken_plugins import BROKEN, FILES, SPEC
 
 
@@ -40,8 +43,9 @@ def plugins(tmp_path, monkeypatch):
         return folder
 
     yield make
+    packages = {folder.name for folder in site.iterdir()}
     for module in set(sys.modules) - before:
-        if not module.startswith(("rlcli", "pydantic")):
+        if module.partition(".")[0] in packages:
             del sys.modules[module]
 
 
@@ -60,6 +64,30 @@ def broken_plugins(plugins):
 @pytest.fixture
 def spec():
     return SPEC
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capfd):
+    """Return command(*arguments) -> the result of `rlcli`, run in this process in an empty folder: faster than `cli`.
+
+    Not for plugins that end or change the process when they are imported.
+    """
+    threads = torch.get_num_threads()
+
+    def run(*arguments, **environment):
+        here = tmp_path / "here"
+        here.mkdir(exist_ok=True)
+        with monkeypatch.context() as changed:
+            changed.chdir(here)
+            for name, value in environment.items():
+                changed.setenv(name, value)
+            capfd.readouterr()
+            code = main([*arguments])
+            out, err = capfd.readouterr()
+        return SimpleNamespace(returncode=code, stdout=out, stderr=err)
+
+    yield run
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture
