@@ -8,13 +8,12 @@ from rlcli.config.load import Resolved
 from rlcli.config.schema import CameraSensorConfig
 from rlcli.envs.environment import Environment
 from rlcli.envs.make import make_env
+from rlcli.envs.sharding.own_code import has_untested_code
 from rlcli.errors import ConfigError
 from rlcli.machine import available_cores
 
 ENVS_PER_WORKER = 256
 """Smallest number of environments for which a further process pays: below it, its fixed cost per step outweighs it."""
-_TESTED = ("rlcli", "rlcli-gymnasium", "rlcli-menagerie")
-"""Distributions whose tasks are tested with several workers."""
 
 
 def make_training_env(resolved: Resolved, *, seed: int, device: str) -> Environment:
@@ -43,7 +42,9 @@ def number_of_workers(resolved: Resolved, device: str) -> int:
     reason = _reason_for_one(resolved, device)
     if scene.workers == "auto":
         cores = resolved.task.sim.engine_threads or available_cores()
-        if reason is not None or not _environments_are_independent(resolved):
+        # a renderer for each process would need several times the memory
+        has_camera = any(isinstance(sensor, CameraSensorConfig) for sensor in scene.sensors.values())
+        if reason is not None or has_camera or has_untested_code(resolved):
             return 1
         return max(1, min(cores, scene.num_envs // ENVS_PER_WORKER))
     if reason is None and scene.num_envs < 2 * scene.workers:
@@ -67,11 +68,3 @@ def _reason_for_one(resolved: Resolved, device: str) -> str | None:
         if term is not None and term.func in resolved.vocabulary.own:
             return f"curriculum '{name}' is a function of the task, and may use all environments"
     return None
-
-
-def _environments_are_independent(resolved: Resolved) -> bool:
-    """Return whether all code that steps the environments is known to treat each of them by itself."""
-    if any(isinstance(sensor, CameraSensorConfig) for sensor in resolved.task.scene.sensors.values()):
-        return False  # a renderer for each process would need several times the memory
-    has_own_code = resolved.source.task is not None or bool(resolved.vocabulary.own)
-    return not has_own_code or resolved.source.distribution in _TESTED

@@ -20,6 +20,7 @@ from rlcli.envs.shard import Shard, split
 from rlcli.envs.sharding import worker
 from rlcli.envs.sharding.arrays import map_tensors
 from rlcli.envs.sharding.engine import ShardedEngine, sums
+from rlcli.envs.sharding.own_code import has_untested_code
 from rlcli.envs.sharding.runner import (
     SLOTS,
     Columns,
@@ -63,9 +64,9 @@ class ShardedEnv(Environment):
         total = resolved.task.scene.num_envs
         self._shards = split(total, workers)
         parts = _resolved_parts(resolved, self._shards)
-        state, files = torch.get_rng_state(), imported_files()
+        state, files, has_own_code = torch.get_rng_state(), imported_files(), has_untested_code(resolved)
         jobs = [
-            Job(_pickled(part), seed, shared_streams, shard, number, files, state)
+            Job(_pickled(part), seed, shared_streams, shard, number, files, has_own_code, state)
             for number, (part, shard) in enumerate(zip(parts, self._shards, strict=True))
         ]
         self._workers = Workers(jobs[1:])

@@ -111,12 +111,18 @@ class ShardRunner:
         arrays: the shared tensors.
         stop: called with a stage and its content at each stage that an observer of the main process needs, and at the
             end. It returns when the shard may continue.
+        check: called before the end of each step and reset.
     """
 
     def __init__(
-        self, env: VecEnv, number: int, arrays: Mapping[str, Tensor], stop: Callable[[Stage, Any], None]
+        self,
+        env: VecEnv,
+        number: int,
+        arrays: Mapping[str, Tensor],
+        stop: Callable[[Stage, Any], None],
+        check: Callable[[], None] = lambda: None,
     ) -> None:
-        self.env, self.stop = env, stop
+        self.env, self.stop, self._check = env, stop, check
         rows, groups = env.shard.rows, list(env.layout.observations)
         self._action, self._restart = arrays["action"][rows], arrays["restart"][rows]
         self._obs = [{group: arrays[f"obs.{group}"][slot, rows] for group in groups} for slot in range(SLOTS)]
@@ -174,6 +180,7 @@ class ShardRunner:
         return self._take_columns()
 
     def _end(self, obs: Mapping[str, Tensor]) -> None:
+        self._check()
         for group, values in obs.items():
             self._obs[self._slot][group].copy_(values)
         self._seconds[0], self._seconds[1] = self.env.seconds["physics"], self.env.seconds["step"]

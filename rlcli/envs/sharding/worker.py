@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import random
 import signal
 import socket
 import traceback
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
-from rlcli.errors import RlcliError
+from rlcli.errors import RlcliError, TaskError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -42,6 +43,8 @@ class Job:
     number: int
     files: list[tuple[Path, str]]
     """Task files that the main process has imported; `resolved` may contain their functions and classes."""
+    has_own_code: bool
+    """Whether the task has code that is not tested with several workers."""
     generator_state: Tensor
     """State of torch's global generator at the start: a task may draw from it while it is built."""
 
@@ -109,7 +112,7 @@ class _Worker:
         torch.set_rng_state(job.generator_state)
         counters = map_tensors(self._arrays, counter_specs(job.shard.total))["counters"]
         shard = replace(job.shard, counters=counters[:, job.shard.rows])
-        self._number = job.number
+        self._number, self._has_own_code = job.number, job.has_own_code
         import_again(job.files)
         resolved: Resolved = pickle.loads(job.resolved)
         self._env = make_env(resolved, seed=job.seed, shared_streams=job.shared_streams, shard=shard)
@@ -119,7 +122,8 @@ class _Worker:
         from rlcli.envs.sharding.runner import ShardRunner
 
         assert self._env is not None
-        self._runner = ShardRunner(self._env, self._number, map_tensors(self._arrays, specs), self._stop)
+        check = _GlobalGenerators().require_unused if self._has_own_code else lambda: None
+        self._runner = ShardRunner(self._env, self._number, map_tensors(self._arrays, specs), self._stop, check)
 
     def _stop(self, stage: Stage, content: Any) -> None:
         """Report a stage; serve calls until the main process continues the step."""
@@ -135,6 +139,39 @@ class _Worker:
     def _call(self, content: tuple[Any, tuple[Any, ...]]) -> None:
         function, arguments = content
         self._channel.send(VALUE, (function(self._env, *arguments),))
+
+
+class _GlobalGenerators:
+    """Check that a task does not draw from the global random generators: each process has its own."""
+
+    def __init__(self) -> None:
+        self._states = self._read()
+
+    def require_unused(self) -> None:
+        """Check that no number has been drawn since this object was made.
+
+        Raises:
+            TaskError: with the library whose generator was used.
+        """
+        used = [name for name, state in self._read().items() if state != self._states[name]]
+        if used:
+            raise TaskError(
+                f"the task draws from the global random generator of {used[0]}; with several workers its results would"
+                " depend on their number",
+                hint="set scene.workers: 1, or draw from the selection (`selection.uniform`, `self.draws`)",
+            )
+
+    @staticmethod
+    def _read() -> dict[str, Any]:
+        import numpy as np
+        import torch
+
+        name, key, *position = np.random.get_state(legacy=True)
+        return {
+            "torch": torch.get_rng_state().numpy().tobytes(),
+            "numpy": (name, np.asarray(key).tobytes(), *position),
+            "Python": random.getstate(),
+        }
 
 
 @dataclass(frozen=True, slots=True)
