@@ -185,7 +185,7 @@ def test_function_that_is_no_term_is_refused(root):
     def untyped(env, *, factor):
         return factor
 
-    for term, said in ((positional, "must be keyword-only"), (untyped, "has no annotation"), (abs, "its source")):
+    for term, said in ((positional, "must be keyword-only"), (untyped, "has no annotation"), (abs, "source cannot be read")):
         with pytest.raises(ConfigError, match=said):
             make_env(cartpole(rewards={"own": RewardConfig(func=term, weight=1.0)}), root=root)
 

@@ -360,7 +360,7 @@ def test_actuator_models_independent_of_num_envs(tmp_path):
     ("model", "message"),
     [
         ({"joints": ["elbov"]}, "no joint matches 'elbov'"),
-        ({"joints": ["elbow"], "kind": "dc_motor"}, "a dc_motor needs saturation_effort and velocity_limit"),
+        ({"joints": ["elbow"], "kind": "dc_motor"}, "kind dc_motor needs saturation_effort and velocity_limit"),
         ({"joints": ["elbow"], "velocity_limit": 3.0}, "belong to kind dc_motor"),
         ({"joints": ["elbow"], "stiffness": {"shoulder": 3.0}}, "no joint matches 'shoulder'"),
         ({"joints": ["elbow", "wrist"], "stiffness": {"elbow": 3.0}}, "no value for joint 'wrist'"),

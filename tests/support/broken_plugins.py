@@ -66,7 +66,7 @@ BROKEN = {
     ),
     "patches-json": Case("is not callable", "import json, os\nos.chdir('/')\njson.dumps = None\n" + SPEC, with_files()),
     "has-no-object": Case("AttributeError", ""),
-    "is-no-spec": Case("is a dict, not a TaskSpec", "SPEC = {'package': 'x'}\n"),
+    "is-no-spec": Case("is a dict, expected a TaskSpec", "SPEC = {'package': 'x'}\n"),
     "names-no-object": Case(
         "is broken", SPEC, {"entry_points": "[rlcli.tasks]\nnames-no-object-task = names_no_object\n"}
     ),
