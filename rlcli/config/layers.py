@@ -140,9 +140,7 @@ def read(file: FilePath, name: str | None = None, *, pipe: bool = False) -> Docu
     try:
         return strict_yaml.load(file.read_bytes() if pipe else read_plain(file, strict_yaml.MAX_BYTES))
     except OSError as error:
-        raise ConfigError(
-            [Problem(name, "", f"cannot be read: {error.strerror or error}; check the path")]
-        ) from None
+        raise ConfigError([Problem(name, "", f"cannot be read: {error.strerror or error}; check the path")]) from None
     except YamlError as error:
         place = f"{name}:{error.line}:{error.column}" if error.line else name
         raise ConfigError([Problem(place, "", error.message)]) from None

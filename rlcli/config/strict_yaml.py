@@ -90,9 +90,7 @@ def _decode(text: str | bytes) -> str:
             text = text.decode("utf-8")
         except UnicodeDecodeError as error:
             before = error.object[: error.start].decode("utf-8")
-            raise YamlError(
-                f"not UTF-8: {error.reason}; save as UTF-8", place=_after(before)
-            ) from None
+            raise YamlError(f"not UTF-8: {error.reason}; save as UTF-8", place=_after(before)) from None
     return text.removeprefix("\ufeff")  # the byte order mark
 
 
@@ -202,17 +200,13 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
     if text in _CONSTANTS:
         return _CONSTANTS[text]
     if _OCTAL.match(text):
-        raise YamlError(
-            f"{text} is ambiguous (octal in YAML 1.1); remove the leading 0 or quote it", event.start_mark
-        )
+        raise YamlError(f"{text} is ambiguous (octal in YAML 1.1); remove the leading 0 or quote it", event.start_mark)
     if _INT.match(text):
         return int(text)
     if _FLOAT.match(text):
         number = float(text)
         if math.isinf(number):
-            raise YamlError(
-                f"the number {text[:20]} is out of range; allowed: up to 1.8e308", event.start_mark
-            )
+            raise YamlError(f"the number {text[:20]} is out of range; allowed: up to 1.8e308", event.start_mark)
         return number
     if _NOT_FINITE.match(text):
         raise YamlError(f"{text} is not allowed; write a number, or null for none", event.start_mark)

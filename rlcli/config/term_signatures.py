@@ -157,9 +157,7 @@ def signature_of(term: Any, name: str) -> Signature:
         file, source = inspect.getsourcefile(term), inspect.getsource(term)
         node = ast.parse(textwrap.dedent(source)).body[0]
     except (OSError, TypeError, SyntaxError, IndexError):
-        raise SignatureError(
-            "the term's source cannot be read; define it at the top of a file"
-        ) from None
+        raise SignatureError("the term's source cannot be read; define it at the top of a file") from None
     call: ast.stmt | None = node
     if isinstance(node, ast.ClassDef):
         call = constructor(SourceClass(Path(file or "?"), node), ClassSearch())
@@ -201,9 +199,7 @@ def params_model(signature: Signature, section: str) -> type[schema.TermConfig]:
         raise SignatureError(signature.error)
     reserved = (*SECTIONS[section].model_fields, "params")
     if taken := [p.name for p in signature.parameters if p.name in reserved]:
-        raise SignatureError(
-            f"rename parameter '{taken[0]}': every term of {section} has a key of this name"
-        )
+        raise SignatureError(f"rename parameter '{taken[0]}': every term of {section} has a key of this name")
     fields: dict[str, Any] = {p.name: (p.type, ... if p.required else p.default) for p in signature.parameters}
     return _model(signature.name, _closed(section), fields)
 

@@ -184,7 +184,7 @@ class DirectEnv(VecEnv):
                 f"task '{source.name}' is broken: {source.task}: {type(error).__name__}: {error}"
             ) from error
         if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
-            raise TaskError(f"task '{source.name}' is broken: {source.task} is not a DirectTask")
+            raise TaskError(f"task '{source.name}' is broken: derive {source.task} from DirectTask")
         return task_class
 
     def _build_workflow(self) -> None:

@@ -258,7 +258,7 @@ class _BinaryJoint(_JointAction):
         values = self._per_joint(command, math.nan)
         if bool(values.isnan().any()):
             name = self.elements[int(values.isnan().nonzero()[0, 0])]
-            raise NameProblem(f"{key} has no value for joint '{name}'")
+            raise NameProblem(f"{key} has no value for joint '{name}'; add one")
         return values
 
 

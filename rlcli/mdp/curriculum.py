@@ -27,7 +27,7 @@ class Stages(Term):
 
     def __post_init__(self) -> None:
         if len(self.steps) != len(self.values) or not self.steps or sorted(self.steps) != self.steps:
-            raise ValueError("steps and values must be lists of equal length, with steps in rising order")
+            raise ValueError("give steps and values as lists of equal length, with steps in rising order")
         self._steps = torch.tensor(self.steps, device=self.env.device)
         table = torch.tensor(self.values, dtype=torch.float32, device=self.env.device)
         _require_shape("each value", table.shape[1:], self.address)
@@ -56,7 +56,7 @@ class Interpolate(Term):
 
     def __post_init__(self) -> None:
         if self.end <= self.begin:
-            raise ValueError("end must be above begin")
+            raise ValueError(f"end ({self.end}) must be above begin ({self.begin}): raise end")
         self._from = self.address.clone()
         self._to = torch.tensor(self.to, dtype=torch.float32, device=self.env.device)
         _require_shape("'to'", self._to.shape, self.address)
@@ -102,7 +102,7 @@ class TerrainLevels(EntityTerm):
 
 def _require_shape(what: str, shape: torch.Size, address: Tensor) -> None:
     if shape != address.shape:
-        raise ValueError(f"{what} has shape {tuple(shape)}, the setting at the address has {tuple(address.shape)}")
+        raise ValueError(f"{what} has shape {tuple(shape)}, expected that of the address, {tuple(address.shape)}")
 
 
 def _length_xy(vector: Tensor) -> Tensor:

@@ -92,9 +92,7 @@ def _package_file(model: str) -> Path:
     package, _, file = model.partition("/")
     folders = package_folders(package)
     if not folders:
-        raise TaskError(
-            f"no Python package '{package}' is installed", hint=f"pip install {package}"
-        )
+        raise TaskError(f"no Python package '{package}' is installed", hint=f"pip install {package}")
     folder = next((folder for folder in folders if (folder / file).is_file()), folders[0])
     path = _inside(folder, file, f"the package '{package}' in {folder}")
     if not path.is_file():

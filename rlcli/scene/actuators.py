@@ -147,9 +147,7 @@ class JointCommand:
         native = dict(entity.actuators_of(kind))
         missing = [entity.joint_names[c] for c in columns if c not in modelled and c not in native]
         if missing:
-            raise NameProblem(
-                f"no {kind} actuator drives {', '.join(missing)}; set actuator: {kind}"
-            )
+            raise NameProblem(f"no {kind} actuator drives {', '.join(missing)}; set actuator: {kind}")
         self.actuators = [None if c in modelled else native[c] for c in columns]
         """Id of the MuJoCo actuator of each column; None where an actuator model drives the joint."""
         self.sinks = [f"{entity.name}/{entity.joint_names[c]} {kind}" if c in modelled else native[c] for c in columns]

@@ -43,7 +43,7 @@ def one_column(columns: Columns, count: int, parameter: str) -> int:
     """
     found = torch.arange(count)[columns if isinstance(columns, slice) else columns.cpu()].tolist()
     if len(found) != 1:
-        raise ValueError(f"'{parameter}' selects {len(found)} elements; this term needs exactly one")
+        raise ValueError(f"'{parameter}' selects {len(found)} elements; select exactly one")
     return int(found[0])
 
 

@@ -64,7 +64,11 @@ TYPOS = [
     ("observations.policy.pos.scale=big", "expected a number or a list", None),
     ("terminations.time_out.time_out=1", "terminations.time_out.time_out: expected true or false, found 1", None),
     ("events.e={func: reset_scene_to_default, mode: rest}", "events.e.mode: expected", "did you mean 'reset'?"),
-    ("events.e={func: reset_scene_to_default, mode: interval}", "events.e: interval_range_s and mode: interval need", None),
+    (
+        "events.e={func: reset_scene_to_default, mode: interval}",
+        "events.e: interval_range_s and mode: interval need",
+        None,
+    ),
     ("params.x=1", "params: remove them: only direct tasks have params", None),
     ("success={func: joints_near, joints: [a], target: 0, tolerance: 1, hold_s: -1}", "success.hold_s: expected", None),
     ("agent.gamma=2", "agents.one.gamma: expected a number <= 1, found 2", None),

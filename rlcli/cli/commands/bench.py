@@ -98,9 +98,7 @@ def _report(
     for line in explanation(findings):
         console.data(line)
     if findings.unsteady:
-        console.warn(
-            "repeated measurements differ: end other programs on this machine"
-        )
+        console.warn("repeated measurements differ: end other programs on this machine")
     changes = None if findings.recommended is None else bench.changes(findings.recommended.setting)
     if changes is not None and file is not None:
         write_atomic(file, bench_preset(resolved, changes, findings, machine, names_agent))
@@ -153,9 +151,7 @@ def _machine(resolved: Resolved) -> dict[str, Any]:
 
     cores, busy = available_cores(), load()
     if busy is not None and busy > _MAX_LOAD * cores:
-        console.warn(
-            f"the machine is busy (load {busy:.1f} on {cores} cores): end other programs"
-        )
+        console.warn(f"the machine is busy (load {busy:.1f} on {cores} cores): end other programs")
     return {
         "cpu": processor()["model"],
         "cores": cores,

@@ -66,9 +66,7 @@ def command(
             both = (one or _find(left[0], runs)[0], other or _find(right[0], runs)[0])
             equal = _compare_configurations(*both, left, right)
     except RecursionError:
-        raise CheckpointError(
-            f"{left[0]} or {right[0]} is corrupt: nested too deeply; train again"
-        ) from None
+        raise CheckpointError(f"{left[0]} or {right[0]} is corrupt: nested too deeply; train again") from None
     if not equal:
         raise typer.Exit(9)
 
@@ -87,9 +85,7 @@ def _sides(words: list[str]) -> tuple[Side, Side]:
         sides.insert(0, (sides[0][0], []))
     if len(sides) != 2:
         found = f"found {len(sides)}: {', '.join(name for name, _ in sides)}"
-        raise UsageError(
-            f"expected two runs or tasks, {found}", hint="rlcli diff A B, or TASK key.path=value"
-        )
+        raise UsageError(f"expected two runs or tasks, {found}", hint="rlcli diff A B, or TASK key.path=value")
     return sides[0], sides[1]
 
 
@@ -154,9 +150,7 @@ def _find(reference: str, runs: Path) -> tuple[Run, int | None]:
     if is_checkpoint_ref(reference):
         run, folder, _ = find_checkpoint(reference, runs)
         if not folder.resolve().name.isdecimal():
-            raise CheckpointError(
-                f"{folder} is not the checkpoint of a run; give RUN or RUN@step:N"
-            )
+            raise CheckpointError(f"{folder} is not the checkpoint of a run; give RUN or RUN@step:N")
         return run, int(folder.resolve().name)
     try:
         run, why = find_run(reference, runs)

@@ -88,9 +88,7 @@ def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | N
     from rlcli.runs.trusted_tasks import named_task
 
     if choice.run is None and choice.bundle is None:
-        raise UsageError(
-            f"{choice.folder} is not in a run", hint="--verify needs a run: --checkpoint RUN"
-        )
+        raise UsageError(f"{choice.folder} is not in a run", hint="--verify needs a run: --checkpoint RUN")
     check_overwrites(file)
     return open_reference(choice, saved, None if task is None else named_task(task))
 
