@@ -139,7 +139,7 @@ class Pipeline:
         if not isinstance(setting, Tensor):
             setting = torch.tensor(value, dtype=torch.float32, device=self._device)
         if setting.dim() == 1 and len(setting) != self.width:
-            raise self.term.error(f"has {len(setting)} values; give one number, or {self.width}", *key.split("."))
+            raise self.term.error(f"has {len(setting)} values; give 1 or {self.width}", *key.split("."))
         return setting
 
     def _modifier(self, number: int, config: schema.ModifierConfig) -> Stage:

@@ -188,25 +188,27 @@ class Checkpoint:
         missing = [part for part in PARTS if f"{part}.safetensors" not in self.manifest["files"]]
         if missing:
             raise CheckpointError(
-                f"{self.folder} has no {missing[0]}.safetensors", hint="--init-from takes its policy into a new run"
+                f"{self.folder} has no {missing[0]}.safetensors", hint="--init-from starts a new run with its policy"
             )
         values = self.json("state.json")
         _check_state(values, self.step, self.folder / "state.json")
         if values["policy"] != self.json("policy.json"):
-            raise CheckpointError(f"{self.folder}/state.json is corrupt: its policy is not that of policy.json")
+            raise CheckpointError(f"{self.folder}: state.json and policy.json have different policies; use RUN@step:N")
         self.policy()
         parts = [name.removesuffix(".safetensors") for name in self.manifest["files"] if name.endswith(".safetensors")]
         tensors = {part: self.tensors(part) for part in parts}
         obs = tensors["trainer"].get("observations")
         if obs is not None and (obs.dim() != 2 or obs.shape[1] != values["policy"]["observation_size"]):
-            raise CheckpointError(f"{self.folder}/trainer.safetensors: 'observations' has shape {tuple(obs.shape)}")
+            raise CheckpointError(
+                f"{self.folder}: 'observations' has the wrong shape {tuple(obs.shape)}; use RUN@step:N"
+            )
         for part in ("policy", "trainer"):
             file = f"{self.folder / part}.safetensors"
             for name, value in tensors[part].items():
                 if value.is_floating_point() and not bool(value.isfinite().all()):
-                    raise CheckpointError(f"{file}: '{name}' holds values that are not finite")
+                    raise CheckpointError(f"{file}: '{name}' is not finite; use an older one: RUN@step:N")
                 if name.endswith(("normalizer.var", "normalizer.count")) and bool((value < 0).any()):
-                    raise CheckpointError(f"{file}: '{name}' is negative")
+                    raise CheckpointError(f"{file}: '{name}' is negative; use an older one: RUN@step:N")
         return TrainerState(tensors, values, {name: self._rows(name) for name in self.shards()})
 
     def verify(self, *, whole: bool) -> None:
@@ -238,10 +240,10 @@ class Checkpoint:
         first, stop, shards = log.first, log.stop, log.shards
         starts = [shard.start for shard in shards] + [stop]
         if [shard.stop for shard in shards] != starts[1:] or starts[0] > first:
-            raise CheckpointError(f"{self.folder}/manifest.json is corrupt: rows of '{name}' are missing")
+            raise CheckpointError(f"{self.folder}/manifest.json is corrupt: '{name}' lacks rows; use RUN@step:N")
         size, limit = sum(shard.size for shard in shards), available_memory() // 3
         if size > limit:
-            raise CheckpointError(f"{self.folder}: '{name}' has {size:,} bytes; this machine has memory for {limit:,}")
+            raise CheckpointError(f"{self.folder}: free some memory: '{name}' needs {size:,} of {limit:,} bytes")
 
         def read(start: int, end: int) -> dict[str, Tensor]:
             parts = []
@@ -251,7 +253,7 @@ class Checkpoint:
                     rows = slice(max(start, shard.start) - shard.start, min(end, shard.stop) - shard.start)
                     parts.append({column: values[rows] for column, values in columns.items()})
             if any(set(part) != set(parts[0]) for part in parts):
-                raise CheckpointError(f"{self.folder}/manifest.json: the files of '{name}' have different columns")
+                raise CheckpointError(f"{self.folder}/manifest.json is corrupt: '{name}' differs in columns")
             return {column: torch.cat([part[column] for part in parts]) for column in parts[0]} if parts else {}
 
         return Rows(first, stop, read)
@@ -263,13 +265,13 @@ class Checkpoint:
         )
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
-                raise CheckpointError(f"{file} is corrupt: '{column}' does not have the rows that the file name states")
+                raise CheckpointError(f"{file} is corrupt: '{column}' lacks rows; use RUN@step:N")
         return columns
 
     def _data(self, name: str, limit: int) -> bytes:
         entry = self.manifest["files"].get(name)
         if entry is None:
-            raise CheckpointError(f"{self.folder} has no {name}")
+            raise CheckpointError(f"{self.folder} has no {name}; choose an older checkpoint: RUN@step:N")
         return _verified(self.folder / name, entry["size"], entry["sha256"], limit)
 
 
@@ -283,7 +285,7 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     try:
         manifest = parse_json(read_file(file, JSON_LIMIT), file)
     except FileNotFoundError:
-        raise CheckpointError(f"{folder} is not a checkpoint: it has no manifest.json") from None
+        raise CheckpointError(f"{folder} is not a checkpoint: it has no manifest.json; check the path") from None
     if type(manifest.get("format")) is not int or manifest["format"] != FORMAT:
         raise CheckpointError(
             f"{folder} has checkpoint format {str(manifest.get('format'))[:40]}; this rlcli reads {FORMAT}",
@@ -292,7 +294,7 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     step = check_json(_Manifest, manifest, file).step
     name = folder.name
     if name.isdecimal() and name.isascii() and len(name) >= 12 and int(name) != step:
-        raise CheckpointError(f"{file} is corrupt: it is for step {step}, but its folder for step {int(name)}")
+        raise CheckpointError(f"{file} is corrupt: it has step {step}, its folder is named {int(name)}; rename it")
     return Checkpoint(folder, manifest)
 
 
@@ -314,7 +316,7 @@ def _verified(file: Path, size: int, digest: str, limit: int) -> bytes:
     try:
         data = read_file(file, limit, size=size)
     except FileNotFoundError:
-        raise CheckpointError(f"{file} is missing") from None
+        raise CheckpointError(f"{file} is missing; choose an older checkpoint: RUN@step:N") from None
     if len(data) != size or sha256(data) != digest:
         raise manifest_error(file, len(data), size)
     return data
@@ -324,7 +326,7 @@ def _tensors(data: bytes, file: Path) -> dict[str, Tensor]:
     """Return the tensors of a safetensors file after a check of its header."""
     length = int.from_bytes(data[:8], "little")
     if length > min(_HEADER_LIMIT, len(data) - 8):
-        raise CheckpointError(f"{file} is corrupt: it is not a safetensors file, or its header is too long")
+        raise CheckpointError(f"{file} is corrupt: not a safetensors file; use RUN@step:N")
     check_json(_Header, parse_json(data[8 : 8 + length], file), file)  # shapes that torch accepts
     try:
         return safetensors.torch.load(data)
@@ -337,7 +339,7 @@ def _check_state(values: dict[str, Any], step: int, file: Path) -> None:
     check_json(_State, values, file)
     if values.get("env_steps", step) != step:
         found = values["env_steps"]
-        raise CheckpointError(f"{file} is corrupt: it is for step {found}, but the manifest for step {step}")
+        raise CheckpointError(f"{file} is corrupt: it has step {found}, the manifest step {step}; use RUN@step:N")
     for key, entry in values.items():
         if key.partition(".")[0] == "statistics":
             check_json(_Statistics, entry, file, key)

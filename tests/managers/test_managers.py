@@ -159,7 +159,7 @@ class Fussy:
         ({"observations": {"policy": {"bad": {"func": "cube"}}}}, "observations.policy.bad: 'cube' gave {}(3, 1, 1)"),
         (
             {"observations": {"policy": {"bad": {"func": "joint_pos", "scale": [1.0, 2.0]}}}},
-            "observations.policy.bad.scale: has 2 values; give one number, or 1",
+            "observations.policy.bad.scale: has 2 values; give 1 or 1",
         ),
     ],
 )

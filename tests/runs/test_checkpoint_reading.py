@@ -178,7 +178,7 @@ SHAPE = f"{HEADER}.shape"
         (edit_manifest(lambda m: m.pop("step")), MANIFEST + "missing key 'step'"),
         (edit_manifest(lambda m: m.update(step=-1)), MANIFEST + "step: expected a whole number >= 0, found -1"),
         (edit_manifest(lambda m: m.update(step=2**62)), MANIFEST + "step: expected a whole number < "),
-        (edit_manifest(lambda m: m.update(step=200)), "it is for step 200, but its folder for step 300"),
+        (edit_manifest(lambda m: m.update(step=200)), "it has step 200, its folder is named 300"),
         (edit_manifest(lambda m: m["files"].pop("rng.safetensors")), "has no rng.safetensors"),
         (edit_manifest(lambda m: m["files"].pop("state.json")), "has no state.json"),
         (edit_manifest(lambda m: m.update(logs=[])), MANIFEST + "logs: expected a mapping, found []"),
@@ -207,7 +207,7 @@ SHAPE = f"{HEADER}.shape"
         (values(updates=1.5), STATE + "updates: expected a whole number, found 1.5"),
         (values(processes="x" * 100), f"processes: expected a whole number, found '{'x' * 56}..."),
         (values(rnd_updates=None), "rnd_updates: expected a whole number, found null"),
-        (values(env_steps=299), "it is for step 299, but the manifest for step 300"),
+        (values(env_steps=299), "it has step 299, the manifest step 300"),
         (values(learning_rate=-1e-9), "learning_rate: expected a number >= 0, found -1e-09"),
         (values(learning_rate=1e6), "learning_rate: expected a number < 1e+06, found 1000000.0"),
         (values(learning_rate=True), "learning_rate: expected a number, found true"),
@@ -279,7 +279,7 @@ def test_log_files_with_different_columns_are_refused(folder):
     shard(1, size=len(data), sha256=checkpoint.sha256(data))(folder)
     opened = checkpoint.open_checkpoint(folder).state().logs["replay"]
     assert set(opened.read(13, 15)) == {"x"}
-    with pytest.raises(CheckpointError, match="the files of 'replay' have different columns"):
+    with pytest.raises(CheckpointError, match="'replay' differs in columns"):
         opened.read(10, 14)
 
 
@@ -288,9 +288,7 @@ def test_log_file_with_other_rows_than_its_name_is_refused(folder):
     data = safetensors.torch.save({"x": torch.zeros(6, 1), "y": torch.zeros(5)})
     file.write_bytes(data)
     shard(1, size=len(data), sha256=checkpoint.sha256(data))(folder)
-    with pytest.raises(
-        CheckpointError, match=f"{file.name} is corrupt: 'y' does not have the rows that the file name states"
-    ):
+    with pytest.raises(CheckpointError, match=f"{file.name} is corrupt: 'y' lacks rows"):
         checkpoint.open_checkpoint(folder).verify(whole=True)
 
 
