@@ -112,7 +112,7 @@ def export(
         write_synced(temporary, formats.write(format_, graph, text, mjlab_properties(metadata)))
         run, found = formats.read(format_, temporary)
         if json.loads(found) != metadata:
-            raise VerdictError(f"{file} is not kept: its metadata differ after writing and reading")
+            raise VerdictError(f"{file} is not kept: its metadata cannot be read back; report this bug")
         difference = _require_equal(run, graph, observations, file)
     return Exported(file, metadata, len(observations), difference)
 

@@ -61,7 +61,7 @@ def check_overwrites(policy: Path) -> None:
     """
     if policy.name == PROGRAM:
         raise UsageError(
-            f"--verify writes its program to {PROGRAM}, so the policy needs another name", hint="--output FILE"
+            f"--verify writes its program to {PROGRAM}, so the policy needs another name", hint="give --output FILE"
         )
     model = policy.with_name(MODEL)
     try:
@@ -73,7 +73,7 @@ def check_overwrites(policy: Path) -> None:
         is_exported = False
     if not is_exported:
         raise UsageError(
-            f"--verify would overwrite {model}, which export has not written",
+            f"--verify would overwrite {model}, which is not a file of rlcli export",
             hint="give an --output in an empty folder",
         )
 

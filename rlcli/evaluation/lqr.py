@@ -188,4 +188,4 @@ def _coordinates(env: VecEnv) -> list[str]:
 
 
 def _no_regulator(resolved: Resolved, why: str) -> UsageError:
-    return UsageError(f"there is no LQR of {resolved.source.name}: {why}", hint="other policies: trained, zero, random")
+    return UsageError(f"there is no LQR of {resolved.source.name}: {why}", hint="use --policy trained, zero or random")

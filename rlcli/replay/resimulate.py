@@ -72,12 +72,12 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
     if trajectory.header.kind != "recording":
         if episode is not None or filmed:
             raise UsageError(
-                "a dump holds no whole episodes: --episode and --video need a recording",
+                "a dump has no complete episodes: --episode and --video need a recording",
                 hint="rlcli autopsy RUN N --video FILE.mp4 draws a case of a run",
             )
         return []
     if episode is not None and episode >= count:
-        raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"it has {count}, counted from 0")
+        raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"the file has {count}, counted from 0")
     if not count:
         raise UsageError(f"{trajectory.file} has no episodes", hint="record with --record-mode all")
     return list(range(count)) if episode is None else [episode]
@@ -272,7 +272,7 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
             world = ReplayWorld(model, resolved, own_model, header.follows_constants)
             width = len(world.engine.state_row(0))
             if states.shape[1] != width or len(final) != width:
-                raise ValueError(f"a state has {len(final)} numbers, the model's {width}")
+                raise ValueError(f"a state of the file has {len(final)} numbers, one of the model has {width}")
         except (ValueError, RuntimeError) as error:
             raise trajectory.mismatch_error(error) from None
         calls = [Call(state, nstep) for state, nstep in zip(states, described.nstep, strict=True)]

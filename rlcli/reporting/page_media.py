@@ -112,5 +112,5 @@ class PageMedia:
         except OSError as error:
             raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
         if data[4:8] != b"ftyp":
-            raise CheckpointError(f"{file} is not an MP4")
+            raise CheckpointError(f"{file} is not an MP4 video; delete it")
         return data

@@ -199,9 +199,7 @@ class Checkpoint:
         tensors = {part: self.tensors(part) for part in parts}
         obs = tensors["trainer"].get("observations")
         if obs is not None and (obs.dim() != 2 or obs.shape[1] != values["policy"]["observation_size"]):
-            raise CheckpointError(
-                f"{self.folder}: 'observations' has the wrong shape {tuple(obs.shape)}; use RUN@step:N"
-            )
+            raise CheckpointError(f"{self.folder}: 'observations' has wrong shape {tuple(obs.shape)}; use RUN@step:N")
         for part in ("policy", "trainer"):
             file = f"{self.folder / part}.safetensors"
             for name, value in tensors[part].items():

@@ -38,7 +38,7 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     findings = list(compare_trajectories(env, (first, second), message, f"{hint} or time"))
     if not findings:
         message = "differs between a new environment, and the same one after reset(seed), with one set of actions"
-        hint = "something outlives the episode: clear it in the term's reset(selection), or in reset_idx"
+        hint = "clear all state of the last episode in the term's reset(selection), or in reset_idx"
         findings = list(compare_trajectories(env, (first, third), message, hint))
     yield from findings
 

@@ -79,7 +79,7 @@ NAMED = {
     "a skin outside": (model("<deformable><skin file='../outside.skn'/></deformable>"), "lies outside"),
     "a flex outside": (model(body='<flexcomp name="f" type="mesh" file="../outside.obj"/>'), "lies outside"),
     "a model outside": (model(asset='<model name="m" file="../outside.xml"/>'), "lies outside"),
-    "a compiled model as asset": (model(asset='<model name="m" file="bin.mjb"/>'), "compiled models"),
+    "a compiled model as asset": (model(asset='<model name="m" file="bin.mjb"/>'), "compiled model"),
     "a resource of another kind": (model(asset='<mesh name="m" file="http://example.invalid/m.obj"/>'), "not the name"),
     "a picture of four terapixels": (
         model(asset='<texture name="t" type="2d" file="huge.png"/>'),

@@ -72,7 +72,7 @@ BROKEN = {
     ),
     "newer-api": Case("needs plugin API 99", IMPORT + "SPEC = TaskSpec(__name__, 'x', api=99)\n"),
     "api-is-text": Case(
-        "api is the number of a plugin interface", IMPORT + "SPEC = TaskSpec(__name__, 'x', api='2')\n"
+        "api must be a whole number", IMPORT + "SPEC = TaskSpec(__name__, 'x', api='2')\n"
     ),
     "unknown-field": Case("unexpected keyword argument 'wings'", IMPORT + "SPEC = TaskSpec(__name__, 'x', wings=2)\n"),
     "no-yaml": Case("does not exist", SPEC),

@@ -162,13 +162,13 @@ def test_missing_journal_is_checkpoint_error(tmp_path):
 )
 def test_different_settings_in_same_folder_are_refused(tmp_path, change):
     open_or_join(tmp_path)
-    with pytest.raises(UsageError, match="is another sweep"):
+    with pytest.raises(UsageError, match="has other settings"):
         open_or_join(tmp_path, **change)
 
 
 def test_task_from_other_folder_is_other_sweep(tmp_path):
     open_or_join(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/one"})
-    with pytest.raises(UsageError, match="is another sweep"):
+    with pytest.raises(UsageError, match="has other settings"):
         open_or_join(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/two"})
 
 

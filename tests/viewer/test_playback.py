@@ -394,7 +394,7 @@ def test_removed_checkpoint_is_reported_and_policy_stays(playing):
     assert playback.view.checkpoint == newest
     assert first not in playback.view.checkpoints
     assert f"step {first} cannot be played, step {newest} continues" in log.messages[0]
-    assert "does not exist any more" in playback.view.message
+    assert "was deleted" in playback.view.message
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ def test_gpu_run_explains_missing_cases(trained, cli):
     (trained / "run.json").write_text(json.dumps(record))
     shown = cli("autopsy", trained)
     assert shown.code == 0
-    assert "it was trained on cuda, where steps cannot be replayed" in shown.err
+    assert "the run was trained on cuda, where steps cannot be replayed" in shown.err
     assert cli("autopsy", trained, "0").code == 2
 
 
