@@ -70,7 +70,7 @@ def test_share_inverts_between(text):
         ("body_mass=1:2:x", "is not a whole number of points"),
         ("body_mass=1:2:1", "1 points"),
         ("body_mass=1:2:99999", "99999 points"),
-        ("body_mass=0:2", "cannot have no mass"),
+        ("body_mass=0:2", "mass must be above 0"),
         ("gravity=-1:1", "cannot be -1"),
         ("body_mass=1,1", "appears twice"),
         ("action_delay=0.5:2", "whole numbers of steps"),

@@ -68,7 +68,7 @@ def test_run_precedes_the_shipped_policy(cli, folder, only_run):
         (("play", "cartpole-direct", "--checkpoint", "GIFT"), 2, "is a policy for cartpole, not for cartpole-direct"),
         (("play", "cartpole", "decimation=4"), 5, "step_dt  0.0166666667 s     0.0333333333 s"),
         (("export", "cartpole", "--format", "torch"), 2, "--output FILE"),
-        (("autopsy", "GIFT", "3"), 2, "without its training"),
+        (("autopsy", "GIFT", "3"), 2, "a bundle has no episodes of training"),
     ],
 )
 def test_invalid_policy_reference_is_refused(cli, coin, copied, words, code, message):

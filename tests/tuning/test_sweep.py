@@ -100,7 +100,7 @@ def test_objective_reads_evaluation_document():
         ((*RATE, "--pruner", "medan"), 2, "median"),
         ((*RATE, "--storage", "nonsense"), 2, "is not the URL of a database"),
         ((*RATE, "--storage", "nodialect://host/x"), 2, "is not the URL of a database"),
-        ((*RATE, "--objective", "return@1000", "--max-steps", "10"), 2, "already limits the length"),
+        ((*RATE, "--objective", "return@1000", "--max-steps", "10"), 2, "limits the length"),
     ],
 )
 def test_invalid_arguments_start_nothing(cli, words, code, message):

@@ -153,7 +153,7 @@ def test_missing_journal_is_checkpoint_error(tmp_path):
     finish(open_or_join(tmp_path), 2)
     (tmp_path / JOURNAL).unlink()
     for look in (open_or_join, read_sweep):
-        with pytest.raises(CheckpointError, match="lost its trials"):
+        with pytest.raises(CheckpointError, match="the file of its trials"):
             look(tmp_path)
 
 

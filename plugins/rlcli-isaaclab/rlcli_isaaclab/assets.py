@@ -43,8 +43,8 @@ def mjcf_of(usd: str) -> str:
     near = did_you_mean(usd.rsplit("/", 1)[-1], [end.rsplit("/", 1)[-1] for end in USD_TO_MJCF])
     known = f"known: {listing(USD_TO_MJCF)}"
     raise TaskError(
-        f"no MJCF is known for '{usd}'",
-        hint=f"rlcli_isaaclab.assets.map_usd('{'/'.join(usd.split('/')[-2:])}', 'model.xml') names one;"
+        f"no MJCF model is known for the USD file '{usd}'",
+        hint=f"rlcli_isaaclab.assets.map_usd('{'/'.join(usd.split('/')[-2:])}', 'model.xml') sets it;"
         f" {near + ' ' if near else ''}{known}",
     )
 

@@ -62,5 +62,5 @@ def _read_modifier(node: Node) -> dict[str, Any]:
         return {"kind": "digital_filter", "a": to_plain(node.get("A")), "b": to_plain(node.get("B"))}
     if kind == "Integrator":
         return {"kind": "integrator"}
-    node.report.problem(node.key, f"the modifier '{kind}' has no counterpart")
+    node.report.problem(node.key, f"the modifier '{kind}' has no counterpart in rlcli; remove it")
     return {"kind": "integrator"}

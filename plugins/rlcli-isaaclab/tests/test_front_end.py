@@ -405,7 +405,7 @@ def test_user_curriculum_changes_reward_weight(cfg):
     [
         (('place = PlaceCfg(asset_name="robot", ', "place = PlaceCfg("), "commands.place: missing 'asset_name'"),
         (("x=(1.0, 2.0)", ""), r"commands\.place\.ranges: missing 'x'"),
-        (("class_type: type = Place", "class_type: type = int"), "or a CommandTerm of your own"),
+        (("class_type: type = Place", "class_type: type = int"), "or write your own CommandTerm"),
         (('"term_name": "place"', '"term_name": "plaice"'), "no reward 'plaice'"),
     ],
 )
@@ -471,7 +471,10 @@ def test_missing_import_gives_replacement_line(cfg, line, message):
 def test_usd_file_is_mapped_or_error_lists_table(cfg):
     own = 'CARTPOLE_CFG.replace(spawn=UsdFileCfg(usd_path="/models/thing.usd"), '
     first = ("from rlcli_isaaclab import (", "from rlcli_isaaclab import (UsdFileCfg, map_usd,")
-    with pytest.raises(ConfigError, match=r"scene\.robot\.spawn\.usd_path: no MJCF is known for '/models/thing\.usd'"):
+    with pytest.raises(
+        ConfigError,
+        match=r"scene\.robot\.spawn\.usd_path: no MJCF model is known for the USD file '/models/thing\.usd'",
+    ):
         resolve(cfg(first, ("CARTPOLE_CFG.replace(", own)))
     known = ("\n\n\ndef positions", '\n\nmap_usd("models/thing.usd", "cartpole:cartpole.xml")\n\n\ndef positions')
     source = cfg(first, known, ("CARTPOLE_CFG.replace(", own))

@@ -97,7 +97,7 @@ def test_scene_is_mapping_and_errors_list_names(env):
         env.scene["terrain"]
     with pytest.raises(AttributeError, match=r"data has no 'joint_poss'; did you mean 'joint_pos"):
         env.scene["robot"].data.joint_poss  # noqa: B018
-    with pytest.raises(AttributeError, match="an asset has no 'root_physx_view'; there is no PhysX"):
+    with pytest.raises(AttributeError, match="an asset has no 'root_physx_view'; rlcli has no PhysX"):
         env.scene["robot"].root_physx_view  # noqa: B018
     with pytest.raises(AttributeError, match="env has no 'step_dtt'; did you mean 'step_dt'"):
         env.step_dtt  # noqa: B018

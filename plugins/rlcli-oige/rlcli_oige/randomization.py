@@ -230,9 +230,9 @@ class Randomizer:
         width = rows.shape[1]
         if width not in (1, size) and (width != 3 or size % 3):
             at = ("oige", "domain_randomization", "randomization_params", *gate.path, gate.gate)
-            message = f"distribution_parameters have {width} columns, {'.'.join(gate.path)} has {size}"
+            message = f"distribution_parameters have {width} pairs, {'.'.join(gate.path)} has {size} columns"
             where = self._env.resolved.place(at)
-            hint = "give one pair for all columns, or one pair for each column"
+            hint = "give one pair for all columns, or one pair per column"
             raise ConfigError([Problem(where, gate.name, message, hint)])
         rows = rows.repeat(1, size // width)
         return rows[0], rows[1]

@@ -176,7 +176,7 @@ SPEC = TrainerSpec(
     },
     trainer="rlcli.rl.sb3.trainer:Sb3Trainer",
     refused={
-        "dqn": "it needs discrete actions, and tasks have continuous ones",
-        "her": "it needs goals as observations, and tasks have vectors",
+        "dqn": "the algorithm needs discrete actions, and tasks have continuous ones",
+        "her": "the algorithm needs goals as observations, and tasks have vectors",
     },
 )

@@ -123,7 +123,7 @@ def test_unknown_case_is_usage_error(trained, cli):
     ("arguments", "message"),
     [
         (["--sort", "lenth"], "did you mean 'length'"),
-        (["--video", "x.mp4"], "--video draws one case"),
+        (["--video", "x.mp4"], "--video needs the number of a case"),
         (["0", "--video", "x.avi"], "is not a video file"),
     ],
 )
