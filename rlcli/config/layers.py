@@ -58,7 +58,7 @@ class Layers:
         """Set one value, as an override does. Missing mappings on the path are created.
 
         Raises:
-            LookupError: if the path leads into a value that is no mapping, or to a list item that does not exist.
+            LookupError: if the path leads into a value that is not a mapping, or to a list item that does not exist.
         """
         target: Any = self.data
         taken: Path = ()

@@ -216,7 +216,7 @@ class TaskCheck:
     # --- validation ---
 
     def agent(self, name: str) -> tuple[TrainerSpec | None, AgentConfig | None]:
-        """Return the agent's trainer and its validated settings; None for what is not valid."""
+        """Return the agent's trainer and its validated settings; None if they are not valid."""
         at: Path = ("agents", name)
         for path in (("agents",), at):
             data = self.layers.get(path)

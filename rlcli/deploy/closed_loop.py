@@ -364,7 +364,7 @@ class _PlainMujocoRunner:
         mujoco.mj_setState(self._models[i], self._datas[i], row, int(mujoco.mjtState.mjSTATE_INTEGRATION))
 
     def _inputs(self, i: int, obs: Tensor) -> dict[str, np.ndarray]:
-        """Return what plain code cannot compute: commands, and observation terms without a formula."""
+        """Return the inputs that plain code cannot compute: commands, and observations without a formula."""
         commands = getattr(self._env, "command_manager", None)
         inputs = {
             f"command/{term.name}": term.instance.command[i].numpy()

@@ -70,7 +70,7 @@ def check_target(format_: str, output: Path | None) -> None:
 
 
 def refusal(spec: PolicySpec) -> str | None:
-    """Return why a policy cannot be exported; None: it can."""
+    """Return the reason why a policy cannot be exported; None if it can be exported."""
     if len(set(spec.memory)) > 1:
         return f"recurrent layers of different sizes ({', '.join(map(str, spec.memory))})"
     return None

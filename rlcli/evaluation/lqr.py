@@ -124,7 +124,7 @@ def riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix) -> Matrix | None:
 
 
 def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Return deviations of states and actions, of the states after one step, of its observations; and those at rest.
+    """Return deviations from the default state: inputs, next states and observations; and the observation at rest.
 
     The first three are half the differences of pairs on both sides of the default state, so that quadratic and other
     even terms cancel.

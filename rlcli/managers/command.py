@@ -180,7 +180,7 @@ class CommandManager(TensorState):
             self._resample(number, selection, _FIRST)
 
     def compute(self, select: Select, running: Tensor) -> None:
-        """Count one step where an episode is `running` (1 or 0), resample what is due, and update all commands.
+        """Count one step of the `running` episodes (1 or 0), resample commands that are due, and update all commands.
 
         `select` selects environments, with draws keyed by the step.
         """

@@ -185,7 +185,7 @@ class _Noise(Stage):
 
 
 class _Constant(Stage):
-    """Operation with an operand that stays, or that a curriculum changes."""
+    """Operation with a constant operand, which a curriculum may change."""
 
     def __init__(self, operation: str, operand: Tensor) -> None:
         self._operation, self._operand = _OPERATIONS[operation], operand
@@ -195,7 +195,7 @@ class _Constant(Stage):
 
 
 class _Bias(_Constant):
-    """Operation with an operand that is drawn once for each episode."""
+    """Operation with an operand that is sampled once for each episode."""
 
     def __init__(self, sampler: Sampler, operation: str, stream: np.uint64, bias: Tensor) -> None:
         super().__init__(operation, bias)

@@ -70,11 +70,11 @@ class Interpolate(Term):
 
 @dataclass(kw_only=True, eq=False)
 class TerrainLevels(EntityTerm):
-    """Terrain levels: up for robots that walk far, down for robots that fall short. -> levels (num_envs,)
+    """Terrain levels: robots that walk far move up, robots that walk too little move down. -> levels (num_envs,)
 
-    An episode that ends more than half a patch (along x) from the environment's origin moves up one level. It moves
-    down if it covers less than half of the distance of `command` (a velocity, x and y first); without a command, less
-    than `least` [m]. Above the last level follows a random one. Isaac Lab: terrain_levels_vel.
+    A robot moves up one level if its episode ends more than half a patch (along x) from the environment's origin. It
+    moves down if it covers less than half of the distance of `command` (a velocity, x and y first); without a command,
+    less than `least` [m]. After the last level a random level follows. Isaac Lab: terrain_levels_vel.
     """
 
     command: Command | None = None

@@ -73,7 +73,7 @@ class Draw:
 class DrawingTerm(Term):
     """Base class of terms that draw values relative to the original ones.
 
-    A term is a dataclass; these are its keys. A term without one of these keys uses the value below.
+    Terms are dataclasses. The attributes below are keys of the YAML; a term that lacks a key uses the value below.
     """
 
     entity: Entity

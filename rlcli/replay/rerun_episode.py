@@ -34,7 +34,7 @@ class EpisodeStart:
     """States of the generators that all environments share, before any step."""
 
     def shared_draws(self) -> bool:
-        """Return whether the task has used them: then the episode depends on the number of environments."""
+        """Return whether the task has drawn from global generators; then `num_envs` changes the episode."""
         return _has_drawn(self.generators)
 
 

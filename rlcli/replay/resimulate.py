@@ -157,7 +157,7 @@ class ReplayWorld:
         model: the model of all environments.
         resolved: the configuration.
         own_model: model fields that differ between environments, with this environment's values.
-        follows_constants: whether MuJoCo's constants are derived from them again.
+        follows_constants: whether MuJoCo's constants are derived from these fields again.
 
     Raises:
         ValueError, RuntimeError: if the fields do not fit the model.
@@ -186,7 +186,7 @@ class ReplayWorld:
         return self.engine.state_row(0)
 
     def differing_field(self, recorded: NDArray[np.float64], now: NDArray[np.float64], *, final: bool) -> str | None:
-        """Return the first field whose bits differ; in other states than the final one, only a field of physics."""
+        """Return the first field whose bits differ. Before the final state only fields of physics are compared."""
         for name, columns in self.layout.fields():
             if (final or name in _PHYSICS_FIELDS) and not _same_bits(recorded[columns], now[columns]):
                 return name

@@ -137,12 +137,12 @@ class Checkpoint:
 
     @property
     def step(self) -> int:
-        """Environment steps before it was written."""
+        """Environment steps of the training when the checkpoint was written."""
         return int(self.manifest["step"])
 
     @property
     def iteration(self) -> int:
-        """Number of the last iteration before it was written."""
+        """Number of the last finished iteration when the checkpoint was written."""
         return check_json(_Iteration, self.manifest, self.folder / "manifest.json").iteration
 
     def json(self, name: str) -> dict[str, Any]:
@@ -154,7 +154,7 @@ class Checkpoint:
 
         Args:
             part: the name of the part.
-            limit: largest size of its file [bytes]; None: the limit for such a part, at most a third of the memory.
+            limit: largest size of the file [bytes]; None: the default of the part, at most a third of the memory.
 
         Raises:
             CheckpointError: if the file is larger, or not a valid safetensors file.

@@ -187,7 +187,7 @@ def _episode_ends(subject: TaskUnderTest, limit: int) -> list[EndedEpisode]:
 
 
 def back_fill(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Check that the first observation of an episode has nothing of the last episode in histories and buffers."""
+    """Check that the first observation of an episode has no values of the last episode in histories and buffers."""
     task = subject.resolved.task
     if task.scene.terrain is not None:
         raise NotRunError("on terrain the start of an episode depends on the one before")

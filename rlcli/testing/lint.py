@@ -1,4 +1,4 @@
-"""Linter of tasks: it finds what makes a task hard to learn, also in tasks that keep the contract.
+"""Linter of tasks: it finds properties that make learning hard, also in tasks that pass `rlcli check`.
 
 ```python
 from rlcli.testing import lint_task

@@ -37,7 +37,7 @@ _REFRESH_S = 1.0
 
 @dataclass(slots=True)
 class Playback:
-    """Playback of a policy; see the module.
+    """Playback of a policy in real time; the module docstring describes its threads.
 
     Args:
         env: the environment; it is reset when the playback is made, unless `initial_obs` is given.

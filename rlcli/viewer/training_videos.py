@@ -29,7 +29,7 @@ class TrainingVideos(StepObserver):
         make_env: builds an environment of one world, before the first video.
         folder: folder of the videos `STEP.mp4`.
         interval: iterations between videos.
-        stopping: returns whether training was asked to stop.
+        stopping: returns whether a stop of the training was requested.
     """
 
     def __init__(

@@ -51,7 +51,7 @@ def mjcf_of(usd: str) -> str:
 
 @configclass
 class AssetBaseCfg:
-    """An asset of the scene."""
+    """Configuration of an asset of the scene."""
 
     @configclass
     class InitialStateCfg:
@@ -70,7 +70,7 @@ class AssetBaseCfg:
 
 @configclass
 class RigidObjectCfg(AssetBaseCfg):
-    """A free body."""
+    """Configuration of a free rigid body."""
 
     @configclass
     class InitialStateCfg(AssetBaseCfg.InitialStateCfg):
@@ -85,7 +85,7 @@ class RigidObjectCfg(AssetBaseCfg):
 
 @configclass
 class ArticulationCfg(AssetBaseCfg):
-    """A robot."""
+    """Configuration of a robot."""
 
     @configclass
     class InitialStateCfg(RigidObjectCfg.InitialStateCfg):

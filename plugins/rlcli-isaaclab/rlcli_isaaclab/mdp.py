@@ -184,7 +184,7 @@ EMAJointPositionToLimitsActionCfg = config_subclass(
 
 @configclass
 class BinaryJointActionCfg(ActionTermCfg):
-    """Open or closed."""
+    """Base configuration of a gripper action, which opens or closes joints."""
 
     joint_names: Any = MISSING
     open_command_expr: Any = MISSING

@@ -1,4 +1,4 @@
-"""Translation of Isaac Lab's randomization events. One of them becomes zero, one or several events of rlcli."""
+"""Translation of Isaac Lab's randomization events. Each event becomes zero, one or several events of rlcli."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ParameterError(ValueError):
 
 
 def translate_event(name: str, params: Node, scene: SceneReader) -> EventConfigs:
-    """Return the events that replace one of Isaac Lab's. Mistakes go into the report."""
+    """Return the rlcli events that replace one event of Isaac Lab. Mistakes are added to the report."""
     report = params.report
     try:
         parts = EVENTS[name](EventParameters(params, scene))

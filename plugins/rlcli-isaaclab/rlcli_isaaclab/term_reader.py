@@ -183,7 +183,7 @@ class TermReader:
         return config
 
     def read_terms(self, section: str, name: str, node: Node) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield the terms that replace one of Isaac Lab's: usually one. The names of several get a suffix."""
+        """Yield the rlcli terms that replace one term of Isaac Lab, usually one; names of several get a suffix."""
         function = _builtin_name(node.data.get("func"))
         if section == "events" and function in EVENTS:
             node.get("func")

@@ -1,8 +1,8 @@
 """Domain randomization with OmniIsaacGymEnvs' syntax, through the engine's per-environment model fields.
 
-`on_startup` changes the model once. `on_reset` starts from that and holds for an episode. `on_interval` starts from the
-values at the start of the episode. The second parameter of a gaussian is its standard deviation. Samples depend only on
-the seed, the environment, and the episode or step.
+`on_startup` changes the model once. `on_reset` starts from the result of `on_startup` and holds for an episode.
+`on_interval` starts from the values at the start of the episode. The second parameter of a gaussian is its standard
+deviation. Samples depend only on the seed, the environment, and the episode or step.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ class Randomizer:
     # --- called by tasks ---
 
     def apply_on_startup_domain_randomization(self, task: Any) -> None:
-        """Do nothing: the environment applies it."""
+        """Do nothing: the environment applies the startup randomization."""
 
     def set_up_domain_randomization(self, task: Any) -> None:
-        """Do nothing: the environment sets it up."""
+        """Do nothing: the environment sets up the randomization."""
 
     def step_randomization(self, reset_inds: Any = None) -> None:
-        """Do nothing: the environment does it."""
+        """Do nothing: the environment randomizes in each step."""
 
     def get_initial_dr_distribution_parameters(self, *path: str) -> np.ndarray:
         """Return the parameters of a distribution as in the YAML."""

@@ -82,7 +82,7 @@ ATTRIBUTES: Mapping[str, Mapping[str, tuple[Status, str]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """One randomization: of which attribute, when, and with which distribution."""
+    """One randomization: its attribute, its time (startup, reset or interval) and its distribution."""
 
     path: tuple[str, ...]
     """(observations,), (actions,), (simulation, gravity) or (kind of view, view, attribute)"""
