@@ -186,7 +186,7 @@ def test_parse_json_accepts_at_most_32_levels(file):
 def test_parse_json_refuses_with_the_reason(file, data, output):
     with pytest.raises(CheckpointError, match=r"data\.json is corrupt: ") as caught:
         parse_json(data, file)
-    assert caught.value.message.endswith(output)
+    assert output in caught.value.message
 
 
 def test_parse_json_error_shortens_keys_and_numbers(file):

@@ -428,7 +428,7 @@ def test_error_in_user_command_lists_valid_names(cfg, change, message):
         (('"robot", joint_names=".*pole"', '"robo", joint_names=".*pole"'), "no 'robo' in the scene; did you mean"),
         (('{"steps": 5}', '{"step": 5}'), r"too_late\.params\.step: unknown key 'step'; did you mean 'steps'"),
         (('"span": 0.1', '"span": 0.1, "mu": 2'), "params.mu: unknown key 'mu'; 'start' takes span, asset_cfg"),
-        (("func=start", "func=lambda env: 1"), r"events\.begin\.func: .* takes \(env, env_ids, \.\.\.\)"),
+        (("func=start", "func=lambda env: 1"), r"events\.begin\.func: .* must take \(env, env_ids, \.\.\.\)"),
         (('joint_names=["slider_to_cart"], ', ""), "actions.effort: missing 'joint_names'"),
         (("func=rel, weight=2.0", "func=rel"), "other/own_0.py.*: rewards.away: missing 'weight'"),
         (("@configclass\nclass Rewards", "class Rewards"), "write @configclass above the class Rewards"),
@@ -440,7 +440,7 @@ def test_error_in_user_command_lists_valid_names(cfg, change, message):
         ),
         (('{"steps": 5}', '{"steps": "x"}'), "expected a whole number"),
         (("self.sim.dt = 0.01", "self.decimation = None"), "missing 'decimation'"),
-        (("CARTPOLE_CFG.replace(", "CARTPOLE_CFG.replace(prim_pth=1, "), "ArticulationCfg has no 'prim_pth'"),
+        (("CARTPOLE_CFG.replace(", "CARTPOLE_CFG.replace(prim_pth=1, "), "ArticulationCfg has no setting 'prim_pth'"),
         (("func=mdp.time_out", "func=mdp.tim_out"), "did you mean 'time_out'"),
         (("mdp.JointEffortActionCfg(", "mdp.JointPositionToLimitsActionCfg("), "no position actuator drives"),
     ],
@@ -530,7 +530,7 @@ def test_configclass_copies_defaults_for_each_object():
     assert two.inner.values == [1, 2]
     assert two.to_dict() == {"inner": {"values": [1, 2], "limit": 3.0}, "name": "b"}
     assert one.replace(name="c").name == "c"
-    with pytest.raises(TypeError, match="has no 'nam'"):
+    with pytest.raises(TypeError, match="has no setting 'nam'"):
         one.replace(nam="c")
 
 

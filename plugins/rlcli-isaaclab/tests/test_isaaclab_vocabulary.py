@@ -333,7 +333,7 @@ MASS = {"asset_cfg": Pick("robot"), "mass_distribution_params": (0.0, 1.0), "ope
         ("rewards", "power_consumption", {"gear_ratio": {"knee": 1.0}}, "no joint matches 'knee'"),
         ("events", "randomize_rigid_body_mass", {**MASS, "asset_cfg": Pick("robot", body_names="base")},
          "no body matches 'base'"),
-        ("events", "randomize_rigid_body_mass", {**MASS, "mass_range": 3}, "'randomize_rigid_body_mass' has no such"),
+        ("events", "randomize_rigid_body_mass", {**MASS, "mass_range": 3}, "'randomize_rigid_body_mass' has no parameter 'mass_range'"),
         ("events", "randomize_rigid_body_mass", {"asset_cfg": Pick("robot")}, "missing 'mass_distribution_params'"),
         ("events", "randomize_rigid_body_com", {"asset_cfg": Pick("robot"), "com_range": {"roll": (0.0, 1.0)}},
          "expected ranges for x, y and z"),
