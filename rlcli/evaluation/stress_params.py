@@ -173,7 +173,9 @@ def _values(text: str, written: str, name: str, points: int, absolute: bool) -> 
     if not low < high:
         raise UsageError(f"--sweep {text}: {low:g} is not below {high:g}", hint="give LOW:HIGH, or a single value")
     if not 2 <= points <= _MAX_POINTS:
-        raise UsageError(f"--sweep {text}: {points} points", hint=f"give 2 to {_MAX_POINTS}, or a single value")
+        raise UsageError(
+            f"--sweep {text}: {points} points are not allowed", hint=f"give 2 to {_MAX_POINTS}, or a single value"
+        )
     box = Sweep(name, None, absolute, (low, high))
     inner = [box.between(i / (points - 1)) for i in range(1, points - 1)]
     return tuple(dict.fromkeys((low, *inner, high)))

@@ -95,7 +95,7 @@ def test_selectors_accept_names_or_lists(model, alias):
         ("x: 'float['", "annotation 'float[' is not valid Python"),
         ("x: float = math.pi", "the default 'math.pi' is not a literal"),
         ("x: Joints", "the term also needs 'entity: Entity'"),
-        ("weight: float", "every term of rewards already has a key of this name"),
+        ("weight: float", "every term of rewards has a key of this name"),
         ("_x: float", "underscore"),
     ],
 )
