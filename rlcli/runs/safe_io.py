@@ -81,7 +81,7 @@ def read_file(file: Path, limit: int, *, size: int | None = None) -> bytes:
         if size is not None and status.st_size != size:
             raise manifest_error(file, status.st_size, size)
         if status.st_size > limit:
-            raise CheckpointError(f"{file} has {status.st_size:,} bytes, {limit:,} are allowed; restore it")
+            raise CheckpointError(f"{file} is too large: {status.st_size:,} bytes, at most {limit:,} are read")
         return _read(opened, file, 0, status.st_size)
 
 

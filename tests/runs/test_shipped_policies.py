@@ -85,7 +85,7 @@ def test_bundle_is_accepted_as_a_checkpoint(cli, copied):
     said = cli("stress", "--checkpoint", copied, "--sweep", "body_mass=1:2:2", "--episodes", 4, "--json").json
     assert said["checkpoint"] == str(copied)
     assert said["nominal"]["success"]["rate"] == 1.0
-    assert "no episode was recorded: it is a policy without its training" in cli("autopsy", copied).err
+    assert "no episode was recorded: a bundle has no episodes of training" in cli("autopsy", copied).err
 
 
 @pytest.mark.parametrize("reference", ["shipped", "GIFT"])
