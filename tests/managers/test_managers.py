@@ -147,16 +147,19 @@ class Fussy:
     [
         (
             {"rewards": {"bad": {"func": "scalar", "weight": 1.0}}},
-            "rewards.bad: 'scalar' gave a float, expected {}(3,)",
+            "rewards.bad: 'scalar' returned a float; return {}(3,)",
         ),
         (
             {"rewards": {"bad": {"func": "column", "weight": 1.0}}},
-            "rewards.bad: 'column' gave {}(3, 1), expected {}(3,)",
+            "rewards.bad: 'column' returned {}(3, 1); return {}(3,)",
         ),
-        ({"success": {"func": "column"}}, "success: 'column' gave {}(3, 1), expected {}(3,)"),
-        ({"terminations": {"bad": {"func": "column"}}}, "terminations.bad: 'column' gave {}(3, 1), expected {}(3,)"),
-        ({"observations": {"policy": {"bad": {"func": "flat"}}}}, "observations.policy.bad: 'flat' gave {}(3,)"),
-        ({"observations": {"policy": {"bad": {"func": "cube"}}}}, "observations.policy.bad: 'cube' gave {}(3, 1, 1)"),
+        ({"success": {"func": "column"}}, "success: 'column' returned {}(3, 1); return {}(3,)"),
+        ({"terminations": {"bad": {"func": "column"}}}, "terminations.bad: 'column' returned {}(3, 1); return {}(3,)"),
+        ({"observations": {"policy": {"bad": {"func": "flat"}}}}, "observations.policy.bad: 'flat' returned {}(3,)"),
+        (
+            {"observations": {"policy": {"bad": {"func": "cube"}}}},
+            "observations.policy.bad: 'cube' returned {}(3, 1, 1)",
+        ),
         (
             {"observations": {"policy": {"bad": {"func": "joint_pos", "scale": [1.0, 2.0]}}}},
             "observations.policy.bad.scale: has 2 values; give 1 or 1",

@@ -100,7 +100,7 @@ class PowerConsumption(JointTerm):
         """Return the sum. (num_envs,)"""
         action, velocity = self.env.action_manager.action, self.entity.data.joint_vel_of(self.joints)
         if action.shape != velocity.shape:
-            raise ValueError(f"joints: {velocity.shape[1]} selected; select {action.shape[1]}, one per action column")
+            raise ValueError(f"selects {velocity.shape[1]} joints; select {action.shape[1]}, one per action")
         power: Tensor = (action * velocity * self._ratio).abs().sum(dim=1)
         return power
 
