@@ -105,7 +105,7 @@ class ClosedLoopResult:
         returns = self.return_difference if synchronized is None else self._relative(synchronized)
         suffix = "" if synchronized is None else " (re-synchronised)"
         checks = (
-            ("metadata: entries that differ from the task", float(len(self.differing)), 0.0),
+            ("description: entries that differ from the task", float(len(self.differing)), 0.0),
             ("action: exported file - policy", self.differences["action"], TOLERANCE),
             ("observation: formulas - task", self.differences["observation"], CLOSE),
             ("control: formulas - task", self.differences["control"], CLOSE),
