@@ -77,7 +77,7 @@ class FailSafeLogger:
             self._logger.write(iteration, step, metrics)
         except Exception as error:  # libraries and servers raise any kind of error
             self._logger = None
-            _log.warning("the logger %s failed and records no further iterations: %s", self._name, one_line(error, 300))
+            _log.warning("the logger %s has failed and records nothing more: %s", self._name, one_line(error, 300))
 
     def close(self, state: str) -> None:
         """Close the logger; log a warning if that fails."""
