@@ -15,7 +15,7 @@ from rlcli.sim.tensor_state import TensorState
 
 
 class EpisodeCounters(TensorState):
-    """Counters of all environments. Each is also a field: the form that selections read and write fastest."""
+    """Counters of all environments, also in the form of fields, which selections read and write fastest."""
 
     def __init__(self, num_envs: int, device: torch.device) -> None:
         self.ids = torch.arange(num_envs, device=device)

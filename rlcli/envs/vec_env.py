@@ -139,7 +139,7 @@ class VecEnv(Workflow):
                 it ends the episode of its environment.
         """
         if not self._playing:
-            raise RuntimeError("the environment is paused")
+            raise RuntimeError("the environment is paused; call pause(False) before step()")
         for before_step in self.observers.before_step:
             before_step()
         start = time.perf_counter()
@@ -166,7 +166,7 @@ class VecEnv(Workflow):
 
     def _checked(self, action: Tensor, restart: Tensor | None) -> Tensor:
         if action.shape != self._action_shape:
-            raise ValueError(f"action has shape {tuple(action.shape)}, expected {self._action_shape}")
+            raise ValueError(f"action has shape {tuple(action.shape)}; pass shape {self._action_shape}")
         self.engine.use_torch_stream()
         if restart is not None:
             action = action.masked_fill(restart[:, None], 0.0)
