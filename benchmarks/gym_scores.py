@@ -133,7 +133,7 @@ def tabulate(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def markdown(table: list[dict[str, Any]], rows: list[dict[str, Any]]) -> str:
     """Return both tables in Markdown."""
     lines = [
-        "| task | ours, as v3: median (lowest .. highest seed) | rl-zoo3 | ours, as v5 |",
+        "| task | rlcli, as v3: median (lowest .. highest seed) | rl-zoo3 | rlcli, as v5 |",
         "| --- | ---: | ---: | ---: |",
     ]
     for entry in table:

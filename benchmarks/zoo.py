@@ -1,6 +1,6 @@
 """Training, evaluation and documentation of the built-in tasks. Their bars are in docs/reference/zoo/zoo.yaml.
 
-    python benchmarks/zoo.py learn TASK            train the default agent here, evaluate, compare with the bar
+    python benchmarks/zoo.py learn TASK            train the default agent, evaluate, compare with the goal
     python benchmarks/zoo.py collect TASK RUN ...  write results and curves of finished runs from any machine; --ship
                                                    also puts the best policy into the package, and draws its picture
     python benchmarks/zoo.py collect --all FOLDER  do this for every task with runs below a folder, and write the pages;
@@ -9,7 +9,7 @@
     python benchmarks/zoo.py picture TASK          draw a strip of pictures of the shipped policy
     python benchmarks/zoo.py pages                 fill the generated parts of docs/reference/zoo/*.md, and its index
 
-`learn` exits with 9 if the bar or the time limit is missed, and appends a line to RUNS/learn.jsonl.
+`learn` exits with 9 if the required result or the time limit is missed, and appends a line to RUNS/learn.jsonl.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Entry:
     seeds: tuple[int, ...] = field(default=())
 
     def missed(self, evaluation: dict[str, Any]) -> list[str]:
-        """Return the misses of the bar in an evaluation, as text."""
+        """Return the values of an evaluation that miss the required result, as text."""
         misses = []
         for name, bound in self.bar.items():
             value = value_of(evaluation, name)
@@ -98,7 +98,7 @@ def value_of(evaluation: dict[str, Any], name: str) -> float | None:
 
 
 def learn(task: str, overrides: list[str], device: str | None, seed: int, runs: Path) -> int:
-    """Train, evaluate and compare with the bar; return the exit status."""
+    """Train, evaluate and compare with the required result; return the exit status."""
     entry = entries()[task]
     device = device or entry.device
     agent = ["--agent", entry.agent] if entry.agent else []
@@ -140,7 +140,7 @@ def learn(task: str, overrides: list[str], device: str | None, seed: int, runs: 
     with (runs / "learn.jsonl").open("a", encoding="utf-8") as log:
         log.write(json.dumps(line) + "\n")
     print(json.dumps(line, indent=1))
-    print(f"{task}: {'; '.join(missed) if missed else 'within its bar'}", file=sys.stderr)
+    print(f"{task}: {'; '.join(missed) if missed else 'required result reached'}", file=sys.stderr)
     return 9 if missed else 0
 
 
@@ -199,7 +199,7 @@ def collect(task: str, runs: list[Path], hardware: str | None, ship: bool, known
         (ZOO / folder).mkdir(exist_ok=True)
         (ZOO / folder / name).write_text(text, encoding="utf-8")
     for row in rows:
-        missed = "; ".join(entry.missed(row["evaluation"])) or "within its bar"
+        missed = "; ".join(entry.missed(row["evaluation"])) or "required result reached"
         print(f"{task}, seed {row['seed']}: {missed}; {row['minutes']:g} min")
     if ship:
         run, checkpoint, evaluation, row = max(found, key=lambda one: _goodness(entry, one[2]))
@@ -251,13 +251,13 @@ def adopt(task: str, other: str) -> None:
     (ZOO / "results" / f"{task}.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     for kind in ("csv", "svg"):
         shutil.copy(ZOO / "curves" / f"{other}.{kind}", ZOO / "curves" / f"{task}.{kind}")
-    missed = "; ".join(entry.missed(evaluation)) or "within its bar"
+    missed = "; ".join(entry.missed(evaluation)) or "required result reached"
     print(f"{task}, the policy of {other}: {missed}")
     subprocess.run([sys.executable, __file__, "picture", task], check=True)
 
 
 def _of_one_agent(entry: Entry, folders: list[Path]) -> list[Any]:
-    """Return the newest run of each seed with the agent of the bar; without such an agent, of any agent."""
+    """Return the newest run of each seed with the agent of the required result; without such an agent, of any agent."""
     from rlcli.config.load import resolve
     from rlcli.runs.run import open_run
 
@@ -340,7 +340,7 @@ def _command(words: list[str]) -> str:
 
 
 def _goodness(entry: Entry, evaluation: dict[str, Any]) -> tuple[float, ...]:
-    """Return a sort key: larger is better, in the order of the bar, then by return."""
+    """Return a sort key: larger is better, in the order of the required values, then by return."""
     values = []
     for name, bound in entry.bar.items():
         value = value_of(evaluation, name)
@@ -408,7 +408,7 @@ def main() -> int:
     collecting.add_argument("--all", type=Path, default=None, metavar="FOLDER")
     collecting.add_argument("task", nargs="?", choices=entries())
     collecting.add_argument("runs", nargs="*", type=Path)
-    collecting.add_argument("--machine", default=None, help="what it was trained on, if the run does not say it well")
+    collecting.add_argument("--machine", default=None, help="machine of the training, for the table")
     collecting.add_argument("--ship", action="store_true")
     adopting = commands.add_parser("adopt")
     adopting.add_argument("task", choices=entries())

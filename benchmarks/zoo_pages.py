@@ -84,11 +84,12 @@ def rows_of(zoo: Path, task: str) -> list[dict[str, Any]]:
 
 
 def results(zoo: Path, entry: Any) -> str:
-    """Return the bar and a table with one row per seed."""
+    """Return the required result and a table with one row per seed."""
     where = "one H200" if entry.device == "cuda" else "two CPU cores"
     held = (
-        f"Tier {entry.tier}. Bar: {bars(entry)} over {entry.episodes:,} episodes, after at most {entry.minutes:g} min"
-        f" of training on {where}. `make learn-{entry.name}` trains the task and checks the bar.\n"
+        f"Required result: {bars(entry)}, over {entry.episodes:,} episodes, after at most {entry.minutes:g} min of"
+        f" training on {where} ([tier {entry.tier}](index.md)). `make learn-{entry.name}`, in a checkout of rlcli,"
+        " trains the task and compares the result with the required one.\n"
     )
     rows = rows_of(zoo, entry.name)
     if not rows:
@@ -116,7 +117,7 @@ def results(zoo: Path, entry: Any) -> str:
 
 
 def bars(entry: Any) -> str:
-    """Format the bar as text."""
+    """Format the required result as text."""
     return ", ".join(
         f"{name} <= {bound['max']:g}" if isinstance(bound, dict) else f"{name} >= {bound:g}"
         for name, bound in entry.bar.items()
@@ -171,12 +172,13 @@ def index(zoo: Path, found: list[Any]) -> str:
         "```",
         "",
         "A success rate is the share of successful episodes; `error_vel_xy` [m/s] and `error_vel_yaw` [rad/s] are mean",
-        "errors of velocity commands; `speed` is in m/s. The page of a task defines its success. Several values are",
-        "those of several seeds. Tier A: the required result is reached within the time limit. Tier B: it is a lower",
-        "level, reached with one seed. *Manager-based* tasks are [lists of terms](../../tutorials/first-task.md),",
-        "*direct* tasks are [one Python class](../../tutorials/direct-task.md).",
+        "errors of velocity commands; `speed` is in m/s. The page of a task defines its success. Several values in a",
+        "cell are those of several seeds. Each task has a required result, in brackets, and a time limit for the",
+        "training. Tier A: the policy solves the task. Tier B: the required result is lower, and one seed reached it.",
+        "*Manager-based* tasks are [lists of terms](../../tutorials/first-task.md), *direct* tasks are",
+        "[one Python class](../../tutorials/direct-task.md).",
         "",
-        "| task | what the policy does | observations, actions | machine, minutes of the limit | result (required) |",
+        "| task | what the policy does | observations, actions | machine, time (of the limit) | result (required) |",
         "| --- | --- | --- | --- | --- |",
     ]
     shipped = _index_json()

@@ -162,14 +162,14 @@ def require_device(device: str) -> None:
     if kind == "cpu":
         return
     if kind != "cuda" or not (index or "0").isdecimal():
-        raise DeviceError(f"device '{device}' is not available: there are engines for cpu, cuda and cuda:N")
+        raise DeviceError(f"device '{device}' is not available; use cpu, cuda or cuda:N")
     import torch
 
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if int(index or 0) >= count:
         found = f"{count} CUDA devices" if count else "no CUDA device"
         message = f"device '{device}' is not available: torch {torch.__version__} sees {found}"
-        raise DeviceError(message, hint="--device cpu")
+        raise DeviceError(message, hint="use --device cpu")
 
 
 def choose_device(wanted: str) -> str:
@@ -187,7 +187,7 @@ def choose_device(wanted: str) -> str:
 
         return "cuda" if torch.cuda.is_available() and find_spec("mujoco_warp") else "cpu"
     if not re.fullmatch(r"cuda(:[0-9]+)?", wanted):
-        raise UsageError(f"no device '{wanted}'", hint="auto, cpu, cuda or cuda:N")
+        raise UsageError(f"no device '{wanted}'", hint="use auto, cpu, cuda or cuda:N")
     require_device(wanted)
     if find_spec("mujoco_warp") is None:
         raise DependencyError("the GPU engine needs mujoco-warp", hint='pip install "rlcli[gpu]"')

@@ -46,7 +46,7 @@ def create(name: str, flavour: str, folder: Path | None = None) -> tuple[Path, l
     try:
         _write(folder, files, name.replace("-", "_"))
     except OSError as error:
-        raise MachineError(f"cannot write {folder}: {error.strerror or error}", hint="--output FOLDER") from error
+        raise MachineError(f"cannot write {folder}: {error.strerror or error}", hint="give --output FOLDER") from error
     return folder, sorted([*files, _SCHEMA])
 
 
@@ -60,7 +60,7 @@ def check_name(name: str) -> None:
         rule = "a task name has only letters a-z, digits and single hyphens, and starts with a letter"
         raise UsageError(f"'{name}' is not a valid task name: {rule}", hint=_suggest_name(name))
     if len(name) > MAX_LENGTH:
-        raise UsageError(f"'{name}' has {len(name)} characters; a task name has at most {MAX_LENGTH}")
+        raise UsageError(f"'{name}' has {len(name)} characters; use at most {MAX_LENGTH}")
     package = name.replace("-", "_")
     for reserved, reason in (
         (keyword.iskeyword(package), "a keyword of Python"),
@@ -69,7 +69,7 @@ def check_name(name: str) -> None:
         (name in _DEVICES, "the name of a device on Windows"),
     ):
         if reserved:
-            raise UsageError(f"'{name}' cannot be a package: it is {reason}", hint=f"{name}-task, for example")
+            raise UsageError(f"'{name}' cannot be a package: it is {reason}", hint=f"use {name}-task, for example")
     owners = [f"{entry.distribution} {entry.version}" for entry in catalog(TASKS, hidden=True)[0] if entry.name == name]
     distribution, module = _installed(name), _module_file(package)
     if owners:
@@ -80,7 +80,7 @@ def check_name(name: str) -> None:
         message = f"a Python module '{package}' already exists: {module}"
     else:
         return
-    raise UsageError(message, hint=f"{name}-2, for example")
+    raise UsageError(message, hint=f"use {name}-2, for example")
 
 
 def render(name: str, flavour: str) -> dict[str, str]:
@@ -139,17 +139,17 @@ def _write(folder: Path, files: dict[str, str], package: str) -> None:
 
 def _check_folder(folder: Path) -> None:
     if os.path.lexists(folder) and not folder.is_dir():
-        raise UsageError(f"'{folder}' exists and is not a folder", hint="--output FOLDER")
+        raise UsageError(f"'{folder}' exists and is not a folder", hint="give another --output FOLDER")
     if folder.is_dir() and any(folder.iterdir()):
         inside = listing(sorted(path.name for path in folder.iterdir()), 5)
-        raise UsageError(f"the folder '{folder}' is not empty ({inside})", hint="--output FOLDER")
+        raise UsageError(f"the folder '{folder}' is not empty ({inside})", hint="give another --output FOLDER")
 
 
 def _suggest_name(name: str) -> str | None:
     """Return a hint with a valid name that is similar to an invalid one."""
     words = re.sub(r"([a-z0-9])([A-Z])", r"\1-\2", name)
     near = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-").lstrip("0123456789-")
-    return f"did you mean '{near}'?" if near and near != name and name.isascii() else "my-arm, for example"
+    return f"did you mean '{near}'?" if near and near != name and name.isascii() else "use my-arm, for example"
 
 
 def _installed(name: str) -> str | None:

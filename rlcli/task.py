@@ -42,10 +42,10 @@ class TaskSpec:
         if isinstance(self.terms, str):
             raise TypeError(f"terms must be a tuple of modules; write ({self.terms!r},)")
         if not isinstance(self.api, int) or self.api < 1:
-            raise TypeError(f"api is the number of a plugin interface, 1 or more, not {self.api!r}")
+            raise TypeError(f"api must be a whole number of 1 or more, found {self.api!r}")
         for name in ("package", "summary", "config", "policies"):
             if not isinstance(getattr(self, name), str):
-                raise TypeError(f"{name} is a string, not {getattr(self, name)!r}")
+                raise TypeError(f"{name} must be a string, found {getattr(self, name)!r}")
 
 
 # Aliases for the parameters of terms. A YAML file gives a name or regular expressions; the term receives the object or

@@ -53,7 +53,7 @@ def open_task(
         source = find_task(task)
         return make_env(cfg.model_copy(update={"scene": scene}), seed=seed, device=device, root=source.root)
     if isinstance(cfg, str):
-        raise TypeError(f"cfg must be a mapping or a list of overrides: [{cfg!r}]")
+        raise TypeError(f"cfg is a string; pass a mapping or a list of overrides: [{cfg!r}]")
     changes = leaves(cfg) if isinstance(cfg, Mapping) and cfg else ()
     overrides = () if cfg is None or isinstance(cfg, Mapping) else tuple(cfg)
     flags = {".".join(map(str, path)): value for path, value in changes} | {"scene.num_envs": num_envs}
@@ -141,7 +141,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             ValueError: if the mask is true for an environment whose episode has not ended.
         """
         if seed is not None and not isinstance(seed, int | np.integer):
-            raise TypeError(f"seed must be one number; each environment has its own stream of it; found {seed!r}")
+            raise TypeError(f"seed must be one number for all environments, found {seed!r}")
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
         # a mask of all environments is a full reset, unless all have ended and wait for their next episode
@@ -199,10 +199,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     def _start_episodes(self, mask: NDArray[np.bool_]) -> Floats:
         """Start the next episode in the environments of a mask."""
         if mask.shape != (self.num_envs,):
-            raise ValueError(f"reset_mask has shape {mask.shape}, expected {(self.num_envs,)}")
+            raise ValueError(f"reset_mask has shape {mask.shape}; pass shape {(self.num_envs,)}")
         running = np.flatnonzero(mask & ~self._ended).tolist()
         if running or self._last_obs is None:
-            raise ValueError(f"reset_mask is true for environments {running}, whose episodes have not ended")
+            raise ValueError(f"set reset_mask to false for environments {running}: their episodes have not ended")
         if mask.any():
             assert self._first is not None
             self._last_obs = np.where(mask[:, None], self._first, self._last_obs)

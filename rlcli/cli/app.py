@@ -138,7 +138,7 @@ def _run(arguments: list[str]) -> int:
         if not console.json:
             console.info(error.message)
             return 2
-        failure: RlcliError = UsageError("no command", hint="rlcli --help")
+        failure: RlcliError = UsageError("no command given", hint="rlcli --help lists the commands")
     except (Exception, KeyboardInterrupt) as error:
         failure = _as_rlcli_error(error, arguments)
         is_expected = isinstance(error, ClickException | KeyboardInterrupt | typer.Abort)
@@ -169,7 +169,7 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
     if known is not None:
         return known
     bug = RlcliError(
-        f"this is a bug in rlcli: {type(error).__name__}: {error}", hint="please report it with the lines above"
+        f"this is a bug in rlcli: {type(error).__name__}: {error}", hint="please report the bug with the lines above"
     )
     bug.kind = "bug"
     return bug
@@ -238,8 +238,8 @@ def _agent_models() -> set[type[BaseModel]]:
 
 _FOREIGN_OPTIONS = {
     "task": "the task is named without an option, as in: rlcli train cartpole",
-    "load-run": "a run or one of its checkpoints is named by --checkpoint RUN; rlcli train --resume RUN goes on",
-    "enable-cameras": "cameras of a task need no option",
+    "load-run": "--checkpoint RUN names a run or one of its checkpoints; rlcli train --resume RUN continues a run",
+    "enable-cameras": "leave it out: cameras of a task need no option",
 }
 """Option of another program -> what to write for rlcli."""
 _SHORT_FOR = {"lr": "learning_rate"}

@@ -58,7 +58,7 @@ class Layers:
         """Set one value, as an override does. Missing mappings on the path are created.
 
         Raises:
-            LookupError: if the path leads into a value that is no mapping, or to a list item that does not exist.
+            LookupError: if the path leads into a value that is not a mapping, or to a list item that does not exist.
         """
         target: Any = self.data
         taken: Path = ()
@@ -140,7 +140,7 @@ def read(file: FilePath, name: str | None = None, *, pipe: bool = False) -> Docu
     try:
         return strict_yaml.load(file.read_bytes() if pipe else read_plain(file, strict_yaml.MAX_BYTES))
     except OSError as error:
-        raise ConfigError([Problem(name, "", f"cannot be read: {error.strerror or error}")]) from None
+        raise ConfigError([Problem(name, "", f"cannot be read: {error.strerror or error}; check the path")]) from None
     except YamlError as error:
         place = f"{name}:{error.line}:{error.column}" if error.line else name
         raise ConfigError([Problem(place, "", error.message)]) from None
@@ -186,7 +186,7 @@ def parse_override(text: str) -> tuple[Path, Any]:
     where = f"override '{text}'"
     match = _OVERRIDE.fullmatch(text)
     if match is None:
-        raise ConfigError([Problem(where, "", "is not of the form key.path=value")])
+        raise ConfigError([Problem(where, "", "is not an override; write KEY.PATH=VALUE, as in scene.num_envs=64")])
     path = parse_address(match[1])
     try:
         return path, strict_yaml.load_value(match[match.lastindex or 0])
@@ -201,7 +201,7 @@ def parse_address(text: str) -> tuple[str, ...]:
 
 def _index(target: list[Any], step: str | int, taken: Path) -> int:
     if not str(step).isdecimal() or int(step) >= len(target):
-        raise LookupError(f"'{taken[-1]}' is a list of {len(target)}, and '{step}' is not one of its indices")
+        raise LookupError(f"'{taken[-1]}' is a list of {len(target)} items: give an index from 0 instead of '{step}'")
     return int(step)
 
 

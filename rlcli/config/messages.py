@@ -118,7 +118,7 @@ def _message(
         hint = did_you_mean(found, choices) or _unquoted(found, items)
     elif isinstance(found, dict) and found and all(key.isdecimal() for key in found):
         # an override of one item, such as `size.0=1`, created a mapping
-        hint = "its default has no items to change; give the whole list"
+        hint = "the default is not a list, so no single item can change; give the whole list"
     return f"expected {' or '.join(dict.fromkeys(map(_expected, items)))}, found {format_value(found)}", hint, path
 
 

@@ -115,7 +115,7 @@ def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
         value = value.__rlcli_agent__(notes)
     plain = _PlainData({}, "agent").plain(value, ())
     if not isinstance(plain, dict):
-        raise TypeError(f"expected an agent's settings, found a {type(value).__name__}")
+        raise TypeError(f"the agent is a {type(value).__name__}; write a mapping of settings")
     return plain
 
 
@@ -151,7 +151,7 @@ class _PlainData:
             return self.plain(value.tolist(), path)
         if isinstance(value, Sequence | set | frozenset):
             return [self.plain(item, (*path, index)) for index, item in enumerate(value)]
-        self._problem(path, f"a {type(value).__name__} cannot be written to a file")
+        self._problem(path, f"a {type(value).__name__} cannot be written to YAML; use numbers, text, lists or mappings")
         return None
 
     def _term(self, term: object, path: tuple[str | int, ...]) -> str:
@@ -239,7 +239,7 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         raise TaskError(f"{source.root} does not register '{wanted}'", hint=f"it registers {listing(found)}")
     if not wanted and len(found) != 1:
         hint = f"name one: {' or '.join(f'{source.root}:{name}' for name in found)}" if found else None
-        raise TaskError(f"{source.root} registers {len(found)} tasks with an env_cfg_entry_point", hint=hint)
+        raise TaskError(f"{source.root} registers {len(found)} tasks with env_cfg_entry_point, expected 1", hint=hint)
     kwargs = found[wanted or next(iter(found))]
     ending = "_cfg_entry_point"
     agents = {
@@ -264,7 +264,7 @@ def _object(entry: object) -> Any:
 def _add_agent(task: PythonTask, name: str, agent: object) -> None:
     if isinstance(agent, str) or not (isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__")):
         what = agent if isinstance(agent, str) else type(agent).__name__
-        task.notes.append(Note("", f"agents.{name}", "ignored", f"{what} is not an agent in a form that rlcli reads"))
+        task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}: write a mapping"))
         return
     agents = task.data.setdefault("agents", {})
     agents.setdefault("default", name)

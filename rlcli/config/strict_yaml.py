@@ -85,13 +85,13 @@ def load_value(text: str) -> Any:
 
 def _decode(text: str | bytes) -> str:
     if len(text) > MAX_BYTES:
-        raise YamlError(f"larger than {MAX_BYTES} bytes")
+        raise YamlError(f"the file is larger than {MAX_BYTES} bytes; make it smaller")
     if isinstance(text, bytes):
         try:
             text = text.decode("utf-8")
         except UnicodeDecodeError as error:
             before = error.object[: error.start].decode("utf-8")
-            raise YamlError(f"not UTF-8: {error.reason}", place=_after(before)) from None
+            raise YamlError(f"not UTF-8: {error.reason}; save as UTF-8", place=_after(before)) from None
     return text.removeprefix("\ufeff")  # the byte order mark
 
 
@@ -137,12 +137,12 @@ class _Reader:
         documents = 0
         for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
             if count > MAX_ITEMS:
-                raise YamlError(f"more than {MAX_ITEMS} items", event.start_mark)
+                raise YamlError(f"the file has more than {MAX_ITEMS} items; make it smaller", event.start_mark)
             self._refuse(event)
             if isinstance(event, events.DocumentStartEvent):
                 documents += 1
                 if documents > 1:
-                    raise YamlError("only one document per file", event.start_mark)
+                    raise YamlError("only one document per file is allowed; remove the line `---`", event.start_mark)
             elif isinstance(event, events.ScalarEvent):
                 self._put(_scalar(event, key=self._awaits_key()), event.start_mark)
             elif isinstance(event, events.MappingStartEvent):
@@ -162,13 +162,13 @@ class _Reader:
             raise YamlError("anchors and aliases are not allowed; write the value again", event.start_mark)
         tag = getattr(event, "tag", None)
         if tag not in (None, "!"):
-            raise YamlError(f"tags are not allowed ({str(tag)[:60]})", event.start_mark)
+            raise YamlError(f"tags are not allowed; remove {str(tag)[:60]}", event.start_mark)
 
     def _open(self, container: dict[str, Any] | list[Any], mark: Any) -> None:
         if len(self.stack) >= MAX_DEPTH:
-            raise YamlError(f"nested deeper than {MAX_DEPTH} levels", mark)
+            raise YamlError(f"values are nested deeper than {MAX_DEPTH} levels; write them flatter", mark)
         if self._awaits_key():
-            raise YamlError("keys must be text", mark)
+            raise YamlError("a key must be text, not a list or mapping; write `name: value`", mark)
         self.stack.append(_Frame(container, self._put(container, mark)))
 
     def _put(self, value: Any, mark: Any) -> Path:
@@ -196,7 +196,7 @@ class _Reader:
             raise YamlError(f"keys must be text, found {key!r}; quote it", mark)
         path = (*frame.path, key)
         if key in frame.container:
-            raise YamlError(f"duplicate key '{key}' (first on line {self.marks[path][0]})", mark)
+            raise YamlError(f"duplicate key '{key}' (first on line {self.marks[path][0]}); remove one", mark)
         frame.key = key
         self.marks[path] = (mark.line + 1, mark.column + 1)
         return path
@@ -206,11 +206,11 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
     """Return the value of a scalar by the rules of YAML 1.2; refuse scalars that other parsers read differently."""
     text = event.value
     if len(text) > MAX_SCALAR:
-        raise YamlError(f"a value longer than {MAX_SCALAR} characters", event.start_mark)
+        raise YamlError(f"the value is longer than {MAX_SCALAR} characters; shorten it", event.start_mark)
     if not event.implicit[0]:  # quoted or block: always text
         return text
     if key and text == "<<":
-        raise YamlError("merge keys (<<) are not allowed", event.start_mark)
+        raise YamlError("merge keys (<<) are not allowed; write the values again", event.start_mark)
     if text in _CONSTANTS:
         return _CONSTANTS[text]
     if _OCTAL.match(text):
@@ -220,10 +220,10 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
     if _FLOAT.match(text):
         number = float(text)
         if math.isinf(number):
-            raise YamlError(f"the number {text[:20]} is out of range", event.start_mark)
+            raise YamlError(f"the number {text[:20]} is out of range; allowed: up to 1.8e308", event.start_mark)
         return number
     if _NOT_FINITE.match(text):
         raise YamlError(f"{text} is not allowed; write a number, or null for none", event.start_mark)
     if text.lower() in _WORDS:  # y and n are allowed, because x, y and z are names of parameters
-        raise YamlError(f"{text} is ambiguous; write true or false, or quote it", event.start_mark)
+        raise YamlError(f"{text} is ambiguous; write true or false, or quote the text", event.start_mark)
     return text

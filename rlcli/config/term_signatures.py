@@ -157,14 +157,14 @@ def signature_of(term: Any, name: str) -> Signature:
         file, source = inspect.getsourcefile(term), inspect.getsource(term)
         node = ast.parse(textwrap.dedent(source)).body[0]
     except (OSError, TypeError, SyntaxError, IndexError):
-        raise SignatureError("its source cannot be read; define it at the top of a file") from None
+        raise SignatureError("the term's source cannot be read; define it at the top of a file") from None
     call: ast.stmt | None = node
     if isinstance(node, ast.ClassDef):
         call = constructor(SourceClass(Path(file or "?"), node), ClassSearch())
     if not isinstance(node, ast.FunctionDef | ast.ClassDef) or not isinstance(call, ast.FunctionDef):
         raise SignatureError("a term is a function (env, *, ...), or a class whose __init__ takes (self, env, *, ...)")
     if not _takes_env(call.args, 1 if isinstance(node, ast.ClassDef) else 0):
-        raise SignatureError("its first parameter must be 'env'")
+        raise SignatureError("the first parameter of a term must be 'env'; write (env, *, ...)")
     return replace(_signature(node, call, name, Path(file or "?")), target=term)
 
 
@@ -211,7 +211,7 @@ def _params_model(signature: Signature, section: str) -> type[schema.TermConfig]
         raise SignatureError(signature.error)
     reserved = (*SECTIONS[section].model_fields, "params")
     if taken := [p.name for p in signature.parameters if p.name in reserved]:
-        raise SignatureError(f"parameter '{taken[0]}': every term of {section} already has a key of this name")
+        raise SignatureError(f"rename parameter '{taken[0]}': every term of {section} has a key of this name")
     fields: dict[str, Any] = {p.name: (p.type, ... if p.required else p.default) for p in signature.parameters}
     return _model(signature.name, _closed(section), fields)
 
@@ -313,9 +313,9 @@ def _selector_error(parameters: list[Parameter]) -> str | None:
 
 def _parameter(argument: ast.arg, default: ast.expr | None) -> Parameter:
     if argument.annotation is None:
-        raise SignatureError("has no annotation")
+        raise SignatureError("has no annotation; write one, as in `scale: float`")
     if argument.arg.startswith("_"):
-        raise SignatureError("starts with an underscore, which is not allowed for a key of a YAML file")
+        raise SignatureError("starts with an underscore, which a YAML key must not; rename it")
     return Parameter(
         argument.arg,
         annotation_type(argument.annotation),
@@ -340,7 +340,7 @@ def _quoted(text: str) -> ast.expr:
     try:
         return ast.parse(text, mode="eval").body
     except (SyntaxError, ValueError):
-        raise SignatureError(f"annotation '{text}' is not valid Python") from None
+        raise SignatureError(f"annotation '{text}' is not valid Python; write a type, as in 'float'") from None
 
 
 def _literal(node: ast.expr) -> Any:
@@ -348,7 +348,7 @@ def _literal(node: ast.expr) -> Any:
     try:
         return ast.literal_eval(node)
     except (ValueError, TypeError):
-        message = f"'{ast.unparse(node)}' is not a literal, and files are checked without running them"
+        message = f"the default '{ast.unparse(node)}' is not a literal; write a number, text, list or mapping"
         raise SignatureError(message) from None
 
 

@@ -178,7 +178,7 @@ class TaskCheck:
         """Add the problem that a change of `agent` has no agent to apply to."""
         names = agent_names(self.layers)
         if not names:
-            self.problems.append(Problem(where, "agent", "this task has no agents"))
+            self.problems.append(Problem(where, "agent", "this task has no agents; add agents: to its YAML"))
         elif not self.problems:  # otherwise the choice of the agent was wrong and is reported already
             hint = f"name one: --agent {' or '.join(names)}"
             self.problems.append(Problem(where, "agent", "the task has several agents and no default", hint))
@@ -190,7 +190,7 @@ class TaskCheck:
             return
         for key in PATCHES:
             if key in patch:
-                self.problem((*at, key), f"'{key}' cannot be patched here")
+                self.problem((*at, key), f"'{key}' cannot be changed by a patch; remove it here")
         task = {key: value for key, value in patch.items() if key not in PATCHES}
         self.layers.merge(task, lambda path: Origin(layer, self.layers.place(at + path)))
 
@@ -217,7 +217,7 @@ class TaskCheck:
     # --- validation ---
 
     def agent(self, name: str) -> tuple[TrainerSpec | None, AgentConfig | None]:
-        """Return the agent's trainer and its validated settings; None for what is not valid."""
+        """Return the agent's trainer and its validated settings; None if they are not valid."""
         at: Path = ("agents", name)
         for path in (("agents",), at):
             data = self.layers.get(path)
@@ -256,7 +256,7 @@ class TaskCheck:
             return spec, _AnyAgent
         model = load_entry(replace(entry, value=spec.algorithms[algorithm]), type)
         if not issubclass(model, AgentConfig):
-            raise TaskError(f"plugin {entry.distribution} {entry.version} is broken: {model} is not an AgentConfig")
+            raise TaskError(f"plugin {entry.distribution} {entry.version} is broken: make {model} an AgentConfig")
         return spec, model
 
     def task(self) -> TaskConfig | None:
@@ -337,8 +337,8 @@ class TaskCheck:
             return None  # the problem is reported already
         if model is None:
             if values:
-                reason = "the class of this task has no Params" if self.source.task else "only direct tasks have params"
-                self.problem(("params",), reason)
+                reason = "the task's class has no Params" if self.source.task else "only direct tasks have params"
+                self.problem(("params",), f"remove them: {reason}")
             return {}
         checked = self._validate(model, values, ("params",))
         return checked.model_dump() if checked is not None else None
@@ -363,7 +363,7 @@ class TaskCheck:
         groups = data.get("observations", {})
         policy = groups.get("policy", {}) if isinstance(groups, dict) else None
         if isinstance(policy, dict) and not any(isinstance(term, dict) for term in policy.values()):
-            self.problem(("observations",), "needs a group 'policy' with at least one term")
+            self.problem(("observations",), "the observations need a group 'policy' with at least one term: add one")
 
     def _require_direct(self, data: Mapping[str, Any]) -> None:
         """Check the block of another framework's format, and that a direct task has no terms."""

@@ -103,13 +103,13 @@ class ClosedLoopResult:
         """Return the checks as (name, value found, largest value allowed, whether the check passed)."""
         synchronized = self.synchronized_return
         returns = self.return_difference if synchronized is None else self._relative(synchronized)
-        suffix = "" if synchronized is None else ", rounding set aside"
+        suffix = "" if synchronized is None else " (re-synchronised)"
         checks = (
-            ("description: places unlike the task", float(len(self.differing)), 0.0),
-            ("action: the file against the policy", self.differences["action"], TOLERANCE),
-            ("observation: formulas against the task", self.differences["observation"], CLOSE),
-            ("control: formulas against the task", self.differences["control"], CLOSE),
-            (f"return: plain MuJoCo against the evaluation{suffix}", returns, RETURN),
+            ("description: entries that differ from the task", float(len(self.differing)), 0.0),
+            ("action: exported file - policy", self.differences["action"], TOLERANCE),
+            ("observation: formulas - task", self.differences["observation"], CLOSE),
+            ("control: formulas - task", self.differences["control"], CLOSE),
+            (f"return: plain MuJoCo - evaluation{suffix}", returns, RETURN),
         )
         return [(name, found, allowed, found <= allowed) for name, found, allowed in checks]
 
@@ -187,7 +187,7 @@ def verify(
     code = generate_program(file, model, format_)
     program = file.parent / PROGRAM
     if not write_program(file.parent, code):
-        _log.warning(f"{program} has other content than export writes and is not replaced; delete it to get a new one")
+        _log.warning(f"{program} was changed and is not replaced; delete it to get a new one")
     _log.info(f"{file.name} controls plain MuJoCo with {model.name} for {episodes} episodes")
     differing = deployment_differences(checkpoint, env.layout.record(), reference.deployment, _may_randomize(env))
     space: dict[str, Any] = {"__name__": "run_policy"}
@@ -241,7 +241,7 @@ class _PlainMujocoRunner:
     def __init__(self, env: VecEnv, policy: Policy, controller: Any, model: mujoco.MjModel, synchronize: bool) -> None:
         engine = env.engine.replayable
         if engine is None:
-            raise UsageError("--verify needs the CPU engine, and the task sets another one in sim.engine")
+            raise UsageError("--verify needs the CPU engine: set sim.engine to auto or batch")
         self._env, self._engine, self._synchronize = env, engine, synchronize
         self.steps = 0
         self.disagreeing_steps = 0
@@ -364,7 +364,7 @@ class _PlainMujocoRunner:
         mujoco.mj_setState(self._models[i], self._datas[i], row, int(mujoco.mjtState.mjSTATE_INTEGRATION))
 
     def _inputs(self, i: int, obs: Tensor) -> dict[str, np.ndarray]:
-        """Return what plain code cannot compute: commands, and observation terms without a formula."""
+        """Return the inputs that plain code cannot compute: commands, and observations without a formula."""
         commands = getattr(self._env, "command_manager", None)
         inputs = {
             f"command/{term.name}": term.instance.command[i].numpy()
@@ -386,11 +386,11 @@ class _PlainMujocoRunner:
         for name in ("nq", "nv", "nu", "na", "nbody", "nsensordata"):
             written, wanted = getattr(model, name), getattr(own, name)
             if written != wanted:
-                raise CheckpointError(f"the written model has {name} = {written}, the run's model has {wanted}")
+                raise CheckpointError(f"export again: {name} is {written} in the file and {wanted} in the run")
 
 
 def _metadata_error(error: Exception) -> CheckpointError:
-    return CheckpointError(f"the file's metadata does not fit the model: {type(error).__name__}: {error}")
+    return CheckpointError(f"the metadata do not fit the model; export again: {type(error).__name__}: {error}")
 
 
 def _control_bounds(controller: Any, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -89,7 +89,7 @@ def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any
         terms.append(_observation(term.name, term.config.func, term.config.params, begin, width, value=value))
         begin += width
     if begin != task.num_observations:
-        message = f"{type(task).__name__}.in_terms() has {begin} columns, the task has {task.num_observations}"
+        message = f"{type(task).__name__}.in_terms() must have {task.num_observations} columns, not {begin}"
         raise ConfigError([Problem("observations", "observations", message)])
     groups["policy"] = terms
     return groups, _controls(env, bound["actions"])
@@ -99,7 +99,7 @@ def _bind(env: DirectEnv, section: str, number: int, entry: Mapping[str, Any]) -
     path = (section, f"{entry['func']}_{number}")
     signature = env.resolved.vocabulary.find(section, entry["func"])
     if signature is None:
-        raise ConfigError([Problem(section, ".".join(path), f"no term '{entry['func']}'")])
+        raise ConfigError([Problem(section, ".".join(path), f"no term '{entry['func']}'; rlcli terms lists all")])
     checked = params_model(signature, section).model_validate(dict(entry), strict=False)
     base = ObservationConfig if section == "observations" else ActionConfig
     term = env._binder.bind(section, path, base.model_construct(**dict(checked)))

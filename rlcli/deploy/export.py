@@ -70,7 +70,7 @@ def check_target(format_: str, output: Path | None) -> None:
 
 
 def refusal(spec: PolicySpec) -> str | None:
-    """Return why a policy cannot be exported; None: it can."""
+    """Return the reason why a policy cannot be exported; None if it can be exported."""
     if len(set(spec.memory)) > 1:
         return f"recurrent layers of different sizes ({', '.join(map(str, spec.memory))})"
     return None
@@ -112,7 +112,7 @@ def export(
         write_synced(temporary, formats.write(format_, graph, text, mjlab_properties(metadata)))
         run, found = formats.read(format_, temporary)
         if json.loads(found) != metadata:
-            raise VerdictError(f"{file} is not kept: its metadata differ after writing and reading")
+            raise VerdictError(f"{file} is not kept: its metadata cannot be read back; report this bug")
         difference = _require_equal(run, graph, observations, file)
     return Exported(file, metadata, len(observations), difference)
 

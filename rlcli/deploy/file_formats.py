@@ -137,10 +137,10 @@ def require_self_contained(data: bytes, file: Path) -> None:
     try:
         model = onnx.load_from_string(data)
     except DecodeError:
-        raise CheckpointError(f"{file} is corrupt, or not an ONNX file") from None
+        raise CheckpointError(f"{file} is not a valid ONNX file; export it again") from None
     for value in _external_tensors(model):
         where = next((entry.value for entry in value.external_data if entry.key == "location"), "?")
-        raise CheckpointError(f"{file} stores '{value.name[:60]}' in another file, {where[:80]!r}; it is not opened")
+        raise CheckpointError(f"{file} stores '{value.name[:60]}' in another file, {where[:80]!r}; save it in one file")
 
 
 def _external_tensors(part: Any) -> Iterator[Any]:

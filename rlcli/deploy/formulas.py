@@ -150,7 +150,7 @@ def _down(entity: Entity) -> Formula:
 
 
 def _require_no_terrain(env: VecEnv) -> None:
-    """Refuse terrain: positions are relative to the environment's origin, which is the world's only without terrain."""
+    """Refuse terrain: positions are relative to the environment's origin, the world's origin only without terrain."""
     if env.terrain is not None:
         raise NoFormula
 

@@ -89,7 +89,7 @@ def metadata_of(
 
 
 def mjlab_properties(metadata: dict[str, Any], entity: str = "robot") -> dict[str, str]:
-    """Return the metadata properties of mjlab 1.6's ONNX files, so that programs for those can read these.
+    """Return the metadata properties of mjlab 1.6's ONNX files, which programs for mjlab can read.
 
     Items of a list are separated by commas, items of an inner list by semicolons. Properties that the checkpoint does
     not have are left out, and lists of names if a name contains a separator.

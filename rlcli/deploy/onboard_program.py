@@ -61,7 +61,7 @@ def check_overwrites(policy: Path) -> None:
     """
     if policy.name == PROGRAM:
         message = f"--verify writes its program to {PROGRAM}, so the policy needs another name"
-        raise UsageError(message, hint="--output FILE")
+        raise UsageError(message, hint="give --output FILE")
     model = policy.with_name(MODEL)
     try:
         with model.open("rb") as file:
@@ -71,7 +71,7 @@ def check_overwrites(policy: Path) -> None:
     except OSError:  # a folder, or no permission
         is_exported = False
     if not is_exported:
-        message = f"--verify would overwrite {model}, which export has not written"
+        message = f"--verify would overwrite {model}, which is not a file of rlcli export"
         raise UsageError(message, hint="give an --output in an empty folder")
 
 

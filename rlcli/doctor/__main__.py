@@ -104,7 +104,7 @@ def _warp() -> dict[str, Any] | None:
 def _render_image(backend: str) -> dict[str, Any]:
     """Render an image offscreen with plain MuJoCo, as videos do; rlcli's renderer would take seconds to import."""
     if backend == "glfw" and not has_display():
-        raise MachineError("there is no display")
+        raise MachineError("there is no display; set DISPLAY, or use MUJOCO_GL=egl")
     os.environ["MUJOCO_GL"] = backend
     import mujoco
     import numpy as np

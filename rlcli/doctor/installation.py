@@ -38,7 +38,7 @@ def installation_checks() -> list[Check]:
 def metadata_checks() -> list[Check]:
     """Return one broken check for each distribution whose metadata cannot be read."""
     bad = unreadable_distributions()
-    hint = "install that package again, or remove the folder; it breaks other programs than rlcli too"
+    hint = "reinstall that package, or delete the folder; it breaks other programs too"
     return [Check(f"metadata of {each.distribution}", "broken", each.reason, hint) for each in bad]
 
 
@@ -56,7 +56,7 @@ def entry_checks(group: str, timeout_s: float, stop: threading.Event) -> list[Ch
         if row.broken:
             state, hint = "broken", _remedy(entry, row.broken)
         elif owners:
-            state, hint = "warning", f"{owners} offers a task of the same name; write {entry.qualified}"
+            state, hint = "warning", f"{owners} has a task of the same name; write {entry.qualified}"
         text = f"{entry.distribution} {entry.version}: {row.broken or row.summary or 'loads'}"
         checks.append(Check(f"{kind} {entry.name}", state, text, hint, {"distribution": entry.distribution}))
     return checks

@@ -74,7 +74,7 @@ def gpu_checks(gpu: Answer | None) -> list[Check]:
         return [Check("gpu", "ok", "none; the CPU engine needs none")]
     answer, reason = gpu
     if answer is None:
-        return [Check("gpu", "warning", f"a driver is installed, but its check failed: {reason}", "nvidia-smi")]
+        return [Check("gpu", "warning", f"a driver is installed, but its check failed: {reason}", "run nvidia-smi")]
     driver, cuda, warp = answer["driver_cuda"], answer["torch_cuda"], answer["warp"]
     failure, warp_package = answer["torch_error"], version("mujoco-warp")
     text, hint = f"{', '.join(answer['devices'])}; driver CUDA {driver or '?'}, torch CUDA {cuda}", None

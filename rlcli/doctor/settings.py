@@ -32,7 +32,7 @@ def _file() -> Check:
     try:
         found = read_settings()
     except ConfigError as error:
-        hint = f"edit {file}; to ignore the file until then, set RLCLI_SETTINGS=none"
+        hint = f"edit {file}, or set RLCLI_SETTINGS=none to ignore it"
         return Check("settings", "broken", "; ".join(map(str, error.problems)), hint, {"file": str(file)})
     text = ", ".join(f"{key}: {value}" for key, value in found.items()) or "sets nothing"
     text = f"{file}: {text}" if file.exists() else f"none; the file would be {file}"
@@ -64,7 +64,7 @@ def harmful_variables(variables: dict[str, str], cores: int) -> dict[str, str]:
         found["OMP_THREAD_LIMIT"] = "fewer threads than the default of agent.torch_threads"
     for name, spinning in (("OMP_WAIT_POLICY", "active"), ("KMP_BLOCKTIME", "infinite")):
         if variables.get(name, "").strip().lower() == spinning:
-            found[name] = "waiting OpenMP threads spin and occupy cores that the engine needs"
+            found[name] = "waiting OpenMP threads occupy cores that the engine needs; unset it"
     if variables.get("LOCAL_WORLD_SIZE", "1") not in ("", "1"):
         found["LOCAL_WORLD_SIZE"] = "the cores are divided by this number, as a launcher of several processes needs it"
     return found

@@ -16,7 +16,7 @@ from rlcli.sim.tensor_state import TensorState
 
 
 class EpisodeCounters(TensorState):
-    """Counters of all environments. Each is also a field: the form that selections read and write fastest."""
+    """Counters of all environments, also in the form of fields, which selections read and write fastest."""
 
     def __init__(self, shard: Shard, device: torch.device) -> None:
         num_envs = shard.count

@@ -135,7 +135,7 @@ class DirectTask:
     def draws(self, env_ids: Tensor, name: str = "reset") -> IdSelection:
         """Return random numbers for the running episodes: `draws(ids).uniform(-1, 1, (k,))` is (n, k).
 
-        They depend only on the seed, the environment, its episode and `name`.
+        The numbers depend only on the seed, the environment, its episode and `name`.
         """
         ids, episodes = env_ids.cpu().numpy(), self.env.episode_index.cpu().numpy()
         device = None if self.device.type == "cpu" else self.device
@@ -143,10 +143,10 @@ class DirectTask:
         return IdSelection(ids, self.env.seed, episodes[ids], key, device, self.env.stream_ids)
 
     def selection(self, mask: Tensor, name: str) -> Selection | None:
-        """Return the environments where `mask` (num_envs,) holds, to draw in the middle of an episode; None for none.
+        """Return a selection of the environments where `mask` (num_envs,) is true, for draws during an episode.
 
-        Draws depend only on the seed, the environment, its episode, the step in that episode and `name`. A GPU never
-        returns None, because a test of the mask would force a host sync.
+        Return None if there is no such environment. Draws depend only on the seed, the environment, its episode, the
+        step in that episode and `name`. A GPU never returns None, because a test of the mask would force a host sync.
         """
         env = self.env
         counters = env.episode_index * (self.max_episode_length + 1) + env.episode_length_buf
@@ -184,7 +184,7 @@ class DirectEnv(VecEnv):
                 f"task '{source.name}' is broken: {source.task}: {type(error).__name__}: {error}"
             ) from error
         if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
-            raise TaskError(f"task '{source.name}' is broken: {source.task} is not a DirectTask")
+            raise TaskError(f"task '{source.name}' is broken: derive {source.task} from DirectTask")
         return task_class
 
     def _build_workflow(self) -> None:
@@ -335,7 +335,8 @@ class DirectEnv(VecEnv):
     def _compute_observations(self) -> dict[str, Tensor]:
         """Return the observations of the current state.
 
-        Running environments have theirs from `_compute_rewards_and_dones`; only those just reset are observed again.
+        `_compute_rewards_and_dones` has computed those of running environments; only environments that were just reset
+        are observed again.
         """
         task, obs, states = self.task, next(self._obs), next(self._states)
         if not self._obs_current:

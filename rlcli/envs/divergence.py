@@ -62,7 +62,7 @@ class DivergenceGuard:
         if engine.asynchronous and self._env.observers.on_divergence and engine.described_divergences:
             self._env.observers.run_on_divergence(engine.described_divergences, pending=False)
         for what in not_finite:
-            raise DivergedError(f"{what} is not finite, within the last steps before step {self._env.common_step}")
+            raise DivergedError(f"{what} is not finite shortly before step {self._env.common_step}; lower sim.dt")
 
     def after_physics(self) -> Tensor | None:
         """Refresh the state after physics, and return diverged environments to a finite one.
@@ -133,7 +133,7 @@ class DivergenceGuard:
             first += shard.first
         raise DivergedError(
             f"{what} is not finite in {int(rows.sum())} of {among}, first in environment {first}{name}"
-            f" (step {env.common_step})"
+            f" (step {env.common_step}); lower sim.dt, or look for divisions by 0"
         )
 
     def _restore_diverged(self, selection: Selection) -> None:

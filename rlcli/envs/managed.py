@@ -94,8 +94,8 @@ class ManagedEnv(VecEnv):
     def episode_dependencies(self) -> list[str]:
         """Return the terms that make an episode depend on earlier ones.
 
-        They draw by the step of training, keep state beyond a reset, or are classes of a task's own, which may do
-        either.
+        Such a term draws random numbers that depend on the training step, keeps state beyond a reset, or is a class of
+        the task, which may do both.
         """
         found = [*super().episode_dependencies(), *(f"actuators.{name}" for name in self.actuators)]
         found += [

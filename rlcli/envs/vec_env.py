@@ -144,7 +144,7 @@ class VecEnv(Workflow):
         9. Observations are computed.
         """
         if not self._playing:
-            raise RuntimeError("the environment is paused")
+            raise RuntimeError("the environment is paused; call pause(False) before step()")
         for before_step in self.observers.before_step:
             before_step()
         start = time.perf_counter()
@@ -177,7 +177,7 @@ class VecEnv(Workflow):
             DivergedError: for a number that is not finite.
         """
         if action.shape != shape:
-            raise ValueError(f"action has shape {tuple(action.shape)}, expected {shape}")
+            raise ValueError(f"action has shape {tuple(action.shape)}; pass shape {shape}")
         self.engine.use_torch_stream()
         if restart is not None:
             action = action.masked_fill(restart[:, None], 0.0)

@@ -117,7 +117,8 @@ class Workflow(Environment):
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the task's own numbers to log, for `StepObserver.on_step`. (num_envs,) each
 
-        They are of the state before resets. `Episodes.metrics` has the metrics of commands, as means over episodes.
+        The numbers describe the state before resets. `Episodes.metrics` has the metrics of commands, as means over
+        episodes.
         """
         return {}
 

@@ -129,13 +129,13 @@ def _require_same_task(name: str, first: PolicyInTask, other_name: str, other: P
     """
     ours, theirs = first.resolved.source, other.resolved.source
     if (ours.distribution, ours.name) != (theirs.distribution, theirs.name):
-        raise UsageError(f"{name} is for the task {ours.name}, but {other_name} for {theirs.name}")
+        raise UsageError(f"compare policies of one task: {name} is for {ours.name}, {other_name} for {theirs.name}")
     left, right = _settings(first.resolved), _settings(other.resolved)
     problems = []
     for path in sorted({*left, *right}):
         ours, theirs = left.get(path, _MISSING), right.get(path, _MISSING)
         if ours != theirs:
-            message = f"{shorten(theirs, 60)}, but {shorten(ours, 60)} in {name}"
+            message = f"is {shorten(theirs, 60)}, but {shorten(ours, 60)} in {name}"
             problems.append(Problem(other_name, path, message))
     if problems:
         hint = "add KEY.PATH=VALUE to use the same value for both"

@@ -1,4 +1,4 @@
-"""Evaluation of a policy on a fixed number of first episodes of each environment, without a bias to short ones."""
+"""Evaluation of a policy: a fixed number of episodes of each environment, so that short episodes are not favoured."""
 
 from __future__ import annotations
 

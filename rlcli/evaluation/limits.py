@@ -61,7 +61,7 @@ class Limit:
         """Return why an evaluation fails this limit; None if it holds."""
         value = self.value_in(summary)
         if value is None:
-            return f"{self.key} is unknown after one episode, the limit is {self.value:g}"
+            return f"{self.key} needs two or more episodes; the limit is {self.value:g}"
         if self.is_minimum and value < self.value:
             return f"{self.key} is {value:.6g}, below {self.value:g}"
         if not self.is_minimum and value > self.value:
@@ -74,7 +74,7 @@ class Limit:
             hint = did_you_mean(name, entries) or f"allowed: {listing(entries)}"
             return UsageError(f"{option}: there is no {group}.{name}", hint=hint)
         if same := _ending_in(entries, name):
-            return UsageError(f"{option}: the name is ambiguous", hint=listing(same))
+            return UsageError(f"{option}: '{name}' is ambiguous", hint=f"write one of {listing(same)}")
         names = [*_KEYS, *entries]
         hint = did_you_mean(name, names) or f"allowed: {listing(names)}"
         return UsageError(f"{option}: the task logs no value '{name}'", hint=hint)
@@ -101,7 +101,7 @@ def require_success(resolved: Resolved, keys: Iterable[str]) -> None:
         UsageError: if it does not.
     """
     if any(key.partition(".")[0] == "success" for key in keys) and resolved.task.success is None:
-        raise UsageError("this task defines no success", hint="add `success:` to its YAML, or use return=X")
+        raise UsageError("the task defines no success", hint="add `success:` to its YAML, or use return=X")
 
 
 def failures(summary: Mapping[str, Any], limits: Iterable[Limit]) -> list[str]:

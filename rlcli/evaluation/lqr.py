@@ -119,7 +119,7 @@ def riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix) -> Matrix | None:
 
 
 def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Return deviations of states and actions, of the states after one step, of its observations; and those at rest.
+    """Return deviations from the default state: inputs, next states and observations; and the observation at rest.
 
     The first three are half the differences of pairs on both sides of the default state, so that quadratic and other
     even terms cancel.
@@ -179,4 +179,4 @@ def _coordinates(env: VecEnv) -> list[str]:
 
 
 def _no_regulator(resolved: Resolved, why: str) -> UsageError:
-    return UsageError(f"there is no LQR of {resolved.source.name}: {why}", hint="other policies: trained, zero, random")
+    return UsageError(f"there is no LQR of {resolved.source.name}: {why}", hint="use --policy trained, zero or random")

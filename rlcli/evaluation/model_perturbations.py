@@ -35,7 +35,7 @@ class ModelPerturbation:
         if field not in FIELDS:
             raise unknown_parameter(sweep.parameter, [name for name in FIELDS if "." not in name])
         if not env.engine.can_expand(field):
-            raise NameProblem(f"'{field}' cannot differ between environments on this engine")
+            raise NameProblem(f"'{field}' cannot differ between environments on a GPU; use --device cpu")
         self._sweep, self._values = sweep, values
         rows, names = _rows(env, field, sweep.element)
         self._parts = [_Part(env, field, rows, _axes(env, field, sweep))]
@@ -47,8 +47,8 @@ class ModelPerturbation:
         self.derives = any(part.field in DERIVED_FROM for part in self._parts)
         now = self._parts[0].now()
         if (not sweep.absolute or sweep.parameter == "gravity") and bool((now == 0).all()):
-            hint = "abs:LOW:HIGH sets it" if field != "opt.gravity" else "sim.gravity=[0,0,-9.81] gives it a direction"
-            raise NameProblem(f"its value is 0 for {listing(names)}, so a factor changes nothing", hint)
+            hint = "write abs:LOW:HIGH" if field != "opt.gravity" else "add sim.gravity=[0,0,-9.81]"
+            raise NameProblem(f"the value is 0 for {listing(names)}, so a factor changes nothing", hint)
         if field == "body_mass" and bool((now == 0).any()):
             massless = [name for name, mass in zip(names, now[0].tolist(), strict=True) if mass == 0]
             raise NameProblem(f"no mass to change on {listing(massless)}", "name other bodies")
@@ -129,7 +129,7 @@ def _rows(env: VecEnv, field: str, pattern: str | None) -> tuple[list[int], list
     model, kind = env.engine.model, FIELDS[field]
     if not kind:
         if pattern is not None:
-            raise NameProblem(f"it belongs to the whole world, not to '{pattern}'", "leave the name out")
+            raise NameProblem("the parameter belongs to the whole world", f"leave out '{pattern}'")
         return [0], ["the world"]
     entities = [f"{name}/" for name in env.entities]
     ids: list[int] = []
@@ -147,7 +147,7 @@ def _rows(env: VecEnv, field: str, pattern: str | None) -> tuple[list[int], list
     else:
         chosen = match(pattern, names, {"Bodies": "body"}.get(kind, kind[:-1].lower()))
     if not chosen:
-        raise NameProblem(f"the model has no {kind.lower()}")
+        raise NameProblem(f"the model has no {kind.lower()}; choose another parameter")
     return [row for i in chosen for row in _elements(model, field, ids[i])], [names[i] for i in chosen]
 
 
@@ -173,9 +173,7 @@ def _axes(env: VecEnv, field: str, sweep: Sweep) -> list[int] | None:
     value = np.asarray(getattr(env.engine.model, field)) if field != "opt.gravity" else np.zeros((1, 3))
     width = value[:1].size
     if sweep.absolute and not own and width > 1:
-        raise NameProblem(
-            f"{field} has {width} values each, which abs: would make equal", "use a factor: leave out abs:"
-        )
+        raise NameProblem(f"abs: would make the {width} values of {field} equal", "use a factor: leave out abs:")
     return None
 
 
@@ -187,5 +185,5 @@ def _require_affine(model: mujoco.MjModel, rows: list[int], names: list[str]) ->
         if gain not in (_FIXED, _AFFINE) or bias not in (_NO_BIAS, _AFFINE_BIAS)
     ]
     if unsupported:
-        hint = "motors, position and velocity actuators can"
+        hint = "choose motors, position or velocity actuators"
         raise NameProblem(f"{listing(unsupported)} cannot be scaled as a whole", hint)

@@ -166,14 +166,14 @@ class _Push:
         if sweep.element is None:
             if len(floating) != 1:
                 reason = "no entity floats" if not floating else "several entities float"
-                hint = f"push.NAME, with one of {listing([*floating, *joints])}"
+                hint = f"write push.NAME, NAME one of {listing([*floating, *joints])}"
                 raise NameProblem(f"{reason}: name the entity or joint to push", hint)
             self._root, self._joint = next(iter(floating.values()), None), None
             return
         names = [*floating, *joints]
         found = match(sweep.element, names, "entity or joint")
         if len(found) != 1:
-            raise NameProblem(f"it matches {len(found)}: {listing(names[i] for i in found)}", "name one of them")
+            raise NameProblem(f"the pattern matches {len(found)}: {listing(names[i] for i in found)}", "name one")
         name = names[found[0]]
         self._root, self._joint = floating.get(name), joints.get(name)
 

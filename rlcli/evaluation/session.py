@@ -177,7 +177,7 @@ def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
     require_known(kind, POLICIES, "policy", "policies")
     if kind == "trained":
         message = "--against trained: only a policy without training can be the reference"
-        raise UsageError(message, hint="lqr, zero or random")
+        raise UsageError(message, hint="use lqr, zero or random")
     return replace(policy, kind=kind, stochastic=False, as_trained=False)
 
 
@@ -238,7 +238,7 @@ def check_record(record: Path | None, mode: str) -> None:
     if record.is_dir():
         raise UsageError(f"--record {record} is a folder", hint=f"give a file: {record / 'episodes.safetensors'}")
     if not record.absolute().parent.is_dir():
-        raise MachineError(f"--record: there is no folder {record.absolute().parent}")
+        raise MachineError(f"--record: there is no folder {record.absolute().parent}; create it")
 
 
 def run_episodes(

@@ -26,9 +26,9 @@ PHYSICAL = {
 """Parameter -> field of the model. The name of a model field is a parameter, too."""
 SIGNALS = {
     "action_delay": "control steps",
-    "action_noise": "standard deviation, in the policy's own units",
+    "action_noise": "standard deviation, in the units of the policy's actions",
     "observation_delay": "control steps",
-    "observation_noise": "standard deviation, in the units that the policy sees",
+    "observation_noise": "standard deviation, in the units of the policy's observations",
     "push": "m/s or rad/s",
 }
 """Parameter -> its unit."""
@@ -100,7 +100,7 @@ def read_sweeps(texts: Sequence[str], points: int) -> list[Sweep]:
     for text in texts:
         sweep = _read(text, points)
         if any(sweep.name == other.name for other in sweeps):
-            raise UsageError(f"--sweep: {sweep.name} is swept twice")
+            raise UsageError(f"--sweep: {sweep.name} is given twice; leave out one")
         sweeps.append(sweep)
     return sweeps
 
@@ -146,11 +146,11 @@ def _read(text: str, points: int) -> Sweep:
     values = _values(text, found["values"], name, points, absolute)
     lowest = min(values)
     if lowest < 0.0:
-        raise UsageError(f"--sweep {text}: {name} cannot be {lowest:g}", hint="0 or more")
+        raise UsageError(f"--sweep {text}: {name} cannot be {lowest:g}", hint="give values of 0 or more")
     if name in _INTEGER and (any(v != round(v) for v in values) or max(values) > _MAX_POINTS):
-        raise UsageError(f"--sweep {text}: {name} takes whole numbers of steps", hint=f"0 to {_MAX_POINTS}")
+        raise UsageError(f"--sweep {text}: {name} takes whole numbers of steps", hint=f"give 0 to {_MAX_POINTS}")
     if name == "body_mass" and lowest == 0.0:
-        raise UsageError(f"--sweep {text}: a body cannot have no mass", hint="values above 0")
+        raise UsageError(f"--sweep {text}: a mass must be above 0", hint="give values above 0")
     return Sweep(name, found["element"], absolute, values)
 
 
@@ -158,20 +158,22 @@ def _values(text: str, written: str, name: str, points: int, absolute: bool) -> 
     if ":" not in written:
         values = tuple(_number(text, part) for part in written.split(","))
         if len(set(values)) != len(values):
-            raise UsageError(f"--sweep {text}: a value appears twice")
+            raise UsageError(f"--sweep {text}: a value appears twice; leave out one")
         return values
     ends = written.split(":")
     if len(ends) not in (2, 3):
-        raise UsageError(f"--sweep {text}: a range is LOW:HIGH or LOW:HIGH:POINTS")
+        raise UsageError(f"--sweep {text}: write the range as LOW:HIGH or LOW:HIGH:POINTS")
     low, high = (_number(text, part) for part in ends[:2])
     if len(ends) == 3:
         if not re.fullmatch("[0-9]{1,6}", ends[2].strip()):
-            raise UsageError(f"--sweep {text}: '{ends[2]}' is not a number of points")
+            raise UsageError(f"--sweep {text}: '{ends[2]}' is not a whole number of points")
         points = int(ends[2])
     if not low < high:
-        raise UsageError(f"--sweep {text}: {low:g} is not below {high:g}", hint="LOW:HIGH, or a single value")
+        raise UsageError(f"--sweep {text}: {low:g} is not below {high:g}", hint="give LOW:HIGH, or a single value")
     if not 2 <= points <= _MAX_POINTS:
-        raise UsageError(f"--sweep {text}: {points} points", hint=f"2 to {_MAX_POINTS}, or a single value")
+        raise UsageError(
+            f"--sweep {text}: {points} points are not allowed", hint=f"give 2 to {_MAX_POINTS}, or a single value"
+        )
     box = Sweep(name, None, absolute, (low, high))
     inner = [box.between(i / (points - 1)) for i in range(1, points - 1)]
     return tuple(dict.fromkeys((low, *inner, high)))
@@ -180,5 +182,5 @@ def _values(text: str, written: str, name: str, points: int, absolute: bool) -> 
 def _number(text: str, part: str) -> float:
     value = float_or_nan(part)
     if not math.isfinite(value):
-        raise UsageError(f"--sweep {text}: '{part.strip()}' is not a number")
+        raise UsageError(f"--sweep {text}: '{part.strip()}' is not a number; write one, as in 0.5")
     return value

@@ -212,7 +212,7 @@ def _from_json(written: object) -> Any:
     if kind == "scalar":
         dtype = np.dtype(content[0])
         if dtype.kind not in "biuf":
-            raise ValueError(f"'{content[0]}' is not a numeric type")
+            raise ValueError(f"the saved value has the type '{content[0]}', expected a numeric type")
         return dtype.type(content[1])
     if kind == "dict":
         return {_from_json(key): _from_json(item) for key, item in content[0]}

@@ -178,7 +178,7 @@ class CommandManager(TensorState):
             self._resample(number, selection, _FIRST)
 
     def compute(self, select: Select, running: Tensor) -> None:
-        """Count one step where an episode is `running` (1 or 0), resample what is due, and update all commands.
+        """Count one step of the `running` episodes (1 or 0), resample commands that are due, and update all commands.
 
         `select` selects environments, with draws keyed by the step.
         """
@@ -208,13 +208,13 @@ class CommandManager(TensorState):
 
 def _require_marker(term: BoundTerm, marker: Marker, num_envs: int) -> None:
     if not isinstance(marker, Arrow | Sphere | Frame):
-        raise term.error(f"markers() gave a {type(marker).__name__}, expected an Arrow, a Sphere or a Frame")
+        raise term.error(f"markers() returned a {type(marker).__name__}; return Arrow, Sphere or Frame")
     for name, value in marker._asdict().items():
         expected = (num_envs, _COLUMNS.get(name, 0))
         if name in _COLUMNS and (not isinstance(value, Tensor) or value.shape != expected):
             found = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
             field = f"{type(marker).__name__}.{name}"
-            raise term.error(f"markers() gave {field} {found}, expected a tensor of shape {expected}")
+            raise term.error(f"markers() returned {field} {found}; return a tensor of shape {expected}")
 
 
 # Two streams: the first command of an episode is keyed by the episode's number, later ones by the step's.

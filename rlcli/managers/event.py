@@ -24,7 +24,8 @@ class EventManager(TensorState):
         num_envs: number of environments.
         step_dt: control period [s].
         device: device of the timers.
-        set_constants: called after events that change an input of the constants that the engine derives from the model.
+        set_constants: recomputes the constants that the engine derives from the model; called after events that change
+            masses, inertias or the like.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class EventManager(TensorState):
 
     @property
     def derives(self) -> bool:
-        """Whether any event changes an input of the constants that the engine derives from the model."""
+        """Whether any event changes model fields, such as masses, from which the engine derives constants."""
         return any(map(_derives, self.terms))
 
     @property
@@ -90,7 +91,7 @@ class EventManager(TensorState):
                 selection.write(left, self._draw(term, selection, _FIRST))
 
     def interval(self, select: Select, running: Tensor, fired: Callback) -> None:
-        """Count one step where an episode is `running` (1 or 0), and fire the events that are due.
+        """Count one step of the `running` episodes (1 or 0), and fire the events that are due.
 
         `select` selects environments, with draws keyed by the step. `fired` is called after each event with its
         environments. Global timers also run where no episode does.

@@ -139,7 +139,7 @@ class Pipeline:
         if not isinstance(setting, Tensor):
             setting = torch.tensor(value, dtype=torch.float32, device=self._device)
         if setting.dim() == 1 and len(setting) != self.width:
-            raise self.term.error(f"has {len(setting)} values for {self.width} columns", *key.split("."))
+            raise self.term.error(f"has {len(setting)} values; give 1 or {self.width}", *key.split("."))
         return setting
 
     def _modifier(self, number: int, config: schema.ModifierConfig) -> Stage:
@@ -185,7 +185,7 @@ class _Noise(Stage):
 
 
 class _Constant(Stage):
-    """Operation with an operand that stays, or that a curriculum changes."""
+    """Operation with a constant operand, which a curriculum may change."""
 
     def __init__(self, operation: str, operand: Tensor) -> None:
         self._operation, self._operand = _OPERATIONS[operation], operand
@@ -195,7 +195,7 @@ class _Constant(Stage):
 
 
 class _Bias(_Constant):
-    """Operation with an operand that is drawn once for each episode."""
+    """Operation with an operand that is sampled once for each episode."""
 
     def __init__(self, sampler: Sampler, operation: str, stream: np.uint64, bias: Tensor) -> None:
         super().__init__(operation, bias)

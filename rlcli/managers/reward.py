@@ -107,7 +107,7 @@ class RewardManager(TensorState):
         return {term.name: row for term, row in zip(self.terms, self._rows, strict=True)}
 
     def replace_diverged(self, diverged: Tensor, total: Tensor) -> None:
-        """Give the `divergence_reward`, if configured, instead of this step's terms."""
+        """Replace this step's terms of diverged environments by the `divergence_reward`, if configured."""
         if self._divergence_reward is None:
             return
         self._sums -= torch.where(diverged, self._values, 0.0)

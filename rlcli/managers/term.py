@@ -65,7 +65,7 @@ class BoundTerm:
         if bool(bad.any()):
             raise DivergedError(
                 f"{what} ({self.config.func}) is not finite in {int(bad.sum())} environments, first in environment"
-                f" {int(bad.nonzero()[0, 0])}"
+                f" {int(bad.nonzero()[0, 0])}; look for divisions by 0, roots and logarithms"
             )
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -254,7 +254,7 @@ class Binder:
             return self._commands[name].instance
         names = [command for command, config in self.resolved.task.commands.items() if config is not None]
         if name not in names:  # else the problem of the command itself is reported already
-            hint = f"commands: {listing(names)}" if names else "the task has no commands: section"
+            hint = f"commands: {listing(names)}" if names else "add the command to commands:"
             self.add_problem((*path, parameter), f"no command '{name}'", did_you_mean(name, names) or hint)
         return None
 
@@ -286,4 +286,4 @@ def check_shape(term: BoundTerm, value: object, expected: tuple[int, ...]) -> No
     if shape == expected:
         return
     found = f"a tensor of shape {shape}" if shape is not None else f"a {type(value).__name__}"
-    raise term.error(f"'{term.config.func}' gave {found}, expected a tensor of shape {expected}")
+    raise term.error(f"'{term.config.func}' returned {found}; return a tensor of shape {expected}")

@@ -65,8 +65,8 @@ class TunableValues:
                     return self._opened(path[: depth + 1], value)[tuple(int(index) for index in path[depth + 1 :])]
                 except (ValueError, IndexError):
                     rest = ".".join(path[depth + 1 :])
-                    raise NameProblem(f"address '{address}' does not exist: '{rest}' is not an index there") from None
-        raise NameProblem(f"address '{address}' is not a number or a list of numbers")
+                    raise NameProblem(f"address '{address}' does not exist: '{rest}' is not an index") from None
+        raise NameProblem(f"address '{address}' must name a number or a list of numbers")
 
     def _opened(self, path: Path, value: object) -> Tensor:
         if path not in self._tensors:

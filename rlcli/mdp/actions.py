@@ -96,7 +96,7 @@ class _AffineJointAction(_ScaledJointAction):
         self._limits = _command_limits(self.entity.engine.model, self.actuators, self.actuator)
 
     def command_map(self) -> CommandMap:
-        """Return what `process` computes, and the limits of the actuators."""
+        """Return the formula of the commands, and the limits of the actuators."""
         scale, offset = (self._each(value) for value in (self._scale, self._offset))
         clip = None if self._clip is None else tuple(zip(*map(self._each, self._clip), strict=True))
         return CommandMap(scale, offset, clip, self._limits)
@@ -232,7 +232,7 @@ class EmaJointPositionToLimits(JointPositionToLimits, TensorState):
         selection.write(self._fresh, True)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the previous targets, and where there is none yet."""
+        """Return the previous targets, and a mask of the environments without a previous target."""
         return {"before": self._before, "fresh": self._fresh}
 
 
@@ -258,7 +258,7 @@ class _BinaryJoint(_JointAction):
         values = self._per_joint(command, math.nan)
         if bool(values.isnan().any()):
             name = self.elements[int(values.isnan().nonzero()[0, 0])]
-            raise NameProblem(f"{key} has no value for joint '{name}'")
+            raise NameProblem(f"{key} has no value for joint '{name}'; add one")
         return values
 
 
@@ -361,7 +361,7 @@ class DifferentialInverseKinematics(_ScaledJointAction):
 
 
 def _command_limits(model: mujoco.MjModel, actuators: list[int | None], kind: str) -> tuple[tuple[float, float], ...]:
-    """Return the commands beyond which each actuator gives no more: its control range and its force limits."""
+    """Return the smallest and largest command with an effect: control range and force limit of each actuator."""
     limits = []
     for a in actuators:
         if a is None:  # an actuator model limits efforts, not commands

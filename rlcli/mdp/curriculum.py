@@ -27,7 +27,7 @@ class Stages(Term):
 
     def __post_init__(self) -> None:
         if len(self.steps) != len(self.values) or not self.steps or sorted(self.steps) != self.steps:
-            raise ValueError("steps and values must be lists of equal length, with steps in rising order")
+            raise ValueError("give steps and values as lists of equal length, with steps in rising order")
         self._steps = torch.tensor(self.steps, device=self.env.device)
         table = torch.tensor(self.values, dtype=torch.float32, device=self.env.device)
         _require_shape("each value", table.shape[1:], self.address)
@@ -56,7 +56,7 @@ class Interpolate(Term):
 
     def __post_init__(self) -> None:
         if self.end <= self.begin:
-            raise ValueError("end must be above begin")
+            raise ValueError(f"end ({self.end}) must be above begin ({self.begin}): raise end")
         self._from = self.address.clone()
         self._to = torch.tensor(self.to, dtype=torch.float32, device=self.env.device)
         _require_shape("'to'", self._to.shape, self.address)
@@ -70,11 +70,11 @@ class Interpolate(Term):
 
 @dataclass(kw_only=True, eq=False)
 class TerrainLevels(EntityTerm):
-    """Terrain levels: up for robots that walk far, down for robots that fall short. -> levels (num_envs,)
+    """Terrain levels: robots that walk far move up, robots that walk too little move down. -> levels (num_envs,)
 
-    An episode that ends more than half a patch (along x) from the environment's origin moves up one level. It moves
-    down if it covers less than half of the distance of `command` (a velocity, x and y first); without a command, less
-    than `least` [m]. Above the last level follows a random one. Isaac Lab: terrain_levels_vel.
+    A robot moves up one level if its episode ends more than half a patch (along x) from the environment's origin. It
+    moves down if it covers less than half of the distance of `command` (a velocity, x and y first); without a command,
+    less than `least` [m]. After the last level a random level follows. Isaac Lab: terrain_levels_vel.
     """
 
     command: Command | None = None
@@ -102,7 +102,7 @@ class TerrainLevels(EntityTerm):
 
 def _require_shape(what: str, shape: torch.Size, address: Tensor) -> None:
     if shape != address.shape:
-        raise ValueError(f"{what} has shape {tuple(shape)}, the setting at the address has {tuple(address.shape)}")
+        raise ValueError(f"{what} has shape {tuple(shape)}, expected that of the address, {tuple(address.shape)}")
 
 
 def _length_xy(vector: Tensor) -> Tensor:

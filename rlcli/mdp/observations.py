@@ -370,5 +370,5 @@ def _offset_xy(env: ManagedEnv, entity: Entity, target: tuple[float, float, floa
 def _reading(entity: Entity, sensors: Sensors, size: int, kind: str) -> Tensor:
     values = entity.data.sensordata[:, sensors]
     if values.shape[1] != size:
-        raise ValueError(f"needs one {kind} sensor, which has {size} columns; those selected have {values.shape[1]}")
+        raise ValueError(f"select one {kind} sensor ({size} columns) in sensors; selected: {values.shape[1]} columns")
     return values

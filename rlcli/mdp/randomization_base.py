@@ -43,7 +43,7 @@ class Draw:
         many = range.dim() == 2 if isinstance(range, Tensor) else isinstance(range, list)
         pairs: list[Pair] = list(range) if many else [range]  # type: ignore
         if len(pairs) not in (1, shape[1]):
-            raise NameProblem(f"range has {len(pairs)} pairs for {shape[1]} axes", "one pair for all, or one for each")
+            raise NameProblem(f"range has {len(pairs)} pairs for {shape[1]} axes", "give 1 pair, or 1 per axis")
         _check(pairs, term.distribution)
         self._ranges = Ranges(term.env.device, *pairs)
         self._distribution, self._operation = term.distribution, term.operation
@@ -73,7 +73,7 @@ class Draw:
 class DrawingTerm(Term):
     """Base class of terms that draw values relative to the original ones.
 
-    A term is a dataclass; these are its keys. A term without one of these keys uses the value below.
+    Terms are dataclasses. The attributes below are keys of the YAML; a term that lacks a key uses the value below.
     """
 
     entity: Entity
@@ -207,8 +207,8 @@ def _check(pairs: list[Pair], distribution: str) -> None:
     for pair in pairs:
         first, second = pair.tolist() if isinstance(pair, Tensor) else pair
         if distribution == "gaussian" and second < 0:
-            raise NameProblem(f"gaussian: the standard deviation {second:g} is negative", "range is [mean, std]")
+            raise NameProblem(f"gaussian: the standard deviation {second:g} is negative", "write [mean, std]")
         if distribution != "gaussian" and first > second:
-            raise NameProblem(f"the lower end {first:g} is above the upper end {second:g}", "range is [low, high]")
+            raise NameProblem(f"the lower end {first:g} is above the upper end {second:g}", "write [low, high]")
         if distribution == "loguniform" and first <= 0:
             raise NameProblem(f"loguniform needs a range above 0, found {first:g}", "use uniform for other ranges")

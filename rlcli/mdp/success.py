@@ -68,7 +68,7 @@ def root_hovers(
 ) -> Tensor:
     """Succeed where the root is within `tolerance` [m] of the root of `goal`. (num_envs,)
 
-    It must also be slower than `speed` [m/s].
+    The root must also be slower than `speed` [m/s].
     """
     near = length(entity.data.root_pos_w - goal.data.root_pos_w) < tolerance
     return near & (length(entity.data.root_lin_vel_w) < speed)

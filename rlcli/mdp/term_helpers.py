@@ -52,7 +52,7 @@ def single(values: Tensor, kind: str) -> Tensor:
         ValueError: if there is not exactly one element.
     """
     if values.shape[1] != 1:
-        raise ValueError(f"needs exactly one {kind}, and {values.shape[1]} are selected")
+        raise ValueError(f"needs exactly one {kind}, found {values.shape[1]}; select one")
     return values[:, 0]
 
 
@@ -63,7 +63,7 @@ def require_one_per_body(values: Tensor, sensor: ContactSensor) -> Tensor:
         ValueError: if their numbers differ.
     """
     if values.shape[1] != sensor.found.shape[1]:
-        raise ValueError(f"selects {values.shape[1]} elements, the sensor has {sensor.found.shape[1]} bodies")
+        raise ValueError(f"selects {values.shape[1]} elements; select {sensor.found.shape[1]}, one per sensor body")
     return values
 
 

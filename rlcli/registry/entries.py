@@ -116,7 +116,7 @@ def find_entry(group: str, name: str, *, what: str) -> Entry:
     if matches:
         owners = " and ".join(f"{e.distribution} {e.version}" for e in matches)
         choices = " or ".join(e.qualified for e in matches)
-        raise TaskError(f"{what} '{name}' is offered by {owners}", hint=f"name one: {choices}")
+        raise TaskError(f"{what} '{name}' exists in several packages: {owners}", hint=f"write one of {choices}")
     if any(name in (e.name, e.qualified) for e in catalog(group, hidden=True)[0]):
         value = os.environ.get("RLCLI_PLUGINS", "").strip()
         excluded_by = f"RLCLI_PLUGINS={value}" if value else plugins_chosen_by()

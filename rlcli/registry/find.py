@@ -54,6 +54,6 @@ def task_source(target: str) -> TaskSource:
     if file.suffix not in (".yaml", ".yml"):
         return find_task(target)
     if not file.is_file():
-        raise TaskError(f"no file '{target}'")
+        raise TaskError(f"no file '{target}'; check the path")
     # for a YAML file of an installed task return that task: a folder task would not have its terms and its class
     return task_of_file(file) or replace(folder_task(file.parent, file.name), name=file.stem)

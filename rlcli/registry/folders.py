@@ -25,7 +25,7 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
     root = folder.resolve()
     config = root / file
     if (root / "run.json").exists():
-        raise TaskError(f"'{folder}' is a run, not a task", hint=f"--checkpoint {folder}")
+        raise TaskError(f"'{folder}' is a run, not a task", hint=f"use --checkpoint {folder}")
     if root.is_file():
         raise TaskError(f"'{folder}' is a file, not a task's folder", hint=f"did you mean '{folder.parent}'?")
     other = None
@@ -38,7 +38,7 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
     if not config.is_file():
         require_format(root)
         found = listing(sorted(p.name for p in root.iterdir())) if root.is_dir() else "no such folder"
-        raise TaskError(f"'{folder}' is not a task: it has no {file} ({found})")
+        raise TaskError(f"'{folder}' is not a task, because it has no {file}; found: {found}")
     terms, task = root / "terms.py", root / "task.py"
     return TaskSource(
         name=root.name,
@@ -78,9 +78,9 @@ def python_task(reference: str, name: str | None = None) -> TaskSource:
     else:
         file, label = path, path.stem
     if not file.is_file():
-        raise TaskError(f"there is no file '{file}'")
+        raise TaskError(f"there is no file '{file}'; check the path")
     if file == path and not attribute:
-        raise TaskError(f"'{reference}' does not name an object in the file", hint=f"{reference}:TASK, for example")
+        raise TaskError(f"'{reference}' does not name an object in the file", hint=f"write {reference}:NAME")
     return TaskSource(
         name=name or re.sub(r"[^A-Za-z0-9_.-]", "-", label),
         root=file.parent,

@@ -60,7 +60,7 @@ def load_entry(entry: Entry, kind: type) -> Any:
     if not isinstance(value, kind):
         raise TaskError(
             f"plugin {entry.distribution} {entry.version} is broken: '{entry.name}' = {entry.value} is a"
-            f" {type(value).__name__}, not a {kind.__name__}"
+            f" {type(value).__name__}, expected a {kind.__name__}; report it to the plugin's authors"
         )
     return value
 

@@ -55,7 +55,7 @@ def _install_hint(model: str) -> str:
         return f"set {MODELS} to a folder that holds {file}"
     if kind == "package":
         return f"install the package {file.partition('/')[0]}, which contains it"
-    return f"install the task {kind}"
+    return f"install the package of the task {kind}"
 
 
 def _model_file(root: Path, model: str) -> Path:
@@ -72,7 +72,7 @@ def _model_file(root: Path, model: str) -> Path:
 
 def _inside(folder: Path, file: str, what: str) -> Path:
     if not (folder / file).resolve().is_relative_to(folder.resolve()):
-        raise TaskError(f"'{file}' lies outside {what}")
+        raise TaskError(f"'{file}' lies outside {what}; move it inside")
     return folder / file
 
 
@@ -92,9 +92,9 @@ def _package_file(model: str) -> Path:
     package, _, file = model.partition("/")
     folders = package_folders(package)
     if not folders:
-        raise TaskError(f"no Python package '{package}' is installed", hint="write package:PACKAGE/FILE")
+        raise TaskError(f"no Python package '{package}' is installed", hint=f"pip install {package}")
     folder = next((folder for folder in folders if (folder / file).is_file()), folders[0])
     path = _inside(folder, file, f"the package '{package}' in {folder}")
     if not path.is_file():
-        raise TaskError(f"no file '{file}' in the package '{package}' in {folder}")
+        raise TaskError(f"no file '{file}' in the package '{package}' in {folder}; correct the name")
     return path

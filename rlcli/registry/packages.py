@@ -32,7 +32,7 @@ def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
     in_python = ":" in spec.config
     config = _module_file(spec.config.partition(":")[0], entry) if in_python else root / spec.config
     if not config.is_file():
-        raise TaskError(f"task '{entry.qualified}' is broken: {config} does not exist")
+        raise TaskError(f"task '{entry.qualified}' is broken: {config} does not exist; reinstall its package")
     task_module = spec.task.partition(":")[0] if spec.task else None
     policy = root / spec.policies / entry.name
     return TaskSource(
@@ -93,14 +93,14 @@ def is_offered(module: str, source: TaskSource) -> bool:
 def _folder(package: str, entry: Entry) -> Path:
     found = _find(package, entry)
     if found is None or not found.submodule_search_locations:
-        raise TaskError(f"task '{entry.qualified}' is broken: '{package}' is not a package")
+        raise TaskError(f"task '{entry.qualified}' is broken: '{package}' is not a package; correct its TaskSpec")
     return Path(next(iter(found.submodule_search_locations)))
 
 
 def _module_file(module: str, entry: Entry) -> Path:
     found = _find(module, entry)
     if found is None or not found.origin:
-        raise TaskError(f"task '{entry.qualified}' is broken: there is no module '{module}'")
+        raise TaskError(f"task '{entry.qualified}' is broken: there is no module '{module}'; correct its TaskSpec")
     return Path(found.origin)
 
 

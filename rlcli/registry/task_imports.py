@@ -40,7 +40,7 @@ def load_module(name: str) -> Any:
         if alias not in sys.modules:
             spec = importlib.util.spec_from_file_location(alias, file)
             if spec is None or spec.loader is None:
-                raise ImportError(f"cannot import {file}")
+                raise ImportError(f"cannot import {file}: Python finds no loader for this file; name a .py file")
             module = importlib.util.module_from_spec(spec)
             sys.modules[alias] = module
             try:

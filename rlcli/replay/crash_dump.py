@@ -55,7 +55,7 @@ class CrashDumper(StepObserver):
         else:
             try:
                 file = write_dump(env, found, pending, self._folder)
-                message += f"; dump {file}; see rlcli replay {shlex.quote(str(file))}"
+                message += f"; dump {file}; to replay it: rlcli replay {shlex.quote(str(file))}"
             except MachineError as error:
                 message += f"; there is no dump: {error.message}"
         stop_observing_divergences(env, self)

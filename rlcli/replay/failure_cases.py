@@ -133,7 +133,7 @@ def list_failure_cases(run: Run) -> list[FailureCase]:
             _log.warning("skipped: %s", error.message)
             continue
         if trajectory.header.failure is None:
-            _log.warning("skipped: %s is not a failure case", file)
+            _log.warning("skipped: %s is not a failure case; move it out of the run's folder", file)
             continue
         cases.append(FailureCase(trajectory))
     return sorted(cases, key=lambda case: (case.failure.step, case.episode.env, case.episode.index))
@@ -144,10 +144,10 @@ def why_no_cases(run: Run) -> str:
     device = str(run.record.get("device", "cpu"))
     if device.startswith("cuda"):
         return (
-            f"it was trained on {device}, where steps cannot be replayed; rlcli eval --checkpoint RUN --record"
-            " FILE --record-mode failed keeps episodes of its policy"
+            f"the run was trained on {device}, where steps cannot be replayed; rlcli eval --checkpoint RUN --record"
+            " FILE --record-mode failed records failed episodes of its policy"
         )
-    return "training records some episodes (agent.autopsy), and writes them with each checkpoint"
+    return "no episode was recorded before the last checkpoint; agent.autopsy sets how many are recorded"
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +210,7 @@ def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase
         states.append(staged.worlds[0].final)
     finite = [state for state in states if np.isfinite(state).all()]
     if not finite:
-        raise CheckpointError(f"{case.trajectory.file} has no finite state")
+        raise CheckpointError(f"{case.trajectory.file} has no finite state; choose another case")
     return StagedCase(staged, finite)
 
 

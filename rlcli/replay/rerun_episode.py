@@ -35,7 +35,7 @@ class EpisodeStart:
     """States of the generators that all environments share, before any step."""
 
     def shared_draws(self) -> bool:
-        """Return whether the task has used them: then the episode depends on the number of environments."""
+        """Return whether the task has drawn from global generators; then `num_envs` changes the episode."""
         return _has_drawn(self.generators)
 
 
@@ -52,13 +52,13 @@ def start_episode(env: VecEnv, act: Act, env_id: int, episode: int, *, drawn_act
     Raises:
         ConfigError: if an episode does not end because the task has no time-out.
     """
-    reasons = [*env.episode_dependencies(), *(["actions that are drawn"] if drawn_actions else [])]
+    reasons = [*env.episode_dependencies(), *(["randomly sampled actions"] if drawn_actions else [])]
     generators, start = rng_state(), env.state_dict()
     if episode > 0 and not reasons:
         run_episode(env, act, env.reset(seed=env.seed, episode=episode)["policy"], env_id)
         if not _has_drawn(generators):
             return EpisodeStart(env.reset(seed=env.seed, episode=episode)["policy"], 0, [], generators)
-        reasons = ["generators of torch, numpy or Python that some term draws from"]
+        reasons = ["random numbers of torch, numpy or Python in a term"]
         load_rng_state(generators)
         env.load_state_dict(start)
     obs = env.reset(seed=env.seed)["policy"]
@@ -90,7 +90,7 @@ def require_end(env: Environment, length: int) -> None:
     """
     if length > PATIENCE * env.max_episode_length:
         message = f"an episode has lasted {length} steps, {PATIENCE} times episode_length_s, and has not ended"
-        hint = "add a termination with time_out: true"
+        hint = "add a termination with `func: time_out` and `time_out: true`"
         raise ConfigError([env.resolved.problem(("terminations",), message, hint)])
 
 

@@ -72,11 +72,11 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
     count = len(trajectory.header.episodes)
     if trajectory.header.kind != "recording":
         if episode is not None or filmed:
-            message = "a dump holds no whole episodes: --episode and --video need a recording"
+            message = "a dump has no complete episodes: --episode and --video need a recording"
             raise UsageError(message, hint="rlcli autopsy RUN N --video FILE.mp4 draws a case of a run")
         return []
     if episode is not None and episode >= count:
-        raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"it has {count}, counted from 0")
+        raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"the file has {count}, counted from 0")
     if not count:
         raise UsageError(f"{trajectory.file} has no episodes", hint="record with --record-mode all")
     return list(range(count)) if episode is None else [episode]
@@ -156,7 +156,7 @@ class ReplayWorld:
         model: the model of all environments.
         resolved: the configuration.
         own_model: model fields that differ between environments, with this environment's values.
-        follows_constants: whether MuJoCo's constants are derived from them again.
+        follows_constants: whether MuJoCo's constants are derived from these fields again.
 
     Raises:
         ValueError, RuntimeError: if the fields do not fit the model.
@@ -185,7 +185,7 @@ class ReplayWorld:
         return self.engine.state_row(0)
 
     def differing_field(self, recorded: NDArray[np.float64], now: NDArray[np.float64], *, final: bool) -> str | None:
-        """Return the first field whose bits differ; in other states than the final one, only a field of physics."""
+        """Return the first field whose bits differ. Before the final state only fields of physics are compared."""
         for name, columns in self.layout.fields():
             if (final or name in _PHYSICS_FIELDS) and not _same_bits(recorded[columns], now[columns]):
                 return name
@@ -270,7 +270,7 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
             world = ReplayWorld(model, resolved, own_model, header.follows_constants)
             width = len(world.engine.state_row(0))
             if states.shape[1] != width or len(final) != width:
-                raise ValueError(f"a state has {len(final)} numbers, the model's {width}")
+                raise ValueError(f"a state of the file has {len(final)} numbers, one of the model has {width}")
         except (ValueError, RuntimeError) as error:
             raise trajectory.mismatch_error(error) from None
         calls = [Call(state, nstep) for state, nstep in zip(states, described.nstep, strict=True)]

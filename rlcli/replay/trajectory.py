@@ -225,9 +225,9 @@ class Header(_Strict):
     def _check_task(cls, task: dict[str, str | None]) -> dict[str, str | None]:
         names = [value for value in task.values() if value is not None]
         if not task.get("name") or not all(name.isprintable() for name in names):
-            raise ValueError("the task is malformed")
+            raise ValueError("task: a name without unprintable characters is missing")
         if not (task.get("folder") or task.get("distribution")):
-            raise ValueError("the origin of the task is missing")
+            raise ValueError("task: folder or distribution is missing")
         return task
 
     @model_validator(mode="after")
@@ -237,18 +237,18 @@ class Header(_Strict):
             if len(world.follows) != len(world.nstep) - 1 or world.first >= len(world.nstep):
                 raise ValueError(f"the engine calls of environment {world.env} are malformed")
         if sum(count for world in self.worlds for count in world.nstep) > MAX_SUBSTEPS:
-            raise ValueError(f"it has more than {MAX_SUBSTEPS} physics steps")
+            raise ValueError(f"the file has more than {MAX_SUBSTEPS} physics steps")
         for number, e in enumerate(self.episodes):
             if e.env >= self.num_envs or e.kept > e.length or (self.kind == "recording" and e.kept != e.length):
                 raise ValueError(f"episode {number} is malformed")
         if self.kind == "failure":
             if len(self.worlds) != 1 or len(self.episodes) != 1 or self.failure is None:
-                raise ValueError("it does not hold the end of one episode")
+                raise ValueError("a failure case must hold the end of exactly one episode")
             first, steps_before = self.worlds[0].first, self.episodes[0].kept - 1
             if first < steps_before or first % max(1, steps_before):
                 raise ValueError("the number of recorded engine calls does not fit the number of steps")
         elif self.failure is not None or bool(self.worlds) != (self.kind == "crash"):
-            raise ValueError(f"it is not a {self.kind}")
+            raise ValueError(f"the content is not that of a {self.kind}")
         return self
 
 
@@ -286,7 +286,7 @@ class Trajectory:
                 problems = (replace(p, where=p.where.replace(str(config), str(self.file))) for p in error.problems)
                 raise ConfigError(problems) from None
         if not flags and resolved.task.scene.num_envs != self.header.num_envs:
-            message = f"{self.file} is corrupt: its number of environments differs from its configuration's"
+            message = f"{self.file} is corrupt: num_envs differs between header and configuration; record it again"
             raise CheckpointError(message)
         return resolved
 
@@ -320,25 +320,25 @@ def read_trajectory(file: Path) -> Trajectory:
     """
     try:
         if file.exists() and not file.is_file():
-            raise ValueError("it is not a regular file")  # reading a pipe would block
+            raise ValueError("the path is not a regular file")  # reading a pipe would block
         with safe_open(file, "pt") as opened:
             data = json.loads((opened.metadata() or {}).get("rlcli", "{}"))
             if not isinstance(data, dict) or "format" not in data:
-                raise ValueError("it has no header of rlcli")
+                raise ValueError("the file has no header of rlcli")
             if data["format"] != FORMAT:
-                raise CheckpointError(f"{file} has trajectory format {data['format']}; this rlcli reads {FORMAT}")
+                raise CheckpointError(f"{file} has format {data['format']}; this rlcli reads {FORMAT}: record it again")
             if data.get("kind") != "recording" and file.stat().st_size > _MAX_BYTES:
-                raise ValueError(f"it is larger than {_MAX_BYTES >> 20} MiB")
+                raise ValueError(f"the file is larger than {_MAX_BYTES >> 20} MiB")
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 (not a mapping)
         if data.pop("sha256", None) != content_digest(tensors, data):
-            raise CheckpointError(f"{file} is corrupt: its content does not match its hash")
+            raise CheckpointError(f"{file} is corrupt: its hash does not match; record it again")
         header = check_json(Header, data, file)
         _check_tensors(header, tensors)
     except FileNotFoundError:
         message = f"there is no recording or dump {file}"
         raise CheckpointError(message, hint="rlcli eval TASK --record FILE makes a recording") from None
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{file} is corrupt, or no recording or dump: {' '.join(str(error).split())}") from None
+        raise CheckpointError(f"{file} is no valid recording or dump: {' '.join(str(error).split())}") from None
     return Trajectory(file, header, tensors)
 
 

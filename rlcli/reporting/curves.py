@@ -140,7 +140,7 @@ def read_history(run: Run) -> History:
             column.append(value)
     count = len(axes["steps"])
     if not count:
-        raise CheckpointError(f"{run.folder} has no metrics yet", hint="the first iteration writes them")
+        raise CheckpointError(f"{run.folder} has no metrics yet", hint="wait for the end of its first iteration")
     for column in columns.values():
         column.extend([math.nan] * (count - len(column)))
     arrays = ({name: np.asarray(values, np.float64) for name, values in each.items()} for each in (axes, columns))

@@ -111,5 +111,5 @@ class PageMedia:
         except FileNotFoundError:
             return None
         if data[4:8] != b"ftyp":
-            raise CheckpointError(f"{file} is not an MP4")
+            raise CheckpointError(f"{file} is not an MP4 video; delete it")
         return data

@@ -93,7 +93,7 @@ def _unknown(name: str, known: Sequence[str]) -> UsageError:
     tails = {each.rpartition("/")[2]: each for each in reversed(names)}
     tail = next(iter(difflib.get_close_matches(name, list(tails), n=1)), None)
     near = did_you_mean(name, names) or (f"did you mean '{tails[tail]}'?" if tail else None)
-    return UsageError(f"no metric '{name}'", hint=f"{near} " * bool(near) + f"there are {listing(names, 60)}")
+    return UsageError(f"no metric '{name}'", hint=f"{near} " * bool(near) + f"metrics: {listing(names, 60)}")
 
 
 def _panel(curves: Sequence[Curve], metric: str, axis: str) -> Panel:

@@ -1,4 +1,4 @@
-"""Content of a run's page, read from the run's files. If a part cannot be read, the others are still shown."""
+"""Content of a run's page, read from the run's files. If a part cannot be read, the page shows the other parts."""
 
 from __future__ import annotations
 

@@ -49,13 +49,13 @@ class VisionSpec(BaseModel):
     @model_validator(mode="after")
     def _fits(self) -> VisionSpec:
         if not len(self.channels) == len(self.kernels) == len(self.strides):
-            raise ValueError("channels, kernels and strides must have one number for each layer")
+            raise ValueError("give channels, kernels and strides one number for each layer")
         end = 0
         for picture in self.pictures:
             if picture.start < end:
-                raise ValueError("images overlap, or are not in the order of their columns")
+                raise ValueError("the images overlap or are not sorted by their first column")
             if picture.shape[0] % picture.steps:
-                raise ValueError(f"{picture.shape[0]} channels cannot be divided into {picture.steps} steps")
+                raise ValueError(f"{picture.shape[0]} channels are not a multiple of {picture.steps} steps")
             end = picture.stop
             self.sizes(picture)
         return self

@@ -114,7 +114,7 @@ class Recording:
 
     def _refuse(self, reason: str) -> None:
         self.refusal = reason
-        _log.warning(f"the step cannot be recorded as a CUDA graph and runs several times slower: {reason}")
+        _log.warning(f"the step cannot run as a CUDA graph and is several times slower; change this: {reason}")
 
     def _numbers(self) -> dict[str, Any]:
         return {

@@ -125,7 +125,7 @@ def join(device: str) -> ProcessGroup:
     try:
         dist.init_process_group("cpu:gloo,cuda:nccl" if on_gpu else "gloo", timeout=_TIMEOUT)
     except (RuntimeError, ValueError) as error:
-        raise MachineError(f"the other processes cannot be reached: {' '.join(str(error).split())}") from error
+        raise MachineError(f"cannot connect to other processes, start all: {' '.join(str(error).split())}") from error
     _current = ProcessGroup(dist.get_rank(), dist.get_world_size(), device)
     return _current
 

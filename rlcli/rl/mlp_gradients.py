@@ -70,7 +70,7 @@ class MlpGradients:
     def __call__(
         self, obs: Tensor, critic_obs: Tensor, actor_loss: OutputGradient, critic_loss: OutputGradient
     ) -> tuple[Tensor, Tensor]:
-        """Write the gradients of a minibatch; return the summed numbers of both losses. (n, d), (n, c)"""
+        """Write the gradients of a minibatch; return the summed metrics of both losses. Inputs (n, d), (n, c)"""
         cuts = self._split(len(obs))
         numbers = [[torch.empty(0)] * len(cuts) for _ in range(2)]
         tasks = deque(itertools.product(range(2), enumerate(cuts)))

@@ -58,13 +58,13 @@ class PolicySpec(BaseModel):
     @model_validator(mode="after")
     def _bounded(self) -> PolicySpec:
         if not self.kind.startswith("gaussian-") and self.action_bound is None:
-            raise ValueError(f"kind {self.kind} needs an action_bound")
+            raise ValueError(f"kind {self.kind} needs action_bound; set it")
         if (self.kind == "gaussian-lstm") != bool(self.memory):
-            raise ValueError("memory must be given for kind gaussian-lstm, and only for it")
+            raise ValueError("memory and kind gaussian-lstm need each other: set both or neither")
         if (self.kind == "gaussian-cnn") != (self.vision is not None):
-            raise ValueError("vision must be given for kind gaussian-cnn, and only for it")
+            raise ValueError("vision and kind gaussian-cnn need each other: set both or neither")
         if self.vision is not None and self.vision.stop > self.observation_size:
-            raise ValueError("an image lies outside of the observation")
+            raise ValueError(f"an image ends at column {self.vision.stop} of {self.observation_size}")
         return self
 
 
@@ -271,11 +271,13 @@ def blank_policy(spec: Mapping[str, object]) -> Policy:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         key = ".".join(map(str, first["loc"])) or "all"
-        raise CheckpointError(f"policy.json does not describe a policy: {key[:80]}: {first['msg']}") from None
+        raise CheckpointError(f"policy.json is not valid; export it again: {key[:80]}: {first['msg']}") from None
     with torch.device("meta"):
         policy = Policy(checked)
     if size_of(policy) > _MAX_BYTES:
-        message = f"policy.json describes a policy of {size_of(policy):,} bytes; at most {_MAX_BYTES:,} are allowed"
+        message = (
+            f"policy.json describes a policy of {size_of(policy):,} bytes; train one of at most {_MAX_BYTES:,} bytes"
+        )
         raise CheckpointError(message)
     return policy
 
@@ -295,12 +297,12 @@ def filled(policy: Policy, weights: Mapping[str, Tensor]) -> Policy:
     if expected != found:
         differs = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
         rows = [f"{n[:80]} is {found.get(n, 'missing')}, expected {expected.get(n, 'nothing')}" for n in differs[:4]]
-        raise CheckpointError(f"policy.safetensors does not fit policy.json: {', '.join(rows)}")
+        raise CheckpointError(f"policy.safetensors and policy.json differ; export again: {', '.join(rows)}")
     for name, value in weights.items():
         if not bool(value.isfinite().all()):
-            raise CheckpointError(f"policy.safetensors: '{name}' has values that are not finite")
+            raise CheckpointError(f"policy.safetensors is corrupt: '{name}' is not finite; export it again")
         if name in ("normalizer.var", "normalizer.count") and bool((value < 0).any()):
-            raise CheckpointError(f"policy.safetensors: '{name}' is negative")
+            raise CheckpointError(f"policy.safetensors is corrupt: '{name}' is negative; export it again")
     policy.load_state_dict(dict(weights), assign=True)
     return policy.eval().requires_grad_(False)
 

@@ -100,6 +100,6 @@ _HINTS = {
     28: "free some space, then continue with --resume",
     13: "choose another folder with --runs-dir",
     30: "choose another folder with --runs-dir",
-    122: "the disk quota is used up",
+    122: "the disk quota is used up: free some space",
 }
 """errno -> hint: ENOSPC, EACCES, EROFS, EDQUOT."""

@@ -69,9 +69,9 @@ def check_bundle_target(output: Path) -> None:
         UsageError: if the path holds anything else.
     """
     if not output.name:
-        raise UsageError(f"--output {output} has no folder name", hint="--output FOLDER")
+        raise UsageError(f"--output {output} has no folder name", hint="give --output FOLDER")
     if output.is_symlink() or (output.exists() and not output.is_dir()):
-        raise UsageError(f"--output {output} is not a folder", hint="a bundle is a folder of its own")
+        raise UsageError(f"--output {output} is not a folder", hint="give the name of a new folder")
     if output.is_dir() and any(output.iterdir()) and not is_bundle(output):
         raise UsageError(f"--output {output} exists and is not a bundle", hint="name a new folder")
 
@@ -149,7 +149,7 @@ def _require_same_policy(checkpoint: Checkpoint, fresh: Path, output: Path) -> N
     before, after = checkpoint.policy(), open_bundle(fresh).policy()
     pairs = zip(before.state_dict().values(), after.state_dict().values(), strict=True)
     if before.spec != after.spec or not all(torch.equal(value, written) for value, written in pairs):
-        raise VerdictError(f"{output} is not kept: it does not read back as the checkpoint's policy")
+        raise VerdictError(f"{output} is not kept: the written policy differs; export it again")
 
 
 def _portable_task(record: object) -> dict[str, Any]:

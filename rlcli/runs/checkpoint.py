@@ -137,12 +137,12 @@ class Checkpoint:
 
     @property
     def step(self) -> int:
-        """Environment steps before it was written."""
+        """Environment steps of the training when the checkpoint was written."""
         return int(self.manifest["step"])
 
     @property
     def iteration(self) -> int:
-        """Number of the last iteration before it was written."""
+        """Number of the last finished iteration when the checkpoint was written."""
         return check_json(_Iteration, self.manifest, self.folder / "manifest.json").iteration
 
     def json(self, name: str) -> dict[str, Any]:
@@ -154,7 +154,7 @@ class Checkpoint:
 
         Args:
             part: the name of the part.
-            limit: largest size of its file [bytes]; None: the limit for such a part, at most a third of the memory.
+            limit: largest size of the file [bytes]; None: the default of the part, at most a third of the memory.
 
         Raises:
             CheckpointError: if the file is larger, or not a valid safetensors file.
@@ -188,23 +188,23 @@ class Checkpoint:
         missing = [part for part in PARTS if f"{part}.safetensors" not in self.manifest["files"]]
         if missing:
             message = f"{self.folder} has no {missing[0]}.safetensors"
-            raise CheckpointError(message, hint="--init-from takes its policy into a new run")
+            raise CheckpointError(message, hint="--init-from starts a new run with its policy")
         values = self.json("state.json")
         _check_state(values, self.step, self.folder / "state.json")
         if values["policy"] != self.json("policy.json"):
-            raise CheckpointError(f"{self.folder}/state.json is corrupt: its policy is not that of policy.json")
+            raise CheckpointError(f"{self.folder}: state.json and policy.json have different policies; use RUN@step:N")
         self.policy()
         parts = [name.removesuffix(".safetensors") for name in self.manifest["files"] if name.endswith(".safetensors")]
         tensors = {part: self.tensors(part) for part in parts}
         obs = tensors["trainer"].get("observations")
         if obs is not None and (obs.dim() != 2 or obs.shape[1] != values["policy"]["observation_size"]):
-            raise CheckpointError(f"{self.folder}/trainer.safetensors: 'observations' has shape {tuple(obs.shape)}")
+            raise CheckpointError(f"{self.folder}: 'observations' has wrong shape {tuple(obs.shape)}; use RUN@step:N")
         file = self.folder / "trainer.safetensors"  # `self.policy()` has checked the tensors of the policy
         for name, value in tensors["trainer"].items():
             if value.is_floating_point() and not bool(value.isfinite().all()):
-                raise CheckpointError(f"{file}: '{name}' holds values that are not finite")
+                raise CheckpointError(f"{file}: '{name}' is not finite; use an older one: RUN@step:N")
             if name.endswith(("normalizer.var", "normalizer.count")) and bool((value < 0).any()):
-                raise CheckpointError(f"{file}: '{name}' is negative")
+                raise CheckpointError(f"{file}: '{name}' is negative; use an older one: RUN@step:N")
         return TrainerState(tensors, values, {name: self._rows(name) for name in self.shards()})
 
     def verify(self, *, whole: bool) -> None:
@@ -236,10 +236,10 @@ class Checkpoint:
         first, stop, shards = log.first, log.stop, log.shards
         starts = [shard.start for shard in shards] + [stop]
         if [shard.stop for shard in shards] != starts[1:] or starts[0] > first:
-            raise CheckpointError(f"{self.folder}/manifest.json is corrupt: rows of '{name}' are missing")
+            raise CheckpointError(f"{self.folder}/manifest.json is corrupt: '{name}' lacks rows; use RUN@step:N")
         size, limit = sum(shard.size for shard in shards), available_memory() // 3
         if size > limit:
-            raise CheckpointError(f"{self.folder}: '{name}' has {size:,} bytes; this machine has memory for {limit:,}")
+            raise CheckpointError(f"{self.folder}: free some memory: '{name}' needs {size:,} of {limit:,} bytes")
 
         def read(start: int, end: int) -> dict[str, Tensor]:
             parts = []
@@ -249,7 +249,7 @@ class Checkpoint:
                     rows = slice(max(start, shard.start) - shard.start, min(end, shard.stop) - shard.start)
                     parts.append({column: values[rows] for column, values in columns.items()})
             if any(set(part) != set(parts[0]) for part in parts):
-                raise CheckpointError(f"{self.folder}/manifest.json: the files of '{name}' have different columns")
+                raise CheckpointError(f"{self.folder}/manifest.json is corrupt: '{name}' differs in columns")
             return {column: torch.cat([part[column] for part in parts]) for column in parts[0]} if parts else {}
 
         return Rows(first, stop, read)
@@ -260,13 +260,13 @@ class Checkpoint:
         columns = _tensors(data, file)
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
-                raise CheckpointError(f"{file} is corrupt: '{column}' does not have the rows that the file name states")
+                raise CheckpointError(f"{file} is corrupt: '{column}' lacks rows; use RUN@step:N")
         return columns
 
     def _data(self, name: str, limit: int) -> bytes:
         entry = self.manifest["files"].get(name)
         if entry is None:
-            raise CheckpointError(f"{self.folder} has no {name}")
+            raise CheckpointError(f"{self.folder} has no {name}; choose an older checkpoint: RUN@step:N")
         return _verified(self.folder / name, entry["size"], entry["sha256"], limit)
 
 
@@ -277,7 +277,7 @@ def open_checkpoint(folder: Path) -> Checkpoint:
         CheckpointError: if it is missing, incomplete, corrupt or of another format.
     """
     file = folder / "manifest.json"
-    data = read_file(file, JSON_LIMIT, missing=f"{folder} is not a checkpoint: it has no manifest.json")
+    data = read_file(file, JSON_LIMIT, missing=f"{folder} is not a checkpoint: it has no manifest.json; check the path")
     manifest = parse_json(data, file)
     if type(manifest.get("format")) is not int or manifest["format"] != FORMAT:
         message = f"{folder} has checkpoint format {str(manifest.get('format'))[:40]}; this rlcli reads {FORMAT}"
@@ -285,7 +285,7 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     step = check_json(_Manifest, manifest, file).step
     name = folder.name
     if name.isdecimal() and name.isascii() and len(name) >= 12 and int(name) != step:
-        raise CheckpointError(f"{file} is corrupt: it is for step {step}, but its folder for step {int(name)}")
+        raise CheckpointError(f"{file} is corrupt: it has step {step}, its folder is named {int(name)}; rename it")
     return Checkpoint(folder, manifest)
 
 
@@ -304,7 +304,7 @@ def sha256(data: bytes) -> str:
 
 def _verified(file: Path, size: int, digest: str, limit: int) -> bytes:
     """Return the content of a file after a check of its size and hash."""
-    data = read_file(file, limit, size=size, missing=f"{file} is missing")
+    data = read_file(file, limit, size=size, missing=f"{file} is missing; choose an older checkpoint: RUN@step:N")
     if len(data) != size or sha256(data) != digest:
         raise manifest_error(file, len(data), size)
     return data
@@ -314,7 +314,7 @@ def _tensors(data: bytes, file: Path) -> dict[str, Tensor]:
     """Return the tensors of a safetensors file after a check of its header."""
     length = int.from_bytes(data[:8], "little")
     if length > min(_HEADER_LIMIT, len(data) - 8):
-        raise CheckpointError(f"{file} is corrupt: it is not a safetensors file, or its header is too long")
+        raise CheckpointError(f"{file} is corrupt: not a safetensors file; use RUN@step:N")
     check_json(_Header, parse_json(data[8 : 8 + length], file), file)  # shapes that torch accepts
     try:
         return safetensors.torch.load(data)
@@ -327,7 +327,7 @@ def _check_state(values: dict[str, Any], step: int, file: Path) -> None:
     check_json(_State, values, file)
     if values.get("env_steps", step) != step:
         found = values["env_steps"]
-        raise CheckpointError(f"{file} is corrupt: it is for step {found}, but the manifest for step {step}")
+        raise CheckpointError(f"{file} is corrupt: it has step {found}, the manifest step {step}; use RUN@step:N")
     for key, entry in values.items():
         if key.partition(".")[0] == "statistics":
             check_json(_Statistics, entry, file, key)

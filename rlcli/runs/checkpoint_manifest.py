@@ -29,7 +29,7 @@ FIELDS = {
     "mocap_quat",
 }  # fmt: skip
 """Fields of MjData that formulas may read."""
-_NO_LAYOUT = "this rlcli reads checkpoints that describe the policy's columns: train again"
+_NO_LAYOUT = "the checkpoint does not describe the policy's columns, which this rlcli needs: train again"
 _INPUT_NAME = re.compile(r"last_action|steps|action|command|(command|observation)/.{1,1000}", re.DOTALL)
 
 
@@ -41,13 +41,13 @@ def check_formula(value: Any) -> None:
     """
     if isinstance(value, list):
         if not all(type(item) in (int, float) for item in value):
-            raise ValueError("a constant is a list of numbers")
+            raise ValueError("a constant must be a list of numbers")
         return
     if not isinstance(value, dict):
         raise ValueError(f"not a formula: {str(value)[:60]}")
     keys, at, name = set(value), value.get("at", []), value.get("given")
     if not isinstance(at, list) or not all(type(i) is int and 0 <= i < 2**31 for i in at):
-        raise ValueError("at is a list of indices")
+        raise ValueError("`at` must be a list of indices from 0")
     if keys == {"field", "at"} and value["field"] in FIELDS:
         return
     if keys in ({"given"}, {"given", "at"}) and isinstance(name, str) and _INPUT_NAME.fullmatch(name):
@@ -57,7 +57,7 @@ def check_formula(value: Any) -> None:
         raise ValueError(f"not a formula: {str(value)[:60]}")
     count, of = OPS[value["op"]], value["of"]
     if not isinstance(of, list) or (count is not None and len(of) != count) or not of:
-        raise ValueError(f"'{value['op']}' takes {count or 'some'} values")
+        raise ValueError(f"'{value['op']}' takes {count or 'one or more'} values")
     if own and not (isinstance(value["key"], str) and all(_are_numbers(value[key]) for key in "ab") and value["b"]):
         raise ValueError("a filter must have the coefficients b and a, and a key")
     for part in of:
@@ -130,9 +130,9 @@ class _Formula(_Record):
         if value is not None:
             check_formula(value)
         if closed and value is None:
-            raise ValueError("'closed' is true, but 'formula' is missing")
+            raise ValueError("'closed' is true, so 'formula' must be given")
         if not closed and isinstance(self, ObservationFormula) and not _is_external_input(value):
-            raise ValueError("not closed, but with a formula")
+            raise ValueError("'closed' is false, so 'formula' must be null")
         return self
 
 
@@ -238,7 +238,7 @@ def deployment_of(checkpoint: Checkpoint, policy: Policy, found: object = None) 
     ends = [0] + [term.columns[1] for term in terms]
     widths = [term.columns[1] - term.columns[0] for term in terms]
     if begins != ends or any(width <= 0 or width % t.history for width, t in zip(widths, terms, strict=True)):
-        raise CheckpointError(f"{file}: deployment: its columns are not the policy's")
+        raise CheckpointError(f"{file}: deployment: its columns differ from the policy's; train again")
     return record
 
 

@@ -33,14 +33,14 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
             for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), start=1):
                 size += len(line)
                 if size > _MOST_BYTES:
-                    raise CheckpointError(f"{run.metrics} is too large: at most {_MOST_BYTES:,} bytes are read")
+                    raise CheckpointError(f"{run.metrics} is larger than {_MOST_BYTES:,} bytes; shorten it")
                 if not line.endswith(b"\n") and len(line) < LONGEST_LINE:
                     return
                 row = parse_row(line)
                 if row is not None:
                     yield row
                 elif strict:
-                    raise CheckpointError(f"{run.metrics}:{number} is corrupt: it is not a row of metrics")
+                    raise CheckpointError(f"{run.metrics}:{number} is corrupt: not a row of metrics; delete this line")
                 else:
                     return
     except FileNotFoundError:

@@ -82,7 +82,7 @@ def choose(
         found = open_bundle(Path(reference))
         owner = found.manifest["task"]["name"]
         if name is not None and owner != name:
-            raise UsageError(f"{reference} is a policy for {owner}, not for {name}", hint="leave out TASK")
+            raise UsageError(f"{reference} is a policy for {owner}, not for {name}", hint="leave out the task")
         return Choice(found.folder, "as named", None, found)
     run, folder, why = find_checkpoint(reference or "latest", runs_dir, name)
     return Choice(folder, why, run, None)

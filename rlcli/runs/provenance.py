@@ -1,4 +1,4 @@
-"""Record of what the bits of a run depend on besides its configuration: versions, source code, hardware, threads."""
+"""Record of everything besides the configuration that may change the bits of a run: versions, sources, hardware."""
 
 from __future__ import annotations
 

@@ -29,9 +29,9 @@ def require_reproducible(run: Run) -> None:
             hint="train again with other seeds, and compare the policies with rlcli eval",
         )
     if processes != 1:
-        raise UsageError(f"{run.folder} was trained by {processes} processes; a single process gives other results")
+        raise UsageError(f"{run.folder} was trained by {processes} processes; choose a run of one process")
     if last_iteration(run) < 1:
-        raise UsageError(f"{run.folder} has no iteration to reproduce")
+        raise UsageError(f"{run.folder} has no finished iteration to reproduce; choose another run")
 
 
 def changed_entries(run: Run, now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
@@ -63,7 +63,7 @@ def create_reproduction(original: Run, runs_dir: Path, name: str, now: Mapping[s
     if initial is not None:
         policy = open_checkpoint(initial).manifest["files"].get("policy.safetensors", {}).get("sha256")
         if policy != was.get("init_from_sha256", policy):
-            raise CheckpointError(f"{initial}: its policy has changed since the run started from it")
+            raise CheckpointError(f"{initial}: its policy has changed since the run started from it; restore it")
     kept: dict[str, Any] = {
         key: was[key]
         for key in ("seed", "device", "task", "agent", "init_from", "init_from_sha256", "given", "torch_threads")

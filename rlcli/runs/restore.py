@@ -93,7 +93,7 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
     try:
         differing = _differing_rows(checkpoint.manifest["layout"], layout.record())
     except (AttributeError, KeyError, TypeError, ValueError):
-        raise CheckpointError(f"{checkpoint.folder}/manifest.json is corrupt: its layout is malformed") from None
+        raise CheckpointError(f"{checkpoint.folder}: manifest.json has a malformed layout; use RUN@step:N") from None
     if not differing:
         return
     table = _table([("field", "in the checkpoint", "now"), *differing])
@@ -111,7 +111,7 @@ def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
     saved = checkpoint.manifest.get("trainer")
     if saved is not None and saved != trainer:
         message = f"{checkpoint.folder} is a checkpoint of trainer '{saved}', but the run's agent uses '{trainer}'"
-        raise CheckpointError(message, hint="--init-from takes only the weights of its policy, in a new run")
+        raise CheckpointError(message, hint="use --init-from to start a new run with the weights of its policy")
 
 
 def require_same_policy(checkpoint: Checkpoint, policy: Policy, trainer: str) -> None:

@@ -66,7 +66,9 @@ class Run:
         Raises:
             CheckpointError: if it is missing, corrupt, or not a regular file.
         """
-        text = read_file(self.config, strict_yaml.MAX_BYTES, missing=f"{self.folder} has no {CONFIG}")
+        text = read_file(
+            self.config, strict_yaml.MAX_BYTES, missing=f"{self.folder} has no {CONFIG}; choose another run"
+        )
         try:
             return strict_yaml.load(text)
         except strict_yaml.YamlError as error:
@@ -87,7 +89,7 @@ class Run:
         try:
             self._lock.acquire()
         except Timeout:
-            raise MachineError(f"{self.folder} is being written to by another process") from None
+            raise MachineError(f"another process writes to {self.folder}; wait for its end") from None
 
     def unlock(self) -> None:
         """Release the lock."""
@@ -132,7 +134,7 @@ def require_name(name: str | None) -> None:
         UsageError: if it cannot.
     """
     if name is not None and not _NAME.fullmatch(name):
-        raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint="letters, digits, - and _")
+        raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint="use letters, digits, - and _")
 
 
 def initialize_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
@@ -156,14 +158,14 @@ def open_run(folder: Path) -> Run:
     Raises:
         CheckpointError: if the folder is not a valid run.
     """
-    record = read_json(folder, RECORD, missing=f"{folder} is not a run: it has no {RECORD}")
+    record = read_json(folder, RECORD, missing=f"{folder} is not a run, because it has no {RECORD}; check the path")
     refuse_links(folder)
     for inner in ("checkpoints", "checkpoints/logs"):
         if (folder / inner).is_dir():
             refuse_links(folder / inner)
     for part in (folder / CONFIG, folder / "metrics.jsonl"):
         if part.exists() and not part.is_file():
-            raise CheckpointError(f"{part} is not a regular file")  # reading a pipe would block
+            raise CheckpointError(f"{part} is not a regular file; delete it")  # reading a pipe would block
     check_json(RunRecord, record, folder / RECORD)
     return Run(folder, record)
 
@@ -243,17 +245,17 @@ def require_own(run: Run, *parts: str) -> None:
             elif not stat.S_ISREG(mode):
                 raise OSError(errno.EINVAL, "it is not a regular file")
             if count > _MAX_FILES:
-                raise OSError(errno.EFBIG, f"the run holds more than {_MAX_FILES} files")
+                raise OSError(errno.EFBIG, f"the run has more than {_MAX_FILES} files")
         except FileNotFoundError:
             continue
         except (OSError, RuntimeError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise CheckpointError(f"{path} cannot be written to: {reason}", hint="rlcli did not create it") from None
+            raise CheckpointError(f"{path} cannot be written to: {reason}", hint="delete this foreign file") from None
 
 
 def _require_task_name(name: str) -> str:
     if not _TASK.fullmatch(name):
-        raise ValueError("the name of a task is part of a path: '/', '\\' and ':' are not allowed")
+        raise ValueError("the task's name must not have '/', '\\' or ':', because it is part of a path")
     return name
 
 
@@ -274,7 +276,7 @@ class _InstalledTask(TaskRecord):
     @model_validator(mode="after")
     def _check_origin(self) -> Self:
         if not (self.folder or self.distribution):
-            raise ValueError("names neither a folder nor a distribution")
+            raise ValueError("give folder or distribution, the origin of the task")
         return self
 
 

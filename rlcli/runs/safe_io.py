@@ -36,7 +36,7 @@ class FileModel(BaseModel):
 
 def _require_printable(text: str) -> str:
     if not text.isprintable():
-        raise ValueError("has characters that cannot be printed")
+        raise ValueError("the text must have only characters that can be printed")
     return text
 
 
@@ -107,7 +107,7 @@ def read_file(file: Path, limit: int, *, size: int | None = None, missing: str |
 def manifest_error(file: Path, found: int, size: int) -> CheckpointError:
     """Return the error for a file of `found` bytes whose size or hash differs from the manifest."""
     message = f"{file} is corrupt: it does not match the manifest ({found} of {size} bytes)"
-    return CheckpointError(message, hint="choose an older checkpoint with RUN@step:N")
+    return CheckpointError(message, hint="choose an older checkpoint: RUN@step:N")
 
 
 def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
@@ -137,7 +137,7 @@ def _open(file: Path) -> tuple[int, os.stat_result]:
     """Open a plain file; return its handle and status."""
     try:
         if file.is_symlink():
-            raise CheckpointError(f"{file} is a link; links in runs are not followed")
+            raise CheckpointError(f"{file} is a link; replace it by the file itself")
         handle = os.open(file, os.O_RDONLY | _NO_LINKS)  # O_NONBLOCK: opening a pipe must not block
     except (FileNotFoundError, NotADirectoryError) as error:
         raise FileNotFoundError(*error.args) from None
@@ -149,7 +149,7 @@ def _open(file: Path) -> tuple[int, os.stat_result]:
     status = os.fstat(handle)
     if not stat.S_ISREG(status.st_mode):
         os.close(handle)
-        raise CheckpointError(f"{file} is not a regular file")
+        raise CheckpointError(f"{file} is not a regular file; delete it")
     return handle, status
 
 
@@ -172,9 +172,9 @@ def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:
     except _StrictError as error:
         raise CheckpointError(f"{file} is corrupt: {error}") from None
     except (ValueError, RecursionError):
-        raise CheckpointError(f"{file} is corrupt: not JSON") from None
+        raise CheckpointError(f"{file} is corrupt: not JSON; restore it from a copy") from None
     if not isinstance(value, dict):
-        raise CheckpointError(f"{file} is corrupt: not a JSON object")
+        raise CheckpointError(f"{file} is corrupt: not a JSON object; restore it from a copy")
     return value
 
 
@@ -205,7 +205,7 @@ def require_inside(folder: Path, file: Path) -> None:
     """
     real = Path(os.path.realpath(file))  # resolve() raises RuntimeError for a link to itself
     if not real.is_relative_to(os.path.realpath(folder)):
-        raise OSError(errno.ELOOP, "it is a link that leads elsewhere", str(file))
+        raise OSError(errno.ELOOP, "it is a link out of the folder; replace it by the file itself", str(file))
 
 
 def refuse_links(folder: Path) -> None:
@@ -219,7 +219,7 @@ def refuse_links(folder: Path) -> None:
     except OSError as error:
         raise CheckpointError(f"{folder} cannot be read: {error.strerror}") from None
     if links:
-        raise CheckpointError(f"{folder / links[0]} is a link; links in runs are not followed")
+        raise CheckpointError(f"{folder / links[0]} is a link; replace it by the file itself")
 
 
 class _StrictError(ValueError):
@@ -242,13 +242,13 @@ def _refuse_constant(name: str) -> NoReturn:
 def _finite_float(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise _StrictError(f"number {text[:20]} is out of range")
+        raise _StrictError(f"the number {text[:20]} is too large; allowed are numbers up to 1.8e308")
     return value
 
 
 def _short_int(text: str) -> int:
     if len(text) > _MAX_DIGITS:
-        raise _StrictError(f"a number has {len(text)} digits")
+        raise _StrictError(f"a number has {len(text)} digits; at most {_MAX_DIGITS} are allowed")
     return int(text)
 
 
@@ -263,4 +263,4 @@ def _check_depth(value: object) -> None:
         ]
         if not level:
             return
-    raise _StrictError(f"it is nested more than {_MAX_DEPTH} levels deep")
+    raise _StrictError(f"values are nested deeper than {_MAX_DEPTH} levels")

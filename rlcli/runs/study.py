@@ -32,13 +32,13 @@ def read_seeds(text: str) -> list[int]:
             raise UsageError(f"--seeds '{text}': '{part.strip()}' is not a seed", hint="as in --seeds 0..4 or 1,5,9")
         first, last = int(found[1]), int(found[2] or found[1])
         if last < first:
-            raise UsageError(f"--seeds '{text}': {part.strip()} is empty", hint=f"{last}..{first}")
+            raise UsageError(f"--seeds '{text}': {part.strip()} is empty", hint=f"write {last}..{first}")
         if last > MAX_SEED or last - first >= _MAX_SEEDS or len(seeds) > _MAX_SEEDS:
-            raise UsageError(f"--seeds '{text}': at most {_MAX_SEEDS} seeds, each up to {MAX_SEED}")
+            raise UsageError(f"--seeds '{text}': give at most {_MAX_SEEDS} seeds, each up to {MAX_SEED}")
         seeds += range(first, last + 1)
     twice = sorted({seed for seed in seeds if seeds.count(seed) > 1})
     if twice:
-        raise UsageError(f"--seeds '{text}' names {twice[0]} twice")
+        raise UsageError(f"--seeds '{text}' has {twice[0]} twice; give each seed once")
     return seeds
 
 
@@ -77,10 +77,12 @@ def read_study(folder: Path, kind: str = "seeds") -> dict[str, Any]:
     Raises:
         CheckpointError: if the folder is not a study of this kind, or its record is malformed.
     """
-    record = read_json(folder, STUDY, _LIMIT, missing=f"{folder} is not a study: it has no {STUDY}")
+    record = read_json(
+        folder, STUDY, _LIMIT, missing=f"{folder} is not a study of several runs: it has no {STUDY}; check the path"
+    )
     check_json(_StudyRecord, record, folder / STUDY)
     if record["kind"] != kind:
-        raise CheckpointError(f"{folder} is a study of {record['kind']}, not of {kind}")
+        raise CheckpointError(f"{folder} has kind {record['kind']}, expected {kind}; choose another folder")
     return record
 
 

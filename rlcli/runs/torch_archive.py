@@ -43,17 +43,17 @@ VEC_NORMALIZE_HINT = (
 def read_archive_file(file: Path) -> bytes:
     """Read a whole file of at most 4 GiB and a quarter of the memory."""
     limit = min(_MAX_BYTES, available_memory() // 4)
-    return read_file(file.resolve(), limit, missing=f"there is no file {file}")
+    return read_file(file.resolve(), limit, missing=f"there is no file {file}; check the path")
 
 
 def read_member(file: Path, name: str) -> bytes:
     """Read a member of a zip file after a check of all members."""
     data = read_archive_file(file)
     if data[:1] == b"\x80":
-        raise CheckpointError(f"{file} is a pickle; it is not opened", hint=VEC_NORMALIZE_HINT)
+        raise CheckpointError(f"{file} is a pickle, which rlcli does not open", hint=VEC_NORMALIZE_HINT)
     archive = _archive(data, str(file))
     if name not in archive.namelist():
-        raise CheckpointError(f"{file} has no {name}: Stable-Baselines3 did not save it")
+        raise CheckpointError(f"{file} has no {name}; save the model with Stable-Baselines3")
     return _content(archive, name, str(file))
 
 
@@ -63,9 +63,9 @@ def _archive(data: bytes, where: str) -> zipfile.ZipFile:
         archive = zipfile.ZipFile(io.BytesIO(data))
         members = archive.infolist()
     except Exception as error:  # zipfile raises many types of errors for malformed numbers
-        raise CheckpointError(f"{where} is corrupt or not a zip file: {one_line(error)}") from None
+        raise CheckpointError(f"{where} is not a valid zip file; save it again: {one_line(error)}") from None
     if len(members) > _MAX_MEMBERS:
-        raise CheckpointError(f"{where} has {len(members)} members")
+        raise CheckpointError(f"{where} has {len(members)} members; at most {_MAX_MEMBERS} are allowed")
     seen: set[str] = set()
     for member in members:
         name = member.filename
@@ -74,10 +74,10 @@ def _archive(data: bytes, where: str) -> zipfile.ZipFile:
         refused = {
             "its path leads out of the file": outside,
             "it appears twice": name.casefold() in seen,
-            "it is a link": stat.S_ISLNK(member.external_attr >> 16),
+            "the member is a link": stat.S_ISLNK(member.external_attr >> 16),
             "it is encrypted": member.flag_bits & 1,
             "its compression is not supported": member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED),
-            f"it grows more than {_MAX_RATIO} times unpacked": member.file_size
+            f"it is more than {_MAX_RATIO} times larger unpacked": member.file_size
             > _MAX_RATIO * max(member.compress_size, 1),
         }
         for reason, applies in refused.items():
@@ -86,7 +86,7 @@ def _archive(data: bytes, where: str) -> zipfile.ZipFile:
         seen.add(name.casefold())
     total, limit = sum(member.file_size for member in members), min(_MAX_BYTES, available_memory() // 4)
     if total > limit:
-        raise CheckpointError(f"{where} holds {total:,} bytes, at most {limit:,} are read")
+        raise CheckpointError(f"{where} unpacks to {total:,} bytes; at most {limit:,} are allowed")
     return archive
 
 
@@ -96,9 +96,9 @@ def _content(archive: zipfile.ZipFile, name: str, where: str) -> bytes:
         with archive.open(name) as member:
             data = member.read(size + 1)
     except Exception as error:
-        raise CheckpointError(f"{where}: {name} is corrupt: {one_line(error)}") from None
+        raise CheckpointError(f"{where}: {name} is corrupt; save it again: {one_line(error)}") from None
     if len(data) != size:
-        raise CheckpointError(f"{where}: {name} is corrupt: {len(data)} bytes of {size}")
+        raise CheckpointError(f"{where}: {name} is corrupt: {len(data)} of {size} bytes; save it again")
     return data
 
 
@@ -106,18 +106,18 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
     """Load nested dictionaries of tensors and numbers from a .pt file; a pickle with other types is refused."""
     if data[:4] != b"PK\x03\x04":
         kind = "a plain pickle or a file of torch before 1.6" if data[:1] == b"\x80" else "not a torch file"
-        raise CheckpointError(f"{where} is {kind}; it is not opened", hint="save it again with torch.save")
+        raise CheckpointError(f"{where} is {kind}, which rlcli does not open", hint="save it again with torch.save")
     archive = _archive(data, where)
     described = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
     if len(described) != 1 or archive.getinfo(described[0]).file_size > _PICKLE_LIMIT:
-        raise CheckpointError(f"{where} is not a torch file: its data.pkl is missing, not unique or too large")
+        raise CheckpointError(f"{where} is not a torch file: bad data.pkl; save it again with torch.save")
     _require_tensors_only(_content(archive, described[0], where), where)
     try:
         saved = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:
-        raise CheckpointError(f"{where} is corrupt or holds more than tensors: {one_line(error, 300)}") from None
+        raise CheckpointError(f"{where} must hold only tensors; save it again: {one_line(error, 300)}") from None
     if not isinstance(saved, Mapping):
-        raise CheckpointError(f"{where} is not a mapping of names to tensors")
+        raise CheckpointError(f"{where} is not a mapping of names to tensors; save a state_dict")
     return saved
 
 
@@ -127,8 +127,8 @@ def _require_tensors_only(description: bytes, where: str) -> None:
         for opcode, argument, _ in pickletools.genops(description):
             if opcode.name in _REFUSED_OPCODES or (opcode.name == "GLOBAL" and argument not in _ALLOWED):
                 found = f"names '{str(argument)[:80]}'" if argument is not None else "creates objects"
-                raise CheckpointError(f"{where} {found}, which is not a tensor; nothing is loaded")
+                raise CheckpointError(f"{where} {found}, which is not a tensor; save only tensors")
     except CheckpointError:
         raise
     except Exception as error:
-        raise CheckpointError(f"{where} is corrupt: {one_line(error)}") from None
+        raise CheckpointError(f"{where} is corrupt; save it again: {one_line(error)}") from None

@@ -2,7 +2,7 @@
 
 Installed tasks are always trusted. A run may also name a task folder or a configuration in Python; its author chose
 them, so they are untrusted. They are loaded only after the user has named them on a command line of this machine. The
-user's state folder has one file for each task named so.
+user's state folder has one file for each such task.
 """
 
 from __future__ import annotations

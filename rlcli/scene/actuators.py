@@ -147,7 +147,7 @@ class JointCommand:
         native = dict(entity.actuators_of(kind))
         missing = [entity.joint_names[c] for c in columns if c not in modelled and c not in native]
         if missing:
-            raise NameProblem(f"no {kind} actuator drives {', '.join(missing)}")
+            raise NameProblem(f"no {kind} actuator drives {', '.join(missing)}; set actuator: {kind}")
         self.actuators = [None if c in modelled else native[c] for c in columns]
         """Id of the MuJoCo actuator of each column; None where an actuator model drives the joint."""
         self.sinks = [f"{entity.name}/{entity.joint_names[c]} {kind}" if c in modelled else native[c] for c in columns]
@@ -192,5 +192,5 @@ def _by_joint(value: float | Mapping[str, float], names: Sequence[str], device: 
         return torch.full((len(names),), float(value), device=device)
     values = match_values(value, names, "joint")
     if None in values:
-        raise NameProblem(f"no value for joint '{names[values.index(None)]}'")
+        raise NameProblem(f"no value for joint '{names[values.index(None)]}'; add one, or a pattern that matches it")
     return torch.tensor(values, dtype=torch.float32, device=device)

@@ -217,7 +217,7 @@ class RendererPool:
                 hint="make the environment in the new process, or start the process with 'spawn'",
             )
         if not self._end.alive:
-            raise MachineError("the environment is closed: its cameras cannot render any more")
+            raise MachineError("the environment is closed, so its cameras cannot render; create a new environment")
         futures: list[Future[None]] = [Future() for _ in work]
         for function, future, orders in zip(work, futures, self._orders, strict=False):
             orders.put((function, future))
@@ -243,7 +243,7 @@ def make_cameras(specs: Mapping[str, CameraSensorSpec], engine: Engine) -> dict[
     if not specs:
         return {}
     if (states := engine.replayable) is None:
-        hint = "--device cpu, and no sim.engine: warp"
+        hint = "use --device cpu, and leave out sim.engine: warp"
         message = "cameras need the CPU engine; the GPU engine cannot render them"
         raise ConfigError([Problem("scene", f"scene.sensors.{name}", message, hint) for name in specs])
     configs = [spec.config for spec in specs.values()]

@@ -152,7 +152,7 @@ class Entity:
             TaskError: if the root is fixed to the world.
         """
         if self.root_qpos is None or self.root_dof is None:
-            raise TaskError(f"entity '{self.name}' is fixed to the world and cannot be moved")
+            raise TaskError(f"entity '{self.name}' is fixed to the world; add a <freejoint/> to its MJCF")
         return self.root_qpos, self.root_dof
 
     def _index(self, positions: Sequence[int]) -> Columns:

@@ -96,7 +96,7 @@ class EntityData:
         return self._once("joint_vel", lambda: self._sim.qvel[:, self._dof_index])
 
     def joint_pos_of(self, joints: Columns) -> Tensor:
-        """Return `joint_pos[:, joints]`; the view is made once, for terms of every step. (num_envs, k) [m or rad]"""
+        """Return `joint_pos[:, joints]`; a view that is created only once. (num_envs, k) [m or rad]"""
         return self._pos.of(self.joint_pos, joints)
 
     def joint_vel_of(self, joints: Columns) -> Tensor:

@@ -71,7 +71,7 @@ def _load_mjcf(entity: EntityConfig, path: tuple[str, ...], root: Path, installe
     except TaskError as error:
         raise SceneProblem(path, error.message, error.hint) from None
     if ":" not in entity.model and not file.is_relative_to(root):
-        raise SceneProblem(path, f"'{entity.model}' lies outside the task's folder {root}")
+        raise SceneProblem(path, f"'{entity.model}' lies outside the task's folder {root}; move it inside")
     if not file.is_file():
         files = sorted(str(p.relative_to(root)) for p in root.rglob("*.xml"))
         hint = f"MJCF files there: {', '.join(files) or 'none'}"

@@ -45,5 +45,5 @@ def default_root_state(entity: Entity) -> Tensor:
         pose = np.concatenate([model.body_pos[body], model.body_quat[body]])
     velocity = [*entity.config.init.lin_vel, *entity.config.init.ang_vel]
     if entity.root_qpos is None and any(velocity):
-        raise NameProblem(f"entity '{entity.name}' has no free root", "remove lin_vel and ang_vel: they need one")
+        raise NameProblem(f"entity '{entity.name}' has no free joint at its root", "remove lin_vel and ang_vel")
     return torch.tensor([*pose, *velocity], dtype=torch.float32)

@@ -86,7 +86,7 @@ class SceneJoints:
             path = ("scene", "entities", name, "actuators", key, "joints")
             for joint in [names[position] for position in self._match(path, config.joints, names)]:
                 if joint in owner:
-                    self._problems.append(SceneProblem(path, f"joint '{joint}' is driven by '{owner[joint]}' already"))
+                    self._problems.append(SceneProblem(path, f"joint '{joint}' is also in '{owner[joint]}'; keep one"))
                     continue
                 owner[joint] = key
                 target = f"{name}/{joint}"
@@ -130,7 +130,7 @@ class SceneJoints:
             actuator.set_to_motor()
         elif kind == "position":
             if settings.kp is None:
-                message = f"joint '{joint}' needs a position actuator and no gain is given"
+                message = f"joint '{joint}' needs a position actuator, but has no gain kp"
                 hint = f"add joints: {{{joint}: {{kp: ..., kv: ...}}}}"
                 self._problems.append(SceneProblem(("scene", "entities", entity, "joints"), message, hint))
                 return

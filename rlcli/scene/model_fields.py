@@ -65,7 +65,7 @@ class ModelField:
         rows = model_rows(engine, name)
         self.width = rows.shape[1]
         if bad := [axis for axis in axes or () if not 0 <= axis < self.width]:
-            raise NameProblem(f"{name} has no axis {bad[0]}", f"axes: 0 to {self.width - 1}")
+            raise NameProblem(f"{name} has no axis {bad[0]}", f"give axes from 0 to {self.width - 1}")
         self.axes = list(range(self.width)) if axes is None else list(axes)
         self.values = _expand(engine, name).view(engine.num_envs, -1)
         """Values of the field in every world, flattened. (num_envs, n)"""
@@ -104,7 +104,7 @@ def model_rows(engine: Engine, name: str) -> np.ndarray:
     """
     if name not in FIELDS:
         suggestion = did_you_mean(name, FIELDS)
-        allowed = f"fields that can: {listing(sorted(FIELDS), 60)}"
+        allowed = f"fields that can differ: {listing(sorted(FIELDS), 60)}"
         hint = f"{suggestion}; {allowed}" if suggestion else allowed
         raise NameProblem(f"'{name}' cannot differ between environments", hint)
     owner, attribute = (engine.model.opt, name[4:]) if name.startswith("opt.") else (engine.model, name)
@@ -118,4 +118,4 @@ def _expand(engine: Engine, name: str) -> Tensor:
     except ValueError:
         allowed = [field for field in FIELDS if engine.can_expand(field)]
         message = f"'{name}' cannot differ between environments on this engine"
-        raise NameProblem(message, f"fields that can: {listing(sorted(allowed), 60)}") from None
+        raise NameProblem(message, f"fields that can differ: {listing(sorted(allowed), 60)}") from None

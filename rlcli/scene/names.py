@@ -45,7 +45,9 @@ def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> lis
         found = [names.index(pattern)] if pattern in names else _search(pattern, names, what)
         for position in found:
             if position in positions:
-                raise NameProblem(f"{what} '{names[position]}' is matched twice, the second time by '{pattern}'")
+                raise NameProblem(
+                    f"{what} '{names[position]}' is matched twice; narrow the second pattern, '{pattern}'"
+                )
             positions.append(position)
     return positions
 
@@ -61,7 +63,9 @@ def match_values(values: Mapping[str, Value], names: Sequence[str], what: str) -
     for pattern, value in values.items():
         for position in match(pattern, names, what):
             if position in owner:
-                raise NameProblem(f"{what} '{names[position]}' is matched by '{owner[position]}' and by '{pattern}'")
+                raise NameProblem(
+                    f"'{owner[position]}' and '{pattern}' both match {what} '{names[position]}'; narrow one"
+                )
             owner[position] = pattern
             found[position] = value
     return found
@@ -71,7 +75,7 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
     try:
         regex = re.compile(pattern)
     except re.error as error:
-        raise NameProblem(f"'{pattern}' is neither a {what} nor a regular expression ({error})") from None
+        raise NameProblem(f"'{pattern}' is neither a {what} nor a regular expression ({error}); correct it") from None
     found = [position for position, name in enumerate(names) if regex.fullmatch(name)]
     if not found:
         suggestion = did_you_mean(pattern, names)

@@ -129,7 +129,7 @@ class SensorBuilder:
         if self._ground is None or self._ground.blocks:
             reason = "the scene has no terrain" if self._ground is None else "the terrain has boxes"
             message = f"heights cannot be looked up: {reason}"
-            raise SceneProblem((*path, "lookup"), message, "lookup: false")
+            raise SceneProblem((*path, "lookup"), message, "set lookup: false")
         return RaySensorSpec(config, body, groups, self._ground)
 
     def _camera(self, name: str, config: CameraSensorConfig, path: tuple[str, ...]) -> CameraSensorSpec:

@@ -74,10 +74,10 @@ def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProbl
         return
     count = round(cells[0]) * config.rows * round(cells[1]) * config.columns
     if count > _MAX_HEIGHTS:
-        hint = "fewer or smaller patches, or a coarser resolution"
+        hint = "set fewer or smaller patches, or a larger resolution"
         yield ("resolution",), f"the height field has {count:,} heights, more than {_MAX_HEIGHTS:,}", hint
     if config.max_start_level is not None and config.max_start_level >= config.rows:
-        yield ("max_start_level",), f"there is no level {config.max_start_level}", f"the last is {config.rows - 1}"
+        yield ("max_start_level",), f"no level {config.max_start_level}", f"levels: 0 to {config.rows - 1}"
     for name, patch in config.sub_terrains.items():
         for key, text, advice in _patch_problems(patch, min(config.patch), config.resolution):
             yield ("sub_terrains", name, key), text, advice
@@ -258,17 +258,17 @@ def _patch_problems(patch: schema.PatchConfig, edge: float, resolution: float) -
     """Yield key, message and hint for each problem of a sub-terrain."""
     platform = getattr(patch, "platform", 0.0)
     if platform >= edge:
-        yield "platform", f"a platform of {platform:g} m does not fit in a patch of {edge:g} m", None
-    fine = "a finer resolution, or boxes: true"
+        yield "platform", f"a platform of {platform:g} m does not fit in a patch of {edge:g} m", "make it smaller"
+    fine = "set a smaller resolution, or boxes: true"
     if isinstance(patch, schema.StairsPatchConfig) and not patch.boxes and patch.step_width < 2 * resolution:
         yield "step_width", f"steps of {patch.step_width:g} m need cells of half that, not {resolution:g} m", fine
     if isinstance(patch, schema.GridPatchConfig) and not patch.boxes and patch.cell < 2 * resolution:
         yield "cell", f"cells of {patch.cell:g} m need a resolution of half that, not {resolution:g} m", fine
     if isinstance(patch, schema.ObstaclesPatchConfig | schema.StonesPatchConfig):
         if patch.width[1] > edge:
-            yield "width", f"{patch.width[1]:g} m does not fit in a patch of {edge:g} m", None
+            yield "width", f"{patch.width[1]:g} m does not fit in a patch of {edge:g} m", "make it smaller"
         if patch.width[0] < resolution:
-            yield "width", f"{patch.width[0]:g} m is less than a cell of {resolution:g} m", "a finer resolution"
+            yield "width", f"{patch.width[0]:g} m is less than a cell of {resolution:g} m", "set a smaller resolution"
 
 
 def _read_heights(file: Path) -> NDArray[Any]:
@@ -280,18 +280,18 @@ def _read_heights(file: Path) -> NDArray[Any]:
     with file.open("rb") as opened:
         size = os.fstat(opened.fileno()).st_size
         if size > _MAX_HEIGHTS * 8 + _MAX_HEADER:
-            raise ValueError(f"the file has {size:,} bytes, more than {_MAX_HEIGHTS:,} heights need")
+            raise ValueError(f"the file has {size:,} bytes; give at most {_MAX_HEIGHTS:,} heights")
         try:
             return np.asarray(np.lib.format.read_array(opened, allow_pickle=False, max_header_size=_MAX_HEADER))
         except (MemoryError, RecursionError, SyntaxError, TokenError) as error:  # errors of a malicious header
-            raise ValueError(f"the header is malformed ({type(error).__name__})") from None
+            raise ValueError(f"its header is malformed ({type(error).__name__}); use numpy.save") from None
 
 
 def _file_problems(config: schema.TerrainHeightsConfig, root: Path) -> Iterator[TerrainProblem]:
     """Yield the problems of a terrain's height file."""
     file = (root / config.file).resolve()
     if not file.is_relative_to(root.resolve()):
-        yield ("file",), f"'{config.file}' lies outside the task's folder {root}", None
+        yield ("file",), f"'{config.file}' lies outside the task's folder {root}", "move it inside"
         return
     if not file.is_file():
         files = ", ".join(sorted(str(p.relative_to(root)) for p in root.rglob("*.npy"))) or "none"
@@ -300,7 +300,7 @@ def _file_problems(config: schema.TerrainHeightsConfig, root: Path) -> Iterator[
     try:
         heights = _read_heights(file)
     except (ValueError, OSError) as error:
-        yield ("file",), f"'{config.file}' is not a NumPy file: {error}", None
+        yield ("file",), f"'{config.file}' is not a NumPy file: {error}", "write it with numpy.save"
         return
     if heights.ndim != 2 or min(heights.shape) < 2:
         found = f"found shape {heights.shape}"

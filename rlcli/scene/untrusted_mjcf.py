@@ -54,12 +54,12 @@ def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False) -> 
     """
     scan = _MjcfScan(file, [root.resolve() for root in roots])
     if not any(file.resolve().is_relative_to(root) for root in scan.roots):
-        raise BadModel(f"{file}: lies outside of {scan.roots[0]}")
+        raise BadModel(f"{file}: lies outside of {scan.roots[0]}; move it inside")
     scan.read(file)
     if not installed and scan.cost > _MAX_COST:
         raise BadModel(
             f"{file}: too large: as expensive as {scan.cost:,.0f} elements, {_MAX_COST:,} are allowed;"
-            f" the most expensive part is {scan.costliest}"
+            f" make its most expensive part smaller: {scan.costliest}"
         )
     if not installed and scan.cost > SUBPROCESS_COST:
         _compile_in_subprocess(file)
@@ -118,7 +118,7 @@ class _MjcfScan:
         """
         self._read_text(file)
         if len(self._assets) > _MAX_FILES:
-            raise BadModel(f"{self.main}: loads more than {_MAX_FILES} files")
+            raise BadModel(f"{self.main}: loads more than {_MAX_FILES} files; use fewer meshes and textures")
         for source, line, element, name in self._assets:
             for found in self._allowed_files(source, line, element, name):
                 self._check_asset(found, source, line)
@@ -126,9 +126,9 @@ class _MjcfScan:
     def _read_text(self, file: Path) -> None:
         if file.suffix.lower() not in _TEXT:
             allowed = ", ".join(_TEXT)
-            raise BadModel(f"{file}: not MJCF: models are text, {allowed}; compiled models (.mjb) are not opened")
+            raise BadModel(f"{file}: not MJCF; give a text file ({allowed}): compiled models (.mjb) are not opened")
         if len(self._texts) >= _MAX_FILES:
-            raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files")
+            raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files; use fewer")
         self._texts.append(file)
         try:
             data = read_plain(file, _MAX_TEXT)
@@ -142,7 +142,7 @@ class _MjcfScan:
         def start(name: str, attributes: dict[str, str]) -> None:
             line = parser.CurrentLineNumber
             if len(copies) > _MAX_DEPTH:
-                raise BadModel(f"{file}:{line}: nested deeper than {_MAX_DEPTH} elements")
+                raise BadModel(f"{file}:{line}: nested deeper than {_MAX_DEPTH} elements; use fewer levels")
             self._add_cost(copies[-1] * _element_cost(name, attributes), f"{name} at {file}:{line}")
             _check_numbers(file, line, name, attributes)
             copies.append(copies[-1] * (max(1.0, _number(attributes.get("count"))) if name == "replicate" else 1.0))
@@ -153,14 +153,14 @@ class _MjcfScan:
                 if not key.startswith("file") or not value:
                     continue
                 if value.lower().endswith((".mjb", ".mjz", ".zip")):
-                    raise BadModel(f"{file}:{line}: {name}: '{value}' is not text; compiled models are not opened")
+                    raise BadModel(f"{file}:{line}: {name}: '{value}' is a compiled model; give its MJCF text")
                 if name in ("include", "model") or "xml" in attributes.get("content_type", ""):
                     includes.append((line, name, value))
                 elif key != "filename" or name in ("mesh", "texture"):
                     self._assets.append((file, line, name, value))
 
         def refuse(*_: Any) -> None:
-            raise BadModel(f"{file}:{parser.CurrentLineNumber}: a DOCTYPE is not allowed in a model")
+            raise BadModel(f"{file}:{parser.CurrentLineNumber}: a DOCTYPE is not allowed; remove it")
 
         parser.StartElementHandler = start
         parser.EndElementHandler = lambda name: copies.pop()
@@ -185,7 +185,7 @@ class _MjcfScan:
     def _allowed_files(self, file: Path, line: int, element: str, name: str) -> Iterator[Path]:
         """Yield the existing files that MuJoCo may open for a file name; MuJoCo reports a file that does not exist."""
         if "\0" in name or "://" in name:
-            raise BadModel(f"{file}:{line}: {element}: '{name}' is not the name of a file")
+            raise BadModel(f"{file}:{line}: {element}: '{name}' is not a file name; correct it")
         seen: set[Path] = set()
         # MuJoCo looks in the folder of the main file and of the including one, with and without an asset folder
         for folder in [base / inner for base in (self.main.parent, file.parent) for inner in self._asset_folders]:
@@ -196,7 +196,7 @@ class _MjcfScan:
                     continue
                 if not inside and (Path(name).is_absolute() or path.exists()):
                     where = " and ".join(str(root) for root in dict.fromkeys(self.roots))
-                    raise BadModel(f"{file}:{line}: {element}: '{name}' lies outside of {where}")
+                    raise BadModel(f"{file}:{line}: {element}: '{name}' lies outside of {where}; move it inside")
             except (OSError, RuntimeError) as error:
                 raise BadModel(f"{file}:{line}: {element}: '{name}': {error}") from None
             if inside:
@@ -205,10 +205,10 @@ class _MjcfScan:
 
     def _check_asset(self, path: Path, file: Path, line: int) -> None:
         if not path.is_file():
-            raise BadModel(f"{file}:{line}: '{path}' is not a regular file")
+            raise BadModel(f"{file}:{line}: '{path}' is not a regular file; name a mesh or image file")
         size = path.stat().st_size
         if size > _MAX_ASSET:
-            raise BadModel(f"{file}:{line}: '{path}' is larger than {_MAX_ASSET:,} bytes")
+            raise BadModel(f"{file}:{line}: '{path}' is too large; allowed are {_MAX_ASSET:,} bytes")
         cost = size / 20_000
         with path.open("rb") as opened:
             head = opened.read(24)
@@ -222,10 +222,10 @@ def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str])
     for key, value in attributes.items():
         limit = _MAX_MEMORY if key == "memory" else 1_000_000
         if name == "size" and _number(value) > limit:
-            raise BadModel(f'{file}:{line}: size {key}="{value[:40]}" is more than {limit:,}')
+            raise BadModel(f'{file}:{line}: size {key}="{value[:40]}" is too large; {limit:,} is allowed')
         is_option = name in ("compiler", "option")
         if is_option and any(word.lower().lstrip("+-")[:3] in ("nan", "inf") for word in value.split()):
-            raise BadModel(f'{file}:{line}: {name} {key}="{value[:40]}" is not a finite number')
+            raise BadModel(f'{file}:{line}: {name} {key}="{value[:40]}" is not finite; give a number')
 
 
 def _element_cost(name: str, attributes: dict[str, str]) -> float:
@@ -267,12 +267,12 @@ def _check_options(spec: mujoco.MjSpec, file: Path) -> None:
             raise BadModel(f"{file}: option {name} is {value}; it must be between 0 and {_MAX_ITERATIONS:,}")
     for name in ("gravity", "wind", "magnetic", "tolerance", "impratio", "density", "viscosity"):
         if not np.isfinite(getattr(option, name)).all():
-            raise BadModel(f"{file}: option {name} is not finite")
+            raise BadModel(f"{file}: option {name} is not finite; give finite numbers")
     widths = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}
     positions = sum(widths.get(joint.type, 1) for joint in spec.joints)
     for key in spec.keys:
         if len(key.qpos) not in (0, positions):
-            raise BadModel(f"{file}: keyframe '{key.name}' has {len(key.qpos)} positions; the model has {positions}")
+            raise BadModel(f"{file}: keyframe '{key.name}' has {len(key.qpos)} positions; give {positions}")
 
 
 def _compile_in_subprocess(file: Path) -> None:
@@ -285,11 +285,11 @@ def _compile_in_subprocess(file: Path) -> None:
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=2 * TIME_S)
     except subprocess.TimeoutExpired:
-        raise BadModel(f"{file}: compiling it takes more than {TIME_S} s") from None
+        raise BadModel(f"{file}: compiling takes more than {TIME_S} s; simplify the model") from None
     if done.returncode == 0:
         return
     limits = f"{TIME_S} s of time or {_MAX_MEMORY >> 30} GiB of memory"
-    why = done.stdout.strip() or f"compiling it takes more than {limits}, or crashes (exit {done.returncode})"
+    why = done.stdout.strip() or f"compiling takes more than {limits}, or crashes (exit {done.returncode}); simplify it"
     raise BadModel(f"{file}: {' '.join(why.split())[:500]}")
 
 

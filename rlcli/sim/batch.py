@@ -239,7 +239,7 @@ class BatchEngine(BatchState):
         return tensor.numpy()
 
     def select(self, mask: Field, seed: int, counters: Field) -> IdSelection | None:
-        """Return the worlds where `mask` holds, as ids; None for none."""
+        """Return a selection of the worlds where `mask` is true; None if there is none."""
         ids = np.asarray(mask).nonzero()[0]
         if not len(ids):
             return None

@@ -93,9 +93,9 @@ class BatchModel:
         """
         target = self.expand(name)
         if target.shape != values.shape or target.dtype != values.dtype:
-            raise ValueError(f"model field '{name}' is {tuple(values.shape)}, not {tuple(target.shape)}")
+            raise ValueError(f"model field '{name}' has shape {tuple(values.shape)}, expected {tuple(target.shape)}")
         if not target.dtype.is_floating_point and name not in _FLAGS and not torch.equal(target, values):
-            raise ValueError(f"model field '{name}' is part of the model's structure and must equal the model's")
+            raise ValueError(f"model field '{name}' is part of the model's structure and must not change")
         target.copy_(values)
 
     def write_own_model(self, env: int, model: mujoco.MjModel) -> None:

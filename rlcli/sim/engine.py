@@ -225,7 +225,7 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
     engine = config.engine if config.engine != "auto" else "batch" if on_cpu else "warp"
     if engine == "batch" and not on_cpu:
         message = f"sim.engine 'batch' runs on a CPU, not on '{device}'"
-        raise ConfigError([Problem("sim", "sim.engine", message, "auto, or --device cpu")])
+        raise ConfigError([Problem("sim", "sim.engine", message, "set it to auto, or give --device cpu")])
     if engine == "batch":
         return open_cpu_engine(model, num_envs, config)
     require_device(device)

@@ -66,7 +66,7 @@ def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[A
             context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
             context.make_current()
             if backend == "glfw" and not _has_window():
-                raise MachineError("the display does not answer")
+                raise MachineError("no window can be opened on the display")
         except Exception as error:  # each backend raises other errors: missing library, device, display
             tried.append(f"{backend} ({one_line(error, 100)})")
             _unload_opengl()

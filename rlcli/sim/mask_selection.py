@@ -99,7 +99,7 @@ class MaskSelection:
         return MaskSelection(self.mask & mask, self.seed, self.counters, self.stream_key, self.shared_streams)
 
     def env_ids(self) -> Tensor:
-        """Return the numbers of the masked rows; this waits for the device. (rows,) int64"""
+        """Return the indices of the masked environments; this forces a host sync. (rows,) int64"""
         return self.mask.nonzero()[:, 0]
 
     def union(self, other: MaskSelection) -> MaskSelection:

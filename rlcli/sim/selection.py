@@ -43,7 +43,7 @@ def one_column(columns: Columns, count: int, parameter: str) -> int:
     """
     found = torch.arange(count)[columns if isinstance(columns, slice) else columns.cpu()].tolist()
     if len(found) != 1:
-        raise ValueError(f"'{parameter}' selects {len(found)} elements; this term needs exactly one")
+        raise ValueError(f"'{parameter}' selects {len(found)} elements; select exactly one")
     return int(found[0])
 
 
@@ -88,7 +88,7 @@ class Selection(Protocol):
         """Return a selection of the rows that are in one of two selections of the same engine."""
 
     def env_ids(self) -> Tensor:
-        """Return the numbers of the environments; on a GPU this waits for the device. (rows,) int64"""
+        """Return the indices of the environments; on a GPU this forces a host sync. (rows,) int64"""
 
     def stream(self, stream: np.uint64) -> Selection:
         """Return a selection of the same rows that draws from another stream."""
@@ -203,7 +203,7 @@ class IdSelection:
         return self._with(ids, counters, self.stream_key)
 
     def env_ids(self) -> Tensor:
-        """Return the numbers of the environments. (rows,) int64"""
+        """Return the indices of the environments. (rows,) int64"""
         return torch.from_numpy(self.ids)
 
     def stream(self, stream: np.uint64) -> IdSelection:

@@ -69,12 +69,12 @@ class WarpEngine(WarpState):
 
     @property
     def divergence_causes(self) -> dict[str, int]:
-        """Number of divergences since the start, by cause; reading it waits for the device."""
+        """Number of divergences since the start, by cause; reading the property forces a host sync."""
         return {name: count for name, count in zip(warp_kernels.CAUSES, self._counts.tolist(), strict=True) if count}
 
     @property
     def described_divergences(self) -> list[Divergence]:
-        """First divergence since the start, or an empty list; reading it waits for the device."""
+        """First divergence since the start, or an empty list; reading the property forces a host sync."""
         world, cause, column = self._first.tolist()
         if not world:
             return []

@@ -75,7 +75,7 @@ def _memory_error(model: mujoco.MjModel, num_envs: int, device: torch.device, ca
     free = wp.device_from_torch(device).free_memory if device.type == "cuda" else 0
     needed, fits = each * num_envs / 2**30, max(1, int(0.8 * free / each))
     message = f"{num_envs} environments need {needed:.1f} GiB, {free / 2**30:.1f} GiB are free on {device}"
-    return DeviceError(message, hint=f"--num-envs {fits} would fit")
+    return DeviceError(message, hint=f"use at most --num-envs {fits}")
 
 
 def _byte_count(value: object) -> int:

@@ -90,7 +90,7 @@ class WarpState(WarpModel):
         """Restore the state returned by `state_dict()`, and compute derived fields again."""
         for name, values in substate(state, "model.").items():
             if not values.is_floating_point() and self.expanded(name) is None:
-                raise ValueError(f"model field '{name}' is part of the model's structure and must equal the model's")
+                raise ValueError(f"model field '{name}' is part of the model's structure and must not change")
             require_matching_tensors({name: values}, {name: self.expand(name)}, "engine")
             self.expand(name).copy_(values)
         substep = substate(state, "substep.")

@@ -38,7 +38,7 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     findings = list(compare_trajectories(env, (first, second), message, f"{hint} or time"))
     if not findings:
         message = "differs between a new environment, and the same one after reset(seed), with one set of actions"
-        hint = "something outlives the episode: clear it in the term's reset(selection), or in reset_idx"
+        hint = "clear all state of the last episode in the term's reset(selection), or in reset_idx"
         findings = list(compare_trajectories(env, (first, third), message, hint))
     yield from findings
 
@@ -187,7 +187,7 @@ def _episode_ends(subject: TaskUnderTest, limit: int) -> list[EndedEpisode]:
 
 
 def back_fill(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Check that the first observation of an episode has nothing of the last episode in histories and buffers."""
+    """Check that the first observation of an episode has no values of the last episode in histories and buffers."""
     task = subject.resolved.task
     if task.scene.terrain is not None:
         raise NotRunError("on terrain the start of an episode depends on the one before")

@@ -1,4 +1,4 @@
-"""Linter of tasks: it finds what makes a task hard to learn, also in tasks that keep the contract.
+"""Linter of tasks: it finds properties that make learning hard, also in tasks that pass `rlcli check`.
 
 ```python
 from rlcli.testing import lint_task
@@ -56,7 +56,7 @@ def lint_task(
     for name in (*only, *ignore):
         require_known(name, list(RULES), "rule", "rules")
     if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
-        raise UsageError(f"--seconds {seconds:g} is not a duration", hint="simulated seconds, above 0")
+        raise UsageError(f"--seconds {seconds:g} is not a duration", hint="give simulated seconds, above 0")
     evidence = RolloutEvidence(open_task(task, agent, overrides), seconds)
     found: list[Remark] = []
     with torch.random.fork_rng(devices=[]):

@@ -134,7 +134,7 @@ def dominant_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
             others = ", ".join(other for other in active if other != name)
             yield warning_at(
                 f"rewards.{name}",
-                f"is {min(found):.1%} or more of the reward's size under every agent: {others} have almost no effect",
+                f"is {min(found):.1%} or more of the reward's size under every agent: {others} have no effect",
                 "lower its weight, or raise the weights of the others",
                 {"share": min(found)},
             )
@@ -150,7 +150,7 @@ def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
         yield error_at(
             "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf",
             f"is {value:g} in every step of every agent, and no episode is terminated: there is nothing to learn",
-            "let it depend on the state or the action",
+            "compute the reward from the state or the action",
             {"value": value},
         )
 
@@ -186,7 +186,7 @@ def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
         message += f"; the mean return of terminated episodes is {return_terminated:.3g}"
         message += f", that of the others {_mean(timed_out):.3g}"
     if good > 0.0:
-        hint = "lower the reward of the end; if the end is the goal, this is correct (--ignore dying-pays)"
+        hint = "lower the terminal reward; if the episode ends at the goal, use --ignore dying-pays"
         yield warning_at("rewards", message, hint, numbers)
         return
     hint = "reward every step (is_alive), make terms positive, or penalise terminations more (is_terminated)"
@@ -203,7 +203,7 @@ def constant_observations(evidence: RolloutEvidence) -> Iterator[Remark]:
         if bool((values == values[:, :1]).all()):
             low = float(values.min())
             value = f"is {low:g}" if len(values) == 1 else "is the same"
-            hint = "leave it out, or compute it from something that changes"
+            hint = "leave the column out, or compute it from the state"
             yield error_at(where, f"{value} in every step of every agent", hint, {"value": low})
 
 

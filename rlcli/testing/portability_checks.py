@@ -42,7 +42,7 @@ def threads(subject: TaskUnderTest) -> Iterator[Finding]:
         env = subject.env(episode_steps=EPISODE, flags={"sim.engine_threads": count})
         torch.manual_seed(0)
         trajectories.append(record_outputs(env, random_actions(env, subject.bound, STEPS)))
-    hint = "let nothing depend on engine_threads or on the number of cores"
+    hint = "remove everything that depends on engine_threads or on the number of cores"
     yield from compare_trajectories(env, trajectories, "differs between 1 and 3 engine threads", hint)
 
 

@@ -191,7 +191,7 @@ def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
                 value = f"is {float(values[0, 0]):g}" if values.shape[2] == 1 else "is the same"
                 message = f"{value} in {NUM_ENVS} environments and {len(obs)} observations"
                 yield error_at(
-                    where, message, "a policy cannot learn from it: compute it from the state, or leave it out"
+                    where, message, "compute the column from the state, or leave it out: a policy cannot learn from it"
                 )
 
 

@@ -71,10 +71,10 @@ def read_sb3(
     }
     prefix = next((p for p in kinds if any(name.startswith(p) for name in weights)), None)
     if prefix is None or ("action_net.weight" in weights and "log_std" not in weights):
-        message = "has no policy of PPO, A2C, SAC, TD3 or DDPG with continuous actions"
+        message = "must have a policy of PPO, A2C, SAC, TD3 or DDPG with continuous actions"
         raise CheckpointError(f"{file} {message}; {_some_names(weights)}")
     if any(name.startswith(("features_extractor.", "pi_features_extractor.", "actor.features")) for name in weights):
-        raise CheckpointError(f"{file} has a policy with a custom features extractor; only MlpPolicy can be imported")
+        raise CheckpointError(f"{file} has a custom features extractor; only MlpPolicy can be imported")
     kind, algorithm, hidden, output, default = kinds[prefix]
     layers = _layers(weights, hidden, file)
     if output is not None:
@@ -118,7 +118,7 @@ def read_rsl_rl(file: Path, *, activation: str | None = None, action_bound: floa
             stats = _named_tensors(saved["obs_norm_state_dict"], where)
         std = {"std": "std", "log_std": "log_std"}
     if not any(name.startswith(hidden) for name in weights):
-        raise CheckpointError(f"{file} has no actor of RSL-RL; {_some_names(weights)}")
+        raise CheckpointError(f"{file} must have an actor of RSL-RL; {_some_names(weights)}")
     layers = _layers(weights, hidden, file)
     spec, actor = _mlp_policy("gaussian-mlp", layers, activation or "elu", action_bound, file)
     actor["log_std"] = _log_std(weights, std, file)
@@ -155,7 +155,7 @@ def create_imported_run(
         table = "\n".join(f"  {a:<18}{b:<14}{c}" for a, b, c in rows)
         raise CheckpointError(
             f"the policy in {record['imported']['file']} does not fit {resolved.source.name}:\n{table}",
-            hint="observations and actions must have the same columns in the same order; see rlcli show TASK",
+            hint="give the task the same observation and action columns in the same order; see rlcli show TASK",
         )
     entries = {
         "seed": 0,
@@ -184,23 +184,23 @@ def create_imported_run(
 def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:
     """Return float32 copies of untrusted tensors; check that they are plain, finite and not larger than the file."""
     if not isinstance(saved, Mapping):
-        raise CheckpointError(f"{where} has no mapping of weights where it is expected")
+        raise CheckpointError(f"{where} must contain a mapping of weights; save a state_dict")
     named: dict[str, Tensor] = {}
     total, limit = 0, available_memory() // 4  # bytes
     for name, value in saved.items():
         if not isinstance(name, str) or type(value) not in (Tensor, torch.nn.Parameter):
-            raise CheckpointError(f"{where}: '{str(name)[:60]}' is not a tensor")
+            raise CheckpointError(f"{where}: '{str(name)[:60]}' is not a tensor; save only tensors")
         if value.layout != torch.strided or value.device.type != "cpu" or value.is_complex() or value.is_quantized:
-            raise CheckpointError(f"{where}: '{name[:60]}' is not a plain tensor on the CPU")
+            raise CheckpointError(f"{where}: '{name[:60]}' must be a dense CPU tensor; save value.cpu()")
         # a stride of 0 makes a large tensor of few numbers: its copy would fill the memory
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
-            raise CheckpointError(f"{where}: '{name[:60]}' claims {value.numel():,} numbers, but the file has fewer")
+            raise CheckpointError(f"{where}: '{name[:60]}' has fewer numbers than its shape; save a clone")
         total += 4 * value.numel()  # several tensors may share the numbers of the file
         if total > limit:
-            raise CheckpointError(f"{where} has tensors of more than {limit:,} bytes in total")
+            raise CheckpointError(f"{where} has tensors of more than {limit:,} bytes; free some memory")
         named[name] = value.detach().to(torch.float32).clone(memory_format=torch.contiguous_format)
         if not bool(named[name].isfinite().all()):
-            raise CheckpointError(f"{where}: '{name[:60]}' has values that are not finite")
+            raise CheckpointError(f"{where}: '{name[:60]}' is not finite; choose an older file")
     return named
 
 
@@ -213,9 +213,9 @@ def _layers(weights: Mapping[str, Tensor], prefix: str, file: Path) -> list[_Lay
     numbers = {n.removeprefix(prefix).partition(".")[0] for n in weights if n.startswith(prefix)}
     if not all(number.isdecimal() and number.isascii() and len(number) < 4 for number in numbers):
         found = ", ".join(sorted(numbers))[:200]
-        raise CheckpointError(f"{file}: {prefix}* is not a sequence of numbered layers: {found}")
+        raise CheckpointError(f"{file}: number the layers of {prefix}*; found {found}")
     if sorted(map(int, numbers)) != list(range(0, 2 * len(numbers), 2)):
-        raise CheckpointError(f"{file}: layers of {prefix}* are missing, or are not linear layers")
+        raise CheckpointError(f"{file}: {prefix}* must have linear layers 0, 2, 4, ...")
     return [_layer(weights, f"{prefix}{number}", file) for number in sorted(numbers, key=int)]
 
 
@@ -223,7 +223,7 @@ def _layer(weights: Mapping[str, Tensor], name: str, file: Path) -> _Layer:
     """Return a linear layer of untrusted weights."""
     weight, bias = weights.get(f"{name}.weight"), weights.get(f"{name}.bias")
     if weight is None or bias is None or weight.dim() != 2 or bias.shape != weight.shape[:1] or not weight.numel():
-        raise CheckpointError(f"{file}: {name} is not a linear layer with a bias")
+        raise CheckpointError(f"{file}: {name} must be a linear layer with a bias")
     return weight, bias
 
 
@@ -232,10 +232,10 @@ def _mlp_policy(
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return the specification of a policy with these layers, and the weights of its actor."""
     if not layers:
-        raise CheckpointError(f"{file} has no layers")
+        raise CheckpointError(f"{file} has no layers; choose a file with a policy")
     for (before, _), (after, _) in itertools.pairwise(layers):
         if after.shape[1] != len(before):
-            raise CheckpointError(f"{file}: a layer has {len(before)} outputs, the next has {after.shape[1]} inputs")
+            raise CheckpointError(f"{file}: layers do not fit: {len(before)} outputs, {after.shape[1]} inputs")
     spec = {
         "kind": kind,
         "observation_size": layers[0][0].shape[1],
@@ -255,7 +255,7 @@ def _log_std(weights: Mapping[str, Tensor], names: Mapping[str, str], file: Path
     if names["log_std"] in weights:
         return weights[names["log_std"]]
     if names["std"] not in weights:
-        message = f"{file}: the standard deviation of actions depends on the state; such a policy cannot be imported"
+        message = f"{file}: the standard deviation depends on the state, which cannot be imported; train it constant"
         raise CheckpointError(message)
     return weights[names["std"]].clamp(min=_MIN_STD).log()
 
@@ -266,13 +266,13 @@ def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[
     for name, value in below(weights, prefix).items():
         kind, _, layer = name.rpartition("_l")
         if kind not in ("weight_ih", "weight_hh", "bias_ih", "bias_hh") or not (layer.isdecimal() and len(layer) < 3):
-            raise CheckpointError(f"{file}: {prefix}{name[:60]} is not a parameter of an LSTM")
+            raise CheckpointError(f"{file}: {prefix}{name[:60]} is not an LSTM parameter; use an LSTM")
         lstm[f"memory.layers.{layer}.{kind}"] = value
     cells: list[int] = []
     while (recurrent := lstm.get(f"memory.layers.{len(cells)}.weight_hh")) is not None:
         # an LSTM has four gates: weight_hh is (4 x cells, cells)
         if recurrent.dim() != 2 or len(recurrent) != 4 * recurrent.shape[1] or not recurrent.numel():
-            raise CheckpointError(f"{file}: its RNN is not an LSTM; other RNNs cannot be imported")
+            raise CheckpointError(f"{file}: the RNN must be an LSTM; train one")
         cells.append(recurrent.shape[1])
     if not cells:
         return {}, lstm
@@ -285,7 +285,7 @@ def _empirical_normalizer(stats: Mapping[str, Tensor], file: Path) -> dict[str, 
     """Convert the normaliser: RSL-RL divides by std + 1e-2, a saved policy by sqrt(var + 1e-8)."""
     mean, std = stats.get("_mean"), stats.get("_std")
     if mean is None or std is None or mean.shape != std.shape or mean.dim() != 2 or len(mean) != 1:
-        raise CheckpointError(f"{file}: its normaliser has no mean and standard deviation of each observation")
+        raise CheckpointError(f"{file}: the normaliser must have one mean and std per observation")
     deviation = std[0].double() + _NORMALIZER_EPS
     return _normalizer(mean[0], (deviation.square() - 1e-8).clamp(min=0.0), stats)
 
@@ -299,7 +299,7 @@ def _vec_normalize(file: Path) -> dict[str, Tensor]:
     """Read the normaliser of SB3's VecNormalize from a safetensors file."""
     data = read_archive_file(file)
     if data[:1] == b"\x80" or file.suffix == ".pkl":
-        raise CheckpointError(f"{file} is a pickle; it is not opened", hint=VEC_NORMALIZE_HINT)
+        raise CheckpointError(f"{file} is a pickle, which rlcli does not open", hint=VEC_NORMALIZE_HINT)
     try:
         stats = safetensors.torch.load(data)
     except (SafetensorError, RuntimeError, ValueError, KeyError) as error:
@@ -325,4 +325,4 @@ def _checked_policy(
 def _some_names(weights: Mapping[str, Tensor]) -> str:
     """Return the first names of the weights, for a message."""
     names = [name[:40] for name in list(weights)[:6]]
-    return f"its weights: {', '.join(names)}" if names else "it has no weights"
+    return f"found weights: {', '.join(names)}" if names else "found no weights"

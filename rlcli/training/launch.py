@@ -137,7 +137,7 @@ def prepare_run(folder: Path, request: TrainingRequest, changes: Sequence[str] =
     if (folder / RECORD).is_file():
         recorded = open_run(folder).record.get("given")
         if recorded is not None and _overrides_in(recorded) != _overrides_in(explicit_values(resolved)):
-            message = f"{folder} is a run of another sweep, with other settings"
+            message = f"{folder} is a run of a sweep with other settings"
             raise UsageError(message, hint="start a new sweep with another --name")
         return device
     for file in ("config.yaml", "checkpoints"):  # left by a process that was killed while creating the run
@@ -270,7 +270,7 @@ def process_device(wanted: str, gpus: int | None) -> str:
     if gpus is not None and wanted == "auto":
         wanted = "cuda"
     if gpus is not None and wanted != "cuda":
-        raise UsageError(f"--gpus {gpus} and --device {wanted} contradict each other", hint="--gpus alone")
+        raise UsageError(f"--gpus {gpus} and --device {wanted} contradict each other", hint="leave out --device")
     device = choose_device(wanted)
     one_process = gpus is None and not distributed.launched()
     if one_process or device == "cpu" or ":" in wanted:
@@ -280,7 +280,7 @@ def process_device(wanted: str, gpus: int | None) -> str:
     local_rank, local_size = distributed.local_rank_and_size()
     need, have = max(gpus or 1, local_size), torch.cuda.device_count()
     if have < need:
-        raise DeviceError(f"{need} processes need a GPU each, but torch finds {have}", hint=f"--gpus {have}")
+        raise DeviceError(f"{need} processes need a GPU each, but torch finds {have}", hint=f"use --gpus {have}")
     return f"cuda:{local_rank}"
 
 
@@ -296,7 +296,7 @@ def _trainer_device(resolved: Resolved, device: str, wanted: str) -> str:
     if wanted == "auto":
         return "cpu"
     message = f"agent '{resolved.agent_name}' (trainer {agent.trainer}) trains on the CPU only, not on '{device}'"
-    raise UsageError(message, hint="--device cpu, or an agent whose trainer uses the GPU (trainer: ppo)")
+    raise UsageError(message, hint="use --device cpu, or choose an agent with trainer: ppo")
 
 
 def _require_parallel(resolved: Resolved, gpus: int = 1) -> None:

@@ -46,7 +46,7 @@ def build_trainer(job: Job, device: str) -> tuple[Trainer, Environment]:
         initial = open_checkpoint(job.init_from)
         require_fit(initial, env.layout)
         require_same_policy(initial, trainer.policy(), agent.trainer)
-        _load(initial, lambda: trainer.load_weights(initial.tensors("policy")), "its weights do not fit the agent")
+        _load(initial, lambda: trainer.load_weights(initial.tensors("policy")), "the weights do not fit the agent")
     if job.config is not None:
         write_atomic(job.run.config, job.config)
     if saved is None:
@@ -73,9 +73,9 @@ def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int)
 def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: Environment) -> None:
     """Load the state of a checkpoint to resume from."""
     require_fit(saved, env.layout)
-    _load(saved, lambda: trainer.load(state), "it cannot be resumed")
+    _load(saved, lambda: trainer.load(state), "the run cannot be resumed; choose RUN@step:N")
     if (trainer.iteration, trainer.env_steps) != (saved.iteration, saved.step):
-        raise CheckpointError(f"{saved.folder} cannot be resumed: manifest.json and state.json have different steps")
+        raise CheckpointError(f"{saved.folder} is corrupt: manifest.json and state.json have different steps")
     processes, size = state.values.get("processes", 1), distributed.current().world_size
     if processes != size:
         _log.info("saved by %s processes, continued by %s: every environment starts a new episode", processes, size)

@@ -74,7 +74,7 @@ class TrainingProcess:
         """Return the error that the process has printed, or an error with the path of its log."""
         printed = self.document.get("error")
         if not isinstance(printed, dict):
-            error = RlcliError(f"its process ended with exit code {self.exit_code}; see {self.run / LOG}")
+            error = RlcliError(f"the process ended with exit code {self.exit_code}; see {self.run / LOG}")
         else:
             error = RlcliError(str(printed.get("message")))
             error.kind = str(printed.get("kind"))

@@ -75,7 +75,7 @@ class FailSafeLogger:
             self._logger.write(iteration, step, metrics)
         except Exception as error:  # libraries and servers raise any kind of error
             self._logger = None
-            _log.warning("the logger %s has failed and is not used any more: %s", self._name, one_line(error, 300))
+            _log.warning("the logger %s has failed and records nothing more: %s", self._name, one_line(error, 300))
 
     def close(self, state: str) -> None:
         """Close the logger; log a warning if that fails."""
@@ -102,7 +102,7 @@ class BackgroundTracker:
         if self._failure is not None:
             raise self._failure
         if self._rows.qsize() > _MAX_ROWS:
-            raise TimeoutError(f"its queue has more than {_MAX_ROWS} iterations")
+            raise TimeoutError(f"the queue has more than {_MAX_ROWS} iterations; check the connection")
         self._rows.put((iteration, step, {name: value for name, value in metrics.items() if math.isfinite(value)}))
 
     def close(self, state: str) -> None:
@@ -115,7 +115,7 @@ class BackgroundTracker:
             self._rows.put(state)
             self._thread.join(_TIMEOUT_S)
         if self._thread.is_alive():
-            raise TimeoutError(f"it did not finish within {_TIMEOUT_S:g} s")
+            raise TimeoutError(f"the logger did not finish within {_TIMEOUT_S:g} s; check the connection")
         if self._failure is not None:
             raise self._failure
 

@@ -228,7 +228,7 @@ class Bench:
             # memory grows linearly with the number of environments
             env_bytes = max(4096, (last.resident - first.resident) // (last.num_envs - first.num_envs))
         if env_bytes * num_envs > available_memory() // 2:
-            return f"it would take about {env_bytes * num_envs / 2**30:.1f} GiB"
+            return f"needs about {env_bytes * num_envs / 2**30:.1f} GiB"
         if last and last.steps_per_s and num_envs / last.steps_per_s > self._pace.longest_s:
             return f"a step would take about {num_envs / last.steps_per_s:.0f} s"
         return None

@@ -49,7 +49,7 @@ def explanation(findings: Findings) -> list[str]:
         lines = [f"{_describe(best)},", f"instead of {_describe(present)}, measured in alternation"]
     lines.append("compared at the same samples and gradient steps per iteration, so that training learns alike")
     if findings.unsteady:
-        lines.append("the machine was busy: the measurements vary")
+        lines.append("the machine was busy, so the measurements vary: end other programs and measure again")
     return lines
 
 

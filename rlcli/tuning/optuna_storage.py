@@ -65,7 +65,7 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
             return optuna.create_study(**study, direction=settings["direction"], load_if_exists=True)
         except KeyError:
             where = without_password(storage) if storage else folder
-            raise CheckpointError(f"there is no sweep '{name}' in {where}") from None
+            raise CheckpointError(f"there is no sweep '{name}' in {where}; see rlcli sweep show") from None
 
 
 @contextlib.contextmanager
@@ -81,7 +81,7 @@ def storage_errors(storage: str | None) -> Iterator[None]:
         if storage is None or not _is_database_error(error):
             raise
         message = f"--storage {without_password(storage)} cannot be reached: {_first_line(error)}"
-        raise MachineError(message, hint="when it is available, run the same command again to continue") from None
+        raise MachineError(message, hint="start the database, then run the same command again to continue") from None
 
 
 def without_password(url: str) -> str:
@@ -99,9 +99,9 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
 
     file = folder / JOURNAL
     if file.is_symlink():
-        raise CheckpointError(f"{file} is a link; rlcli does not create links")
+        raise CheckpointError(f"{file} is a link; replace it by the file itself")
     if not create and not file.is_file():
-        raise CheckpointError(f"{folder} has lost its trials: it has no {JOURNAL}")
+        raise CheckpointError(f"{folder} has no {JOURNAL}, the file of its trials; choose another --name")
 
     lock: Any = FileLock(folder / f".{JOURNAL}")  # the system releases it when the process is killed
 
@@ -122,7 +122,7 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
             try:
                 for entry in super().read_logs(log_number_from):
                     if not isinstance(entry, dict) or not {"op_code", "worker_id"} <= entry.keys():
-                        raise ValueError("a line is not a log entry")
+                        raise ValueError("a line is not a log entry of Optuna")
                     yield entry
             except ValueError as error:
                 raise CheckpointError(

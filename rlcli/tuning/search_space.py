@@ -83,7 +83,7 @@ class Objective:
         if not isinstance(entry, dict):
             known = listing(f"{first}.{key}" for key in found) if name and isinstance(found, dict) else ""
             message = f"--objective {self.key}: not in the results of the evaluation"
-            raise UsageError(message, hint=f"there are: {known}" if known else "return, success or length")
+            raise UsageError(message, hint=f"choose from {known}" if known else "use return, success or length")
         value = entry["rate"] if "rate" in entry else entry["mean"]
         return math.nan if value is None else float(value)
 
@@ -103,7 +103,7 @@ def read_parameters(texts: Sequence[str]) -> list[Parameter]:
     keys = [parse_address(parameter.key) for parameter in found]
     twice = next((key for key in keys if keys.count(key) > 1), None)
     if twice is not None:
-        raise UsageError(f"--param varies {'.'.join(twice)} twice")
+        raise UsageError(f"--param varies {'.'.join(twice)} twice; leave out one")
     return found
 
 
@@ -158,7 +158,7 @@ def _choices(text: str, key: str, words: str) -> Parameter:
         raise UsageError(f"--param '{text}' has fewer than two choices", hint=HINT)
     written = [_to_line(choice) for choice in choices]
     if len(set(written)) < len(written):
-        raise UsageError(f"--param '{text}' has a choice twice")
+        raise UsageError(f"--param '{text}' has a choice twice; leave out one")
     return Parameter(key, choices=tuple(choices))
 
 

@@ -141,7 +141,7 @@ class Sweep:
                 return None
             lock = self._lock_trial(new.number)
             if lock is None:
-                raise MachineError(f"{self.trial_folder(new.number)} is being written to by another process")
+                raise MachineError(f"another process writes to {self.trial_folder(new.number)}; wait for its end")
             return self._claim(lock, self._with_own_sampler(new))
 
     def tell(self, trial: Trial, value: float | None = None, *, state: str | None = None, **notes: Any) -> None:
@@ -255,7 +255,7 @@ def read_sweep(folder: Path, storage: str | None = None) -> Sweep:
     """
     settings = read_study(folder, "sweep")
     if any(not isinstance(settings.get(key), kind) for key, kind in _KINDS.items()):
-        raise CheckpointError(f"{folder / STUDY} is corrupt: settings of the sweep are missing")
+        raise CheckpointError(f"{folder / STUDY} is corrupt: settings are missing; start a new sweep")
     if settings.get("storage") and storage is None:
         raise UsageError(f"{folder} has its trials in a database", hint="add the --storage URL of the sweep")
     study = open_study(folder, settings, storage, create=False)
@@ -296,7 +296,7 @@ def draw_sweep(sweep: Sweep) -> Path:
     check_drawing()
     done = [trial for trial in sweep.trials() if trial.state.name == "COMPLETE"]
     if not done:
-        raise UsageError("nothing to draw: no trial is complete yet")
+        raise UsageError("nothing to draw: wait until a trial is complete")
     panels = [("trial", [trial.number for trial in done], False)]
     panels += [(p.key, [sweep.values(trial)[p.key] for trial in done], p.log) for p in sweep.parameters]
     values = [trial.value for trial in done if trial.value is not None]  # a finished trial has a value
@@ -314,7 +314,7 @@ def _require_same(location: object, known: Mapping[str, Any], settings: Mapping[
     if differing:
         differences = "; ".join(f"{key}: {known.get(key)!r} there, {settings[key]!r} here" for key in differing[:3])
         where = without_password(str(location))
-        message = f"{where} is another sweep ({differences})"
+        message = f"{where} has other settings ({differences})"
         raise UsageError(message, hint="choose another --name, or the same settings")
 
 
@@ -336,7 +336,7 @@ def _locked(file: Path) -> Iterator[None]:
     try:
         lock = FileLock(file).acquire(timeout=120)
     except Timeout:
-        raise MachineError(f"another process holds {file}") from None
+        raise MachineError(f"another process holds {file}; wait for its end") from None
     except OSError as error:
         raise disk_error(file, error) from error
     with lock:

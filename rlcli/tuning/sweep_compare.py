@@ -131,13 +131,13 @@ def compare(
     """
     best = sweep.best()
     if best is None:
-        raise CheckpointError(f"{sweep.folder} has no finished trial yet", hint="rlcli sweep show")
+        raise CheckpointError(f"{sweep.folder} has no finished trial yet", hint="see rlcli sweep show")
     threshold = read_threshold(until or "success=0.99")
     comparison = Comparison(sweep.folder, sweep.settings["task"], threshold, best.number, seeds)
     with _request_of_sweep(sweep, request) as base:
         resolved, _ = base.resolve()
         if resolved.task.success is None and until is None:
-            raise UsageError("the task defines no success; a threshold is needed", hint="--until return=X")
+            raise UsageError("the task defines no success, so --until is needed", hint="add --until return=X")
         require_success(resolved, [threshold.key])
         if resolved.agent is not None and not resolved.agent.eval_interval:
             base.overrides.append("agent.eval_interval=1")

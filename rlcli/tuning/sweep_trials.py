@@ -173,7 +173,7 @@ class TrialRunner:
 
     def _store_value(self, trial: Trial, value: float) -> None:
         if not math.isfinite(value):
-            self._fail(trial, DivergedError(f"{self._objective.key} is not finite in its evaluation"))
+            self._fail(trial, DivergedError(f"{self._objective.key} is not finite in the evaluation"))
             return
         run = overview(trial.folder)
         self._sweep.tell(trial, value, seconds=run.duration_s, step=run.step)

@@ -50,7 +50,7 @@ def read_threshold(text: str) -> Threshold:
         message = f"--until '{text}' is not a threshold"
         raise UsageError(message, hint="as in --until success=0.99, return=200 or length=250")
     if key == "success" and not 0.0 < value <= 1.0:
-        raise UsageError(f"--until '{text}': a success rate must be above 0 and at most 1")
+        raise UsageError(f"--until '{text}': give a success rate above 0 and at most 1")
     return Threshold(key, value)
 
 

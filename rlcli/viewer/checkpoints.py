@@ -45,7 +45,7 @@ class RunCheckpoints:
         """
         folder = self.run.checkpoints / f"{step:012d}"
         if step not in self.steps():
-            raise CheckpointError(f"{folder} does not exist any more")
+            raise CheckpointError(f"{folder} was deleted; choose a newer checkpoint")
         try:
             checkpoint = open_checkpoint(folder)
             policy = checkpoint.policy()

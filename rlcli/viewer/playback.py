@@ -37,7 +37,7 @@ _REFRESH_S = 1.0
 
 @dataclass(slots=True)
 class Playback:
-    """Playback of a policy; see the module.
+    """Playback of a policy in real time; the module docstring describes its threads.
 
     Args:
         env: the environment; it is reset when the playback is made, unless `initial_obs` is given.
@@ -301,7 +301,7 @@ def hold_command(env: VecEnv, name: str, value: float | None) -> None:
     """
     manager = _commands(env)
     if manager is None:
-        raise UsageError(f"no command '{name}'", hint="the task has no commands")
+        raise UsageError(f"no command '{name}'", hint="leave it out: the task has no commands")
     manager.hold(name, value)
 
 

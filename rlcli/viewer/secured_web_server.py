@@ -93,7 +93,7 @@ def listen(port: int, socket_class: type[socket.socket] = socket.socket) -> sock
         listener.close()
         in_use = error.errno == errno.EADDRINUSE
         problem = "is in use, perhaps by another viewer" if in_use else f"cannot be opened: {error.strerror}"
-        raise MachineError(f"port {port} {problem}", hint="--port 0 takes a free one, --port N another") from None
+        raise MachineError(f"port {port} {problem}", hint="give --port 0 for a free port") from None
     return listener
 
 

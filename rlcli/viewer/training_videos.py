@@ -29,7 +29,7 @@ class TrainingVideos(StepObserver):
         make_env: builds an environment of one world, before the first video.
         folder: folder of the videos `STEP.mp4`.
         interval: iterations between videos.
-        stopping: returns whether training was asked to stop.
+        stopping: returns whether a stop of the training was requested.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class TrainingVideos(StepObserver):
         except Exception as error:  # a full disk, a driver, an encoder, or the task's own code must not stop training
             kind = type(error).__name__
             if kind not in self._warned:
-                _log.warning(f"no video {file.name}: {' '.join(str(error).split()) or kind}; training goes on")
+                _log.warning(f"no video {file.name}: {' '.join(str(error).split()) or kind}; training continues")
             self._warned.add(kind)
             return None
         return file

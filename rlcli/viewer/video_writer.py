@@ -27,7 +27,7 @@ def check_video(file: Path) -> None:
         MachineError: if there is no ffmpeg for an .mp4.
     """
     if file.suffix not in FORMATS:
-        raise UsageError(f"'{file}' is not a video file", hint=f"name it *{' or *'.join(FORMATS)}")
+        raise UsageError(f"'{file}' is not a video file", hint=f"give FILE{' or FILE'.join(FORMATS)}")
     needed = ["imageio"] if file.suffix == ".gif" else ["imageio", "imageio_ffmpeg"]
     if any(importlib.util.find_spec(name) is None for name in needed):
         raise DependencyError("imageio is not installed", hint='pip install "rlcli[video]"')

@@ -41,7 +41,7 @@ def run(playback: Playback, *, title: str, num_drawn: int = 1, port: int, ready:
         try:
             verify_refusals(port)
             viewer.raise_error()
-            instructions = [f"open http://127.0.0.1:{port}/ in a browser of this machine; Ctrl-C ends it"]
+            instructions = [f"open http://127.0.0.1:{port}/ in a browser on this machine; Ctrl-C ends the viewer"]
             tunnel = ssh_tunnel_command(port)
             if tunnel is not None:
                 instructions.append(f"on the machine of your SSH client: {tunnel}, then open http://localhost:{port}/")

@@ -142,7 +142,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
             if changed:
                 start = min(max(0.0, knob.low), knob.high)
                 self._playback.submit(partial(self._playback.hold, knob.name, start if hold else None))
-            imgui.SetItemTooltip("hold it; else the task draws it")
+            imgui.SetItemTooltip("Checked: keep this value. Unchecked: the task samples it.")
             imgui.SameLine()
             moved, value = imgui.SliderFloat(knob.name, view.held.get(knob.name, 0.0), knob.low, knob.high)
             if moved:

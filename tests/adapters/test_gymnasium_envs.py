@@ -135,7 +135,7 @@ def test_disabled_autoreset_refuses_step_and_early_reset():
     envs = vector(autoreset_mode="Disabled", cfg=short_episodes(2))
     envs.reset(seed=1)
     envs.step(envs.action_space.sample())
-    with pytest.raises(ValueError, match=r"\[1\], whose episodes have not ended"):
+    with pytest.raises(ValueError, match=r"\[1\]: their episodes have not ended"):
         envs.reset(options={"reset_mask": np.array([False, True, False])})
     last = envs.step(envs.action_space.sample())[0]
     with pytest.raises(RuntimeError, match=r"environments \[0, 1, 2\] have ended"):

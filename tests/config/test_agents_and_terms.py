@@ -135,7 +135,7 @@ def test_problem_of_flag_shows_flag_name(problems_of):
 def test_malformed_overrides_are_all_reported(problems_of):
     found = problems_of(TASK, "decimation", "sim.dt=[", "scene.num_envs=0")
     assert len(found) == 3
-    assert "is not of the form key.path=value" in found[0]
+    assert "is not an override; write KEY.PATH=VALUE" in found[0]
 
 
 # --- what a task must have ---
@@ -148,14 +148,14 @@ def test_malformed_overrides_are_all_reported(problems_of):
         (
             "  policy:\n    pos: {func: joint_pos_rel}\n",
             "  critic:\n    pos: {func: joint_pos_rel}\n",
-            "observations: needs a group",
+            "observations: the observations need a group",
         ),
         (
             "    pos: {func: joint_pos_rel}\n",
             "    pos: null\n",
-            "observations: needs a group 'policy' with at least one",
+            "observations: the observations need a group 'policy' with at least one",
         ),
-        ("observations:\n  policy:\n    pos: {func: joint_pos_rel}\n", "", "observations: needs a group 'policy'"),
+        ("observations:\n  policy:\n    pos: {func: joint_pos_rel}\n", "", "the observations need a group 'policy'"),
     ],
 )
 def test_manager_based_task_requires_sections(problems_of, old, new, said):
@@ -263,7 +263,7 @@ def test_direct_params_are_checked_against_class(task, problems_of):
 def test_direct_task_refuses_terms_and_undeclared_params(task, problems_of):
     assert resolve(task(DIRECT, task=PLAIN)).task.params == {}
     (message,) = problems_of(f"{DIRECT}params: {{x: 1}}\n", files={"task": PLAIN})
-    assert "params: the class of this task has no Params" in message
+    assert "params: remove them: the task's class has no Params" in message
     (message,) = problems_of(f"{DIRECT}rewards: {{a: {{func: is_alive, weight: 1}}}}\n", files={"task": PLAIN})
     assert "rewards: a direct task has no rewards terms; its class implements them" in message
 

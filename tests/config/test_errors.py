@@ -64,8 +64,12 @@ TYPOS = [
     ("observations.policy.pos.scale=big", "expected a number or a list", None),
     ("terminations.time_out.time_out=1", "terminations.time_out.time_out: expected true or false, found 1", None),
     ("events.e={func: reset_scene_to_default, mode: rest}", "events.e.mode: expected", "did you mean 'reset'?"),
-    ("events.e={func: reset_scene_to_default, mode: interval}", "events.e: interval_range_s belongs to mode", None),
-    ("params.x=1", "params: only direct tasks have params", None),
+    (
+        "events.e={func: reset_scene_to_default, mode: interval}",
+        "events.e: interval_range_s and mode: interval need",
+        None,
+    ),
+    ("params.x=1", "params: remove them: only direct tasks have params", None),
     ("success={func: joints_near, joints: [a], target: 0, tolerance: 1, hold_s: -1}", "success.hold_s: expected", None),
     ("agent.gamma=2", "agents.one.gamma: expected a number <= 1, found 2", None),
     ("agent.gama=0.9", "agents.one.gama: unknown key 'gama'", "did you mean 'gamma'?"),
@@ -80,9 +84,9 @@ TYPOS = [
     ("agents=3", "agents: expected a mapping, found 3", None),
     ("agents.one=3", "agents.one: expected a mapping, found 3", None),
     ("agent.task=3", "agents.one.task: expected a mapping, found 3", None),
-    ("agent.task.agents={}", "agents.one.task.agents: 'agents' cannot be patched here", None),
+    ("agent.task.agents={}", "agents.one.task.agents: 'agents' cannot be changed by a patch; remove it here", None),
     ("play=3", "play: expected a mapping, found 3", None),
-    ("play.play={}", "play.play: 'play' cannot be patched here", None),
+    ("play.play={}", "play.play: 'play' cannot be changed by a patch; remove it here", None),
     ("decimation.x=1", "'decimation' is a value, not a mapping", None),
     ("dt=1", "dt: unknown key 'dt'", "it belongs in sim (sim.dt)"),
     ("num_envs=1", "num_envs: unknown key", "it belongs in scene (scene.num_envs)"),
@@ -126,7 +130,7 @@ def test_all_problems_are_reported_with_location(problems_of, tmp_path):
 
 def test_relation_of_keys_is_reported_at_their_mapping(problems_of):
     (message,) = problems_of(TASK, "agent.max_iterations=null")
-    assert "task.yaml:22:3: agents.one: set max_iterations or max_steps" in message
+    assert "task.yaml:22:3: agents.one: the training has no length: set max_iterations or max_steps" in message
 
 
 def test_unknown_agent_does_not_hide_other_mistakes(problems_of):

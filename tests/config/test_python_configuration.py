@@ -153,7 +153,7 @@ def test_function_with_wrong_shape_is_reported_by_key(root):
     def column(env, *, entity: Entity = "robot"):
         return entity.data.joint_pos
 
-    message = r"rewards\.own: 'column' gave a tensor of shape \(8, 2\), expected a tensor of shape \(8,\)"
+    message = r"rewards\.own: 'column' returned a tensor of shape \(8, 2\); return a tensor of shape \(8,\)"
     with pytest.raises(ConfigError, match=message) as refusal:
         make_env(cartpole(rewards={"own": RewardConfig(func=column, weight=1.0)}), root=root)
     assert str(refusal.value).count("own") == 1
@@ -185,7 +185,11 @@ def test_function_that_is_no_term_is_refused(root):
     def untyped(env, *, factor):
         return factor
 
-    for term, said in ((positional, "must be keyword-only"), (untyped, "has no annotation"), (abs, "its source")):
+    for term, said in (
+        (positional, "must be keyword-only"),
+        (untyped, "has no annotation"),
+        (abs, "source cannot be read"),
+    ):
         with pytest.raises(ConfigError, match=said):
             make_env(cartpole(rewards={"own": RewardConfig(func=term, weight=1.0)}), root=root)
 

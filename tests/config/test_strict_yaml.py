@@ -73,15 +73,15 @@ def test_scalars_follow_yaml_1_2(text, value):
         ("a: 1\nb: *x\n", 2, 4, "anchors and aliases"),
         ("a: 1\nb:\n  <<: {c: 1}\n", 3, 3, "merge keys"),
         ("a: 010\n", 1, 4, "remove the leading 0 or quote it"),
-        ("a: [on]\n", 1, 5, "true or false, or quote it"),
-        ("a: No\n", 1, 4, "true or false, or quote it"),
+        ("a: [on]\n", 1, 5, "true or false, or quote the text"),
+        ("a: No\n", 1, 4, "true or false, or quote the text"),
         ("a: .nan\n", 1, 4, "null for none"),
         ("a: -.INF\n", 1, 4, "null for none"),
         ("a: 1e999\n", 1, 4, "out of range"),
         ("a: 1\n---\nb: 2\n", 2, 1, "only one document"),
         ("a: 1\n1: 2\n", 2, 1, "keys must be text, found 1; quote it"),
-        ("true: 2\n", 1, 1, "keys must be text"),
-        ("? [a, b]\n: 1\n", 1, 3, "keys must be text"),
+        ("true: 2\n", 1, 1, "keys must be text, found True; quote it"),
+        ("? [a, b]\n: 1\n", 1, 3, "a key must be text"),
         ("- 1\n- 2\n", 1, 1, "the top level must be a mapping"),
         ("a: [1, 2\nb: 3\n", 2, 2, "expected"),
         ("a:\n\t- 1\n", 2, 1, "cannot start any token"),
@@ -127,7 +127,7 @@ def test_oversized_input_is_refused_quickly(data, said):
     ("most", "one_more", "said"),
     [
         (b"a: 1 #" + b"x" * (262_144 - 6), b"a: 1 #" + b"x" * (262_144 - 5), "larger than 262144 bytes"),
-        (b"a: " + b"x" * 16_384, b"a: " + b"x" * 16_385, "a value longer than 16384 characters"),
+        (b"a: " + b"x" * 16_384, b"a: " + b"x" * 16_385, "the value is longer than 16384 characters"),
         (b"a: " + b"[" * 31 + b"]" * 31, b"a: " + b"[" * 32 + b"]" * 32, "nested deeper than 32 levels"),
         # around the items stand the beginnings and ends of stream, document, mapping and list, and the key
         (b"a: [" + b"1," * 19_992 + b"]", b"a: [" + b"1," * 19_993 + b"]", "more than 20000 items"),
@@ -144,7 +144,7 @@ def test_largest_allowed_input_is_read(most, one_more, said):
 def test_list_as_key_is_refused_without_printing_it():
     with pytest.raises(YamlError) as caught:
         load("? [a, b]\n: 1\n")
-    assert str(caught.value) == caught.value.message == "keys must be text"
+    assert str(caught.value) == caught.value.message == "a key must be text, not a list or mapping; write `name: value`"
 
 
 def test_byte_order_mark_and_empty_file_are_read():

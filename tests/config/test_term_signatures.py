@@ -93,9 +93,9 @@ def test_selectors_accept_names_or_lists(model, alias):
         ("x: Callable[[int], int]", "annotation 'Callable"),
         ("x", "parameter 'x': has no annotation"),
         ("x: 'float['", "annotation 'float[' is not valid Python"),
-        ("x: float = math.pi", "'math.pi' is not a literal"),
+        ("x: float = math.pi", "the default 'math.pi' is not a literal"),
         ("x: Joints", "the term also needs 'entity: Entity'"),
-        ("weight: float", "every term of rewards already has a key of this name"),
+        ("weight: float", "every term of rewards has a key of this name"),
         ("_x: float", "underscore"),
     ],
 )
@@ -287,7 +287,7 @@ def test_circular_inheritance_across_files_terminates(tmp_path):
     ("source", "said"),
     [
         (CLASS.replace("count: int", "count: dict"), "line 8: 'count': YAML cannot express the annotation 'dict'"),
-        (CLASS.replace("count: int", "count: int = COUNT"), "line 8: 'count': 'COUNT' is not a literal"),
+        (CLASS.replace("count: int", "count: int = COUNT"), "line 8: 'count': the default 'COUNT' is not a literal"),
         (CLASS + "   )", "not valid Python"),
         ("class Task: ...", "has no Params"),
     ],

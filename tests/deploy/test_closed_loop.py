@@ -224,7 +224,7 @@ def test_verify_prints_table_of_checks(copied, tmp_path, capfd):
     asked = ["export", "--checkpoint", str(copied), "--output", str(tmp_path / "p.py"), "--format", "numpy"]
     assert main([*asked, "--verify", "--episodes", "4"]) == 9
     out, _ = capfd.readouterr()
-    assert "observation: formulas against the task" in out
+    assert "observation: formulas - task" in out
     assert "FAILS" in out
 
 

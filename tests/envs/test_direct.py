@@ -268,7 +268,7 @@ def test_view_of_unknown_entity_lists_entities(tmp_path):
 
 
 def test_module_without_direct_task_raises_task_error(tmp_path):
-    with pytest.raises(TaskError, match="is not a DirectTask"):
+    with pytest.raises(TaskError, match="from DirectTask"):
         build(direct(tmp_path, "class Task:\n    pass\n"))
     with pytest.raises(TaskError, match="ZeroDivisionError"):
         build(direct(tmp_path / "b", "1 / 0\n"))

@@ -200,7 +200,7 @@ def test_bad_action_is_refused_before_any_process_steps(folder):
         with pytest.raises(DivergedError, match="action is not finite in 1 of 9 environments, first in environment 7"):
             sharded.step(bad)
         assert sharded.step(torch.zeros(9, 1)).reward.isfinite().all()
-        with pytest.raises(ValueError, match=r"shape \(9, 2\), expected \(9, 1\)"):
+        with pytest.raises(ValueError, match=r"shape \(9, 2\); pass shape \(9, 1\)"):
             sharded.step(torch.zeros(9, 2))
 
 

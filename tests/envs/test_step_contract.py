@@ -355,7 +355,7 @@ def test_pushes_add_up_and_start_from_reset_state(tmp_path):
 def test_step_rejects_nonfinite_or_misshaped_actions(tmp_path):
     env = build(world(tmp_path))
     env.reset()
-    with pytest.raises(ValueError, match=r"action has shape \(3,\), expected \(3, 1\)"):
+    with pytest.raises(ValueError, match=r"action has shape \(3,\); pass shape \(3, 1\)"):
         env.step(torch.zeros(3))
     env.pause()
     assert not env.is_playing()

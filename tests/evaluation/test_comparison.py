@@ -92,7 +92,7 @@ def test_compare_refuses_tasks_with_different_settings(cli, trained):
     one, other = trained("cartpole"), trained("changed")
     done = cli("eval", "--compare", one, other)
     assert done.code == 3
-    assert "episode_length_s: 2.0, but 5.0 in" in done.err
+    assert "episode_length_s: is 2.0, but 5.0 in" in done.err
     assert "rewards.alive.weight: 3.0" in done.err
     assert done.err.count("error: ") == 2
     problems = json.loads(cli("eval", "--compare", one, other, "--json").out)["error"]["problems"]
@@ -110,7 +110,7 @@ def test_compare_refuses_different_tasks(cli, trained):
     one, other = trained("cartpole"), trained("direct")
     done = cli("eval", "--compare", one, other)
     assert done.code == 2
-    assert "is for the task cartpole, but" in done.err
+    assert "compare policies of one task" in done.err
     assert "for cartpole-direct" in done.err
 
 

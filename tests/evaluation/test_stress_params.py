@@ -66,11 +66,11 @@ def test_share_inverts_between(text):
         ("body_mass=1:x", "'x' is not a number"),
         ("body_mass=1:inf", "'inf' is not a number"),
         ("body_mass=nan", "'nan' is not a number"),
-        ("body_mass=1:2:3:4", "a range is"),
-        ("body_mass=1:2:x", "is not a number of points"),
+        ("body_mass=1:2:3:4", "write the range as"),
+        ("body_mass=1:2:x", "is not a whole number of points"),
         ("body_mass=1:2:1", "1 points"),
         ("body_mass=1:2:99999", "99999 points"),
-        ("body_mass=0:2", "cannot have no mass"),
+        ("body_mass=0:2", "mass must be above 0"),
         ("gravity=-1:1", "cannot be -1"),
         ("body_mass=1,1", "appears twice"),
         ("action_delay=0.5:2", "whole numbers of steps"),
@@ -86,5 +86,5 @@ def test_invalid_sweep_raises_usage_error(text, output):
 
 
 def test_repeated_parameter_raises_usage_error():
-    with pytest.raises(UsageError, match="swept twice"):
+    with pytest.raises(UsageError, match="given twice"):
         read_sweeps(["gravity=1:2", "gravity=1:3"], 5)

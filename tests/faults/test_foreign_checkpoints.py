@@ -487,7 +487,7 @@ def test_zip_bomb_is_not_unpacked(good):
                 if name != member:
                     archive.writestr(name, good.read(name), zipfile.ZIP_STORED)
             archive.writestr(member, bytes(20 * 2**20))
-        assert "grows more than 100 times" in refused("sb3", bad)
+        assert "more than 100 times larger" in refused("sb3", bad)
 
 
 def test_zip_members_of_gigabytes_are_not_unpacked(good):
@@ -571,23 +571,23 @@ def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
 @pytest.mark.parametrize(
     ("weights", "output"),
     [
-        ({}, "no actor"),
-        ({"actor.0.weight": torch.zeros(1, 4)}, "is not a linear layer"),
-        ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(3)}, "is not a linear layer"),
+        ({}, "must have an actor"),
+        ({"actor.0.weight": torch.zeros(1, 4)}, "must be a linear layer"),
+        ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(3)}, "must be a linear layer"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1)}, "depends on the state"),
-        ({"actor.1.weight": torch.zeros(1, 4), "actor.1.bias": torch.zeros(1)}, "missing"),
-        ({"actor.x.weight": torch.zeros(1, 4), "actor.x.bias": torch.zeros(1)}, "is not a sequence of numbered layers"),
+        ({"actor.1.weight": torch.zeros(1, 4), "actor.1.bias": torch.zeros(1)}, "must have linear layers"),
+        ({"actor.x.weight": torch.zeros(1, 4), "actor.x.bias": torch.zeros(1)}, "number the layers of"),
         ({"actor.00.weight": torch.zeros(1, 4), "actor.0.weight": torch.zeros(1, 4)}, "actor"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1), "std": torch.ones(2)}, "log_std"),
         (
             {"actor.0.weight": torch.zeros(8, 4), "actor.0.bias": torch.zeros(8), "actor.2.weight": torch.zeros(1, 9),
              "actor.2.bias": torch.zeros(1), "std": torch.ones(1)},
-            "has 8 outputs",
+            "8 outputs, 9 inputs",
         ),
         (
             {"actor.0.weight": torch.zeros(1, 6), "actor.0.bias": torch.zeros(1), "std": torch.ones(1),
              "memory_a.rnn.weight_hh_l0": torch.zeros(18, 6), "memory_a.rnn.weight_ih_l0": torch.zeros(18, 4)},
-            "is not an LSTM",
+            "must be an LSTM",
         ),
         (
             {"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1), "std": torch.ones(1),
@@ -621,7 +621,9 @@ def test_missing_file_or_folder_is_refused(form):
 def test_policy_of_another_algorithm_is_refused(good):
     _, file = good
     for names in ({"q_net.q_net.0.weight": torch.zeros(2, 4)}, {"action_net.weight": torch.zeros(2, 4)}, {}):
-        assert "no policy of PPO" in refused("sb3", zipped({"policy.pth": saved_by_torch(names)}, "bad.zip", like=file))
+        assert "must have a policy of PPO" in refused(
+            "sb3", zipped({"policy.pth": saved_by_torch(names)}, "bad.zip", like=file)
+        )
 
 
 @pytest.mark.parametrize("form", ["sb3", "rsl-rl"])

@@ -79,7 +79,7 @@ NAMED = {
     "a skin outside": (model("<deformable><skin file='../outside.skn'/></deformable>"), "lies outside"),
     "a flex outside": (model(body='<flexcomp name="f" type="mesh" file="../outside.obj"/>'), "lies outside"),
     "a model outside": (model(asset='<model name="m" file="../outside.xml"/>'), "lies outside"),
-    "a compiled model as asset": (model(asset='<model name="m" file="bin.mjb"/>'), "compiled models"),
+    "a compiled model as asset": (model(asset='<model name="m" file="bin.mjb"/>'), "compiled model"),
     "a resource of another kind": (model(asset='<mesh name="m" file="http://example.invalid/m.obj"/>'), "not the name"),
     "a picture of four terapixels": (
         model(asset='<texture name="t" type="2d" file="huge.png"/>'),
@@ -107,13 +107,13 @@ NAMED = {
     ),
     "a time step of nothing": (model('<option timestep="0"/>'), "timestep is 0"),
     "a time step below nothing": (model('<option timestep="-1"/>'), "timestep is -1"),
-    "a time step that is no number": (model('<option timestep="nan"/>'), "not a finite number"),
+    "a time step that is no number": (model('<option timestep="nan"/>'), "is not finite; give a number"),
     "endless iterations": (model('<option iterations="1000000000"/>'), "iterations is 1000000000"),
     "endless line search": (model('<option ls_iterations="1000000000"/>'), "ls_iterations"),
     "iterations below nothing": (model('<option iterations="-4"/>'), "iterations is -4"),
-    "gravity that is no number": (model('<option gravity="0 nan 0"/>'), "not a finite number"),
-    "an endless impratio": (model('<option impratio="inf"/>'), "not a finite number"),
-    "a tolerance that is no number": (model('<option tolerance="NaN"/>'), "not a finite number"),
+    "gravity that is no number": (model('<option gravity="0 nan 0"/>'), "is not finite; give a number"),
+    "an endless impratio": (model('<option impratio="inf"/>'), "is not finite; give a number"),
+    "a tolerance that is no number": (model('<option tolerance="NaN"/>'), "is not finite; give a number"),
     "a keyframe of the wrong size": (model('<keyframe><key name="k" qpos="1 2 3"/></keyframe>'), "keyframe 'k'"),
     "a terabyte": (model('<size memory="1T"/>'), "size memory"),
     "a hundred gigabytes": (model('<size memory="100G"/>'), "size memory"),
@@ -211,7 +211,7 @@ def test_large_model_is_first_compiled_under_limits(tmp_path, monkeypatch):
     monkeypatch.setattr(untrusted_mjcf, "TIME_S", 1)
     file.write_text(model(body=many.replace("6000", "400000")))
     begin = time.perf_counter()
-    with pytest.raises(BadModel, match=r"model\.xml: compiling it takes more than"):
+    with pytest.raises(BadModel, match=r"model\.xml: compiling takes more than"):
         read_mjcf(file, [tmp_path])
     assert time.perf_counter() - begin < 20
 

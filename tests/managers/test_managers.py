@@ -147,19 +147,22 @@ class Fussy:
     [
         (
             {"rewards": {"bad": {"func": "scalar", "weight": 1.0}}},
-            "rewards.bad: 'scalar' gave a float, expected {}(3,)",
+            "rewards.bad: 'scalar' returned a float; return {}(3,)",
         ),
         (
             {"rewards": {"bad": {"func": "column", "weight": 1.0}}},
-            "rewards.bad: 'column' gave {}(3, 1), expected {}(3,)",
+            "rewards.bad: 'column' returned {}(3, 1); return {}(3,)",
         ),
-        ({"success": {"func": "column"}}, "success: 'column' gave {}(3, 1), expected {}(3,)"),
-        ({"terminations": {"bad": {"func": "column"}}}, "terminations.bad: 'column' gave {}(3, 1), expected {}(3,)"),
-        ({"observations": {"policy": {"bad": {"func": "flat"}}}}, "observations.policy.bad: 'flat' gave {}(3,)"),
-        ({"observations": {"policy": {"bad": {"func": "cube"}}}}, "observations.policy.bad: 'cube' gave {}(3, 1, 1)"),
+        ({"success": {"func": "column"}}, "success: 'column' returned {}(3, 1); return {}(3,)"),
+        ({"terminations": {"bad": {"func": "column"}}}, "terminations.bad: 'column' returned {}(3, 1); return {}(3,)"),
+        ({"observations": {"policy": {"bad": {"func": "flat"}}}}, "observations.policy.bad: 'flat' returned {}(3,)"),
+        (
+            {"observations": {"policy": {"bad": {"func": "cube"}}}},
+            "observations.policy.bad: 'cube' returned {}(3, 1, 1)",
+        ),
         (
             {"observations": {"policy": {"bad": {"func": "joint_pos", "scale": [1.0, 2.0]}}}},
-            "observations.policy.bad.scale: has 2 values for 1 columns",
+            "observations.policy.bad.scale: has 2 values; give 1 or 1",
         ),
     ],
 )
@@ -178,8 +181,8 @@ def test_parameter_error_names_its_path(tmp_path):
 @pytest.mark.parametrize(
     ("joints", "message"),
     [
-        (["hip_fl", "hip_fl"], r"joint 'hip_fl' is matched twice, the second time by 'hip_fl'"),
-        (["hip_f.", "hip_fr"], r"joint 'hip_fr' is matched twice, the second time by 'hip_fr'"),
+        (["hip_fl", "hip_fl"], r"joint 'hip_fl' is matched twice; narrow the second pattern, 'hip_fl'"),
+        (["hip_f.", "hip_fr"], r"joint 'hip_fr' is matched twice; narrow the second pattern, 'hip_fr'"),
         (["hip_f", "hip_fl"], r"no joint matches 'hip_f'; did you mean 'hip_f"),
         (["knee.*"], r"no joint matches 'knee.\*'.*joints: hip_fl, hip_fr, hip_bl, hip_br"),
         (["hip_("], r"'hip_\(' is neither a joint nor a regular expression"),

@@ -201,8 +201,11 @@ def test_final_obs_does_not_advance_memory(tmp_path):
 @pytest.mark.parametrize(
     ("term", "message"),
     [
-        ({"noise": {"kind": "uniform", "low": [0.0, 0.0], "high": 1.0}}, "noise.low: has 2 values for 1 columns"),
-        ({"scale": [1.0, 2.0]}, "scale: has 2 values for 1 columns"),
+        (
+            {"noise": {"kind": "uniform", "low": [0.0, 0.0], "high": 1.0}},
+            "noise.low: has 2 values; give 1 or 1",
+        ),
+        ({"scale": [1.0, 2.0]}, "scale: has 2 values; give 1 or 1"),
         ({"delay": {"steps": [3, 1]}}, "delay.steps"),
         ({"noise": {"kind": "pink"}}, "noise"),
         ({"noise": {"kind": "uniform", "std": 1.0}}, "unknown key 'std'"),

@@ -529,7 +529,7 @@ BAD = [
     ({"func": "randomize_geom_friction", "axes": [3], "range": U}, "geom_friction has no axis 3"),
     ({"func": "randomize_joint_range", "joints": "slide", "upper": U}, "slide has no limits"),
     ({"func": "randomize_actuator_gains", "actuators": ["push", "servo"], "kp": U}, "push has no kp"),
-    ({"func": "randomize_actuator_gains"}, "nothing to randomise"),
+    ({"func": "randomize_actuator_gains"}, "no gain is given"),
     ({"func": "randomize_pd_gains", "stiffness": U}, "has no actuator model"),
     ({"func": "randomize_effort_limit", "actuators": "spin", "range": U}, "spin has no effort limit"),
     ({"func": "randomize_pair_friction", "pairs": "none", "range": U}, "no pair matches 'none'"),

@@ -42,7 +42,7 @@ def test_ambiguous_name_lists_owners(plugins, spec):
     plugins("robots", spec, task="walk", files=HERE)
     plugins("animals", spec, task="walk", version="2.0", files=HERE)
     said = failure("walk")
-    assert "offered by animals 2.0 and robots 1.0" in said
+    assert "in several packages: animals 2.0 and robots 1.0" in said
     assert "animals:walk or robots:walk" in said
     assert find_task("animals:walk").version == "2.0"
 
@@ -82,7 +82,7 @@ BROKEN = {
     "exits": ("import sys\nsys.exit(3)\n", "SystemExit: 3"),
     "raises": ("\n\nraise ValueError('out of cheese')\n", "ValueError: out of cheese"),
     "empty": ("", "AttributeError"),
-    "wrong": ("SPEC = {'package': 'x'}\n", "is a dict, not a TaskSpec"),
+    "wrong": ("SPEC = {'package': 'x'}\n", "is a dict, expected a TaskSpec"),
     "newer": (IMPORT + "SPEC = TaskSpec(__name__, 'x', api=99)\n", "needs plugin API 99; this rlcli has 1"),
     "future": (IMPORT + "SPEC = TaskSpec(__name__, 'x', wings=2)\n", "TypeError"),
     "terms": (IMPORT + "SPEC = TaskSpec(__name__, 'x', terms='a.b')\n", "terms must be a tuple"),
@@ -161,7 +161,7 @@ def test_installed_task_wins_over_folder(tmp_path, monkeypatch):
 
 def test_folder_without_task_lists_its_files(tmp_path):
     (tmp_path / "notes.txt").write_text("x")
-    assert "it has no task.yaml (notes.txt)" in failure(str(tmp_path))
+    assert "it has no task.yaml; found: notes.txt" in failure(str(tmp_path))
     assert "no such folder" in failure(str(tmp_path / "nowhere"))
     assert "is a file, not a task's folder" in failure(str(tmp_path / "notes.txt"))
 

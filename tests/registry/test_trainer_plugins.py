@@ -39,7 +39,7 @@ def two(plugins):
 def test_ambiguous_trainer_is_reported_and_can_be_qualified(two, mine):
     done = train(mine, "learner")
     assert done.returncode == 3, done.stderr
-    assert "offered by first-learner 1.0 and second-learner 1.0" in done.stderr
+    assert "in several packages: first-learner 1.0 and second-learner 1.0" in done.stderr
     assert "first-learner:learner or second-learner:learner" in done.stderr
     chosen = train(mine, "'second-learner:learner'")
     assert chosen.returncode == 0, chosen.stderr

@@ -73,7 +73,7 @@ def test_write_atomic_reports_an_error_of_the_temporary_path(tmp_path):
         (errno.ENOSPC, "free some space, then continue with --resume"),
         (errno.EACCES, "choose another folder with --runs-dir"),
         (errno.EROFS, "choose another folder with --runs-dir"),
-        (errno.EDQUOT, "the disk quota is used up"),
+        (errno.EDQUOT, "the disk quota is used up: free some space"),
         (errno.EIO, None),
     ],
 )

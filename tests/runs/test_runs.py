@@ -68,7 +68,7 @@ def test_lock_refuses_a_second_writer(tmp_path):
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert holder.stdout.readline() == "held\n"
-    with pytest.raises(MachineError, match="written to by another process"):
+    with pytest.raises(MachineError, match="another process writes to"):
         open_run(run.folder).lock()
     holder.communicate()
     run.lock()

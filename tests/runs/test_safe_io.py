@@ -29,7 +29,7 @@ def test_read_file_refuses_one_byte_above_the_limit(file):
 def test_read_file_refuses_another_size(file, size):
     with pytest.raises(CheckpointError, match=rf"is corrupt: .* \(8 of {size} bytes\)") as caught:
         read_file(file, 100, size=size)
-    assert caught.value.hint == "choose an older checkpoint with RUN@step:N"
+    assert caught.value.hint == "choose an older checkpoint: RUN@step:N"
 
 
 def test_read_file_raises_file_not_found_for_a_missing_file(tmp_path):
@@ -43,7 +43,7 @@ def test_read_file_refuses_links(file):
     for number, target in enumerate((file, file.parent / "nothing")):
         link = file.with_name(f"link{number}")
         link.symlink_to(target)
-        with pytest.raises(CheckpointError, match="is a link; links in runs are not followed"):
+        with pytest.raises(CheckpointError, match="is a link; replace it by the file itself"):
             read_file(link, 100)
 
 
@@ -162,7 +162,7 @@ def test_parse_json_reads_valid_json(file, data, value):
 def test_parse_json_accepts_at_most_32_levels(file):
     assert json.dumps(parse_json(nested(31), file)).count("{") == 31
     for deep in (nested(32), b'{"a":' + b"[" * 31 + b"1" + b"]" * 31 + b"}"):
-        with pytest.raises(CheckpointError, match="is corrupt: it is nested more than 32 levels deep"):
+        with pytest.raises(CheckpointError, match="is corrupt: values are nested deeper than 32 levels"):
             parse_json(deep, file)
 
 
@@ -173,7 +173,7 @@ def test_parse_json_accepts_at_most_32_levels(file):
         (b'{"c": {"xy": 1, "xy": 1}}', "key 'xy' appears twice"),
         (b'{"a": NaN}', "NaN is not a JSON number"),
         (b'{"a": -Infinity}', "-Infinity is not a JSON number"),
-        (b'{"a": 1e999}', "number 1e999 is out of range"),
+        (b'{"a": 1e999}', "the number 1e999 is too large"),
         (b'{"a": 123456789012345678901}', "a number has 21 digits"),
         (b"[1]", "not a JSON object"),
         (b"3", "not a JSON object"),
@@ -186,7 +186,7 @@ def test_parse_json_accepts_at_most_32_levels(file):
 def test_parse_json_refuses_with_the_reason(file, data, output):
     with pytest.raises(CheckpointError, match=r"data\.json is corrupt: ") as caught:
         parse_json(data, file)
-    assert caught.value.message.endswith(output)
+    assert output in caught.value.message
 
 
 def test_parse_json_error_shortens_keys_and_numbers(file):
@@ -201,7 +201,7 @@ def test_refuse_links_names_the_first_link(tmp_path):
     refuse_links(tmp_path)
     for name in ("b", "a", "c"):
         (tmp_path / name).symlink_to(tmp_path / "plain")
-    with pytest.raises(CheckpointError, match=r"/a is a link; links in runs are not followed"):
+    with pytest.raises(CheckpointError, match=r"/a is a link; replace it by the file itself"):
         refuse_links(tmp_path)
     with pytest.raises(CheckpointError, match=r"nowhere cannot be read: No such file"):
         refuse_links(tmp_path / "nowhere")

@@ -423,7 +423,7 @@ def test_state_dict_restores_contact_times_and_history(tmp_path):
         (rays(pattern=[[0, 0, -1]], sees=[6]), "feet.sees", None),
         (rays(pattern=[[0, 1, -1]], lookup=True, alignment="yaw"), "feet: lookup needs rays straight down", None),
         (rays(**DOWN), "feet: lookup needs rays straight down", None),
-        (rays(**DOWN, alignment="yaw", sees="all"), "feet: lookup needs rays that see", None),
+        (rays(**DOWN, alignment="yaw", sees="all"), "feet: lookup needs rays that hit", None),
         (rays(**DOWN, alignment="yaw"), "feet.lookup: heights cannot be looked up: the scene has no terra",
          "lookup: false"),
     ],

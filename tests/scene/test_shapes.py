@@ -180,20 +180,29 @@ def test_trajectory_with_objects_is_independent_of_num_envs(tmp_path):
 @pytest.mark.parametrize(
     ("entity", "message"),
     [
-        ({}, "robot: an entity is a model (an MJCF file) or a shape: write one of the two"),
-        ({"model": "cart.xml", "shape": "box"}, "robot: an entity is a model (an MJCF file) or a shape"),
-        ({"model": "cart.xml", "mass": 1.0}, "robot: 'mass' is a key of a shape"),
-        ({"model": "cart.xml", "free": True}, "robot: 'free' is a key of a shape"),
-        ({"shape": "box"}, "robot: size of a box is [x, y, z], its edges [m]; found none"),
-        ({"shape": "box", "size": [1.0]}, "robot: size of a box is [x, y, z], its edges [m]; found 1 numbers"),
-        ({"shape": "capsule", "size": [1.0, 2.0, 3.0]}, "size of a capsule is [radius, length]"),
+        ({}, "robot: an entity has either `model` (an MJCF file) or `shape`: write one of the two"),
+        ({"model": "cart.xml", "shape": "box"}, "robot: an entity has either `model`"),
+        ({"model": "cart.xml", "mass": 1.0}, "robot: 'mass' is only allowed with `shape`"),
+        ({"model": "cart.xml", "free": True}, "robot: 'free' is only allowed with `shape`"),
+        ({"shape": "box"}, "robot: size of a box must be [x, y, z], the lengths of its edges [m]; found none"),
+        ({"shape": "box", "size": [1.0]}, "found 1 numbers"),
+        ({"shape": "capsule", "size": [1.0, 2.0, 3.0]}, "size of a capsule must be [radius, length]"),
         ({"shape": "box", "size": [1.0, 0.0, 1.0]}, "robot.size.1: expected a number > 0, found 0"),
         ({"shape": "bux", "size": [1.0]}, "robot.shape: expected 'box'"),
-        ({"shape": "sphere", "size": [1.0], "mass": 1.0, "density": 2.0}, "mass and density exclude each other"),
-        ({"shape": "sphere", "size": [1.0], "mocap": True, "free": True}, "free and mocap exclude each other"),
+        (
+            {"shape": "sphere", "size": [1.0], "mass": 1.0, "density": 2.0},
+            "mass and density cannot be combined: remove one",
+        ),
+        (
+            {"shape": "sphere", "size": [1.0], "mocap": True, "free": True},
+            "free and mocap cannot be combined: remove one",
+        ),
         ({"shape": "plane", "size": [1.0, 1.0], "free": True}, "a plane cannot move"),
         ({"shape": "sphere", "size": [1.0], "mass": 0.0}, "robot.mass: expected a number > 0, found 0"),
-        ({"shape": "sphere", "size": [1.0], "init": {"lin_vel": [1.0, 0.0, 0.0]}}, "entity 'robot' has no free root"),
+        (
+            {"shape": "sphere", "size": [1.0], "init": {"lin_vel": [1.0, 0.0, 0.0]}},
+            "entity 'robot' has no free joint at its root",
+        ),
     ],
 )
 def test_invalid_shape_raises_config_error_with_key(tmp_path, entity, message):

@@ -362,7 +362,7 @@ def test_captured_finds_host_sync_with_its_line(managed):
     ((finding,), _) = only(managed, "captured")
     assert finding.severity == "warning"
     assert finding.where.endswith("terms.py:11")
-    assert "waits for the device" in finding.message
+    assert "forces a host sync" in finding.message
 
 
 @needs_warp

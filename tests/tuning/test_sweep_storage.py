@@ -153,7 +153,7 @@ def test_missing_journal_is_checkpoint_error(tmp_path):
     finish(open_or_join(tmp_path), 2)
     (tmp_path / JOURNAL).unlink()
     for look in (open_or_join, read_sweep):
-        with pytest.raises(CheckpointError, match="lost its trials"):
+        with pytest.raises(CheckpointError, match="the file of its trials"):
             look(tmp_path)
 
 
@@ -162,13 +162,13 @@ def test_missing_journal_is_checkpoint_error(tmp_path):
 )
 def test_different_settings_in_same_folder_are_refused(tmp_path, change):
     open_or_join(tmp_path)
-    with pytest.raises(UsageError, match="is another sweep"):
+    with pytest.raises(UsageError, match="has other settings"):
         open_or_join(tmp_path, **change)
 
 
 def test_task_from_other_folder_is_other_sweep(tmp_path):
     open_or_join(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/one"})
-    with pytest.raises(UsageError, match="is another sweep"):
+    with pytest.raises(UsageError, match="has other settings"):
         open_or_join(tmp_path, source={"name": "cartpole", "distribution": None, "folder": "/two"})
 
 
@@ -176,7 +176,7 @@ def test_task_from_other_folder_is_other_sweep(tmp_path):
 def test_malformed_study_file_is_checkpoint_error(tmp_path, text):
     open_or_join(tmp_path)
     (tmp_path / "study.json").write_text(text)
-    with pytest.raises(CheckpointError, match=r"study\.json|study of seeds"):
+    with pytest.raises(CheckpointError, match=r"study\.json|has kind seeds"):
         read_sweep(tmp_path)
 
 

@@ -88,7 +88,7 @@ def test_failed_video_warns_once_and_restores_rng(caplog):
     films = TrainingVideos(make, Path("videos"), 2)
     assert [films.record(None, step) for step in (1, 2)] == [None, None]
     assert len(caplog.messages) == 1
-    assert "the driver is gone; training goes on" in caplog.messages[0]
+    assert "the driver is gone; training continues" in caplog.messages[0]
     assert torch.equal(torch.get_rng_state(), before)
     assert [films.due(iteration) for iteration in (1, 2, 3, 4)] == [False, True, False, True]
 

@@ -220,7 +220,7 @@ def test_learn_writes_results_curves_and_policy(tmp_path):
     (tmp_path / "runs" / "cartpole.eval.json").write_text(message.stdout)
     collected = run("collect", "--all", "runs", "--ship")
     assert collected.returncode == 0, collected.stderr
-    assert "cartpole, seed 5: within its bar" in collected.stdout
+    assert "cartpole, seed 5: required result reached" in collected.stdout
     assert (copy / "docs" / "reference" / "zoo" / "pictures" / "cartpole.jpg").stat().st_size < 80_000
     (row,) = json.loads((copy / "docs" / "reference" / "zoo" / "results" / "cartpole.json").read_text())
     assert (row["seed"], row["agent"], row["evaluation"]["episodes"]) == (5, "sb3-ppo", 16)

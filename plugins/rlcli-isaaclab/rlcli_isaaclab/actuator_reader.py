@@ -34,7 +34,7 @@ def read_actuators(
             if kind != "DCMotor" or key != "velocity_limit":
                 item.note("ignored", key, "MuJoCo's joints have no speed limit")
         for key in ("dynamic_friction", "viscous_friction"):
-            item.note("ignored", key, "use friction and damping instead")
+            item.note("ignored", key, "MuJoCo has no such setting; set friction and damping instead")
         passive = {"armature": item.get("armature"), "friction_loss": item.get("friction")}
         gains = {"stiffness": item.get("stiffness"), "damping": item.get("damping")}
         if kind == "ImplicitActuator":
@@ -43,7 +43,10 @@ def read_actuators(
             models[group] = _read_explicit_actuator(item, kind, order_joints(patterns, item), gains)
             settings = passive
         else:
-            item.report.problem(item.key, f"an actuator of kind '{kind}' has no counterpart")
+            item.report.problem(
+                item.key,
+                f"an actuator of kind '{kind}' has no counterpart in rlcli; use ImplicitActuator or IdealPDActuator",
+            )
             continue
         for setting, value in settings.items():
             if isinstance(value, Mapping):

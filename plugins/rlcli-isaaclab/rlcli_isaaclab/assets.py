@@ -43,15 +43,15 @@ def mjcf_of(usd: str) -> str:
     near = did_you_mean(usd.rsplit("/", 1)[-1], [end.rsplit("/", 1)[-1] for end in USD_TO_MJCF])
     known = f"known: {listing(USD_TO_MJCF)}"
     raise TaskError(
-        f"no MJCF is known for '{usd}'",
-        hint=f"rlcli_isaaclab.assets.map_usd('{'/'.join(usd.split('/')[-2:])}', 'model.xml') names one;"
+        f"no MJCF model is known for the USD file '{usd}'",
+        hint=f"rlcli_isaaclab.assets.map_usd('{'/'.join(usd.split('/')[-2:])}', 'model.xml') sets it;"
         f" {near + ' ' if near else ''}{known}",
     )
 
 
 @configclass
 class AssetBaseCfg:
-    """An asset of the scene."""
+    """Configuration of an asset of the scene."""
 
     @configclass
     class InitialStateCfg:
@@ -70,7 +70,7 @@ class AssetBaseCfg:
 
 @configclass
 class RigidObjectCfg(AssetBaseCfg):
-    """A free body."""
+    """Configuration of a free rigid body."""
 
     @configclass
     class InitialStateCfg(AssetBaseCfg.InitialStateCfg):
@@ -85,7 +85,7 @@ class RigidObjectCfg(AssetBaseCfg):
 
 @configclass
 class ArticulationCfg(AssetBaseCfg):
-    """A robot."""
+    """Configuration of a robot."""
 
     @configclass
     class InitialStateCfg(RigidObjectCfg.InitialStateCfg):

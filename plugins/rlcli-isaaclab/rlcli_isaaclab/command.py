@@ -36,5 +36,8 @@ def import_run(
     models = dict(item.partition("=")[::2] for item in model or [])
     for name, file in models.items():
         if not file or not Path(file).is_file():
-            raise UsageError(f"--model {name}={file}: file not found", hint="--model robot=robot.xml")
+            raise UsageError(
+                f"--model {name}={file}: there is no file {file}",
+                hint="correct the path, as in --model robot=robot.xml",
+            )
     return convert(env, agent, output or Path("imported"), models)

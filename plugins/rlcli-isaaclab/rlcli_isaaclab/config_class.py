@@ -74,7 +74,7 @@ def _replace(self: Any, **changes: Any) -> Any:
     changed = copy.deepcopy(self)
     for name, value in changes.items():
         if name not in vars(changed):
-            raise TypeError(f"{type(self).__name__} has no '{name}'; it has {', '.join(vars(changed))}")
+            raise TypeError(f"{type(self).__name__} has no setting '{name}'; settings: {', '.join(vars(changed))}")
         setattr(changed, name, value)
     return changed
 
@@ -88,7 +88,7 @@ def _from_dict(self: Any, data: Mapping[str, Any]) -> None:
     """Set members from a mapping, and nested members from nested mappings."""
     for name, value in data.items():
         if name not in vars(self):
-            raise KeyError(f"{type(self).__name__} has no '{name}'")
+            raise KeyError(f"{type(self).__name__} has no setting '{name}'; settings: {', '.join(vars(self))}")
         member = getattr(self, name)
         if isinstance(value, Mapping) and hasattr(member, "from_dict"):
             member.from_dict(value)

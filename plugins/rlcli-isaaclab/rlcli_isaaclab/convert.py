@@ -62,7 +62,7 @@ def task(
     top.skip("ui_window_class_type", "wait_for_textures", "rerender_on_reset", "export_io_descriptors", "log_dir")
     top.skip("recorders", "teleop_devices", "xr", "is_finite_horizon")
     if "seed" in top:
-        top.note("ignored", "seed", "use --seed")
+        top.note("ignored", "seed", "give the seed on the command line: --seed")
     report.stubs = terms.stubs
     report.finish(data, defaults)
     return {key: value for key, value in config.items() if value is not None}
@@ -75,9 +75,11 @@ def _check_members(value: Any, key: Key, report: Report) -> None:
     """Report values that are missing, and functions where a term is expected."""
     for name, item in value.items() if isinstance(value, Mapping) else ():
         if is_missing(item):
-            report.problem(key, f"missing '{name}'")
+            report.problem(key, f"missing '{name}'; give it a value")
         elif callable(item) and (len(key) == 1 or (len(key) == 2 and key[0] == "observations")) and name != "func":
-            report.problem((*key, str(name)), "found a function, expected a term", "write ...TermCfg(func=...)")
+            report.problem(
+                (*key, str(name)), "found a function, expected a term", "write NAME = ...TermCfg(func=FUNCTION)"
+            )
         elif isinstance(item, Mapping):
             _check_members(item, (*key, str(name)), report)
 

@@ -35,16 +35,18 @@ def read(file: Path) -> dict[str, Any]:
     try:
         text = read_plain(file, MAX_BYTES)  # refuses pipes, which would block
     except OSError as error:
-        raise ConfigError([Problem(str(file), "", f"cannot be read: {error.strerror or error}")]) from None
+        raise ConfigError(
+            [Problem(str(file), "", f"cannot be read: {error.strerror or error}; check the path")]
+        ) from None
     try:
         data = yaml.load(text, Loader=_Loader)
         _count(data)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         position = f"{file}:{mark.line + 1}:{mark.column + 1}" if mark else str(file)
-        raise ConfigError([Problem(position, "", error.problem or "not YAML")]) from None
+        raise ConfigError([Problem(position, "", error.problem or "not YAML; correct it")]) from None
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        raise ConfigError([Problem(str(file), "", str(error) or "nested too deeply")]) from None
+        raise ConfigError([Problem(str(file), "", str(error) or "nested too deeply; write flatter values")]) from None
     if not isinstance(data, dict):
         raise ConfigError([Problem(str(file), "", "the top level must be a mapping (key: value)")])
     return data
@@ -173,7 +175,7 @@ def _agent(file: Path, report: Report) -> dict[str, Any]:
     data = read(file)
     if "algorithm" not in data or "num_steps_per_env" not in data:
         hint = "agents of rl_games, skrl and Stable-Baselines3 cannot be imported: write the agent by hand"
-        raise ConfigError([Problem(str(file), "", "is not RSL-RL's agent.yaml", hint)])
+        raise ConfigError([Problem(str(file), "", "not an agent.yaml of RSL-RL", hint)])
     return agent(data, report)
 
 
@@ -188,7 +190,7 @@ def _count(value: Any) -> None:
         item = stack.pop()
         left -= 1
         if left < 0:
-            raise ValueError(f"more than {MAX_VALUES} values")
+            raise ValueError(f"the file has more than {MAX_VALUES} values; shorten it")
         if isinstance(item, Mapping):
             stack += item.values()
         elif isinstance(item, list | tuple):

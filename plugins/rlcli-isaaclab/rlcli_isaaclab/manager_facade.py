@@ -54,7 +54,7 @@ class TerminationManagerFacade(ManagerFacade):
         """Return where a term fired in this step. (num_envs,) bool"""
         fired = self._manager.fired
         if name not in fired:
-            raise NameProblem(f"no termination '{name}'; there are {listing(fired)}")
+            raise NameProblem(f"no termination '{name}'; terminations: {listing(fired)}")
         return fired[name]
 
 
@@ -82,7 +82,7 @@ class RewardManagerFacade(ManagerFacade):
         """Return the settings of a term. An assigned weight takes effect in the next step."""
         found = {term.name: term for term in self._manager.terms}
         if name not in found:
-            raise NameProblem(f"no reward '{name}'", did_you_mean(name, found) or f"there are {listing(found)}")
+            raise NameProblem(f"no reward '{name}'", did_you_mean(name, found) or f"rewards: {listing(found)}")
         return RewardSettings(found[name].config, self._tunable.get((*found[name].path, "weight")))
 
     def set_term_cfg(self, name: str, cfg: Any) -> None:
@@ -105,12 +105,12 @@ class RewardSettings:
     @weight.setter
     def weight(self, value: float) -> None:
         if self._weight is None:
-            raise AttributeError("only a curriculum term can change the weight of a reward")
+            raise AttributeError("the weight of a reward can change only in a curriculum term; write one")
         self._weight.fill_(value)
 
 
 def _find_term(terms: Any, name: str, kind: str) -> Any:
     found = {term.name: term.instance for term in terms}
     if name not in found:
-        raise NameProblem(f"no {kind} '{name}'; there are {listing(found)}")
+        raise NameProblem(f"no {kind} '{name}'; choose from {listing(found)}")
     return found[name]

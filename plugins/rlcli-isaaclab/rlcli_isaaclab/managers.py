@@ -44,7 +44,7 @@ class ManagerTermBaseCfg:
 
 @configclass
 class ObservationTermCfg(ManagerTermBaseCfg):
-    """An observation."""
+    """Configuration of an observation term: a function, its parameters, noise, clip, scale and history."""
 
     modifiers: Any = None
     noise: Any = None
@@ -56,7 +56,7 @@ class ObservationTermCfg(ManagerTermBaseCfg):
 
 @configclass
 class ObservationGroupCfg:
-    """A group of observations; its other members are terms."""
+    """Configuration of an observation group; its other members are terms."""
 
     concatenate_terms: bool = True
     concatenate_dim: int = -1
@@ -67,14 +67,14 @@ class ObservationGroupCfg:
 
 @configclass
 class RewardTermCfg(ManagerTermBaseCfg):
-    """A reward."""
+    """Configuration of a reward term: a function, its parameters and its weight."""
 
     weight: float = MISSING
 
 
 @configclass
 class TerminationTermCfg(ManagerTermBaseCfg):
-    """A termination."""
+    """Configuration of a termination term; with `time_out` the episode is truncated, not terminated."""
 
     time_out: bool = False
 
@@ -91,19 +91,19 @@ class EventTermCfg(ManagerTermBaseCfg):
 
 @configclass
 class CurriculumTermCfg(ManagerTermBaseCfg):
-    """A curriculum."""
+    """Configuration of a curriculum term: a function and its parameters."""
 
 
 @configclass
 class RecorderTermCfg:
-    """A recorder; use `rlcli eval --record` instead."""
+    """Configuration of a recorder, which has no effect; use `rlcli eval --record` instead."""
 
     class_type: Any = MISSING
 
 
 @configclass
 class ActionTermCfg:
-    """An action; `mdp` has its subclasses."""
+    """Base configuration of an action term; its subclasses are in `mdp`."""
 
     class_type: Any = MISSING
     asset_name: str = MISSING

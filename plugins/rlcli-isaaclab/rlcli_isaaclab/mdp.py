@@ -108,7 +108,7 @@ def find_term(name: str) -> tuple[str, str]:
         ours = (entry.name if entry else None) or name
         if section not in ("actions", "success") and ours in builtin_terms(section):
             return section, ours
-    raise KeyError(name)
+    raise KeyError(f"Isaac Lab's term '{name}' has no counterpart in rlcli")
 
 
 @functools.cache
@@ -184,7 +184,7 @@ EMAJointPositionToLimitsActionCfg = config_subclass(
 
 @configclass
 class BinaryJointActionCfg(ActionTermCfg):
-    """Open or closed."""
+    """Base configuration of a gripper action, which opens or closes joints."""
 
     joint_names: Any = MISSING
     open_command_expr: Any = MISSING

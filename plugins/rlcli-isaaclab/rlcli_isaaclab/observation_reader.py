@@ -1,4 +1,4 @@
-"""Reader of what is done to an observation: modifiers, noise, clip, scale and history."""
+"""Reader of the processing of an observation: modifiers, noise, clip, scale and history."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rlcli_isaaclab.settings import Node, as_float, kind_of, to_plain
 
 
 def read_processing(node: Node) -> dict[str, Any]:
-    """Return what is done to an observation: modifiers, noise, clip, scale and history."""
+    """Return the processing of an observation: modifiers, noise, clip, scale and history."""
     config: dict[str, Any] = {}
     modifiers = node.get("modifiers")
     if modifiers:
@@ -62,5 +62,5 @@ def _read_modifier(node: Node) -> dict[str, Any]:
         return {"kind": "digital_filter", "a": to_plain(node.get("A")), "b": to_plain(node.get("B"))}
     if kind == "Integrator":
         return {"kind": "integrator"}
-    node.report.problem(node.key, f"the modifier '{kind}' has no counterpart")
+    node.report.problem(node.key, f"the modifier '{kind}' has no counterpart in rlcli; remove it")
     return {"kind": "integrator"}

@@ -1,4 +1,4 @@
-"""Translation of Isaac Lab's randomization events. One of them becomes zero, one or several events of rlcli."""
+"""Translation of Isaac Lab's randomization events. Each event becomes zero, one or several events of rlcli."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ParameterError(ValueError):
 
 
 def translate_event(name: str, params: Node, scene: SceneReader) -> EventConfigs:
-    """Return the events that replace one of Isaac Lab's. Mistakes go into the report."""
+    """Return the rlcli events that replace one event of Isaac Lab. Mistakes are added to the report."""
     report = params.report
     try:
         parts = EVENTS[name](EventParameters(params, scene))
@@ -30,7 +30,7 @@ def translate_event(name: str, params: Node, scene: SceneReader) -> EventConfigs
         return {}
     for key in params.data:
         if (*params.key, key) not in report.entries:
-            report.problem((*params.key, key), f"'{name}' has no such parameter")
+            report.problem((*params.key, key), f"'{name}' has no parameter '{key}'; remove it")
     return parts
 
 
@@ -52,7 +52,7 @@ class EventParameters:
         """
         value = self.params.get(name)
         if value is None:
-            raise ParameterError(f"missing '{name}'")
+            raise ParameterError(f"missing '{name}'; give it a value")
         return value
 
     def range(self, name: str) -> Any:
@@ -126,7 +126,7 @@ def _material(event: EventParameters) -> EventConfigs:
     friction = event.range("dynamic_friction_range")
     static = event.range("static_friction_range")
     if friction is None and static is None:
-        raise ParameterError("missing 'dynamic_friction_range'")
+        raise ParameterError("missing 'dynamic_friction_range'; give [low, high]")
     if static != friction:
         event.approximate("static_friction_range", "MuJoCo has one friction, the dynamic one")
     event.ignore("restitution_range", "in MuJoCo, solref of a geom sets how contacts bounce")
@@ -167,7 +167,9 @@ def _gains(event: EventParameters) -> EventConfigs:
     if explicit and gains:
         parts["explicit"] = {"func": "randomize_pd_gains", "joints": explicit, **gains, **sampling}
     if not parts:
-        event.params.report.problem(event.key, f"no actuator of '{event.name}' has a gain to randomize")
+        event.params.report.problem(
+            event.key, f"no actuator of '{event.name}' has a gain to randomize; remove the event"
+        )
     return parts
 
 
@@ -194,7 +196,7 @@ def _tendons(event: EventParameters) -> EventConfigs:
         if pair is not None:
             parts[kind] = {"func": f"randomize_tendon_{kind}", **common, "range": pair, **sampling}
     for kind in ("limit_stiffness", "lower_limit", "upper_limit", "rest_length", "offset"):
-        event.ignore(f"{kind}_distribution_params", "it cannot differ between environments in MuJoCo")
+        event.ignore(f"{kind}_distribution_params", "this setting cannot differ between environments in MuJoCo")
     return parts
 
 
@@ -216,14 +218,14 @@ def _gaussian(event: EventParameters) -> EventConfigs:
 
 def _axes(name: str, ranges: Any, neutral: float) -> list[list[float]]:
     if not isinstance(ranges, Mapping) or not set(ranges) <= {"x", "y", "z"}:
-        raise ParameterError(f"{name}: expected ranges for x, y and z, found {ranges}")
+        raise ParameterError(f"{name}: expected ranges for x, y and z, {{x: [low, high], ...}}, found {ranges}")
     return [_pair(f"{name}.{axis}", ranges.get(axis, (neutral, neutral))) for axis in ("x", "y", "z")]
 
 
 def _pair(name: str, value: Any) -> list[float]:
     numbers = isinstance(value, list | tuple) and all(isinstance(end, int | float) for end in value)
     if not numbers or len(value) != 2:
-        raise ParameterError(f"{name}: expected two numbers, found {value}")
+        raise ParameterError(f"{name}: expected two numbers, [low, high], found {value}")
     return [float(end) for end in value]
 
 

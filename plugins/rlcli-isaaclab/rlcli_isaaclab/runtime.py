@@ -62,7 +62,9 @@ class ManagerBasedRLEnv(gymnasium.Env):
             raise AttributeError(name)
         if not hasattr(self.managed, name):
             if name.endswith("_manager") and name in dir(type(self)):
-                raise AttributeError(f"env has no '{name}' yet: it is created after every term was evaluated once")
+                raise AttributeError(
+                    f"env has no '{name}' yet: use it only in reset() and __call__(), not in __init__()"
+                )
             known = [n for n in (*dir(type(self)), *dir(self.managed)) if not n.startswith("_")]
             raise AttributeError(f"env has no '{name}'; {did_you_mean(name, known) or listing(sorted(set(known)), 60)}")
         return getattr(self.managed, name)

@@ -116,9 +116,9 @@ class Asset:
         if name.startswith("_"):
             raise AttributeError(name)
         known = [n for n in (*dir(type(self)), *vars(self)) if not n.startswith("_")]
-        hint = did_you_mean(name, known) or f"it has {listing(known, 40)}"
+        hint = did_you_mean(name, known) or f"attributes: {listing(known, 40)}"
         if "physx" in name and not did_you_mean(name, known):
-            hint = "there is no PhysX; use data and the randomization events"
+            hint = "rlcli has no PhysX; use `data` and the randomization events"
         raise AttributeError(f"an asset has no '{name}'; {hint}")
 
     def find_joints(self, name_keys: Any, joint_subset: Any = None, preserve_order: bool = False) -> Any:
@@ -213,7 +213,7 @@ class Scene(Mapping[str, Any]):
             return sensors[name]
         if name == "terrain" and self.terrain is not None:
             return self.terrain
-        raise KeyError(f"no '{name}' in the scene: {listing([*self.articulations, *sensors])}")
+        raise KeyError(f"no '{name}' in the scene; choose from {listing([*self.articulations, *sensors])}")
 
     def __iter__(self) -> Iterator[str]:
         return iter([*self.articulations, *self.sensors])
@@ -228,7 +228,7 @@ class Scene(Mapping[str, Any]):
             NameProblem: if a name matches nothing.
         """
         if cfg.name not in self:
-            hint = did_you_mean(cfg.name, list(self)) or f"there are {listing(self)}"
+            hint = did_you_mean(cfg.name, list(self)) or f"choose from {listing(self)}"
             raise NameProblem(f"no '{cfg.name}' in the scene", hint)
         element = self[cfg.name]
         for kind in ("joint", "body"):

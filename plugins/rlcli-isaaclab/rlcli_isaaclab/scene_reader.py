@@ -56,7 +56,7 @@ class SceneReader:
             elif spawn:
                 self._read_entity(name, item, spawn)
             else:
-                self.report.entries[item.key] = ("ignored", "it has no counterpart")
+                self.report.entries[item.key] = ("ignored", "MuJoCo has no counterpart of this asset")
         # Sensors come last: their prim paths refer to entities that may be listed after them.
         for kind, item in sensors:
             sensor = read_sensor(kind, item, self.prims)
@@ -65,7 +65,9 @@ class SceneReader:
         config["ground"] = ground
         config["lights"] = lights
         if not self.entities and not self.report.problems:
-            self.report.problem(node.key, "has no robot or object")
+            self.report.problem(
+                node.key, "the scene has no robot or object; add an ArticulationCfg or a RigidObjectCfg"
+            )
         config["entities"] = self.entities
         if self.sensors:
             config["sensors"] = self.sensors
@@ -182,7 +184,7 @@ class SceneReader:
             return
         if not isinstance(path, str):
             source = kind_of(spawn.data.get("func")) if spawn else "nothing"
-            message = f"is config of {source}; give it a model: spawn=UsdFileCfg(usd_path='{name}.xml')"
+            message = f"has no model, but {source}; write spawn=UsdFileCfg(usd_path='{name}.xml')"
             self.report.problem(item.key, message)
             return
         spawn = spawn or item.node("spawn")

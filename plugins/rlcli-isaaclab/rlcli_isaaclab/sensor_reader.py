@@ -60,7 +60,7 @@ def _read_ray_sensor(item: Node, entity: str, body: str | None) -> dict[str, Any
     if body is not None:
         config["body"] = body
     if kind_of(pattern.get("func")) != "grid_pattern":
-        item.report.problem(pattern.key, "only patterns.GridPatternCfg has a counterpart")
+        item.report.problem(pattern.key, "only patterns.GridPatternCfg has a counterpart in rlcli; use it")
     pattern.skip("ordering")
     grid = {
         "size": list(pattern.get("size", (1.0, 1.0))),

@@ -80,7 +80,7 @@ class Node:
         """Return a value; report a mistake if it is null or missing."""
         value = self.get(name)
         if value is None:
-            self.report.problem(self.key, f"missing '{name}'")
+            self.report.problem(self.key, f"missing '{name}'; give it a value")
         return value
 
     def node(self, name: str) -> Node:

@@ -51,7 +51,7 @@ class TermReader:
         signature = builtin_terms("actions").get(name or "")
         if name is None or signature is None:
             near = did_you_mean(kind, ACTIONS) or f"there are {listing(ACTIONS)}"
-            self.report.problem(node.key, f"the action '{kind}' has no counterpart", near)
+            self.report.problem(node.key, f"the action '{kind}' has no counterpart in rlcli", near)
             return {"func": "joint_effort"}
         node.skip("debug_vis")
         entity = node.get("asset_name", "robot")
@@ -148,8 +148,8 @@ class TermReader:
             self.report.entries[(*node.key, "class_type")] = ("to do", f"write '{kind}' in terms.py")
             return {"func": snake_case(kind), **config, **params}
         if not (isinstance(class_type, type) and issubclass(class_type, CommandTerm)):
-            near = did_you_mean(kind, COMMANDS) or f"there are {listing(COMMANDS)}, or a CommandTerm of your own"
-            self.report.problem(node.key, f"the command '{kind}' has no counterpart", near)
+            near = did_you_mean(kind, COMMANDS) or f"use {listing(COMMANDS)}, or write your own CommandTerm"
+            self.report.problem(node.key, f"the command '{kind}' has no counterpart in rlcli", near)
             return {"func": "null_command"}
         self._report_missing(node.data, node.key)
         plain = {key: value for key, value in settings.items() if _is_plain(value)}
@@ -161,7 +161,7 @@ class TermReader:
     def _report_missing(self, value: Mapping[str, Any], key: Key) -> None:
         for name, item in value.items():
             if is_missing(item):
-                self.report.problem(key, f"missing '{name}'")
+                self.report.problem(key, f"missing '{name}'; give it a value")
             elif isinstance(item, Mapping):
                 self._report_missing(item, (*key, str(name)))
 
@@ -183,7 +183,7 @@ class TermReader:
         return config
 
     def read_terms(self, section: str, name: str, node: Node) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield the terms that replace one of Isaac Lab's: usually one. The names of several get a suffix."""
+        """Yield the rlcli terms that replace one term of Isaac Lab, usually one; names of several get a suffix."""
         function = _builtin_name(node.data.get("func"))
         if section == "events" and function in EVENTS:
             node.get("func")
@@ -207,8 +207,8 @@ class TermReader:
         if name == "modify_reward_weight":
             return self._read_reward_stage(params)
         if name in ("modify_env_param", "modify_term_cfg", "initial_final_interpolate_fn"):
-            hint = "the terms 'stages' and 'interpolate' change a value of the configuration by its address"
-            what = f"'{name}' has no counterpart: it calls a function that edits the configuration"
+            hint = "use the term 'stages' or 'interpolate', which change a value by its address"
+            what = f"'{name}' has no counterpart, because it calls a function that edits the configuration"
             self.report.problem(node.key, what, hint)
             return {"func": "stages", "address": "", "steps": [], "values": []}
         ours, entry = self._find_builtin(section, name)
@@ -422,7 +422,7 @@ def _builtin_name(function: Any) -> str | None:
 
 def _find_signature(terms: Mapping[str, Signature], name: str) -> Signature:
     if name not in terms:
-        raise ConfigError([Problem("configuration", "commands", f"no term '{name}'", f"there are {listing(terms)}")])
+        raise ConfigError([Problem("configuration", "commands", f"no term '{name}'", f"choose from {listing(terms)}")])
     return terms[name]
 
 

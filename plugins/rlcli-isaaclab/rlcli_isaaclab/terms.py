@@ -49,7 +49,7 @@ class UserTerm:
         self._skip = (1 if self.is_class else 0) + (2 if takes_env_ids else 1)  # self, env, env_ids
         if len(declared) < self._skip and not any(p.kind is p.VAR_POSITIONAL for p in declared):
             expected = "(env, env_ids, ...)" if takes_env_ids else "(env, ...)"
-            raise SignatureError(f"a term of {section} takes {expected}")
+            raise SignatureError(f"a term of {section} must take {expected}")
         hints = _type_hints(call)
         named = [p for p in declared[self._skip :] if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
         self.parameters = [self._parameter(p, hints.get(p.name), entities) for p in named]
@@ -139,7 +139,7 @@ def entity_data(settings: Any) -> dict[str, Any]:
     """
     for key in ("fixed_tendon_names", "object_collection_names"):
         if settings.get(key) is not None:
-            raise ValueError(f"{key} has no counterpart in MuJoCo")
+            raise ValueError(f"{key} has no counterpart in MuJoCo; remove it")
     data = {"name": settings["name"]}
     for key in ("joint_names", "body_names"):
         if settings.get(key) is not None:

@@ -117,7 +117,7 @@ def _read_sub_terrain(node: Node) -> dict[str, Any]:
     node.skip("size", "horizontal_scale", "vertical_scale", "slope_threshold", "border_width", "flat_patch_sampling")
     kind = _SUB_TERRAINS.get(function)
     if kind is None:
-        why = f"replaced by flat ground: '{function}' has no counterpart; known are {listing(_SUB_TERRAINS)}"
+        why = f"replaced by flat ground: '{function}' has no counterpart; use one of {listing(_SUB_TERRAINS)}"
         node.report.entries[node.key] = ("approximated", why)
         return {"kind": "flat", "proportion": proportion}
     inverted = "inverted" in function or bool(node.data.get("inverted"))

@@ -405,7 +405,7 @@ def test_user_curriculum_changes_reward_weight(cfg):
     [
         (('place = PlaceCfg(asset_name="robot", ', "place = PlaceCfg("), "commands.place: missing 'asset_name'"),
         (("x=(1.0, 2.0)", ""), r"commands\.place\.ranges: missing 'x'"),
-        (("class_type: type = Place", "class_type: type = int"), "or a CommandTerm of your own"),
+        (("class_type: type = Place", "class_type: type = int"), "or write your own CommandTerm"),
         (('"term_name": "place"', '"term_name": "plaice"'), "no reward 'plaice'"),
     ],
 )
@@ -428,7 +428,7 @@ def test_error_in_user_command_lists_valid_names(cfg, change, message):
         (('"robot", joint_names=".*pole"', '"robo", joint_names=".*pole"'), "no 'robo' in the scene; did you mean"),
         (('{"steps": 5}', '{"step": 5}'), r"too_late\.params\.step: unknown key 'step'; did you mean 'steps'"),
         (('"span": 0.1', '"span": 0.1, "mu": 2'), "params.mu: unknown key 'mu'; 'start' takes span, asset_cfg"),
-        (("func=start", "func=lambda env: 1"), r"events\.begin\.func: .* takes \(env, env_ids, \.\.\.\)"),
+        (("func=start", "func=lambda env: 1"), r"events\.begin\.func: .* must take \(env, env_ids, \.\.\.\)"),
         (('joint_names=["slider_to_cart"], ', ""), "actions.effort: missing 'joint_names'"),
         (("func=rel, weight=2.0", "func=rel"), "other/own_0.py.*: rewards.away: missing 'weight'"),
         (("@configclass\nclass Rewards", "class Rewards"), "write @configclass above the class Rewards"),
@@ -440,7 +440,7 @@ def test_error_in_user_command_lists_valid_names(cfg, change, message):
         ),
         (('{"steps": 5}', '{"steps": "x"}'), "expected a whole number"),
         (("self.sim.dt = 0.01", "self.decimation = None"), "missing 'decimation'"),
-        (("CARTPOLE_CFG.replace(", "CARTPOLE_CFG.replace(prim_pth=1, "), "ArticulationCfg has no 'prim_pth'"),
+        (("CARTPOLE_CFG.replace(", "CARTPOLE_CFG.replace(prim_pth=1, "), "ArticulationCfg has no setting 'prim_pth'"),
         (("func=mdp.time_out", "func=mdp.tim_out"), "did you mean 'time_out'"),
         (("mdp.JointEffortActionCfg(", "mdp.JointPositionToLimitsActionCfg("), "no position actuator drives"),
     ],
@@ -471,7 +471,10 @@ def test_missing_import_gives_replacement_line(cfg, line, message):
 def test_usd_file_is_mapped_or_error_lists_table(cfg):
     own = 'CARTPOLE_CFG.replace(spawn=UsdFileCfg(usd_path="/models/thing.usd"), '
     first = ("from rlcli_isaaclab import (", "from rlcli_isaaclab import (UsdFileCfg, map_usd,")
-    with pytest.raises(ConfigError, match=r"scene\.robot\.spawn\.usd_path: no MJCF is known for '/models/thing\.usd'"):
+    with pytest.raises(
+        ConfigError,
+        match=r"scene\.robot\.spawn\.usd_path: no MJCF model is known for the USD file '/models/thing\.usd'",
+    ):
         resolve(cfg(first, ("CARTPOLE_CFG.replace(", own)))
     known = ("\n\n\ndef positions", '\n\nmap_usd("models/thing.usd", "cartpole:cartpole.xml")\n\n\ndef positions')
     source = cfg(first, known, ("CARTPOLE_CFG.replace(", own))
@@ -527,7 +530,7 @@ def test_configclass_copies_defaults_for_each_object():
     assert two.inner.values == [1, 2]
     assert two.to_dict() == {"inner": {"values": [1, 2], "limit": 3.0}, "name": "b"}
     assert one.replace(name="c").name == "c"
-    with pytest.raises(TypeError, match="has no 'nam'"):
+    with pytest.raises(TypeError, match="has no setting 'nam'"):
         one.replace(nam="c")
 
 

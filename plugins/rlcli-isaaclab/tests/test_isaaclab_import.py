@@ -183,7 +183,7 @@ def test_agent_file_of_other_library_is_refused(imported, tmp_path):
     other.write_text("params:\n  seed: 42\n")
     code, document, _, _ = imported(None, str(other), agent=False)
     assert code == 3
-    assert "is not RSL-RL's agent.yaml" in json.dumps(document)
+    assert "not an agent.yaml of RSL-RL" in json.dumps(document)
 
 
 def test_settings_that_cartpole_lacks_are_translated(imported):

@@ -96,7 +96,7 @@ class _Translator(YamlTranslator):
                 self.problem((key,), f"unknown key '{key}'", "keys: params")
         params = train.get("params")
         if not isinstance(params, dict) or not isinstance(params.get("config"), dict):
-            self.problem(("params",), "an rl_games YAML has params: {algo, model, network, config}")
+            self.problem(("params",), "an rl_games YAML has params: {algo, model, network, config}; add them")
             raise ConfigError(self.problems)
         self.data = {"trainer": "ppo", "algorithm": "ppo", "dialect": "rl_games"}
         self._params(params)
@@ -138,7 +138,7 @@ class _Translator(YamlTranslator):
     def _network(self, network: Any) -> None:
         at = ("params", "network")
         if not isinstance(network, dict):
-            self.problem(at, "expected a mapping with mlp: {units, activation}")
+            self.problem(at, "expected a mapping; write mlp: {units: [...], activation: NAME}")
             return
         for key, value in network.items():
             if key == "name":
@@ -159,7 +159,7 @@ class _Translator(YamlTranslator):
 
     def _mlp(self, at: Path, mlp: Any) -> None:
         if not isinstance(mlp, dict):
-            self.problem(at, "expected a mapping")
+            self.problem(at, "expected a mapping; write {units: [...], activation: NAME}")
             return
         shape: dict[str, Any] = {}
         for key, value in mlp.items():
@@ -172,11 +172,11 @@ class _Translator(YamlTranslator):
                 shape["activation"] = value
                 self.note((*at, key), "mapped", "actor.activation, critic.activation")
             elif key == "d2rl" and value:
-                self.problem((*at, key), "d2rl networks are not supported")
+                self.problem((*at, key), "d2rl networks are not supported; remove this key")
             elif key in ("d2rl", "initializer", "regularizer"):
                 self.note((*at, key), "mapped" if key == "initializer" else "ignored", "init")
             else:
-                self.problem((*at, key), f"unknown key '{key}'")
+                self.problem((*at, key), f"unknown key '{key}'; remove it")
         for network in ("actor", "critic"):
             self.put((network,), dict(shape), at)
 
@@ -184,7 +184,7 @@ class _Translator(YamlTranslator):
         kinds = space if isinstance(space, dict) else {}
         continuous = kinds.get("continuous")
         if not isinstance(continuous, dict):
-            self.problem(at, f"only continuous action spaces are supported, found {listing(kinds)}")
+            self.problem(at, f"only continuous action spaces are supported, found {listing(kinds)}; write `continuous`")
             return
         for key, value in continuous.items():
             inner = (*at, "continuous", key)
@@ -202,7 +202,7 @@ class _Translator(YamlTranslator):
 
     def _rnn(self, at: Path, rnn: Any) -> None:
         if not isinstance(rnn, dict) or rnn.get("name") != "lstm":
-            self.problem(at, "only {name: lstm, units, layers} is supported")
+            self.problem(at, "only LSTMs are supported; write {name: lstm, units: N, layers: N}")
             return
         self.put(("rnn",), {"hidden": rnn.get("units", 64), "layers": rnn.get("layers", 1)}, at)
         for key, value in rnn.items():
@@ -233,7 +233,7 @@ class _Translator(YamlTranslator):
         mapped("reward_shaper", "reward_scale", scale)
         if isinstance(shaper, dict) and set(shaper) - {"scale_value"}:
             others = listing(sorted(set(shaper) - {"scale_value"}))
-            self.problem((*at, "reward_shaper"), f"only scale_value is supported, found {others}")
+            self.problem((*at, "reward_shaper"), f"only scale_value is supported; remove {others}")
         mapped("critic_coef", "value_coef", 0.5 * _number(config.get("critic_coef"), 2.0))
         mapped("clip_value", "clip_value", "larger" if config.get("clip_value") else None)
         mapped("normalize_advantage", "normalize_advantage", "batch" if config.get("normalize_advantage") else None)

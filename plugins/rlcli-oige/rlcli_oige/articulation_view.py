@@ -28,7 +28,7 @@ class ArticulationView(XFormPrimView):
         entity = self._entities[0]
         if any(other is not entity for other in self._entities):
             names = listing(other.name for other in self._entities)
-            raise TaskError(f"view '{self.name}': '{self.prim_paths_expr}' matches several robots: {names}")
+            raise TaskError(f"view '{self.name}': '{self.prim_paths_expr}' matches several robots; name one: {names}")
         model, device = self.env.engine.model, self.env.device
         # a view of a robot is a view of its root, also if the path names one of its links
         self._entities, self._bodies, self._per_env = [entity], [entity.root_body], 1

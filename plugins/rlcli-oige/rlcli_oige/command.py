@@ -13,7 +13,7 @@ from rlcli.formats import Imported
 def import_task(
     task: Annotated[Path, typer.Argument(metavar="TASK.yaml", help="cfg/task/NAME.yaml of OmniIsaacGymEnvs.")],
     train: Annotated[
-        Path | None, typer.Argument(metavar="TRAINPPO.yaml", help="Its cfg/train/NAMEPPO.yaml, of rl_games.")
+        Path | None, typer.Argument(metavar="TRAINPPO.yaml", help="cfg/train/NAMEPPO.yaml of the task, for rl_games.")
     ] = None,
     output: Annotated[
         Path | None,

@@ -61,7 +61,7 @@ def check(block: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str, str]
         section, key = map(str, path)
         values = block.get(section)
         if isinstance(values, dict) and values.get(key) is not None:
-            yield (section, key), "this key has another name in rlcli", f"set {target}"
+            yield (section, key), "this key has another name in rlcli", f"write {target} instead"
 
 
 def _config(folder: Path) -> Path | None:
@@ -89,7 +89,7 @@ def _task(root: Path, config: Path, name: str) -> TaskSource:
         file, class_name = find_class(home(config), name)
     except LookupError as problem:
         if next(home(config).rglob("*.py"), None) is not None:
-            raise TaskError(f"'{config}' is not a task: {problem.args[0]}") from None
+            raise TaskError(f"'{config}' is not a task of OmniIsaacGymEnvs: {problem.args[0]}") from None
         file, class_name = None, f"{name}Task"  # the YAML can be checked without the class
     return TaskSource(
         name=root.name if config.name == "task.yaml" else config.stem,

@@ -117,12 +117,12 @@ class _Evaluator:
         dots = len(text) - len(text.lstrip("."))
         if dots > len(path):
             raise InterpolationError(
-                path, f"'${{{text}}}' has too many leading dots: it points above the top level of the configuration"
+                path, f"'${{{text}}}' points above the top level of the configuration: remove leading dots"
             )
         base = path[: len(path) - dots] if dots else ()
         target: Path = (*base, *(step for step in text[dots:].split(".") if step))
         if target in self.active:
-            raise InterpolationError(path, f"'${{{text}}}' refers to itself")
+            raise InterpolationError(path, f"'${{{text}}}' refers to itself; write the value")
         try:
             found = self.look_up(target)
         except KeyError as missing:
@@ -152,7 +152,7 @@ def _closing(path: Path, text: str, start: int) -> int:
             depth -= 1
             if not depth:
                 return position
-    raise InterpolationError(path, f"'{text}' is not closed", "every ${ needs a }")
+    raise InterpolationError(path, f"'{text}' is not closed", "add the closing }")
 
 
 def _split(text: str) -> list[str]:

@@ -40,16 +40,20 @@ def convert(files: list[Path], output: Path | None) -> Imported:
         ConfigError: with every mistake in the files.
     """
     if len(files) > 2:
-        raise UsageError(f"found {len(files)} files", hint="rlcli import oige TASK.yaml [TRAINPPO.yaml]")
+        raise UsageError(
+            f"expected one or two files, found {len(files)}", hint="rlcli import oige TASK.yaml [TRAINPPO.yaml]"
+        )
     source = files[0]
     document = read(source)
     if not task_yaml.is_oige(document.data):
-        message = "is not a task of OmniIsaacGymEnvs: it has no env: and sim:"
+        message = (
+            "this YAML is not a task of OmniIsaacGymEnvs, because it has no keys env and sim; give cfg/task/NAME.yaml"
+        )
         raise ConfigError([Problem(str(source), "", message)])
     name = str(document.data.get("name") or source.stem)
     # the name becomes the name of a class and of a folder
     if not (name.isidentifier() and name.isascii() and len(name) <= _LONGEST_NAME):
-        message = f"'{name[:_LONGEST_NAME]}' is not a valid name of a task's class"
+        message = f"'{name[:_LONGEST_NAME]}' is not a valid name of a Python class; use letters, digits and _"
         raise ConfigError([Problem(str(source), "name", message)])
     folder = output or Path(_kebab(name))
     target = folder / "task.yaml"
@@ -106,9 +110,9 @@ def _copy_models(models: dict[str, Any], source: Path, folder: Path) -> list[Pat
     for entry in models.values():
         file, target = source / entry["model"], folder / entry["model"]
         if not target.resolve().is_relative_to(folder.resolve()):
-            raise TaskError(f"'{entry['model']}' in mjcf: is outside of the task's folder")
+            raise TaskError(f"'{entry['model']}' in mjcf: is outside of the task's folder; move it inside")
         if not file.is_file():
-            raise TaskError(f"no file '{file}', which mjcf: refers to")
+            raise TaskError(f"no file '{file}', which mjcf: names; correct the name")
         if file.resolve() != target.resolve():
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, target)

@@ -26,7 +26,9 @@ def find(name: str, known: Iterable[str]) -> Any:
         if name in _definitions(file):
             return getattr(load_module(str(file)), name)
     near = did_you_mean(name, known)
-    raise AttributeError(f"rlcli_oige has no '{name}'{f'; {near}' if near else ''}")
+    raise AttributeError(
+        f"rlcli_oige has no name '{name}'; {near or 'docs/guides/omniisaacgymenvs.md lists the names'}"
+    )
 
 
 def used_names(known: Iterable[str]) -> list[str]:

@@ -1,8 +1,8 @@
 """Domain randomization with OmniIsaacGymEnvs' syntax, through the engine's per-environment model fields.
 
-`on_startup` changes the model once. `on_reset` starts from that and holds for an episode. `on_interval` starts from the
-values at the start of the episode. The second parameter of a gaussian is its standard deviation. Samples depend only on
-the seed, the environment, and the episode or step.
+`on_startup` changes the model once. `on_reset` starts from the result of `on_startup` and holds for an episode.
+`on_interval` starts from the values at the start of the episode. The second parameter of a gaussian is its standard
+deviation. Samples depend only on the seed, the environment, and the episode or step.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ class Randomizer:
     # --- called by tasks ---
 
     def apply_on_startup_domain_randomization(self, task: Any) -> None:
-        """Do nothing: the environment applies it."""
+        """Do nothing: the environment applies the startup randomization."""
 
     def set_up_domain_randomization(self, task: Any) -> None:
-        """Do nothing: the environment sets it up."""
+        """Do nothing: the environment sets up the randomization."""
 
     def step_randomization(self, reset_inds: Any = None) -> None:
-        """Do nothing: the environment does it."""
+        """Do nothing: the environment randomizes in each step."""
 
     def get_initial_dr_distribution_parameters(self, *path: str) -> np.ndarray:
         """Return the parameters of a distribution as in the YAML."""
@@ -230,9 +230,9 @@ class Randomizer:
         width = rows.shape[1]
         if width not in (1, size) and (width != 3 or size % 3):
             at = ("oige", "domain_randomization", "randomization_params", *gate.path, gate.gate)
-            message = f"distribution_parameters have {width} columns, {'.'.join(gate.path)} has {size}"
+            message = f"distribution_parameters have {width} pairs, {'.'.join(gate.path)} has {size} columns"
             where = self._env.resolved.place(at)
-            hint = "give one pair for all columns, or one pair for each column"
+            hint = "give one pair for all columns, or one pair per column"
             raise ConfigError([Problem(where, gate.name, message, hint)])
         rows = rows.repeat(1, size // width)
         return rows[0], rows[1]

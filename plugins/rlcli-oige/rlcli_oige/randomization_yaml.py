@@ -82,7 +82,7 @@ ATTRIBUTES: Mapping[str, Mapping[str, tuple[Status, str]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """One randomization: of which attribute, when, and with which distribution."""
+    """One randomization: its attribute, its time (startup, reset or interval) and its distribution."""
 
     path: tuple[str, ...]
     """(observations,), (actions,), (simulation, gravity) or (kind of view, view, attribute)"""
@@ -137,7 +137,7 @@ def check(
     """Report every key of a `domain_randomization:` block, as a mistake or as a note."""
     base: Path = ("domain_randomization",)
     if not isinstance(block, dict):
-        problem(base, "expected a mapping", None)
+        problem(base, "expected a mapping", "write {randomize: true, randomization_params: {...}}")
         return
     for key in block:
         if key in ("randomize", "min_frequency"):
@@ -153,7 +153,7 @@ def check(
         elif key == "simulation":
             for attribute in content if isinstance(content, dict) else ():
                 if attribute != "gravity":
-                    problem((*at, attribute), f"'{attribute}' cannot be randomized", "expected gravity")
+                    problem((*at, attribute), f"'{attribute}' cannot be randomized", "only gravity can")
         elif key not in ("observations", "actions"):
             groups = ("observations", "actions", "simulation", *VIEWS)
             problem(at, f"unknown key '{key}'", did_you_mean(key, groups) or f"keys: {listing(groups)}")
@@ -186,7 +186,7 @@ def _check_gate(
     if gate == "on_startup" and target[0] not in VIEWS:
         problem(at, f"{target[0]} cannot be randomized on_startup", "use on_reset or on_interval")
     if not isinstance(entry, dict):
-        problem(at, "expected a mapping", None)
+        problem(at, "expected a mapping", "write {operation: ..., distribution: ..., distribution_parameters: [...]}")
         return
     for key in entry:
         if key not in _KEYS:
@@ -196,7 +196,7 @@ def _check_gate(
         key for key in (*needed, *(("frequency_interval",) if gate == "on_interval" else ())) if key not in entry
     ]
     if missing:
-        problem(at, f"missing {listing(missing)}", None)
+        problem(at, f"missing {listing(missing)}", "add each of these keys")
         return
     for key, known in (("operation", OPERATIONS), ("distribution", tuple(DISTRIBUTIONS)), ("schedule", SCHEDULES)):
         if key in entry and entry[key] not in known:
@@ -207,7 +207,7 @@ def _check_gate(
         if isinstance(count, bool) or not isinstance(count, int | float) or count != int(count) or count < minimum:
             problem((*at, key), f"expected a whole number >= {minimum}, found {count!r}", None)
     if entry["operation"] == "direct" and target[0] in ("observations", "actions"):
-        problem((*at, "operation"), "expected additive or scaling for noise", None)
+        problem((*at, "operation"), "operation: expected additive or scaling for noise", None)
     _check_numbers((*at, "distribution_parameters"), entry, problem)
     status: tuple[Status, str] = ("mapped", "")
     if target[0] in VIEWS:
@@ -226,13 +226,13 @@ def _check_numbers(at: Path, entry: Mapping[str, Any], problem: Callable[[Path, 
         problem(at, f"expected [a, b] or [[a, ...], [b, ...]], found {parameters!r}", None)
         return
     if not all(isinstance(x, int | float) for pair in pairs for x in pair):
-        problem(at, "expected numbers", None)
+        problem(at, "expected numbers in distribution_parameters", "as in [-0.1, 0.1]")
     elif entry["distribution"] in ("uniform", "loguniform", "log_uniform") and any(a > b for a, b in pairs):
-        problem(at, "a lower bound is above its upper bound", None)
+        problem(at, "a lower bound is above its upper bound", "write [low, high]")
     elif entry["distribution"] in ("loguniform", "log_uniform") and any(a <= 0 for a, _ in pairs):
-        problem(at, "a loguniform distribution needs bounds above 0", None)
+        problem(at, "a loguniform distribution needs bounds above 0", "raise them, or use uniform")
     elif entry["distribution"] in ("gaussian", "normal") and any(b < 0 for _, b in pairs):
-        problem(at, "a standard deviation is negative", None)
+        problem(at, "a standard deviation is negative", "write [mean, std] with std >= 0")
 
 
 def _entries(block: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], Any]]:

@@ -88,7 +88,7 @@ class Stage:
             if prefix in self.prims:
                 return self.prims[prefix]
             prefix = prefix.rpartition("/")[0]
-        raise TaskError(f"no prim at '{path}'", hint=f"prims: {listing(self.prims)}")
+        raise TaskError(f"no prim at '{path}'", hint=f"choose from {listing(self.prims)}")
 
     def define(self, path: str, pos: Any, quat: Any) -> Prim:
         """Add a prim."""
@@ -117,7 +117,7 @@ class Stage:
         try:
             prim.child = read_mjcf(file, [*package_roots(self.root), home(self.root / "task.yaml"), MODELS])
         except BadModel as error:
-            raise ConfigError([Problem(where, "", f"'{file}' is not a valid MJCF: {error}")]) from None
+            raise ConfigError([Problem(where, "", f"'{file}' is not a valid MJCF; correct it: {error}")]) from None
         prim.label = str(entry.get("model", file.name))
         prim.names = {"joints": entry.get("joints", {}), "bodies": entry.get("bodies", {})}
         self._rename_elements(prim, where)
@@ -167,7 +167,7 @@ def get_current_stage() -> Stage:
         TaskError: outside of `set_up_scene`.
     """
     if not _CURRENT_STAGES:
-        raise TaskError("there is no stage", hint="create robots and shapes in the task's set_up_scene")
+        raise TaskError("the task has no stage yet", hint="create robots and shapes in the task's set_up_scene")
     return _CURRENT_STAGES[-1]
 
 
@@ -208,7 +208,9 @@ def path_pattern(expression: str) -> re.Pattern[str]:
     try:
         return re.compile("/".join(steps))
     except re.error as error:
-        raise TaskError(f"'{expression}' is not a valid pattern of prim paths: {error}") from None
+        raise TaskError(
+            f"'{expression}' is not a valid regular expression of prim paths; correct it: {error}"
+        ) from None
 
 
 class XFormPrim:

@@ -1,4 +1,4 @@
-"""Keys of OmniIsaacGymEnvs' task YAML, and what becomes of each."""
+"""Keys of OmniIsaacGymEnvs' task YAML, and the translation of each key."""
 
 from __future__ import annotations
 

@@ -218,7 +218,7 @@ class _Translator(YamlTranslator):
         for key, value in viewport.items():
             target = MOVED_KEYS.get(("viewport", key))
             if target is None:
-                self.problem(("viewport", key), f"unknown key '{key}'")
+                self.problem(("viewport", key), f"unknown key '{key}'; remove it")
                 continue
             self.put(tuple(target.split(".")), value, ("viewport", key))
             self.note(("viewport", key), "mapped", target)
@@ -246,11 +246,11 @@ class _Translator(YamlTranslator):
                 elif key != "model" and not (
                     isinstance(names, dict) and all(isinstance(name, str) for name in names.values())
                 ):
-                    self.problem((*at, key), "expected a mapping from the task's names to the model's names")
+                    self.problem((*at, key), "not a mapping; write {NAME IN THE TASK: NAME IN THE MODEL}")
             models[relative(path)] = entry
             self.note(at, "mapped", str(entry["model"]))
         if block is not None and not isinstance(block, dict):
-            self.problem(("mjcf",), "expected a mapping from robots to MJCF files")
+            self.problem(("mjcf",), "expected a mapping from robots to MJCF files, {ROBOT: FILE.xml}")
         return models
 
     def _agents(self, file: FilePath, task: Any) -> tuple[dict[str, Any], Callable[[Path], Origin]]:
@@ -261,7 +261,7 @@ class _Translator(YamlTranslator):
 
     def _section(self, at: Path, block: Any, known: Mapping[str, tuple[Status, str]]) -> None:
         if not isinstance(block, dict):
-            self.problem(at, f"expected a mapping, found {block!r}")
+            self.problem(at, f"expected a mapping, found {block!r}; write `key: value`")
             return
         for key in block:
             if key in known:

@@ -56,7 +56,7 @@ class XFormPrimView:
         if not found:
             near = did_you_mean(self.prim_paths_expr.replace("/.*/", "/env_0/"), known)
             raise TaskError(
-                f"view '{self.name}': nothing matches '{self.prim_paths_expr}'",
+                f"view '{self.name}': no prim path matches '{self.prim_paths_expr}'",
                 hint=near or f"paths: {listing(known)}",
             )
         self._entities = [entity for entity, _ in found]

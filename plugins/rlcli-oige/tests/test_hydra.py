@@ -45,12 +45,12 @@ def test_value_keeps_type_and_overrides_default():
 @pytest.mark.parametrize(
     ("text", "message", "hint"),
     [
-        ("${....sed}", "too many leading dots", None),
+        ("${....sed}", "above the top level of the configuration: remove leading dots", None),
         ("${...sed}", "has no 'sed'", "did you mean 'seed'?"),
         ("${oc.env:HOME}", "unknown resolver 'oc.env'", "resolvers: eq, contains, if, resolve_default"),
         ("${eq:1}", "expects 2 arguments, found 1", None),
         ("${.a}", "refers to itself", None),
-        ("${...seed", "is not closed", "every ${ needs a }"),
+        ("${...seed", "is not closed", "add the closing }"),
     ],
 )
 def test_invalid_interpolation_error_has_key(text, message, hint):

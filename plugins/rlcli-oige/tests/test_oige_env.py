@@ -243,7 +243,7 @@ def test_restored_state_continues_bit_for_bit(env):
 @pytest.mark.parametrize(
     ("where", "old", "new", "error", "message"),
     [
-        ("task", '/.*/Arm"', '/.*/Army"', TaskError, "nothing matches '/World/envs/.*/Army'"),
+        ("task", '/.*/Arm"', '/.*/Army"', TaskError, "no prim path matches '/World/envs/.*/Army'"),
         ("task", '"left_a"', '"left_c"', TaskError, "view 'arm_view' has no joint 'left_c'"),
         ("task", '["maxEffort"]', '["maxForce"]', TaskError, "ArmTask reads the key 'maxForce', which is missing"),
         ("task", "super().set_up_scene(scene)", "pass", TaskError, "set_up_scene does not call RLTask.set_up_scene"),

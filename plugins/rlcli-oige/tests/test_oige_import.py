@@ -43,7 +43,7 @@ def test_task_name_that_is_path_is_refused(tmp_path, monkeypatch, capsys, name):
     file = tmp_path / "given.yaml"
     file.write_text(f'name: "{name}"\nenv: {{numEnvs: 4}}\nsim: {{dt: 0.01}}\n'.replace("{tmp}", str(tmp_path)))
     assert main(["import", "oige", str(file)]) == 3
-    assert "is not a valid name of a task's class" in capsys.readouterr().err
+    assert "is not a valid name of a Python class" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == [tmp_path / "a", tmp_path / "a" / "b", file]
 
 

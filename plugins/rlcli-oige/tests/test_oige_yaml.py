@@ -89,7 +89,7 @@ def test_wrong_agent_key_error_has_line(tmp_path):
 
 
 def test_moved_key_is_refused_in_oige_block(tmp_path):
-    with pytest.raises(ConfigError, match=r"oige\.env\.numEnvs.*set scene\.num_envs"):
+    with pytest.raises(ConfigError, match=r"oige\.env\.numEnvs.*write scene\.num_envs"):
         resolved(arm_folder(tmp_path / "arm"), "oige.env.numEnvs=3")
 
 
@@ -98,7 +98,7 @@ def test_class_is_found_by_task_name(tmp_path):
     assert find_task(str(folder)).task.endswith("arm.py:ArmTask")
     assert find_task(str(folder / "Arm.yaml")).task.endswith("arm.py:ArmTask")
     (folder / "arm.py").write_text("class Other:\n    pass\n")
-    with pytest.raises(TaskError, match="no task class in any Python file of the folder; expected 'ArmTask'"):
+    with pytest.raises(TaskError, match="no task class in any Python file of the folder; name the class 'ArmTask'"):
         find_task(str(folder))
 
 

@@ -62,7 +62,11 @@ class RlGamesTrainer(BaseTrainer):
         )
         if self.vec.central and "critic" not in env.layout.observations:
             hint = f"groups of the task: {', '.join(env.layout.observations)}"
-            raise self._error("central_value_config", "the task has no observation group critic", hint)
+            raise self._error(
+                "central_value_config",
+                "the task has no observation group 'critic'; add it, or remove central_value_config",
+                hint,
+            )
         self.spec = self._policy_spec()
         torch.set_num_threads(torch_threads)
         seed_generators(derive(seed, "trainer"))

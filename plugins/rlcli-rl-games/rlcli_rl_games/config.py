@@ -23,21 +23,21 @@ _DEFAULT: Initializer = {"name": "default"}
 _ZERO: Initializer = {"name": "const_initializer", "val": 0}
 
 IGNORED: Mapping[str, str] = {
-    "name": "a run is named by its task",
+    "name": "the task names the run",
     "full_experiment_name": "--name",
-    "env_name": "there is one environment loop",
+    "env_name": "rlcli has only one environment loop",
     "device": "use --device",
     "device_name": "use --device",
     "multi_gpu": "one process trains",
     "ppo": "use algorithm",
     "num_actors": "use scene.num_envs",
-    "score_to_win": "training runs to its budget",
+    "score_to_win": "training runs until its limit of iterations or steps",
     "save_best_after": "use save_interval",
     "print_stats": "",
     "player": "rlcli play",
     "games_to_track": "",
     "max_frames": "use --max-steps",
-    "seq_length": "of networks with a memory",
+    "seq_length": "sequences of recurrent networks are whole rollouts",
     "num_seed_steps": "rl_games itself does not read it",
 }
 """Key of `params.config` that has no effect -> reason."""
@@ -240,7 +240,7 @@ class PpoSettings(_Settings):
     @model_validator(mode="after")
     def _minibatch(self) -> PpoSettings:
         if (self.minibatch_size is None) == (self.minibatch_size_per_env is None):
-            raise ValueError("one of minibatch_size and minibatch_size_per_env is needed")
+            raise ValueError("no minibatch size: give minibatch_size or minibatch_size_per_env")
         return self
 
 
@@ -338,7 +338,7 @@ class SacParams(_Params):
 
 def _require(named: Named, key: str, name: str, algorithm: str) -> None:
     if named.name != name:
-        raise ValueError(f"{key}.name '{named.name}' does not fit algorithm {algorithm}: expected '{name}'")
+        raise ValueError(f"{key}.name '{named.name}' does not fit algorithm {algorithm}; write '{name}'")
 
 
 class RlGamesConfig(AgentConfig):
@@ -405,11 +405,11 @@ CentralValueConfig.model_rebuild()
 PpoConfig.model_rebuild()
 
 SPEC = TrainerSpec(
-    summary="rl_games, its settings as they stand",
+    summary="rl_games, with its own settings",
     algorithms={"ppo": "rlcli_rl_games.config:PpoConfig", "sac": "rlcli_rl_games.config:SacConfig"},
     trainer="rlcli_rl_games.trainer:make_trainer",
     refused={
-        "a2c_continuous": "here it is called ppo",
-        "a2c_discrete": "it needs discrete actions, and tasks have continuous ones",
+        "a2c_continuous": "rlcli names this algorithm ppo",
+        "a2c_discrete": "the algorithm needs discrete actions, and tasks have continuous ones",
     },
 )

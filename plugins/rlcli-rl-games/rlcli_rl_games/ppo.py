@@ -32,7 +32,7 @@ class PpoTrainer(RlGamesTrainer):
             if self.steps_per_iteration % wanted:
                 message = f"minibatches of {wanted} samples do not divide a rollout of horizon_length x num_envs ="
                 message += f" {config.horizon_length} x {self.env.num_envs} = {self.steps_per_iteration}"
-                raise self._error(key, message, f"{self.steps_per_iteration}, or a divisor of it")
+                raise self._error(key, message, f"give {self.steps_per_iteration}, or a divisor of it")
         parameters["config"] = {**_DEFAULTS, **parameters["config"]}
         agent = A2CAgent("rlcli", parameters)
         if agent.has_central_value:

@@ -51,7 +51,7 @@ class SacTrainer(RlGamesTrainer):
             message = (
                 f"the buffer of {config.replay_buffer_size} does not hold a step of {self.env.num_envs} environments"
             )
-            raise self._error("replay_buffer_size", message, f"at least {self.env.num_envs}")
+            raise self._error("replay_buffer_size", message, f"give at least {self.env.num_envs}")
         agent = SACAgent("rlcli", parameters)
         if self.bootstrap == "final_obs":
             agent.replay_buffer = ReplayBuffer(self.vec, agent.replay_buffer)

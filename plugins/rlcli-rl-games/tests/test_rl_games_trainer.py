@@ -318,9 +318,9 @@ def test_load_weights_gives_same_policy(sac_task):
         (["agent.params.config.mixed_precision=true"], "params.config.mixed_precision", "false"),
         (["agent.params.algo.name=sac"], "agents.rl-games.params", "algorithm ppo"),
         (["agent.algorithm=a2c_discrete"], "algorithm", "discrete actions"),
-        (["agent.algorithm=a2c_continuous"], "algorithm", "called ppo"),
+        (["agent.algorithm=a2c_continuous"], "algorithm", "this algorithm ppo"),
         (["agent.action_bound=2.0"], "agents.rl-games", "clip_actions"),
-        (["agent.params.config.minibatch_size_per_env=4"], "params.config", "one of minibatch_size"),
+        (["agent.params.config.minibatch_size_per_env=4"], "params.config", "no minibatch size"),
     ],
 )
 def test_invalid_settings_are_refused_without_heavy_imports(overrides, place, words):
@@ -334,7 +334,7 @@ def test_invalid_settings_are_refused_without_heavy_imports(overrides, place, wo
     ("overrides", "place", "words"),
     [
         (["agent.params.config.minibatch_size=25"], "params.config.minibatch_size", "16 x 6 = 96"),
-        ([CENTRAL], "params.config.central_value_config", "observation group critic"),
+        ([CENTRAL], "params.config.central_value_config", "observation group 'critic'"),
     ],
 )
 def test_settings_that_do_not_fit_env_name_their_key(overrides, place, words):

@@ -260,20 +260,20 @@ class RunnerConfig(AgentConfig):
             clip = data.pop("clip_actions")
             if data.get("action_bound", clip) != clip:
                 bound = data["action_bound"]
-                raise ValueError(f"clip_actions ({clip}) and action_bound ({bound}) are two names of one setting")
+                raise ValueError(f"clip_actions ({clip}) and action_bound ({bound}) name one setting: remove one")
             data["action_bound"] = clip
         return _tuples(data)
 
     @model_validator(mode="after")
     def _relations(self) -> RunnerConfig:
         if self.policy is not None and (self.actor is not None or self.critic is not None):
-            raise ValueError("policy is the older form of actor and critic: give one of the two forms")
+            raise ValueError("policy is the older form of actor and critic: remove policy, or both others")
         if self.algorithm.symmetry_cfg is not None and self.memory is not None:
-            raise ValueError("RSL-RL does not support symmetry for recurrent networks")
+            raise ValueError("RSL-RL does not support symmetry for recurrent networks: remove one of the two")
         if self.algorithm.schedule == "adaptive" and self.algorithm.desired_kl is None:
-            raise ValueError("algorithm.schedule adaptive needs algorithm.desired_kl")
+            raise ValueError("algorithm.schedule adaptive needs algorithm.desired_kl: set it")
         if self.critic is not None and self.critic.distribution_cfg is not None:
-            raise ValueError("critic.distribution_cfg: only the actor has a distribution")
+            raise ValueError("only the actor has a distribution: remove critic.distribution_cfg")
         return self
 
     @property
@@ -329,8 +329,8 @@ def _tuples(data: dict[str, Any]) -> dict[str, Any]:
 
 
 SPEC = TrainerSpec(
-    summary="RSL-RL's PPO, its settings as they stand",
+    summary="RSL-RL's PPO, with its own settings",
     algorithms={"ppo": "rlcli_rsl_rl.config:RunnerConfig"},
     trainer="rlcli_rsl_rl.trainer:RslRlTrainer",
-    refused={"distillation": "it needs a teacher's observations and policy"},
+    refused={"distillation": "the algorithm needs a teacher's observations and policy"},
 )

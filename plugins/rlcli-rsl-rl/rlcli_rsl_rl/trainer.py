@@ -72,7 +72,7 @@ class RslRlTrainer(BaseTrainer):
     def start(self) -> None:
         """Reset the environment to its first episodes."""
         for key in self.config.not_read:
-            _log.warning(f"ignored by trainer rsl-rl: {key}")
+            _log.warning(f"trainer rsl-rl ignores the setting {key}; remove it")
         obs = self.env.reset(seed=self.env.seed)
         self._obs = self._adapter.observations(obs)
         self._keep_recent_obs(obs["policy"])
@@ -347,7 +347,7 @@ def _mirror(env: Environment, reference: str) -> Any:
     elif not is_offered(module, env.resolved.source):
         at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
         message = f"'{module}' belongs neither to the task nor to an installed plugin"
-        raise agent_error(env, at, message, "file.py:function beside the task, or module:function of its package")
+        raise agent_error(env, at, message, "give file.py:function beside the task, or module:function of its package")
     try:
         found = load_object(f"{module}:{name}")
     except (ImportError, AttributeError, OSError, ValueError) as error:
@@ -356,6 +356,6 @@ def _mirror(env: Environment, reference: str) -> Any:
         why = ", which is not a function"
     if not callable(found):
         at = ("algorithm", "symmetry_cfg", "data_augmentation_func")
-        hint = "module:function of the task's package or a plugin, or file.py:function beside the task"
+        hint = "give module:function of the task's package or a plugin, or file.py:function beside the task"
         raise agent_error(env, at, f"no function '{reference}'{why}", hint)
     return found

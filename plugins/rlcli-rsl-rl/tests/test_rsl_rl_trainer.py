@@ -293,7 +293,7 @@ def test_ignored_settings_are_reported_once(caplog):
         (["agent.algorithm.gama=0.9"], "algorithm.gama", "gamma"),
         (["agent.policy.activation=sigmoid"], "policy.activation", "elu"),
         (["agent.policy.rnn_type=gru"], "policy.rnn_type", "lstm"),
-        (["agent.actor={hidden_dims: [4]}"], "agents.rsl-rl", "two forms"),
+        (["agent.actor={hidden_dims: [4]}"], "agents.rsl-rl", "older form"),
         (["agent.algorithm.desired_kl=null"], "agents.rsl-rl", "desired_kl"),
         (["agent.algorithm.class_name=Distillation"], "algorithm", "teacher"),
         (["agent.clip_actions=1.0", "agent.action_bound=2.0"], "agents.rsl-rl", "one thing"),

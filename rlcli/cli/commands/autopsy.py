@@ -58,7 +58,7 @@ def command(
     """
     require_known(sort, list(_SORT_KEYS), "--sort", "orders")
     if video is not None and case is None:
-        raise UsageError("--video draws one case", hint="rlcli autopsy RUN N --video FILE.mp4")
+        raise UsageError("--video needs the number of a case", hint="rlcli autopsy RUN N --video FILE.mp4")
     video = video_file(video, "autopsy.mp4")
     from rlcli.replay.failure_cases import list_failure_cases, why_no_cases
     from rlcli.runs.bundle import is_bundle
@@ -77,7 +77,7 @@ def command(
     elif case < len(cases):
         _print_case(found, cases[case], case, steps, video, named)
     else:
-        hint = f"it has {len(cases)} cases, counted from 0" if cases else why_no_cases(found)
+        hint = f"the run has {len(cases)} cases, counted from 0" if cases else why_no_cases(found)
         raise UsageError(f"no case {case} in {found.folder}", hint=hint)
 
 
@@ -87,8 +87,8 @@ def _refuse_bundle(folder: str, case: int | None) -> None:
 
     open_bundle(Path(folder))
     why = (
-        f"it is a policy without its training; rlcli eval --checkpoint {folder} --record FILE --record-mode failed"
-        " records its failed episodes"
+        f"a bundle has no episodes of training; rlcli eval --checkpoint {folder} --record FILE --record-mode failed"
+        " records new ones"
     )
     if case is not None:
         raise UsageError(f"no case {case} in {folder}", hint=why)

@@ -76,7 +76,7 @@ def command(
             stopped = True
     _report(bench, present, machine, file, f"rlcli train {task}", names_agent=agent is not None, stopped=stopped)
     if stopped:
-        raise Stopped("stopped; the measurements so far are shown, and no preset was written", exit_code=130)
+        raise Stopped("stopped; the measurements until now are shown, and no preset was written", exit_code=130)
 
 
 def _report(
@@ -98,7 +98,7 @@ def _report(
     for line in explanation(findings):
         console.data(line)
     if findings.unsteady:
-        console.warn("repeated measurements differ: other programs run on this machine")
+        console.warn("repeated measurements differ: end other programs on this machine")
     changes = None if findings.recommended is None else bench.changes(findings.recommended.setting)
     if changes is not None and file is not None:
         write_atomic(file, bench_preset(resolved, changes, findings, machine, names_agent))
@@ -127,7 +127,7 @@ def _preset_file(name: str, overwrite: bool) -> Path:
     """
     file = Path(name)
     if not name or file.name in ("", ".."):
-        raise UsageError("--save-preset needs the name of a file", hint="--save-preset cartpole.yaml")
+        raise UsageError("--save-preset needs the name of a file", hint="as in --save-preset cartpole.yaml")
     if file.suffix not in (".yaml", ".yml"):
         file = file.with_name(f"{file.name}.yaml")
     folder = file.absolute().parent
@@ -136,7 +136,7 @@ def _preset_file(name: str, overwrite: bool) -> Path:
     if os.path.lexists(file) and not overwrite:
         raise UsageError(f"--save-preset: {file} exists", hint="choose another name, or add --overwrite")
     if not folder.is_dir():
-        raise MachineError(f"--save-preset: there is no folder {folder}")
+        raise MachineError(f"--save-preset: there is no folder {folder}; create it, or choose another")
     if not os.access(folder, os.W_OK):
         raise MachineError(f"--save-preset: {folder} cannot be written", hint="choose another folder")
     return file
@@ -151,7 +151,7 @@ def _machine(resolved: Resolved) -> dict[str, Any]:
 
     cores, busy = available_cores(), load()
     if busy is not None and busy > _MAX_LOAD * cores:
-        console.warn(f"the machine is busy (load {busy:.1f} on {cores} cores): measurements will vary")
+        console.warn(f"the machine is busy (load {busy:.1f} on {cores} cores): end other programs")
     return {
         "cpu": processor()["model"],
         "cores": cores,

@@ -58,15 +58,15 @@ def command(
     try:
         if one is None and other is None:
             if agent is not None:
-                raise UsageError("--agent applies to tasks; a run keeps the agent of its training")
+                raise UsageError("--agent applies to tasks; a run keeps the agent of its training: leave out --agent")
             equal = _compare_runs(left[0], right[0], runs, only)
         else:
             if only:
-                raise UsageError("--only applies to two runs; a task has only a configuration")
+                raise UsageError("--only applies to two runs; a task has only a configuration: leave out --only")
             both = (one or _find(left[0], runs)[0], other or _find(right[0], runs)[0])
             equal = _compare_configurations(*both, left, right)
     except RecursionError:
-        raise CheckpointError(f"{left[0]} or {right[0]} is corrupt: values nested too deeply") from None
+        raise CheckpointError(f"{left[0]} or {right[0]} is corrupt: nested too deeply; train again") from None
     if not equal:
         raise typer.Exit(9)
 
@@ -85,7 +85,7 @@ def _sides(words: list[str]) -> tuple[Side, Side]:
         sides.insert(0, (sides[0][0], []))
     if len(sides) != 2:
         found = f"found {len(sides)}: {', '.join(name for name, _ in sides)}"
-        raise UsageError(f"two runs or tasks are compared, {found}", hint="rlcli diff A B, or TASK key.path=value")
+        raise UsageError(f"expected two runs or tasks, {found}", hint="rlcli diff A B, or TASK key.path=value")
     return sides[0], sides[1]
 
 
@@ -106,7 +106,7 @@ def _task(side: Side, agent: str | None) -> Resolved | None:
             if looks_like_task or (overrides and name != "latest"):
                 raise
     if overrides:
-        raise UsageError(f"{name} is a run; overrides apply only to tasks: {' '.join(overrides)}")
+        raise UsageError(f"{name} is a run; overrides apply only to tasks: leave out {' '.join(overrides)}")
     return None
 
 
@@ -134,7 +134,7 @@ def _compare_runs(left: str, right: str, runs: Path, only: list[str] | None) -> 
     one, step = _find(left, runs)
     other, twin = _find(right, runs)
     if step is not None and twin is not None and step != twin:
-        raise UsageError(f"{left} is at step {step}, {right} at step {twin}", hint="compare equal steps")
+        raise UsageError(f"{left} is at step {step}, {right} at step {twin}", hint="compare equal steps: RUN@step:N")
     until = step if step is not None else twin
     if until is not None:
         for run in (one, other):
@@ -150,7 +150,7 @@ def _find(reference: str, runs: Path) -> tuple[Run, int | None]:
     if is_checkpoint_ref(reference):
         run, folder, _ = find_checkpoint(reference, runs)
         if not folder.resolve().name.isdecimal():
-            raise CheckpointError(f"{folder} is not the checkpoint of a run: its name is not a step")
+            raise CheckpointError(f"{folder} is not the checkpoint of a run; give RUN or RUN@step:N")
         return run, int(folder.resolve().name)
     try:
         run, why = find_run(reference, runs)

@@ -77,7 +77,7 @@ def _default_file(choice: Choice, format_: str) -> Path:
     from rlcli.runs.run import require_own
 
     if choice.run is None:
-        raise UsageError(f"{choice.folder} is not in a run", hint="name the file with --output FILE")
+        raise UsageError(f"{choice.folder} is not in a run", hint="give the file to write: --output FILE")
     require_own(choice.run, "exports")
     return choice.run.folder / "exports" / f"policy{FORMATS.get(format_, '')}"
 
@@ -88,7 +88,7 @@ def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | N
     from rlcli.runs.trusted_tasks import named_task
 
     if choice.run is None and choice.bundle is None:
-        raise UsageError(f"{choice.folder} is not in a run", hint="--verify needs the run's configuration")
+        raise UsageError(f"{choice.folder} is not in a run", hint="--verify needs a run: --checkpoint RUN")
     check_overwrites(file)
     return open_reference(choice, saved, None if task is None else named_task(task))
 
@@ -134,7 +134,7 @@ def _export_bundle(saved: Checkpoint, run: Run | None, output: Path) -> None:
     check_bundle_target(output)
     evaluation = None if run is None else read_evaluation(run, saved.folder.name)
     if run is not None and evaluation is None:
-        console.info(f"the bundle has no evaluation; make one with rlcli eval --checkpoint {saved.folder}")
+        console.info(f"the bundle has no evaluation; rlcli eval --checkpoint {saved.folder} makes one")
     bundle = write_bundle(saved, output, run, evaluation)
     size = sum(file.stat().st_size for file in bundle.folder.iterdir())
     _report(saved.folder, "bundle", bundle.folder, size, metadata=bundle.manifest)

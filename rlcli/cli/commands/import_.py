@@ -106,7 +106,7 @@ def _resolve(task: str, agent: str | None, activation: str | None, action_bound:
     if activation is not None:
         require_known(activation, ("elu", "relu", "tanh", "silu"), "activation", "activations")
     if action_bound is not None and not 0.0 < action_bound < float("inf"):
-        raise UsageError(f"--action-bound {action_bound} is no bound", hint="a number above 0")
+        raise UsageError(f"--action-bound {action_bound} cannot bound actions", hint="give a number above 0")
     resolved = resolve(find_task(task), agent=agent, device="cpu")
     resolved.require_agent()
     return resolved

@@ -48,10 +48,11 @@ def command(
         near = did_you_mean(pattern.lower(), by_name)
         console.info(f"no task's name or summary contains '{pattern}'; {near or 'rlcli list-tasks shows all'}")
     for bad in broken:
-        console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed")
+        console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed; see rlcli doctor")
     for name in unknown_wanted():
         console.warn(
-            f"{plugins_chosen_by()} names '{name}', but no installed distribution of that name has tasks or trainers"
+            f"{plugins_chosen_by()} names '{name}', but no installed distribution of that name has tasks or trainers;"
+            " correct the name"
         )
     console.document(
         "list-tasks",

@@ -98,7 +98,7 @@ def _check_record(record: Path | None, mode: str, video: Path | None, commands: 
     if record is not None and video is not None:
         raise UsageError("--record and --video cannot be combined", hint="rlcli replay FILE --video draws a recording")
     if record is not None and commands:
-        raise UsageError("--record with --command would write episodes that replay cannot repeat")
+        raise UsageError("leave out --record or --command: rlcli replay cannot repeat commanded episodes")
     check_record(record, mode)
 
 

@@ -109,7 +109,7 @@ def _require(rows: list[Row], force: bool) -> None:
         return
     console.table(["ENVIRONMENT", "THEN", "NOW"], [[cell(name), cell(was), cell(now)] for name, was, now in rows])
     if force:
-        console.warn("software or machine have changed: expect different bits")
+        console.warn("software or machine have changed since the training: the weights may differ in their last bits")
         return
     console.info("software or machine differ from those recorded in run.json; --force trains anyway")
     console.document("reproduce", equal=False, first=None, trained=False, environment=[_entry(row) for row in rows])

@@ -105,12 +105,13 @@ def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
     from rlcli.evaluation.stress_params import grid, read_sweeps
 
     if not texts:
-        raise UsageError("no --sweep given", hint="--sweep body_mass=0.5:2, --sweep action_delay=0:3")
+        raise UsageError("no --sweep given", hint="as in --sweep body_mass=0.5:2 or --sweep action_delay=0:3")
     sweeps = read_sweeps(texts, points)
     count = len(grid(sweeps))
     if count > _MAX_VARIANTS:
         raise UsageError(
-            f"{count:,} variants, but at most {_MAX_VARIANTS:,} are allowed", hint="fewer sweeps or --points"
+            f"{count:,} variants, but at most {_MAX_VARIANTS:,} are allowed",
+            hint="give fewer sweeps, or a smaller --points",
         )
     return sweeps
 

@@ -147,7 +147,7 @@ def _search(
     objective, parameters = read_objective(settings["objective"]), read_parameters(settings["params"])
     if objective.steps is not None:
         if request.budget:
-            message = f"--objective {settings['objective']} already limits the length of a training"
+            message = f"--objective {settings['objective']} limits the length of each training"
             raise UsageError(message, hint="leave out --max-iterations and --max-steps")
         request.budget = {"agent.max_iterations": None, "agent.max_steps": objective.steps}
     request.source = named_task(task)

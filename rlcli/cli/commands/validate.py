@@ -49,7 +49,7 @@ def command(
     log_notes(resolved.notes)
     console.data(f"{source.label}: valid ({checked})")
     if unchecked:
-        console.warn(f"agents not checked, because their trainer is not installed: {', '.join(unchecked)}")
+        console.warn(f"agents not checked, because their trainer is not installed; install it: {', '.join(unchecked)}")
     console.document(
         "validate",
         file=str(source.config),

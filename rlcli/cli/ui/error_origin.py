@@ -24,7 +24,7 @@ def error_of_task(error: BaseException) -> TaskError | None:
     message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return TaskError(
         f"{code.co_filename}:{line}: {code.co_name}: {message}",
-        hint="the task's own code raised this error; --debug shows the traceback",
+        hint="correct the task's code at this line; --debug shows the traceback",
     )
 
 

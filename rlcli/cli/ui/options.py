@@ -150,9 +150,9 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
     if output.suffix.lower() not in suffixes:
         raise UsageError(f"'{output}' is not a {what}", hint=f"name it *{', *'.join(suffixes)}")
     if output.is_dir():
-        raise UsageError(f"-o {output} is a folder", hint="give a file")
+        raise UsageError(f"-o {output} is a folder", hint="give the name of a file in it")
     if not output.absolute().parent.is_dir():
-        raise MachineError(f"cannot write {output}: there is no folder {output.absolute().parent}")
+        raise MachineError(f"cannot write {output}: there is no folder {output.absolute().parent}; create it")
 
 
 def exit_on_failures(failures: list[str]) -> None:

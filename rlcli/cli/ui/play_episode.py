@@ -35,15 +35,16 @@ def check_choice(
     """
     if env is None or episode is None:
         given, missing = ("--episode", "--env") if env is None else ("--env", "--episode")
-        raise UsageError(f"{given} needs {missing}", hint="as in --env 317 --episode 12, both counted from 0")
+        raise UsageError(f"{given} needs {missing} too", hint="as in --env 317 --episode 12, both counted from 0")
     if num_envs is not None and num_envs <= env:
         raise UsageError(
-            f"there is no environment {env} of {num_envs}", hint=f"--num-envs {env + 1}, or leave out --num-envs"
+            f"--env {env}: only {num_envs} environments, counted from 0",
+            hint=f"give --num-envs {env + 1}, or leave it out",
         )
     if record_mode != "all":
-        raise UsageError("--record-mode selects episodes, but --env and --episode name a single one")
+        raise UsageError("--env and --episode choose one episode: leave out --record-mode")
     if commands:
-        raise UsageError("--command changes the episode", hint="leave out --command, or --env and --episode")
+        raise UsageError("--command would change the episode", hint="leave out --command, or --env and --episode")
 
 
 def play_episode(

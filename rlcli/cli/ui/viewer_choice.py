@@ -35,7 +35,7 @@ def require_viewer(viewer: str | None, port: int | None, *, drawn: bool) -> None
             f"--viewer {viewer} opens a viewer, but --video and --record only write files", hint="leave one out"
         )
     if port is not None and (drawn or viewer in ("native", "none")):
-        raise UsageError("--port is an option of the web viewer", hint="--viewer web")
+        raise UsageError("--port is an option of the web viewer", hint="add --viewer web")
 
 
 def read_commands(texts: Sequence[str]) -> dict[str, float]:

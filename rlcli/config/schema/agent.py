@@ -55,5 +55,5 @@ class AgentConfig(StrictModel):
     @model_validator(mode="after")
     def _budget(self) -> AgentConfig:
         if self.max_iterations is None and self.max_steps is None:
-            raise ValueError("set max_iterations or max_steps")
+            raise ValueError("the training has no length: set max_iterations or max_steps")
         return self

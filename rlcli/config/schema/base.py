@@ -36,7 +36,7 @@ class _FractionString:
 
 def _check_order(value: tuple[float, float]) -> tuple[float, float]:
     if value[0] > value[1]:
-        raise ValueError(f"the lower end {value[0]:g} is above the upper end {value[1]:g}")
+        raise ValueError(f"the lower end {value[0]:g} is above the upper end {value[1]:g}; write [low, high]")
     return value
 
 

@@ -116,9 +116,9 @@ class ActuatorConfig(StrictModel):
     def _motor(self) -> ActuatorConfig:
         curve = (self.saturation_effort is not None, self.velocity_limit is not None)
         if self.kind == "dc_motor" and not all(curve):
-            raise ValueError("a dc_motor needs saturation_effort and velocity_limit")
+            raise ValueError("kind dc_motor needs saturation_effort and velocity_limit: set both")
         if self.kind == "pd" and any(curve):
-            raise ValueError("saturation_effort and velocity_limit belong to kind dc_motor")
+            raise ValueError("saturation_effort and velocity_limit are allowed only with kind: dc_motor")
         return self
 
 
@@ -136,11 +136,11 @@ class InitialStateConfig(StrictModel):
 
 
 SHAPE_SIZES = {
-    "box": "[x, y, z], its edges",
+    "box": "[x, y, z], the lengths of its edges",
     "sphere": "[radius]",
     "cylinder": "[radius, length]",
     "capsule": "[radius, length], the length without the round ends",
-    "plane": "[x, y], its edges",
+    "plane": "[x, y], the lengths of its edges",
 }
 """Shape -> meaning of its `size` [m]."""
 
@@ -189,11 +189,11 @@ class EntityConfig(StrictModel):
     @model_validator(mode="after")
     def _one_kind(self) -> EntityConfig:
         if (self.model is None) == (self.shape is None):
-            raise ValueError("an entity is a model (an MJCF file) or a shape: write one of the two")
+            raise ValueError("an entity has either `model` (an MJCF file) or `shape`: write one of the two")
         if self.shape is not None:
             self._check_shape(self.shape)
         elif keys := [key for key in _SHAPE_KEYS if getattr(self, key) not in (None, False)]:
-            raise ValueError(f"'{keys[0]}' is a key of a shape; for a model set it in the MJCF")
+            raise ValueError(f"'{keys[0]}' is only allowed with `shape`; remove it and set it in the MJCF of the model")
         return self
 
     def _check_shape(self, shape: str) -> None:
@@ -201,13 +201,13 @@ class EntityConfig(StrictModel):
         count = wanted.partition("]")[0].count(",") + 1
         if self.size is None or len(self.size) != count:
             found = "none" if self.size is None else f"{len(self.size)} numbers"
-            raise ValueError(f"size of a {shape} is {wanted} [m]; found {found}")
+            raise ValueError(f"size of a {shape} must be {wanted} [m]; found {found}")
         if self.mass is not None and self.density is not None:
-            raise ValueError("mass and density exclude each other")
+            raise ValueError("mass and density cannot be combined: remove one")
         if self.free and self.mocap:
-            raise ValueError("free and mocap exclude each other")
+            raise ValueError("free and mocap cannot be combined: remove one")
         if shape == "plane" and (self.free or self.mocap):
-            raise ValueError("a plane cannot move; a flat box can")
+            raise ValueError("a plane cannot move: remove free and mocap, or use `shape: box`")
 
 
 class SceneConfig(StrictModel):

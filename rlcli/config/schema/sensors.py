@@ -79,9 +79,9 @@ class RaySensorConfig(StrictModel):
         pattern = self.pattern
         directions = [pattern.direction] if isinstance(pattern, GridPatternConfig) else pattern
         if any(x or y or z >= 0.0 for x, y, z in directions) or self.alignment == "base":
-            raise ValueError("lookup needs rays straight down: directions [0, 0, -1], alignment yaw or world")
+            raise ValueError("lookup needs rays straight down: set directions [0, 0, -1] and alignment yaw or world")
         if self.sees != "ground":
-            raise ValueError("lookup needs rays that see only the ground; set sees: ground, or remove lookup")
+            raise ValueError("lookup needs rays that hit only the ground: set sees: ground, or remove lookup")
         return self
 
 
@@ -125,9 +125,9 @@ class CameraSensorConfig(StrictModel):
             keys = ", ".join(placed)
             raise ValueError(f"a camera of the MJCF has its own position and field of view: remove {keys}")
         if self.clip[0] >= self.clip[1]:
-            raise ValueError(f"clip: {self.clip[0]:g} is not below {self.clip[1]:g}")
+            raise ValueError(f"clip: {self.clip[0]:g} is not below {self.clip[1]:g}; write [nearest, farthest]")
         if self.eye == self.lookat:
-            raise ValueError("eye and lookat are the same point: the camera has no direction")
+            raise ValueError("eye and lookat are the same point, so the camera has no direction: move one of them")
         return self
 
 

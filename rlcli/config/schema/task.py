@@ -135,7 +135,7 @@ class TaskConfig(StrictModel):
         if "sim" in info.data and "decimation" in info.data:
             step_dt = info.data["sim"].dt * info.data["decimation"]
             if value < step_dt:
-                raise ValueError(f"{value:g} s is shorter than one step (dt x decimation = {step_dt:g} s)")
+                raise ValueError(f"{value:g} s is shorter than one step (dt x decimation = {step_dt:g} s); raise it")
         return value
 
     @field_validator("viewer")

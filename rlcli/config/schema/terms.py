@@ -74,7 +74,7 @@ class EventConfig(TermConfig):
     @model_validator(mode="after")
     def _interval(self) -> EventConfig:
         if (self.mode == "interval") != (self.interval_range_s is not None):
-            raise ValueError("interval_range_s belongs to mode interval, and mode interval needs it")
+            raise ValueError("interval_range_s and mode: interval need each other: set both or neither")
 
         if self.global_time and self.mode != "interval":
             raise ValueError("global_time belongs to mode interval; remove it or set mode: interval")

@@ -170,7 +170,7 @@ class TerrainGeneratorConfig(StrictModel):
     @classmethod
     def _check_proportions(cls, value: dict[str, SubTerrainConfig]) -> dict[str, SubTerrainConfig]:
         if sum(patch.proportion for patch in value.values()) <= 0.0:
-            raise ValueError("the proportions of the sub-terrains sum to 0; one must be above 0")
+            raise ValueError("the proportions of the sub-terrains sum to 0; set at least one above 0")
         return value
 
 

@@ -32,7 +32,7 @@ class RandomizeActuatorGains(DrawKeys, ActuatorTerm):
 
     def __post_init__(self) -> None:
         if self.kp is None and self.kv is None:
-            raise NameProblem("nothing to randomise", "give kp, kv or both")
+            raise NameProblem("no gain is given, so the term changes nothing", "give kp, kv or both")
         model = self.env.engine.model
         kinds = [model_actuator_kind(model, number) for number in self.entity.actuator_ids.tolist()]
         has_kp = [kind == "position" for kind in kinds]
@@ -82,7 +82,7 @@ class RandomizePdGains(DrawKeys, JointTerm):
     def __post_init__(self) -> None:
         pairs = {"stiffness": self.stiffness, "damping": self.damping, "effort_limit": self.effort_limit}
         if not any(pair is not None for pair in pairs.values()):
-            raise NameProblem("nothing to randomise", "give stiffness, damping, effort_limit or several")
+            raise NameProblem("the term changes nothing", "give stiffness, damping or effort_limit")
         driven = {
             joint: (model, column) for model in self.entity.actuators for column, joint in enumerate(model.joints)
         }

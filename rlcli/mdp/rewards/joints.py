@@ -100,7 +100,7 @@ class PowerConsumption(JointTerm):
         """Return the sum. (num_envs,)"""
         action, velocity = self.env.action_manager.action, self.entity.data.joint_vel_of(self.joints)
         if action.shape != velocity.shape:
-            raise ValueError(f"selects {velocity.shape[1]} joints, the action has {action.shape[1]} columns")
+            raise ValueError(f"selects {velocity.shape[1]} joints; select {action.shape[1]}, one per action")
         power: Tensor = (action * velocity * self._ratio).abs().sum(dim=1)
         return power
 
@@ -291,5 +291,5 @@ def _per_joint(term: JointTerm, value: float | list[float] | Tensor, key: str = 
     count = len(term.entity.data.joint_vel_limits[term.joints])
     values = value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float32, device=term.env.device)
     if values.dim() and len(values) != count:
-        raise ValueError(f"has {len(values)} values of {key} for {count} joints")
+        raise ValueError(f"{key} has {len(values)} values; give one, or {count} (one per joint)")
     return values.view(-1)

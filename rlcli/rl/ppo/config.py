@@ -178,7 +178,7 @@ class PpoConfig(AgentConfig):
     @model_validator(mode="after")
     def _relations(self) -> PpoConfig:
         if self.schedule.startswith("adaptive") != (self.desired_kl is not None):
-            raise ValueError("desired_kl must be given for an adaptive schedule, and only for it")
+            raise ValueError("desired_kl and an adaptive schedule need each other: set both or neither")
         if self.kl_from == "last_pass" and self.shuffle == "epoch":
             message = "kl_from last_pass needs the same minibatches in every epoch: set shuffle to update or none"
             raise ValueError(message)
@@ -186,7 +186,7 @@ class PpoConfig(AgentConfig):
             raise ValueError("cnn and rnn cannot be combined; give the image a history to show motion")
         low, high = self.learning_rate_range
         if low > high:
-            raise ValueError(f"learning_rate_range: {low:g} is above {high:g}")
+            raise ValueError(f"learning_rate_range: {low:g} is above {high:g}; write [low, high]")
         return self
 
 

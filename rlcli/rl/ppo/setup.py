@@ -22,7 +22,7 @@ def policy_spec(env: Environment, config: PpoConfig) -> PolicySpec:
     vision = vision_spec(env, config, ("policy",))
     if config.cnn is not None and vision is None:
         message = "no term of the observation group 'policy' is an image"
-        raise agent_error(env, ("cnn",), message, "an observation term like `image`, or cnn: null")
+        raise agent_error(env, ("cnn",), message, "add a term like `image`, or set cnn: null")
     return PolicySpec(
         kind="gaussian-lstm" if config.rnn else "gaussian-mlp" if vision is None else "gaussian-cnn",
         vision=vision,
@@ -56,7 +56,7 @@ def vision_spec(env: Environment, config: PpoConfig, groups: tuple[str, ...]) ->
         return VisionSpec.model_validate({"pictures": pictures, **config.cnn.model_dump()})
     except ValidationError as error:
         message = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
-        hint = "smaller kernels or strides, fewer layers, or larger images"
+        hint = "use smaller kernels or strides, fewer layers, or larger images"
         raise agent_error(env, ("cnn",), message, hint) from None
 
 
@@ -96,7 +96,7 @@ def minibatch_sizes(env: Environment, config: PpoConfig, total: int) -> list[int
     else:
         return sizes
     key = "num_minibatches" if config.minibatch_size is None else "minibatch_size"
-    raise agent_error(env, (key,), message, "more environments, more num_steps, or fewer minibatches")
+    raise agent_error(env, (key,), message, "raise num_envs or num_steps, or use fewer minibatches")
 
 
 def compile_mode(config: PpoConfig, device: torch.device, steps_per_iteration: int) -> bool | str:

@@ -79,7 +79,7 @@ class PpoConfig(OnPolicyConfig):
     @model_validator(mode="after")
     def _schedule(self) -> PpoConfig:
         if (self.schedule == "adaptive") != (self.desired_kl is not None):
-            raise ValueError("desired_kl must be given for schedule adaptive, and only for it")
+            raise ValueError("desired_kl and schedule adaptive need each other: set both or neither")
         return self
 
 
@@ -128,7 +128,7 @@ class OffPolicyConfig(Sb3Config):
     @model_validator(mode="after")
     def _sizes(self) -> OffPolicyConfig:
         if self.buffer_size < self.batch_size:
-            raise ValueError(f"buffer_size ({self.buffer_size}) is smaller than batch_size ({self.batch_size})")
+            raise ValueError(f"buffer_size ({self.buffer_size}) is below batch_size ({self.batch_size}); raise it")
         return self
 
 
@@ -176,7 +176,7 @@ SPEC = TrainerSpec(
     },
     trainer="rlcli.rl.sb3.trainer:Sb3Trainer",
     refused={
-        "dqn": "it needs discrete actions, and tasks have continuous ones",
-        "her": "it needs goals as observations, and tasks have vectors",
+        "dqn": "the algorithm needs discrete actions, and tasks have continuous ones",
+        "her": "the algorithm needs goals as observations, and tasks have vectors",
     },
 )

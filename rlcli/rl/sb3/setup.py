@@ -80,4 +80,4 @@ def _require_batch(env: Environment, config: OnPolicyConfig) -> None:
         key, message = "n_steps", f"advantages cannot be normalised: {rollout}"
     else:
         return
-    raise agent_error(env, (key,), message, "more environments, more n_steps, or fewer minibatches")
+    raise agent_error(env, (key,), message, "raise num_envs or n_steps, or use fewer minibatches")

@@ -116,14 +116,14 @@ def test_replay_with_changed_model_differs(trained, cli):
 def test_unknown_case_is_usage_error(trained, cli):
     shown = cli("autopsy", trained, "99", "--json")
     assert shown.code == 2
-    assert f"it has {len(files(trained))}" in shown.json["error"]["hint"]
+    assert f"the run has {len(files(trained))}" in shown.json["error"]["hint"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--sort", "lenth"], "did you mean 'length'"),
-        (["--video", "x.mp4"], "--video draws one case"),
+        (["--video", "x.mp4"], "--video needs the number of a case"),
         (["0", "--video", "x.avi"], "is not a video file"),
     ],
 )
@@ -148,7 +148,7 @@ def test_gpu_run_explains_missing_cases(trained, cli):
     (trained / "run.json").write_text(json.dumps(record))
     shown = cli("autopsy", trained)
     assert shown.code == 0
-    assert "it was trained on cuda, where steps cannot be replayed" in shown.err
+    assert "the run was trained on cuda, where steps cannot be replayed" in shown.err
     assert cli("autopsy", trained, "0").code == 2
 
 

@@ -139,7 +139,7 @@ def test_category_of_key(path, kind):
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["cartpole"], 2, "two runs or tasks are compared, found 1: cartpole"),
+        (["cartpole"], 2, "expected two runs or tasks, found 1: cartpole"),
         (["cartpole", "cartpole", "cartpole"], 2, "found 3"),
         (["sim.dt=1", "cartpole"], 2, "the override 'sim.dt=1' comes before any task"),
         (["cartpoel", "cartpole"], 5, "did you mean 'cartpole'"),

@@ -290,7 +290,7 @@ def test_resume_of_locked_run_is_machine_error(cli, only_run):
     done = cli("train", "--resume", "latest", "--max-iterations", 2)
     holder.communicate()
     assert done.code == 10
-    assert "written to by another process" in done.err
+    assert "another process writes to" in done.err
     assert cli("train", "--resume", "latest", "--max-iterations", 2, "-q").code == 0
 
 

@@ -109,7 +109,7 @@ def test_play_prints_viewer_and_reason(cli):
         (("--command", "vx=fast"), "--command 'vx=fast' is not NAME=NUMBER"),
         (("--command", ""), "is not NAME=NUMBER"),
         (("--command", "vx=1"), "no command 'vx'; hint: the task has no commands"),
-        (("--command", "vx=1", "--record", "x.safetensors"), "--record with --command"),
+        (("--command", "vx=1", "--record", "x.safetensors"), "leave out --record or --command"),
     ],
 )
 def test_contradicting_flags_are_usage_errors(cli, arguments, message):
