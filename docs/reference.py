@@ -33,6 +33,7 @@ MODULES = {
     "rlcli.config.load": "Resolve a configuration",
     "rlcli.config.schema": "Configuration models",
     "rlcli.reporting.task_card": "Task cards",
+    "rlcli.envs.environment": "Interface of environments",
     "rlcli.envs.vec_env": "Vectorized environments",
     "rlcli.envs.make": "Make an environment",
     "rlcli.envs.build": "Build a simulation",

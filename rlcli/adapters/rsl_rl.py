@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from rsl_rl.env import Environment as RslRlBase
+from rsl_rl.env import VecEnv as RslRlBase
 from tensordict import TensorDict
 from torch import Tensor
 
