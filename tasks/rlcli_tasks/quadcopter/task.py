@@ -65,6 +65,10 @@ class QuadcopterTask(DirectTask):
         """Target angles of the servos. (n, 8) [rad]"""
         self.thrusts = torch.zeros(n, len(THRUSTS), device=self.device)
         """Thrusts. (n, 4) [N]"""
+        self.units = torch.tensor([3.0] * 3 + [1.0] * 4 + [2.0] * 3 + [math.pi] * 3 + [1.0] * 8, device=self.device)
+        """Values that are observed as 1. (21,)"""
+        self.to_target = torch.zeros(n, 3, device=self.device)
+        """From the robot to the target, since the last `get_observations`. (n, 3) [m]"""
         self.distance = torch.zeros(n, device=self.device)
         self.extras["distance"] = self.distance  # distance to the target [m]
 
@@ -89,22 +93,17 @@ class QuadcopterTask(DirectTask):
     def get_observations(self) -> None:
         """Fill obs_buf."""
         data = self.robot.data
+        torch.sub(self.goal.data.root_pos_w, data.root_pos_w, out=self.to_target)
         torch.cat(
-            [
-                (self.goal.data.root_pos_w - data.root_pos_w).div_(3.0),
-                data.root_quat_w,
-                data.root_lin_vel_w * 0.5,
-                data.root_ang_vel_w / math.pi,
-                data.joint_pos,
-            ],
+            [self.to_target, data.root_quat_w, data.root_lin_vel_w, data.root_ang_vel_w, data.joint_pos],
             dim=1,
             out=self.obs_buf,
-        )
+        ).div_(self.units)
 
     def calculate_metrics(self) -> None:
         """Reward nearness, and near the target an upright pose without spin."""
         data = self.robot.data
-        self.distance.copy_(length(self.goal.data.root_pos_w - data.root_pos_w))
+        self.distance.copy_(length(self.to_target))
         _, x, y, _ = data.root_quat_w.unbind(dim=1)
         tilt = 2.0 * torch.addcmul(x * x, y, y)  # 1 - cos of the angle between up and the vertical
         spin = data.root_ang_vel_w[:, 2].square()
