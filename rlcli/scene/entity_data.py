@@ -41,10 +41,17 @@ class EntityData:
         device = entity.engine.device
         self._qpos_index = as_index(entity.qpos_columns.tolist(), device)
         self._dof_index = as_index(entity.dof_columns.tolist(), device)
+        self._body_ids = id_tensor(entity.body_ids, device)
         self._body_index = as_index(entity.body_ids.tolist(), device)
         # joints in consecutive columns: a view of the copied state, made once
         self._joint_pos = sim.qpos[:, self._qpos_index] if isinstance(self._qpos_index, slice) else None
         self._joint_vel = sim.qvel[:, self._dof_index] if isinstance(self._dof_index, slice) else None
+        q, d = entity.root_qpos, entity.root_dof
+        self._free_root: tuple[Tensor, ...] | None = None
+        """Position, orientation, linear and angular velocity of a free root: views of the copied state, made once."""
+        if q is not None and d is not None:
+            pose, velocity = sim.qpos[:, q : q + 7], sim.qvel[:, d : d + 6]
+            self._free_root = (pose[:, :3], pose[:, 3:], velocity[:, :3], velocity[:, 3:])
         ranges = torch.tensor(model.jnt_range[entity.joint_ids], dtype=torch.float32, device=device)
         limited = torch.tensor(model.jnt_limited[entity.joint_ids], dtype=torch.bool, device=device)
         infinite = torch.tensor([-torch.inf, torch.inf], device=device)
@@ -154,30 +161,26 @@ class EntityData:
     @property
     def root_pos_w(self) -> Tensor:
         """Root position. (num_envs, 3) [m]"""
-        q = self._entity.root_qpos
         if self._entity.mocap >= 0:
             return self._sim.derived_field("mocap_pos")[:, self._entity.mocap]
-        return self._sim.qpos[:, q : q + 3] if q is not None else self.default_root_state[:, :3]
+        return self.default_root_state[:, :3] if self._free_root is None else self._free_root[0]
 
     @property
     def root_quat_w(self) -> Tensor:
         """Root orientation (w, x, y, z). (num_envs, 4)"""
-        q = self._entity.root_qpos
         if self._entity.mocap >= 0:
             return self._sim.derived_field("mocap_quat")[:, self._entity.mocap]
-        return self._sim.qpos[:, q + 3 : q + 7] if q is not None else self.default_root_state[:, 3:7]
+        return self.default_root_state[:, 3:7] if self._free_root is None else self._free_root[1]
 
     @property
     def root_lin_vel_w(self) -> Tensor:
         """Root linear velocity, world frame. (num_envs, 3) [m/s]"""
-        d = self._entity.root_dof
-        return self._sim.qvel[:, d : d + 3] if d is not None else self.default_root_state[:, 7:10]
+        return self.default_root_state[:, 7:10] if self._free_root is None else self._free_root[2]
 
     @property
     def root_ang_vel_b(self) -> Tensor:
         """Root angular velocity, body frame. (num_envs, 3) [rad/s]"""
-        d = self._entity.root_dof
-        return self._sim.qvel[:, d + 3 : d + 6] if d is not None else self.default_root_state[:, 10:13]
+        return self.default_root_state[:, 10:13] if self._free_root is None else self._free_root[3]
 
     @property
     def root_lin_vel_b(self) -> Tensor:
@@ -286,6 +289,17 @@ class EntityData:
         bodies, roots = self._body_index, self._tree_root
         return self._once("body_lin_vel_w", lambda: self._velocity_at(self.body_pos_w, bodies, roots))
 
+    def body_states_of(self, bodies: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return `body_pos_w`, `body_quat_w`, `body_lin_vel_w` and `body_ang_vel_w` of some bodies.
+
+        Only these bodies are copied from the engine. bodies (k,) int64 -> (num_envs, k, 3 or 4) each
+        """
+        ids, roots = self._body_ids[bodies], self._tree_root[bodies]
+        position, velocity = self._derived_rows("xpos", ids), self._derived_rows("cvel", ids)
+        arm = position - self._derived_rows("subtree_com", roots)
+        linear = velocity[..., 3:] + cross(velocity[..., :3], arm)
+        return position, self._derived_rows("xquat", ids), linear, velocity[..., :3]
+
     @property
     def body_com_lin_vel_w(self) -> Tensor:
         """Velocities of the bodies' centres of mass, world frame. (num_envs, bodies, 3) [m/s]"""
@@ -383,6 +397,11 @@ class EntityData:
     def _from_tree_com(self, points: Tensor, roots: Tensor) -> Tensor:
         """Return the vectors to points from the centres of mass of the kinematic trees with some root bodies."""
         return points - self._sim.derived_field("subtree_com")[:, roots]
+
+    def _derived_rows(self, name: str, elements: Tensor) -> Tensor:
+        """Return a derived field of some bodies. elements (k,) -> (num_envs, k, ...)"""
+        self._sim.forward_moved()
+        return self._entity.engine.field(name).index_select(1, elements).float()
 
     def _body_force(self, name: str) -> Tensor:
         if not self._computes_body_forces:

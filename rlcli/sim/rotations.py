@@ -6,6 +6,7 @@ rounds equally in its vectorised and its scalar loops: no `torch.atan2` and no `
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -71,6 +72,35 @@ def axis_z(quat: Tensor) -> Tensor:
     """Return the z axis of the quaternion's frame in the parent frame. (..., 4) -> (..., 3)"""
     w, x, y, z = quat.unbind(-1)
     return torch.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)], dim=-1)
+
+
+def axes(quat: Tensor) -> Tensor:
+    """Return `axis_x`, `axis_y` and `axis_z` side by side, in a third of the time. (n, 4) -> (n, 9)"""
+    factors, scales, offsets = _axis_tables(quat.device)
+    left, right = quat.index_select(1, factors).chunk(2, dim=1)
+    first, second = (left * right).mul_(scales).chunk(2, dim=1)
+    return (first + second).add_(offsets)
+
+
+@functools.lru_cache
+@torch.inference_mode(False)  # tensors that can be used in both modes
+def _axis_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what the sums of two products in `axes` consist of.
+
+    They are the columns of the quaternion (36,): the left factors of the first and of the second products, then the
+    right factors; the scales of the products (18,); and the offsets of the sums (9,).
+    """
+    first, second = (
+        ["yy", "xy", "xz", "xy", "xx", "yz", "xz", "yz", "xx"],
+        ["zz", "wz", "wy", "wz", "zz", "wx", "wy", "wx", "yy"],
+    )
+    factors = ["wxyz".index(product[side]) for side in (0, 1) for product in first + second]
+    scales = torch.tensor(
+        [-2.0, 2.0, 2.0, 2.0, -2.0, 2.0, 2.0, 2.0, -2.0, -2.0, 2.0, -2.0, -2.0, -2.0, 2.0, 2.0, -2.0, -2.0]
+    )
+    offsets = torch.full((9,), -0.0)  # adding -0.0 keeps the sign of a zero
+    offsets[::4] = 1.0
+    return torch.tensor(factors, device=device), scales.to(device), offsets.to(device)
 
 
 def roll_pitch_yaw(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:

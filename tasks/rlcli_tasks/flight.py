@@ -42,6 +42,8 @@ class FlightTask(DirectTask):
         """Targets of the current episode, in order. (n, phases, 3) [m]"""
         self.target = torch.zeros(n, 3, device=self.device)
         """Current target. (n, 3) [m]"""
+        self.to_target = torch.zeros(n, 3, device=self.device)
+        """From the robot to the target, since the last `get_observations`. (n, 3) [m]"""
         self.distance = torch.zeros(n, device=self.device)
         self.extras["distance"] = self.distance  # distance to the target [m]
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rlcli.sim.rotations import atan2
+from rlcli.sim.rotations import atan2, axes, axis_x, axis_y, axis_z
 
 torch.set_num_threads(1)
 
@@ -33,3 +33,13 @@ def test_atan2_has_same_bits_for_any_number_of_rows():
     for rows in range(1, 40):
         alone = points[:rows].clone()
         assert torch.equal(atan2(alone[:, 0], alone[:, 1]), together[:rows])
+
+
+@pytest.mark.parametrize("rows", [1, 3, 17, 64])
+def test_axes_have_the_bits_of_each_axis(rows):
+    generator = torch.Generator().manual_seed(0)
+    quat = torch.randn(rows, 9, generator=generator)
+    quat *= torch.rand(quat.shape, generator=generator) < 0.6  # some zeros, of both signs
+    for values in (quat[:, 3:7], quat[:, 3:7].contiguous()):
+        expected = torch.cat([axis_x(values), axis_y(values), axis_z(values)], dim=1)
+        assert torch.equal(axes(values).view(torch.int32), expected.view(torch.int32))

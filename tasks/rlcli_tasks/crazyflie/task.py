@@ -6,7 +6,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from rlcli.sim.rotations import axis_x, axis_y, axis_z, length
+from rlcli.sim.rotations import axes, length
 from rlcli.sim.selection import Selection
 from rlcli_tasks.flight import FlightTask
 
@@ -59,6 +59,8 @@ class CrazyflieTask(FlightTask):
         """Fraction of the speed error that a motor corrects in one step."""
         self.everywhere = torch.ones(n, dtype=torch.bool, device=self.device)
         self.actions = torch.zeros(n, len(MOTORS), device=self.device)
+        self.up = torch.zeros(n, device=self.device)
+        """Height of the tip of the robot's z axis, since the last `get_observations`. (n,)"""
         self.speeds = torch.zeros(n, len(MOTORS), device=self.device)
         """Motor speeds, divided by the highest speed. (n, 4)"""
 
@@ -83,34 +85,28 @@ class CrazyflieTask(FlightTask):
     def get_observations(self) -> None:
         """Fill obs_buf."""
         data = self.robot.data
-        quat = data.root_quat_w
+        torch.sub(self.target, data.root_pos_w, out=self.to_target)
+        robot_axes = axes(data.root_quat_w)
+        self.up.copy_(robot_axes[:, 8])
         torch.cat(
-            [
-                self.target - data.root_pos_w,
-                axis_x(quat),
-                axis_y(quat),
-                axis_z(quat),
-                data.root_lin_vel_w,
-                data.root_ang_vel_w,
-            ],
+            [self.to_target, robot_axes, data.root_lin_vel_w, data.root_ang_vel_w],
             dim=1,
             out=self.obs_buf,
         )
 
     def calculate_metrics(self) -> None:
         """Reward nearness, and near the target an upright pose without spin; small actions cost a little."""
-        data = self.robot.data
-        self.distance.copy_(length(self.target - data.root_pos_w))
+        self.distance.copy_(length(self.to_target))
         near = 1.0 / (1.0 + self.distance)
-        up = axis_z(data.root_quat_w)[:, 2].clamp_(0.0, 1.0)
-        still = (-data.root_ang_vel_w.square().sum(dim=1)).exp_()
+        up = self.up.clamp(0.0, 1.0)
+        still = (-self.robot.data.root_ang_vel_w.square().sum(dim=1)).exp_()
         low_effort = (-0.5 * self.actions.square().sum(dim=1)).exp_()
         reward = torch.addcmul(near, near, up.add_(still, alpha=0.01))
         self.rew_buf.copy_(reward.sub_(low_effort, alpha=self.params.effort_cost))
 
     def is_done(self) -> None:
         """Terminate where the drone is too far, too low, too high or upside down. The environment adds the time-out."""
-        data = self.robot.data
         low, high = self.params.height_range
-        height, up = data.root_pos_w[:, 2], axis_z(data.root_quat_w)[:, 2]
-        self.reset_buf.copy_((self.distance > self.params.max_distance) | (height < low) | (height > high) | (up < 0.0))
+        height = self.robot.data.root_pos_w[:, 2]
+        outside = (height < low) | (height > high)
+        self.reset_buf.copy_((self.distance > self.params.max_distance) | outside | (self.up < 0.0))

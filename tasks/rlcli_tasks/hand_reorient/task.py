@@ -157,17 +157,17 @@ class HandTask(DirectTask):
 
     def get_states(self) -> None:
         """Fill states_buf: the observations, then position, orientation, velocity and load of the fingertips."""
-        data, ends = self.robot.data, self.ends
+        position, quat, linear, angular = self.robot.data.body_states_of(self.ends)
         # no physics step yet in a new episode: sensor values belong to the old state
         felt = (self.progress_buf > 0).mul(0.1)
         torch.cat(
             [
                 self.obs_buf,
-                data.body_pos_w[:, ends].flatten(1),
-                data.body_quat_w[:, ends].flatten(1),
-                data.body_lin_vel_w[:, ends].flatten(1),
-                data.body_ang_vel_w[:, ends].flatten(1) * 0.2,
-                data.sensordata * felt[:, None],
+                position.flatten(1),
+                quat.flatten(1),
+                linear.flatten(1),
+                angular.flatten(1) * 0.2,
+                self.robot.data.sensordata * felt[:, None],
             ],
             dim=1,
             out=self.states_buf,

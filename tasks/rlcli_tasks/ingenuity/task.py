@@ -50,6 +50,8 @@ class IngenuityTask(FlightTask):
         super().post_reset()
         self.forces = torch.zeros(self.num_envs, len(ROTORS), 3, device=self.device)
         """Force of each rotor, in the rotor's frame. (n, 2, 3) [N]"""
+        self.units = torch.tensor([3.0] * 3 + [1.0] * 4 + [2.0] * 3 + [math.pi] * 3, device=self.device)
+        """Values that are observed as 1. (13,)"""
 
     def pre_physics_step(self, actions: Tensor) -> None:
         """Set each rotor's thrust, and two sideways fractions of it."""
@@ -63,21 +65,17 @@ class IngenuityTask(FlightTask):
     def get_observations(self) -> None:
         """Fill obs_buf."""
         data = self.robot.data
+        torch.sub(self.target, data.root_pos_w, out=self.to_target)
         torch.cat(
-            [
-                (self.target - data.root_pos_w).div_(3.0),
-                data.root_quat_w,
-                data.root_lin_vel_w * 0.5,
-                data.root_ang_vel_w / math.pi,
-            ],
+            [self.to_target, data.root_quat_w, data.root_lin_vel_w, data.root_ang_vel_w],
             dim=1,
             out=self.obs_buf,
-        )
+        ).div_(self.units)
 
     def calculate_metrics(self) -> None:
         """Reward nearness, and near the target an upright pose, no spin, and `steadiness`."""
         data = self.robot.data
-        self.distance.copy_(length(self.target - data.root_pos_w))
+        self.distance.copy_(length(self.to_target))
         _, x, y, _ = data.root_quat_w.unbind(dim=1)
         tilt = 2.0 * torch.addcmul(x * x, y, y)  # 1 - cos of the angle between up and the vertical
         spin = data.root_ang_vel_w[:, 2]

@@ -56,15 +56,23 @@ class QuadcopterTask(DirectTask):
         """Create constants and buffers. The hooks write the buffers in place."""
         params, n = self.params, self.num_envs
         self.robot, self.goal = self.env.entities["robot"], self.env.entities["target"]
-        self.low, self.high = self.robot.data.joint_pos_limits.to(self.device).unbind(dim=1)
+        low, high = self.robot.data.joint_pos_limits.to(self.device).unbind(dim=1)
         noise = params.joint_pos_noise
-        self.tilt_low, self.tilt_high = self.low.clamp(min=-noise), self.high.clamp(max=noise)
+        self.tilt_low, self.tilt_high = low.clamp(min=-noise), high.clamp(max=noise)
         self.start_low = torch.tensor(params.start_low, device=self.device)
         self.start_high = torch.tensor(params.start_high, device=self.device)
-        self.tilts = torch.zeros(n, len(JOINTS), device=self.device)
-        """Target angles of the servos. (n, 8) [rad]"""
-        self.thrusts = torch.zeros(n, len(THRUSTS), device=self.device)
-        """Thrusts. (n, 4) [N]"""
+        rates = [params.tilt_speed] * len(JOINTS) + [params.thrust_speed] * len(THRUSTS)
+        self.steps = torch.tensor([self.step_dt * rate for rate in rates], device=self.device)
+        """Change of each control in a step at action 1. (12,)"""
+        thrusts = torch.full((len(THRUSTS),), params.max_thrust, device=self.device)
+        self.lowest, self.highest = torch.cat([low, -thrusts]), torch.cat([high, thrusts])
+        self.controls = torch.zeros(n, self.num_actions, device=self.device)
+        """Target angles of the servos [rad], then thrusts [N]. (n, 12)"""
+        self.tilts, self.thrusts = self.controls.split([len(JOINTS), len(THRUSTS)], dim=1)
+        self.units = torch.tensor([3.0] * 3 + [1.0] * 4 + [2.0] * 3 + [math.pi] * 3 + [1.0] * 8, device=self.device)
+        """Values that are observed as 1. (21,)"""
+        self.to_target = torch.zeros(n, 3, device=self.device)
+        """From the robot to the target, since the last `get_observations`. (n, 3) [m]"""
         self.distance = torch.zeros(n, device=self.device)
         self.extras["distance"] = self.distance  # distance to the target [m]
 
@@ -80,31 +88,24 @@ class QuadcopterTask(DirectTask):
 
     def pre_physics_step(self, actions: Tensor) -> None:
         """Change the target tilts and the thrusts: the actions are rates."""
-        params, dt = self.params, self.step_dt
-        tilts, thrusts = actions.split([len(JOINTS), len(THRUSTS)], dim=1)
-        torch.clamp(self.tilts.add_(tilts, alpha=dt * params.tilt_speed), self.low, self.high, out=self.tilts)
-        self.thrusts.add_(thrusts, alpha=dt * params.thrust_speed).clamp_(-params.max_thrust, params.max_thrust)
-        self.env.engine.field("ctrl").copy_(torch.cat([self.tilts, self.thrusts], dim=1))
+        self.controls.addcmul_(actions, self.steps)
+        torch.clamp(self.controls, self.lowest, self.highest, out=self.controls)
+        self.env.engine.field("ctrl").copy_(self.controls)
 
     def get_observations(self) -> None:
         """Fill obs_buf."""
         data = self.robot.data
+        torch.sub(self.goal.data.root_pos_w, data.root_pos_w, out=self.to_target)
         torch.cat(
-            [
-                (self.goal.data.root_pos_w - data.root_pos_w).div_(3.0),
-                data.root_quat_w,
-                data.root_lin_vel_w * 0.5,
-                data.root_ang_vel_w / math.pi,
-                data.joint_pos,
-            ],
+            [self.to_target, data.root_quat_w, data.root_lin_vel_w, data.root_ang_vel_w, data.joint_pos],
             dim=1,
             out=self.obs_buf,
-        )
+        ).div_(self.units)
 
     def calculate_metrics(self) -> None:
         """Reward nearness, and near the target an upright pose without spin."""
         data = self.robot.data
-        self.distance.copy_(length(self.goal.data.root_pos_w - data.root_pos_w))
+        self.distance.copy_(length(self.to_target))
         _, x, y, _ = data.root_quat_w.unbind(dim=1)
         tilt = 2.0 * torch.addcmul(x * x, y, y)  # 1 - cos of the angle between up and the vertical
         spin = data.root_ang_vel_w[:, 2].square()
