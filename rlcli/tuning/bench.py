@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from rlcli.config.load import Resolved
-from rlcli.envs.make import make_env
+from rlcli.envs.sharding.choice import make_training_env, number_of_workers
 from rlcli.errors import ConfigError
 from rlcli.machine import available_cores, available_memory, resident_memory
 from rlcli.rl.trainer import Trainer
@@ -64,6 +64,7 @@ class Stepped:
 
     num_envs: int
     engine_threads: int
+    workers: int
     steps_per_s: float | None = None
     physics: float | None = None
     """Share of the physics in the time of a step."""
@@ -84,6 +85,7 @@ class Setting:
     minibatches: int | None
     engine_threads: int
     torch_threads: int
+    workers: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +168,8 @@ class Bench:
         horizon = None if self.horizon_key is None else int(getattr(agent, self.horizon_key))
         fixed_size = getattr(agent, "minibatch_size", None) is not None
         minibatches = None if fixed_size else getattr(agent, "num_minibatches", None)
-        self.present = Setting(present.task.scene.num_envs, horizon, minibatches, engine, update)
+        workers = number_of_workers(present, "cpu")
+        self.present = Setting(present.task.scene.num_envs, horizon, minibatches, engine, update, workers)
 
     def run(self) -> Findings:
         """Run all measurements; `findings` holds those that are finished."""
@@ -180,6 +183,7 @@ class Bench:
             "scene.num_envs": setting.num_envs,
             "sim.engine_threads": setting.engine_threads,
             "agent.torch_threads": setting.torch_threads,
+            "scene.workers": setting.workers,
         }
         if self.horizon_key is not None:
             changed[f"agent.{self.horizon_key}"] = setting.horizon
@@ -191,21 +195,26 @@ class Bench:
 
     def _step_all(self) -> None:
         present = self.present
-        sizes = [(num_envs, present.engine_threads) for num_envs in SIZES]
-        other_threads = [count for count in _powers(available_cores()) if count != present.engine_threads]
-        sizes += [(present.num_envs, count) for count in other_threads]
-        for num_envs, engine_threads in sizes:
-            self.findings.stepped.append(self._step(num_envs, engine_threads))
+        threads, workers, counts = present.engine_threads, present.workers, _powers(available_cores())
+        sizes = [(num_envs, threads, min(workers, num_envs // 2)) for num_envs in SIZES]
+        sizes += [(present.num_envs, count, workers) for count in counts if count != threads]
+        sizes += [(present.num_envs, threads, count) for count in counts if count != workers]
+        for size in sizes:
+            self.findings.stepped.append(self._step(*size))
             self._show(self.findings)
 
-    def _step(self, num_envs: int, engine_threads: int) -> Stepped:
-        self._announce(f"{num_envs:,} environments, {engine_threads} engine threads")
+    def _step(self, num_envs: int, engine_threads: int, workers: int) -> Stepped:
+        self._announce(f"{num_envs:,} environments, {engine_threads} engine threads, workers {workers}")
         reason = self._too_large(num_envs)
         if reason is not None:
-            return Stepped(num_envs, engine_threads, left_out=reason)
+            return Stepped(num_envs, engine_threads, workers, left_out=reason)
         torch.set_num_threads(1)  # as in a rollout
-        resolved = self._resolve({"scene.num_envs": num_envs, "sim.engine_threads": engine_threads})
-        with contextlib.closing(make_env(resolved, seed=42, device="cpu")) as env, torch.inference_mode():
+        flags = {"scene.num_envs": num_envs, "sim.engine_threads": engine_threads, "scene.workers": workers}
+        try:
+            env = make_training_env(self._resolve(flags), seed=42, device="cpu")
+        except ConfigError as error:
+            return Stepped(num_envs, engine_threads, workers, left_out=error.problems[0].message)
+        with contextlib.closing(env), torch.inference_mode():
             generator = torch.Generator().manual_seed(42)
             shape = (_ACTIONS, num_envs, env.layout.action_size)
             actions = itertools.cycle(torch.rand(shape, generator=generator) * 2.0 - 1.0)
@@ -216,7 +225,7 @@ class Bench:
             blocks = _blocks(lambda: env.step(next(actions)), self._pace)
             physics = (env.seconds["physics"] - before["physics"]) / (env.seconds["step"] - before["step"])
             rate = num_envs / statistics.median(blocks)
-            return Stepped(num_envs, engine_threads, rate, physics, _spread(blocks), resident_memory())
+            return Stepped(num_envs, engine_threads, workers, rate, physics, _spread(blocks), resident_memory())
 
     def _too_large(self, num_envs: int) -> str | None:
         """Return the reason for not building so many environments; None if they can be built."""
@@ -237,7 +246,8 @@ class Bench:
 
     def _train_all(self) -> None:
         best = self._add_trained(self.present)
-        for key, most in (("torch_threads", min(16, available_cores())), ("engine_threads", available_cores())):
+        cores = available_cores()
+        for key, most in (("torch_threads", min(16, cores)), ("engine_threads", cores), ("workers", cores)):
             others = [count for count in _powers(most) if count != getattr(best.setting, key)]
             best = _fastest([best, *(self._add_trained(replace(best.setting, **{key: count})) for count in others)])
         best = _fastest([best, *(self._add_trained(setting) for setting in self._sizes(best.setting))])
@@ -383,4 +393,5 @@ def _describe(setting: Setting) -> str:
         parts.append(f"{setting.horizon} steps")
     if setting.minibatches is not None:
         parts.append(f"{setting.minibatches} minibatches")
-    return ", ".join([*parts, f"threads {setting.engine_threads} and {setting.torch_threads}"])
+    threads = f"threads {setting.engine_threads} and {setting.torch_threads}"
+    return ", ".join([*parts, threads, f"workers {setting.workers}"])

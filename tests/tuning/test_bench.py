@@ -50,7 +50,9 @@ def test_threads_are_measured_up_to_number_of_cores(coin, cli, short_measurement
     found = cli("bench", coin, "--quick", "--json").json
     tried = {(row["engine_threads"], row["torch_threads"]) for row in found["training"]}
     assert {engine for engine, _ in tried} == {update for _, update in tried} == {1, 2, 3}
-    assert {row["engine_threads"] for row in found["environment"] if row["num_envs"] == 32} == {2, 3}
+    rows = [row for row in found["environment"] if row["num_envs"] == 32]
+    assert {(row["engine_threads"], row["workers"]) for row in rows} == {(2, 1), (3, 1), (1, 2), (1, 3)}
+    assert {row["workers"] for row in found["training"]} == {1, 2, 3}
 
 
 def test_preset_can_be_trained(coin, cli, short_measurements, only_run):
@@ -131,7 +133,7 @@ def test_unknown_horizon_keeps_sizes(coin, cli, short_measurements, monkeypatch)
     found = cli("bench", coin, "--quick", "--json").json
     assert {row["num_envs"] for row in found["training"]} == {32}
     assert set(found["recommended"]) == {
-        "scene.num_envs", "sim.engine_threads", "agent.torch_threads", "agent.num_minibatches"
+        "scene.num_envs", "scene.workers", "sim.engine_threads", "agent.torch_threads", "agent.num_minibatches"
     }  # fmt: skip
 
 

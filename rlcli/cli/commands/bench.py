@@ -164,11 +164,11 @@ def _machine(resolved: Resolved) -> dict[str, Any]:
 
 def _show(findings: Findings, horizon: str) -> None:
     if findings.stepped:
-        columns = ["ENVS", "THREADS", "STEPS/S", "PHYSICS", "SPREAD", "MEMORY", ""]
+        columns = ["ENVS", "THREADS", "WORKERS", "STEPS/S", "PHYSICS", "SPREAD", "MEMORY", ""]
         console.table(columns, [_step_cells(row) for row in findings.stepped], "environment, random actions")
     if findings.trained:
         shares = list(dict.fromkeys(name for row in findings.trained for name in row.shares))
-        columns = ["ENVS", horizon, "MINIBATCHES", "ENGINE", "TORCH", "MS", "STEPS/S", *map(str.upper, shares)]
+        columns = ["ENVS", horizon, "MINIBATCHES", "ENGINE", "TORCH", "WORKERS", "MS", "STEPS/S", *map(str.upper, shares)]
         rows = [_training_cells(row, shares) for row in findings.trained]
         console.data("")
         console.table([*columns, "SPREAD", "MEMORY", ""], rows, "training, one iteration")
@@ -179,6 +179,7 @@ def _step_cells(row: Stepped) -> list[str]:
     return [
         f"{row.num_envs:,}",
         str(row.engine_threads),
+        str(row.workers),
         cell(row.steps_per_s, ",.0f"),
         cell(row.physics, ".0%"),
         *_last_cells(row, ""),
@@ -188,7 +189,7 @@ def _step_cells(row: Stepped) -> list[str]:
 def _training_cells(row: Trained, shares: Sequence[str]) -> list[str]:
     setting = row.setting
     sizes = [cell(setting.num_envs, ","), cell(setting.horizon), cell(setting.minibatches)]
-    threads = [str(setting.engine_threads), str(setting.torch_threads)]
+    threads = [str(setting.engine_threads), str(setting.torch_threads), str(setting.workers)]
     times = [cell(row.milliseconds, ".4g"), cell(row.steps_per_s, ",.0f")]
     times += [cell(row.shares.get(name), ".0%") for name in shares]
     return [*sizes, *threads, *times, *_last_cells(row, "" if row.alike else "learns differently")]
@@ -218,7 +219,7 @@ class _View(LiveView):
         for row in findings.trained:
             setting, ms = row.setting, cell(row.milliseconds, ".4g", " ms")
             steps = [] if setting.horizon is None else [f"{setting.horizon} steps"]
-            threads = f"threads {setting.engine_threads}, {setting.torch_threads}"
+            threads = f"threads {setting.engine_threads}, {setting.torch_threads}, workers {setting.workers}"
             rows.append([f"{setting.num_envs:,} envs", *steps, threads, ms])
         if self._live is None and len(rows) > len(self._rows):
             console.info("  ".join(rows[-1]))
@@ -233,7 +234,8 @@ class _View(LiveView):
 
 
 def _step_parts(row: Stepped) -> list[str]:
-    envs, threads, rate, physics, spread, memory, _ = _step_cells(row)
+    envs, threads, workers, rate, physics, spread, memory, _ = _step_cells(row)
     if row.steps_per_s is None:
         return [f"{envs} envs", "left out"]
-    return [f"{envs} envs", f"threads {threads}", f"{rate} steps/s", f"physics {physics}", f"spread {spread}", memory]
+    sizes = [f"{envs} envs", f"threads {threads}", f"workers {workers}"]
+    return [*sizes, f"{rate} steps/s", f"physics {physics}", f"spread {spread}", memory]
