@@ -25,7 +25,7 @@ from machine import describe
 from mujoco.batch import Batch
 
 from rlcli.config.load import resolve
-from rlcli.envs.sharding.choice import make_training_env
+from rlcli.envs.sharding.training_env import make_training_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.registry import find_task
 

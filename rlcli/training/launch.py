@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.config.dump import explicit_values, to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
+from rlcli.envs.sharding.choice import number_of_workers
+from rlcli.envs.sharding.workers import close_early, start_early
 from rlcli.errors import CheckpointError, DeviceError, UsageError
 from rlcli.machine import choose_device
 from rlcli.rl import distributed
@@ -234,11 +236,13 @@ def setup_job(
     """
     try:
         with stop.before_training(interruptible=not distributed.launched()):
+            start_early(number_of_workers(job.resolved, device) - 1)
             from rlcli.training.setup import build_trainer
 
             trainer, env = build_trainer(job, device)
             check_model(env)
     except BaseException:
+        close_early()
         if job.created and job.writes:
             job.run.discard()
         job.run.unlock()

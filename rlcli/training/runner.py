@@ -62,9 +62,10 @@ def run_training(
     run, resolved = job.run, job.resolved
     _log.debug("built in %.1f s", time.monotonic() - job.begin)
     size, actions = env.layout.size(), env.layout.action_size
+    workers = f" in {env.workers} processes" if env.workers > 1 else ""
     _log.info(
         f"{resolved.source.name}: {env.num_envs} environments, {size} observations, {actions} actions,"
-        f" {env.engine.threads} engine threads, agent {resolved.agent_name}, seed {run.record['seed']}"
+        f" {env.engine.threads} engine threads{workers}, agent {resolved.agent_name}, seed {run.record['seed']}"
     )
     if job.writes:
         CrashDumper(env, run.folder / "dumps")

@@ -8,7 +8,7 @@ from typing import Any
 
 from rlcli.config.load import Resolved
 from rlcli.envs.environment import Environment
-from rlcli.envs.sharding.choice import make_training_env
+from rlcli.envs.sharding.training_env import make_training_env
 from rlcli.errors import CheckpointError, RlcliError, one_line
 from rlcli.random import derive
 from rlcli.registry import load_object

@@ -12,9 +12,10 @@ from support.sharded_runs import both, differences, same, step_differences
 from rlcli.config.load import resolve
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.shard import split
-from rlcli.envs.sharding.choice import make_training_env, number_of_workers
+from rlcli.envs.sharding.choice import number_of_workers
 from rlcli.envs.sharding.env import ShardedEnv
 from rlcli.envs.sharding.state import join_states, split_state
+from rlcli.envs.sharding.training_env import make_training_env
 from rlcli.errors import ConfigError, DivergedError, MachineError
 from rlcli.registry import find_task
 

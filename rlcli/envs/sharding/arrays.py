@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import mmap
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -28,14 +27,6 @@ class ArraySpec:
         """Size with padding [bytes]."""
         used = math.prod(self.shape) * self.dtype.itemsize
         return -(-used // _ALIGNMENT) * _ALIGNMENT
-
-
-def create_shared_file() -> int:
-    """Create a file in memory without a name and return its descriptor; it disappears with the last process."""
-    if hasattr(os, "memfd_create"):
-        return os.memfd_create("rlcli")
-    with tempfile.TemporaryFile() as file:
-        return os.dup(file.fileno())
 
 
 def map_tensors(descriptor: int, specs: Mapping[str, ArraySpec]) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""Number of worker processes of an environment, and `make_training_env`."""
+"""Number of worker processes of an environment. This module imports neither torch nor MuJoCo."""
 
 from __future__ import annotations
 
@@ -6,28 +6,12 @@ import os
 
 from rlcli.config.load import Resolved
 from rlcli.config.schema import CameraSensorConfig
-from rlcli.envs.environment import Environment
-from rlcli.envs.make import make_env
 from rlcli.envs.sharding.own_code import has_untested_code
 from rlcli.errors import ConfigError
 from rlcli.machine import available_cores
 
 ENVS_PER_WORKER = 256
 """Smallest number of environments for which a further process pays: below it, its fixed cost per step outweighs it."""
-
-
-def make_training_env(resolved: Resolved, *, seed: int, device: str) -> Environment:
-    """Return the environment of a training, in as many processes as `scene.workers` says.
-
-    Raises:
-        ConfigError: if the task cannot run in several processes.
-    """
-    workers = number_of_workers(resolved, device)
-    if workers == 1:
-        return make_env(resolved, seed=seed, device=device)
-    from rlcli.envs.sharding.env import ShardedEnv
-
-    return ShardedEnv(resolved, workers=workers, seed=seed)
 
 
 def number_of_workers(resolved: Resolved, device: str) -> int:

@@ -33,7 +33,7 @@ from rlcli.envs.sharding.runner import (
 )
 from rlcli.envs.sharding.state import join, join_states, split_state
 from rlcli.envs.sharding.worker import Job
-from rlcli.envs.sharding.workers import Worker, Workers
+from rlcli.envs.sharding.workers import Worker, take_workers
 from rlcli.envs.step import Episodes, StepRecord, StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, one_line
@@ -69,8 +69,9 @@ class ShardedEnv(Environment):
             Job(_pickled(part), seed, shared_streams, shard, number, files, has_own_code, state)
             for number, (part, shard) in enumerate(zip(parts, self._shards, strict=True))
         ]
-        self._workers = Workers(jobs[1:])
+        self._workers = take_workers(workers - 1)
         try:
+            self._workers.build(jobs[1:])
             counters = map_tensors(self._workers.arrays, counter_specs(total))["counters"]
             first = replace(self._shards[0], counters=counters[:, self._shards[0].rows])
             self._local = make_env(parts[0], seed=seed, shared_streams=shared_streams, shard=first)

@@ -9,12 +9,12 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import weakref
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rlcli.envs.sharding import worker
-from rlcli.envs.sharding.arrays import create_shared_file
 from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
 from rlcli.envs.sharding.worker import Job
 from rlcli.errors import MachineError
@@ -116,21 +116,27 @@ class Workers:
     """All worker processes of an environment; they end with this object.
 
     Args:
-        jobs: what each process builds; the processes start at once and build while the caller builds its own shard.
+        count: number of processes; they start to import at once.
     """
 
-    def __init__(self, jobs: Sequence[Job]) -> None:
-        self.arrays = create_shared_file()
+    def __init__(self, count: int) -> None:
+        self.arrays = _create_shared_file()
         self._workers: list[Worker] = []
         self.close = weakref.finalize(self, _close, self._workers, self.arrays)
         try:
-            for job in jobs:
-                self._workers.append(Worker(job.number, self.arrays))
-            for process, job in zip(self._workers, jobs, strict=True):
-                process.send(worker.BUILD, job)
+            for number in range(1, count + 1):
+                self._workers.append(Worker(number, self.arrays))
         except BaseException:
             self.close()
             raise
+
+    def build(self, jobs: Sequence[Job]) -> None:
+        """Let each process build its shard, while the caller builds its own."""
+        for process, job in zip(self._workers, jobs, strict=True):
+            process.send(worker.BUILD, job)
+
+    def __len__(self) -> int:
+        return len(self._workers)
 
     def __iter__(self) -> Iterator[Worker]:
         return iter(self._workers)
@@ -156,6 +162,38 @@ class Workers:
         if first_error is not None:
             raise first_error
         return contents
+
+
+_early: list[Workers] = []
+"""Processes that were started before the environment of which they step a part."""
+
+
+def start_early(count: int) -> None:
+    """Start processes for the next environment, before this process imports torch: both then import at once."""
+    if count:
+        _early.append(Workers(count))
+
+
+def take_workers(count: int) -> Workers:
+    """Return the processes that were started early, if there are as many; else start them."""
+    if _early and len(_early[-1]) == count:
+        return _early.pop()
+    close_early()
+    return Workers(count)
+
+
+def close_early() -> None:
+    """End the processes that were started early and that no environment has taken."""
+    while _early:
+        _early.pop().close()
+
+
+def _create_shared_file() -> int:
+    """Create a file in memory without a name and return its descriptor; it disappears with the last process."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("rlcli")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
 
 
 def _close(workers: list[Worker], arrays: int) -> None:

@@ -1,0 +1,22 @@
+"""`make_training_env`: the environment of a training, in one process or in several."""
+
+from __future__ import annotations
+
+from rlcli.config.load import Resolved
+from rlcli.envs.environment import Environment
+from rlcli.envs.make import make_env
+from rlcli.envs.sharding.choice import number_of_workers
+
+
+def make_training_env(resolved: Resolved, *, seed: int, device: str) -> Environment:
+    """Return the environment of a training, in as many processes as `scene.workers` says.
+
+    Raises:
+        ConfigError: if the task cannot run in several processes.
+    """
+    workers = number_of_workers(resolved, device)
+    if workers == 1:
+        return make_env(resolved, seed=seed, device=device)
+    from rlcli.envs.sharding.env import ShardedEnv
+
+    return ShardedEnv(resolved, workers=workers, seed=seed)
