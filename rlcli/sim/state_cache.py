@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rlcli.sim.engine import Engine
-from rlcli.sim.selection import Selection, ids_of
+from rlcli.sim.selection import Columns, Selection, ids_of
 
 
 def is_finite(values: Tensor) -> bool:
@@ -117,6 +117,13 @@ class SimData:
             value = self.engine.field(name).float()
             self._derived[name] = (self.stamp, value)
         return value
+
+    def derived_columns(self, name: str, columns: Columns) -> Tensor:
+        """Return `derived_field(name)[:, columns]`; only these columns are cast. (num_envs, k, ...)"""
+        self.forward_moved()
+        stamp, value = self._derived.get(name, (-1, None))
+        source = self.engine.field(name) if stamp != self.stamp or value is None else value
+        return source[:, columns].float()
 
 
 def _joined(left: Tensor, right: Tensor) -> Tensor | None:
