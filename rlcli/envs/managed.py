@@ -205,6 +205,7 @@ class ManagedEnv(VecEnv):
             return
         running = (self.episode_length_buf > 0).long()  # 0 where the episode has just begun
         self.command_manager.compute(self._select_by_step, running)
+        self.sim.command_stamp += 1
         self.event_manager.interval(self._select_by_step, running, self._after_interval_event)
 
     def _select_all_by_step(self) -> Selection:
