@@ -202,10 +202,10 @@ class RaySensor(LazySensor):
     def _down_from(self, position: Tensor, axes: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Return x and y of rays that point straight down, (rows, r) each, and their common height (rows, 1) [m]."""
         ahead, left, _ = self._starts.unbind(1)
-        x, y, z = position.split(1, dim=1)
+        x, y, z = position[:, None].unbind(2)
         if axes is None:
             return x + ahead, y + left, z
-        (cos, sin, _), (across_x, across_y, _) = (axis.split(1, dim=1) for axis in axes.unbind(1)[:2])
+        (cos, sin, _), (across_x, across_y, _) = (axis[:, None].unbind(2) for axis in axes.unbind(1)[:2])
         turned_x = (ahead * cos).add_(left * across_x)
         turned_y = (ahead * sin).add_(left * across_y)
         return turned_x.add_(x), turned_y.add_(y), z
