@@ -21,6 +21,8 @@ _MIX1 = np.array(0xBF58476D1CE4E5B9, np.uint64)
 _MIX2 = np.array(0x94D049BB133111EB, np.uint64)
 _S30, _S27, _S31, _S40 = (np.array(shift, np.uint64) for shift in (30, 27, 31, 40))
 _TO_UNIT = np.array(2.0**-24, np.float32)
+_BLOCK = 1 << 14
+"""Number of words that are mixed at once: their copies stay in the cache of a core."""
 
 
 @functools.lru_cache(maxsize=4096)
@@ -56,9 +58,12 @@ def bits(keys: Keys, stream: np.uint64, index: int, count: int) -> Keys:
 
 def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
     """Return uniform numbers in [0, 1), multiples of 2**-24. (n, count)"""
-    words = bits(keys, stream, index, count)
-    words >>= _S40  # 24 bits remain, as many as the significand of a float32 holds exactly
-    unit = words.astype(np.float32)
+    unit = np.empty((len(keys), count), np.float32)
+    rows = max(1, _BLOCK // max(1, count))
+    for first in range(0, len(keys), rows):
+        words = bits(keys[first : first + rows], stream, index, count)
+        words >>= _S40  # 24 bits remain, as many as the significand of a float32 holds exactly
+        unit[first : first + rows] = words.view(np.int64)  # numpy converts signed words faster
     unit *= _TO_UNIT
     return unit
 

@@ -29,7 +29,7 @@ from rlcli.scene.joint_setup import ActuatorNeed
 from rlcli.scene.scene import Scene
 from rlcli.sim.acceleration_stage import add_body_forces
 from rlcli.sim.markers import Marker
-from rlcli.sim.selection import Selection
+from rlcli.sim.selection import Field, Selection
 from rlcli.sim.tensor_state import require_matching_tensors, substate
 
 _STATELESS = ("functools", "rlcli.mdp.")
@@ -165,7 +165,8 @@ class ManagedEnv(VecEnv):
             self.reward_manager.require_finite_terms()
 
     def _compute_final_obs(self) -> dict[str, Tensor]:
-        return self.observation_manager.compute_final()
+        rows = None if self.engine.asynchronous else self._select_by_step(self._read_finals)
+        return self.observation_manager.compute_final(rows)
 
     def _episode_returns_and_causes(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
         returns, terms = self.reward_manager.episode(ended)
@@ -204,6 +205,7 @@ class ManagedEnv(VecEnv):
             return
         running = (self.episode_length_buf > 0).long()  # 0 where the episode has just begun
         self.command_manager.compute(self._select_by_step, running)
+        self.sim.command_stamp += 1
         self.event_manager.interval(self._select_by_step, running, self.on_moved)
 
     def _select_all_by_step(self) -> Selection:
@@ -211,7 +213,7 @@ class ManagedEnv(VecEnv):
         assert selection is not None
         return selection
 
-    def _select_by_step(self, mask: Tensor) -> Selection | None:
+    def _select_by_step(self, mask: Field) -> Selection | None:
         """Return a selection whose draws are keyed by the step."""
         return self.engine.select(mask, self.seed, self._counters.common_step.expand(self.num_envs).contiguous())
 

@@ -71,6 +71,7 @@ class VecEnv(Workflow):
         self.physics_override: Callable[[], None] | None = None
         """Called instead of the engine to step the simulations; it must write their states and derived fields."""
         self._last_obs: dict[str, Tensor] = {}
+        self._read_finals: Field = torch.zeros(self.num_envs, dtype=torch.bool)  # where `final_obs` is valid
         self._counters = EpisodeCounters(self.shard, self.device)
         self.episode_length_buf = self._counters.lengths
         """Steps of the running episode. (num_envs,) int64"""
@@ -206,6 +207,7 @@ class VecEnv(Workflow):
         ended = self._select(finished)
         if ended is None:
             return None, None, None
+        self._read_finals = finished if self.final_obs_of == "finished" else timed_out
         wanted = self.final_obs_of == "finished" or self._may_be_any(timed_out)
         final_obs = self._compute_final_obs() if wanted else None
         returns, terms, causes = self._episode_returns_and_causes(ended)

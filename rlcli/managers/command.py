@@ -151,8 +151,9 @@ class CommandManager(TensorState):
         """Add the metrics of this step to the sums, before commands are resampled."""
         if not self._measured:
             return
-        metrics = {id(term): term.instance.metrics() for _, term, _ in self._measured}
-        self._sums += torch.stack([metrics[id(term)][name] for _, term, name in self._measured], dim=1)
+        terms = {term.name: term for _, term, _ in self._measured}
+        metrics = {name: term.instance.metrics() for name, term in terms.items()}
+        self._sums += torch.stack([metrics[term.name][name] for _, term, name in self._measured], dim=1)
         self._steps += 1.0
 
     def episode(self, ended: Selection) -> dict[str, Tensor]:

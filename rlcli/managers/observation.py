@@ -81,11 +81,18 @@ class ObservationManager(TensorState):
         self._fresh = None
         return result
 
-    def compute_final(self) -> dict[str, Tensor]:
-        """Return the observations in separate buffers; histories, delays and filters do not advance."""
+    def compute_final(self, rows: Selection | None = None) -> dict[str, Tensor]:
+        """Return the observations in separate buffers; histories, delays and filters do not advance.
+
+        rows: the environments whose observations are read, with draws keyed by the step; None: all.
+        """
         draws = self._draws(_FINAL)
         for name, group in self.groups.items():
-            self._fill(group, self._final_views[name], draws, advance=False)
+            for pipeline, view in zip(group.pipelines, self._final_views[name], strict=True):
+                if rows is None or pipeline.has_memory:
+                    pipeline.write(view, draws, self._fresh, False)
+                else:
+                    pipeline.write_rows(view, rows, _FINAL)
             self._require_finite(name, group, self._final[name])
         return self._final
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from rlcli.config import schema
 from rlcli.managers.term import BoundTerm, resets
 from rlcli.managers.tunable import TunableValues
-from rlcli.sim.selection import Selection
+from rlcli.sim.selection import Selection, in_place
 
 Draws = Callable[[np.uint64], Selection]
 """Returns a selection of all environments that draws from a stream, keyed by the step."""
@@ -112,6 +112,16 @@ class Pipeline:
             if advance:
                 self._frames.copy_(view)
 
+    def write_rows(self, view: Tensor, rows: Selection, salt: np.uint64) -> None:
+        """Compute the selected rows of a term without a memory, and write them to its columns.
+
+        Draws are keyed by the selection. view (num_envs, size)
+        """
+        value = rows.read(self.term.call().reshape(view.shape)).float()
+        for stage in self._stages:
+            stage(value, lambda stream: rows.stream(stream ^ salt), None, False)
+        rows.write(view, value)
+
     @property
     def resets(self) -> list[Callable[[Selection], None]]:
         """Functions to call with the environments that start a new episode."""
@@ -158,7 +168,7 @@ class Pipeline:
         """Return a function that draws from a distribution for the rows of a selection. -> (rows, width)"""
         shape = (self.width,)
         if isinstance(config, schema.UniformNoiseConfig):
-            low, high = self._columns(f"{key}.low", config.low), self._columns(f"{key}.high", config.high)
+            low, high = (in_place(self._columns(f"{key}.{end}", getattr(config, end))) for end in ("low", "high"))
             return lambda selection: selection.uniform(low, high, shape)
         if isinstance(config, schema.GaussianNoiseConfig):
             mean, std = self._columns(f"{key}.mean", config.mean), self._columns(f"{key}.std", config.std)

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from rlcli.mdp.term import EntityTerm, Term
+from rlcli.mdp.term_helpers import goal_in_world, goal_quat_in_world
 from rlcli.sim.markers import ACTUAL, COMMANDED, Arrow, Color, Frame, Marker, Sphere
-from rlcli.sim.rotations import atan2, from_euler, heading, multiply, rotate, unique, wrap_to_pi, yaw_only
+from rlcli.sim.rotations import atan2, from_euler, heading, rotate, unique, wrap_to_pi, yaw_only
 from rlcli.sim.selection import Selection, one_column
 from rlcli.sim.tensor_state import TensorState
 from rlcli.task import Bodies, Range
@@ -212,9 +213,7 @@ class UniformPose(EntityTerm):
     @property
     def pose_w(self) -> tuple[Tensor, Tensor]:
         """Goal pose in the world frame: position [m], quaternion (w, x, y, z). (num_envs, 3), (num_envs, 4)"""
-        root = self.entity.data
-        position = root.root_pos_w + rotate(root.root_quat_w, self.command[:, :3])
-        return position, multiply(root.root_quat_w, self.command[:, 3:])
+        return goal_in_world(self.entity, self), goal_quat_in_world(self.entity, self)
 
     @property
     def body_pose_w(self) -> tuple[Tensor, Tensor]:

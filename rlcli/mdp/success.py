@@ -5,8 +5,8 @@ from __future__ import annotations
 from torch import Tensor
 
 from rlcli.mdp.parameters import Command, Entity, ManagedEnv, VecEnv
-from rlcli.mdp.term_helpers import all_columns, constant, cosine, goal_in_world, goal_quat_in_world, single
-from rlcli.sim.rotations import length, turn_between, wrap_to_pi
+from rlcli.mdp.term_helpers import all_columns, angle_to_goal, constant, cosine, distance_to_goal, goal_in_world, single
+from rlcli.sim.rotations import length, wrap_to_pi
 from rlcli.task import Bodies, Joints, Sites
 
 
@@ -118,11 +118,10 @@ def body_at_goal(
 
     angle_tolerance: if given, the body's orientation must also be within this angle of the goal's [rad].
     """
-    near = length(single(entity.data.body_pos_w[:, bodies], "body") - goal_in_world(entity, command)) < tolerance
+    near = distance_to_goal(entity, bodies, command) < tolerance
     if angle_tolerance is None:
         return near
-    orientation = single(entity.data.body_quat_w[:, bodies], "body").contiguous()
-    return near & (turn_between(orientation, goal_quat_in_world(entity, command)) < angle_tolerance)
+    return near & (angle_to_goal(entity, bodies, command) < angle_tolerance)
 
 
 def site_at_goal(env: VecEnv, *, entity: Entity = "robot", sites: Sites, command: Command, tolerance: float) -> Tensor:

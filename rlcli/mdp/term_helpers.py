@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rlcli.mdp.parameters import Command
 from rlcli.mdp.term import EntityTerm
-from rlcli.sim.rotations import length, multiply, rotate
+from rlcli.sim.rotations import length, multiply, rotate, turn_between
 from rlcli.sim.selection import Columns
 from rlcli.task import ContactSensor, Entity, Sites
 
@@ -118,13 +118,45 @@ def is_moving(entity: Entity, command: Command, velocity_threshold: float) -> Te
 
 def goal_in_world(entity: Entity, command: Command) -> Tensor:
     """Return the position of a pose command in the world frame; the command is in the root's. (num_envs, 3) [m]"""
-    goal: Tensor = entity.data.root_pos_w + rotate(entity.data.root_quat_w, command.command[:, :3])
-    return goal
+    data = entity.data
+
+    def compute() -> Tensor:
+        goal: Tensor = data.root_pos_w + rotate(data.root_quat_w, command.command[:, :3])
+        return goal
+
+    return _once(entity, ("goal position", command.command), compute)
 
 
 def goal_quat_in_world(entity: Entity, command: Command) -> Tensor:
     """Return the quaternion of a pose command in the world frame; the command is in the root's. (num_envs, 4)"""
-    return multiply(entity.data.root_quat_w, command.command[:, 3:7])
+    return _once(
+        entity, ("goal quat", command.command), lambda: multiply(entity.data.root_quat_w, command.command[:, 3:7])
+    )
+
+
+def distance_to_goal(entity: Entity, bodies: Columns, command: Command) -> Tensor:
+    """Return the distance from a body to the goal of a pose command. (num_envs,) [m]"""
+
+    def compute() -> Tensor:
+        return length(single(entity.data.body_pos_w[:, bodies], "body") - goal_in_world(entity, command))
+
+    return _once(entity, ("distance", id(bodies), command.command), compute)
+
+
+def angle_to_goal(entity: Entity, bodies: Columns, command: Command) -> Tensor:
+    """Return the angle between a body's orientation and the goal of a pose command. (num_envs,) [rad]"""
+
+    def compute() -> Tensor:
+        orientation = single(entity.data.body_quat_w[:, bodies], "body").contiguous()
+        return turn_between(orientation, goal_quat_in_world(entity, command))
+
+    return _once(entity, ("angle", id(bodies), command.command), compute)
+
+
+def _once(entity: Entity, key: tuple[object, ...], compute: Callable[[], Tensor]) -> Tensor:
+    """Return a value that is computed once for all terms of a step; do not write to the value."""
+    value: Tensor = entity.sim.once_per_goal((entity.name, *key), compute)
+    return value
 
 
 @functools.cache

@@ -13,7 +13,7 @@ from rlcli.scene.initial_state import default_joint_state, default_root_state
 from rlcli.scene.joint_efforts import JointEfforts
 from rlcli.scene.joint_setup import joint_settings
 from rlcli.sim.acceleration_stage import computes_body_forces
-from rlcli.sim.column_views import MAX_CACHED_VIEWS, CachedViews, as_index, id_tensor
+from rlcli.sim.column_views import MAX_CACHED_VIEWS, CachedViews, as_index, evenly_spaced, id_tensor
 from rlcli.sim.rotations import atan2, axis_x, cross, length, multiply, rotate, rotate_inverse, wrap_to_pi
 from rlcli.sim.selection import ALL, Columns, Field, Selection
 from rlcli.sim.state_cache import SimData
@@ -41,7 +41,6 @@ class EntityData:
         device = entity.engine.device
         self._qpos_index = as_index(entity.qpos_columns.tolist(), device)
         self._dof_index = as_index(entity.dof_columns.tolist(), device)
-        self._body_ids = id_tensor(entity.body_ids, device)
         self._body_index = as_index(entity.body_ids.tolist(), device)
         # joints in consecutive columns: a view of the copied state, made once
         self._joint_pos = sim.qpos[:, self._qpos_index] if isinstance(self._qpos_index, slice) else None
@@ -79,12 +78,12 @@ class EntityData:
         """Speed limit of each joint, `velocity_limit`; infinite for a joint without one. (k,) [m/s or rad/s]"""
         self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32, device=device).expand(num_envs, -1)
         self._down = _direction(self._gravity)
-        self._tree_root = id_tensor(model.body_rootid[entity.body_ids], device)
+        self._body_columns: dict[int, tuple[Columns, Columns, Columns]] = {}
         self._site_index = as_index(entity.site_ids.tolist(), device)
         site_bodies = model.site_bodyid[entity.site_ids]
         self._site_body = id_tensor(site_bodies, device)
         self._site_quat = torch.tensor(model.site_quat[entity.site_ids], dtype=torch.float32, device=device)
-        self._tree_root_of_sites = id_tensor(model.body_rootid[site_bodies], device)
+        self._tree_root_of_sites = evenly_spaced(model.body_rootid[site_bodies].tolist(), device)
         self._computes_body_forces = computes_body_forces(model)
         self._efforts = JointEfforts(entity)
 
@@ -286,25 +285,29 @@ class EntityData:
     @property
     def body_lin_vel_w(self) -> Tensor:
         """Velocities of the bodies' frame origins, world frame. (num_envs, bodies, 3) [m/s]"""
-        bodies, roots = self._body_index, self._tree_root
-        return self._once("body_lin_vel_w", lambda: self._velocity_at(self.body_pos_w, bodies, roots))
+        return self._once("body_lin_vel_w", lambda: self.body_lin_vel_of(ALL))
+
+    def body_lin_vel_of(self, bodies: Columns) -> Tensor:
+        """Return `body_lin_vel_w[:, bodies]`, computed for these bodies only. (num_envs, k, 3) [m/s]"""
+        columns, roots = self._columns_of(bodies)
+        return self._velocity_at(self._sim.derived_columns("xpos", columns), columns, roots)
 
     def body_states_of(self, bodies: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return `body_pos_w`, `body_quat_w`, `body_lin_vel_w` and `body_ang_vel_w` of some bodies.
 
         Only these bodies are copied from the engine. bodies (k,) int64 -> (num_envs, k, 3 or 4) each
         """
-        ids, roots = self._body_ids[bodies], self._tree_root[bodies]
-        position, velocity = self._derived_rows("xpos", ids), self._derived_rows("cvel", ids)
-        arm = position - self._derived_rows("subtree_com", roots)
-        linear = velocity[..., 3:] + cross(velocity[..., :3], arm)
-        return position, self._derived_rows("xquat", ids), linear, velocity[..., :3]
+        columns, roots = self._columns_of(bodies)
+        derived = self._sim.derived_columns
+        position, velocity = derived("xpos", columns), derived("cvel", columns)
+        linear = velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(position, roots))
+        return position, derived("xquat", columns), linear, velocity[..., :3]
 
     @property
     def body_com_lin_vel_w(self) -> Tensor:
         """Velocities of the bodies' centres of mass, world frame. (num_envs, bodies, 3) [m/s]"""
-        bodies, roots = self._body_index, self._tree_root
-        return self._once("body_com_lin_vel_w", lambda: self._velocity_at(self.body_com_pos_w, bodies, roots))
+        columns = self._columns_of(ALL)
+        return self._once("body_com_lin_vel_w", lambda: self._velocity_at(self.body_com_pos_w, *columns))
 
     @property
     def body_lin_vel_b(self) -> Tensor:
@@ -331,7 +334,7 @@ class EntityData:
         def compute() -> Tensor:
             acceleration = self._body_force("cacc")[:, self._body_index]
             angular, linear = acceleration[..., :3], acceleration[..., 3:]
-            at_origin = linear + cross(angular, self._from_tree_com(self.body_pos_w, self._tree_root))
+            at_origin = linear + cross(angular, self._from_tree_com(self.body_pos_w, self._columns_of(ALL)[1]))
             turning = cross(self.body_ang_vel_w, self.body_lin_vel_w)
             # MuJoCo's cacc contains -gravity, as an accelerometer measures it
             return at_origin + turning + self.gravity_w[:, None]
@@ -348,7 +351,7 @@ class EntityData:
         def compute() -> Tensor:
             wrench = self._body_force("cfrc_int")[:, self._body_index]
             force = wrench[..., 3:]
-            torque = wrench[..., :3] - cross(self._from_tree_com(self.body_pos_w, self._tree_root), force)
+            torque = wrench[..., :3] - cross(self._from_tree_com(self.body_pos_w, self._columns_of(ALL)[1]), force)
             quat = self.body_quat_w
             return torch.cat([rotate_inverse(quat, force), rotate_inverse(quat, torque)], dim=-1)
 
@@ -388,20 +391,27 @@ class EntityData:
         middle, half = 0.5 * (low + high), 0.5 * self._entity.config.soft_joint_pos_limit_factor * (high - low)
         return middle - half, middle + half
 
-    def _velocity_at(self, points: Tensor, bodies: Columns, roots: Tensor) -> Tensor:
+    def _columns_of(self, bodies: Columns) -> tuple[Columns, Columns]:
+        """Return the columns of bodies and of the roots of their kinematic trees in the model, looked up once."""
+        found = self._body_columns.get(id(bodies))
+        if found is None:
+            model, device = self._entity.engine.model, self._entity.engine.device
+            ids = self._entity.body_ids[bodies if isinstance(bodies, slice) else bodies.cpu().numpy()]
+            index = (ids, model.body_rootid[ids])
+            columns, roots = (evenly_spaced(part.tolist(), device) for part in index)
+            # the index stays referenced, so that Python does not give its id to another object
+            found = self._body_columns[id(bodies)] = bodies, columns, roots
+        return found[1:]
+
+    def _velocity_at(self, points: Tensor, bodies: Columns, roots: Columns) -> Tensor:
         """Return the velocity of a point of each body, world frame. (num_envs, bodies, 3) [m/s]"""
         # MuJoCo's cvel is the velocity at the centre of mass of the body's kinematic tree
-        velocity = self._sim.derived_field("cvel")[:, bodies]
+        velocity = self._sim.derived_columns("cvel", bodies)
         return velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(points, roots))
 
-    def _from_tree_com(self, points: Tensor, roots: Tensor) -> Tensor:
+    def _from_tree_com(self, points: Tensor, roots: Columns) -> Tensor:
         """Return the vectors to points from the centres of mass of the kinematic trees with some root bodies."""
-        return points - self._sim.derived_field("subtree_com")[:, roots]
-
-    def _derived_rows(self, name: str, elements: Tensor) -> Tensor:
-        """Return a derived field of some bodies. elements (k,) -> (num_envs, k, ...)"""
-        self._sim.forward_moved()
-        return self._entity.engine.field(name).index_select(1, elements).float()
+        return points - self._sim.derived_columns("subtree_com", roots)
 
     def _body_force(self, name: str) -> Tensor:
         if not self._computes_body_forces:

@@ -135,9 +135,11 @@ class RaySensor(LazySensor):
         """Names of the r rays."""
         self._distance = torch.zeros(n, r, device=engine.device)
         self._missed = torch.zeros(n, r, dtype=torch.bool, device=engine.device)
-        self._hits = torch.zeros(n, r, 3, device=engine.device)
+        # x, y and z of all hits are one plane each: terms read the heights
+        planes = torch.zeros(3, n, r, device=engine.device)
+        self._hits = planes.movedim(0, 2)
         self._position = torch.zeros(n, 3, device=engine.device)
-        self._buffers = (self._distance, self._missed, self._hits, self._position)
+        self._buffers = (self._distance, self._missed, self._position, *planes.unbind(0))
 
     @property
     def distance(self) -> Tensor:
@@ -179,20 +181,34 @@ class RaySensor(LazySensor):
                 buffer.copy_(values)
 
     def _rays(self, position: Tensor, quat: Tensor, selection: Selection | None = None) -> tuple[Tensor, ...]:
-        """Return distances, misses, end points and sensor positions, in the order of `_buffers`."""
+        """Return distances, misses, sensor positions, and x, y and z of the end points, in the order of `_buffers`."""
         self._sim.forward_moved()
         axes = self._axes(quat)
         position = position + _rotated(axes, self._offset)[:, 0]
+        max_distance = self._config.max_distance
+        if self._table is not None:
+            x, y, z = self._down_from(position, axes)
+            distance, on_ground = self._table.depth(x, y, z)
+            missed = ((distance >= 0.0) & (distance <= max_distance) & on_ground).logical_not_()
+            distance.masked_fill_(missed, max_distance)
+            return distance, missed, position, x, y, z - distance
         points = position[:, None] + _rotated(axes, self._starts)
         directions = _rotated(axes, self._directions)
-        if self._table is not None:
-            found = self._table.distance(points)
-        else:
-            found = self._engine.rays(points, directions, groups=self._groups, exclude=self._body, selection=selection)
-        max_distance = self._config.max_distance
+        found = self._engine.rays(points, directions, groups=self._groups, exclude=self._body, selection=selection)
         missed = (found < 0.0) | (found > max_distance)
         distance = found.masked_fill_(missed, max_distance)
-        return distance, missed, points + directions * distance[..., None], position
+        return distance, missed, position, *(points + directions * distance[..., None]).unbind(2)
+
+    def _down_from(self, position: Tensor, axes: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return x and y of rays that point straight down, (rows, r) each, and their common height (rows, 1) [m]."""
+        ahead, left, _ = self._starts.unbind(1)
+        x, y, z = position[:, None].unbind(2)
+        if axes is None:
+            return x + ahead, y + left, z
+        (cos, sin, _), (across_x, across_y, _) = (axis[:, None].unbind(2) for axis in axes.unbind(1)[:2])
+        turned_x = (ahead * cos).add_(left * across_x)
+        turned_y = (ahead * sin).add_(left * across_y)
+        return turned_x.add_(x), turned_y.add_(y), z
 
     def _pose(self) -> tuple[Tensor, Tensor]:
         """Return position (num_envs, 3) and orientation (num_envs, 4) of the sensor's body."""

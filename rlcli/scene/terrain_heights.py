@@ -21,15 +21,23 @@ class HeightTable:
     def distance(self, points: Tensor) -> Tensor:
         """Return the distance from each point down to the ground; -1 if no ground is below. (..., 3) -> (...) [m]"""
         px, py, pz = points.unbind(-1)
-        half_x, half_y = self._half
-        x, y = (px + half_x) / self._resolution, (py + half_y) / self._resolution
-        i, j = x.floor().clamp_(0, self._nx - 2), y.floor().clamp_(0, self._ny - 2)
-        u, v = x - i, y - j
-        corner = i.long() * self._ny + j.long()
-        low, ahead, left, both = (self._heights.take(corner + step) for step in (0, self._ny, 1, self._ny + 1))
-        # the diagonal of a cell runs from `low` to `both`
-        rise = torch.where(u >= v, u * (ahead - low) + v * (both - ahead), v * (left - low) + u * (both - left))
-        on_field = (px.abs() <= half_x) & (py.abs() <= half_y)
-        on_ground = (px.abs() <= half_x + self._border) & (py.abs() <= half_y + self._border)
-        depth = pz - torch.where(on_field, low + rise, 0.0)
+        depth, on_ground = self.depth(px, py, pz)
         return torch.where(on_ground & (depth >= 0.0), depth, -1.0)
+
+    def depth(self, px: Tensor, py: Tensor, pz: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the height of points above the ground [m], and whether there is ground at their x and y. (...) each"""
+        half_x, half_y = self._half
+        x, y = (px + half_x).div_(self._resolution), (py + half_y).div_(self._resolution)
+        i, j = x.floor().clamp_(0, self._nx - 2), y.floor().clamp_(0, self._ny - 2)
+        u, v = x.sub_(i), y.sub_(j)
+        corner = torch.add(j.long(), i.long(), alpha=self._ny)
+        low, ahead, left, both = (self._heights.take(corner + step) for step in (0, self._ny, 1, self._ny + 1))
+        # the diagonal of a cell runs from `low` to `both`: u runs along one of the two other sides, v along the other
+        first = u >= v
+        along = torch.where(first, ahead - low, both - left)
+        across = torch.where(first, both - ahead, left - low)
+        ground = u.mul_(along).add_(v.mul_(across)).add_(low)
+        far_x, far_y = px.abs(), py.abs()
+        ground.masked_fill_(((far_x <= half_x) & (far_y <= half_y)).logical_not_(), 0.0)
+        on_ground = (far_x <= half_x + self._border) & (far_y <= half_y + self._border)
+        return torch.sub(pz, ground), on_ground

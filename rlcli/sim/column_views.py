@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,6 +23,14 @@ def as_index(positions: Sequence[int], device: torch.device | None = None) -> Co
     first = positions[0] if len(positions) else 0
     if list(positions) == list(range(first, first + len(positions))):
         return _consecutive(first, first + len(positions))
+    return torch.tensor(list(positions), dtype=torch.int64, device=device)
+
+
+def evenly_spaced(positions: Sequence[int], device: torch.device | None = None) -> Columns:
+    """Return positions as a slice if they are evenly spaced, or all the same (one column), else as a tensor."""
+    steps = {after - before for before, after in itertools.pairwise(positions)} or {1}
+    if len(positions) and len(steps) == 1 and min(steps) >= 0:
+        return slice(positions[0], positions[-1] + 1, min(steps) or 1)
     return torch.tensor(list(positions), dtype=torch.int64, device=device)
 
 

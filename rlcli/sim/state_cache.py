@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from rlcli.sim.engine import Engine
-from rlcli.sim.selection import Selection, ids_of
+from rlcli.sim.selection import Columns, Selection, ids_of
 
 
 def is_finite(values: Tensor) -> bool:
@@ -39,6 +40,9 @@ class SimData:
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
         """Number of updates; a cached value with an older stamp is out of date."""
+        self.command_stamp = 0
+        """Number of updates of the commands."""
+        self._goals: dict[tuple[object, ...], tuple[int, int, Tensor]] = {}
         self._saved_at, self._summed = -1, (-1, 0.0)
         self._moved: Selection | None = None
         self._derived: dict[str, tuple[int, Tensor]] = {}
@@ -117,6 +121,21 @@ class SimData:
             value = self.engine.field(name).float()
             self._derived[name] = (self.stamp, value)
         return value
+
+    def once_per_goal(self, key: tuple[object, ...], compute: Callable[[], Tensor]) -> Tensor:
+        """Return a value of the state and the commands, which is computed once for all terms of a step."""
+        state, commands, value = self._goals.get(key, (-1, -1, None))
+        if value is None or state != self.stamp or commands != self.command_stamp:
+            value = compute()
+            self._goals[key] = (self.stamp, self.command_stamp, value)
+        return value
+
+    def derived_columns(self, name: str, columns: Columns) -> Tensor:
+        """Return `derived_field(name)[:, columns]`; only these columns are cast. (num_envs, k, ...)"""
+        self.forward_moved()
+        stamp, value = self._derived.get(name, (-1, None))
+        source = self.engine.field(name) if stamp != self.stamp or value is None else value
+        return source[:, columns].float()
 
 
 def _joined(left: Tensor, right: Tensor) -> Tensor | None:

@@ -75,7 +75,7 @@ def foot_slip_penalty(
 
     bodies: those of the sensor, in its order.
     """
-    speed = length(require_one_per_body(entity.data.body_lin_vel_w[:, bodies, :2], sensor))
+    speed = length(require_one_per_body(entity.data.body_lin_vel_of(bodies)[..., :2], sensor))
     return (speed * (strongest_force(sensor) > threshold)).sum(dim=1)
 
 
@@ -105,7 +105,7 @@ def foot_clearance_reward(
     z: height of the body above the environment's origin [m]. tanh_mult [s/m], std [m^2].
     """
     off = (entity.data.body_pos_w[:, bodies, 2] - env.origins[:, 2:3] - target_height).square_()
-    moving = torch.tanh(tanh_mult * length(entity.data.body_lin_vel_w[:, bodies, :2]))
+    moving = torch.tanh(tanh_mult * length(entity.data.body_lin_vel_of(bodies)[..., :2]))
     return torch.exp(-(off * moving).sum(dim=1) / std)
 
 

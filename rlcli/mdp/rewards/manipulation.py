@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rlcli.mdp.parameters import Command, Entity, ManagedEnv
-from rlcli.mdp.term_helpers import HandleTerm, goal_in_world, goal_quat_in_world, single
+from rlcli.mdp.term_helpers import HandleTerm, angle_to_goal, distance_to_goal, goal_in_world, single
 from rlcli.sim.rotations import axis_x, axis_y, axis_z, length, turn_between
 from rlcli.task import Bodies, Joints, Sites
 
@@ -17,21 +17,19 @@ from rlcli.task import Bodies, Joints, Sites
 
 def position_command_error(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command) -> Tensor:
     """Distance from a body to the goal of a pose command [m]. (num_envs,)"""
-    return length(single(entity.data.body_pos_w[:, bodies], "body") - goal_in_world(entity, command))
+    return distance_to_goal(entity, bodies, command)
 
 
 def position_command_error_tanh(
     env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command, std: float
 ) -> Tensor:
     """1 - tanh(distance / std), the distance from a body to the goal of a pose command; std [m]. (num_envs,)"""
-    return _near(length(single(entity.data.body_pos_w[:, bodies], "body") - goal_in_world(entity, command)), std)
+    return _near(distance_to_goal(entity, bodies, command), std)
 
 
 def orientation_command_error(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command) -> Tensor:
     """Angle between a body's orientation and the goal of a pose command [rad]. (num_envs,)"""
-    return turn_between(
-        single(entity.data.body_quat_w[:, bodies], "body").contiguous(), goal_quat_in_world(entity, command)
-    )
+    return angle_to_goal(entity, bodies, command)
 
 
 def orientation_command_error_tanh(
