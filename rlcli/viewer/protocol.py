@@ -23,7 +23,7 @@ REQUEST_KEYS: dict[str, tuple[int, str | None]] = {
     "newer checkpoint": (266, "PageUp"), "older checkpoint": (267, "PageDown"), "previous command": (268, None),
     "next command": (269, None), "raise command": (260, None), "lower command": (261, None),
 }  # fmt: skip
-"""Request of the playback -> its key: code in GLFW, name in Dear ImGui; None: the browser's viewer has no such key.
+"""Request of the playback -> its key: code in GLFW, name in Dear ImGui (None: the browser's viewer has no such key).
 
 A viewer with other key codes has its own table in its module. The names of the requests are those of
 `Playback.requests`.
@@ -39,8 +39,8 @@ class Viewer(Protocol):
     def __call__(self, playback: Playback, *, title: str, num_drawn: int, port: int, ready: Ready) -> None:
         """Show the playback in real time.
 
-        A viewer lets `KeyboardInterrupt` through: Ctrl-C ends the command. A viewer writes nothing to stdout, which is for
-        results; the caller prints the lines that `ready` receives.
+        A viewer lets `KeyboardInterrupt` through: Ctrl-C ends the command. A viewer writes nothing to stdout, which is
+        for results; the caller prints the lines that `ready` receives.
 
         Args:
             playback: environments and policy.
