@@ -128,7 +128,7 @@ def test_source_archive_contents(archives):
     needed = ["LICENSE", "README.md", "CHANGELOG.md", "pyproject.toml", "constraints.txt", "Makefile", "rlcli/py.typed"]
     needed += ["docs/index.md", "docs/conf.py", "tests/conftest.py", "tasks/rlcli_tasks/index.json"]
     assert set(needed) <= names
-    assert not [name for name in names if re.search(r"__pycache__|\.pyc$|^runs/|_build|\.egg-info|junk\.txt", name)]
+    assert not [name for name in names if re.search(r"__pycache__|\.pyc$|^runs/|_build/|\.egg-info|junk\.txt", name)]
 
 
 @pytest.mark.slow
