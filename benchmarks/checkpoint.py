@@ -20,7 +20,7 @@ from machine import describe
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.registry import find_task, load_object
-from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.training.checkpoint_writer import CheckpointWriter, Keep
 
 AGENT = """

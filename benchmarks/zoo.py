@@ -210,7 +210,7 @@ def collect(task: str, runs: list[Path], hardware: str | None, ship: bool, known
 
 def _ship(task: str, run: Any, checkpoint: Path, evaluation: dict[str, Any]) -> None:
     from rlcli.runs.bundle import write_bundle
-    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.checkpoint_reader import open_checkpoint
 
     write_bundle(open_checkpoint(checkpoint), find_task(task).root / "policies" / task, run, evaluation)
 
@@ -226,7 +226,7 @@ def adopt(task: str, other: str) -> None:
     from rlcli.envs.make import make_env
     from rlcli.runs.atomic_io import to_json
     from rlcli.runs.bundle import write_bundle
-    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.checkpoint_reader import open_checkpoint
 
     entry, source = entries()[task], find_task(task)
     given = open_checkpoint(find_task(other).root / "policies" / other)

@@ -9,13 +9,14 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
+import tomllib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import griffe
 
-from rlcli.config.term_reference import TermEntry, term_entries, type_text, yaml_text
+from rlcli.config.term_docs import TermEntry, term_entries, type_text, yaml_text
 
 DOCS = Path(__file__).resolve().parent
 PUBLIC = DOCS / "public-names.txt"
@@ -45,6 +46,9 @@ MODULES = {
     "rlcli.sim.selection": "Selections of environments",
     "rlcli.sim.rotations": "Rotations",
     "rlcli.rl.trainer": "Trainers",
+    "rlcli.rl.trainer_base": "Base class of trainers",
+    "rlcli.rl.budget": "Budget of a training",
+    "rlcli.rl.nan_check": "Checks for NaN and infinity",
     "rlcli.rl.policy": "Policies",
     "rlcli.rl.statistics": "Episode statistics",
     "rlcli.rl.optimizers": "Optimizers",
@@ -55,7 +59,11 @@ MODULES = {
     "rlcli.testing": "Contract checks",
 }
 """Modules with public names -> titles of their pages."""
-TRAINERS = {"ppo": "rlcli.rl.ppo.config", "sb3": "rlcli.rl.sb3.config"}
+_PROJECT = tomllib.loads((DOCS.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+TRAINERS = {
+    name: object_reference.partition(":")[0]
+    for name, object_reference in _PROJECT["entry-points"]["rlcli.trainers"].items()
+}
 """Built-in trainers -> the modules with their `SPEC`."""
 SECTIONS = {
     "observations": "Values that the policy or the critic receives, one row per environment.",

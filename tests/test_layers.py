@@ -4,6 +4,7 @@ import ast
 import functools
 import subprocess
 import sys
+import tomllib
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -19,7 +20,13 @@ LAYERS = """
     training  adapters  tuning  doctor  scaffold  api  cli  gym  pytest_plugin
 """
 """Lowest first. All names of the first line are one layer; each later name is a separate layer."""
-INNER = ["rl < rl.ppo rl.sb3", "mdp < mdp.rewards mdp.randomization", "cli.ui < cli.commands < cli.app"]
+TRAINERS = sorted(file.parent.name for file in PACKAGE.glob("rl/*/config.py"))
+"""Folders of the built-in trainers in `rl/`."""
+INNER = [
+    f"rl < {' '.join(f'rl.{name}' for name in TRAINERS)}",
+    "mdp < mdp.rewards mdp.randomization",
+    "cli.ui < cli.commands < cli.app",
+]
 """Orders within a folder: its own modules, and its subfolders."""
 ANYWHERE = {"rlcli", "rlcli.__main__"}
 """The package, which imports nothing, and the module that starts the command line."""
@@ -41,8 +48,7 @@ LIGHT = [
     "rl/trainer.py",
     "envs/observers.py",
     "training/signals.py",
-    "rl/sb3/config.py",
-    "rl/ppo/config.py",
+    *(f"rl/{name}/config.py" for name in TRAINERS),
     "rl/distributed.py",
     "evaluation/stress_params.py",
     "reporting/heat_map.py",
@@ -118,6 +124,12 @@ def folder(module):
 def test_every_module_belongs_to_a_layer():
     tops = {name.split(".")[1] for name in MODULES - ANYWHERE}
     assert tops == set(RANKS)
+
+
+def test_every_trainer_folder_has_an_entry_point():
+    entry_points = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["entry-points"]
+    registered = {place.partition(":")[0] for place in entry_points["rlcli.trainers"].values()}
+    assert registered == {f"rlcli.rl.{name}.config" for name in TRAINERS}
 
 
 def test_modules_import_only_own_and_lower_layers():

@@ -29,7 +29,7 @@ from torch import Tensor
 from rlcli.config.load import resolve
 from rlcli.deploy.env_description import describe
 from rlcli.deploy.export import TOLERANCE, relative_difference
-from rlcli.deploy.onboard_program import PROGRAM, generate_program, open_model, write_model, write_program
+from rlcli.deploy.verification_files import PROGRAM, generate_program, open_model, write_model, write_program
 from rlcli.envs.direct import DirectEnv
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
@@ -40,8 +40,8 @@ from rlcli.registry import TaskSource
 from rlcli.rl.acting import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators
-from rlcli.runs.checkpoint import Checkpoint
 from rlcli.runs.checkpoint_manifest import deployment_differences
+from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.policy_ref import Choice
 from rlcli.runs.restore import require_fit
 

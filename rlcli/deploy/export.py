@@ -25,8 +25,8 @@ from rlcli.deploy.metadata import metadata_of, mjlab_properties
 from rlcli.errors import MachineError, UsageError, VerdictError, require_known
 from rlcli.rl.policy import PolicySpec
 from rlcli.runs.atomic_io import sync_folder, write_synced
-from rlcli.runs.checkpoint import Checkpoint
 from rlcli.runs.checkpoint_manifest import deployment_of, layout_of
+from rlcli.runs.checkpoint_reader import Checkpoint
 
 __all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "refusal", "require_self_contained"]
 
@@ -101,7 +101,7 @@ def export(
     if reason is not None:
         raise UsageError(
             f"{checkpoint.folder} cannot be exported: its policy has {reason}",
-            hint="use the policy in Python: rlcli.runs.checkpoint.open_checkpoint(FOLDER).policy()",
+            hint="use the policy in Python: rlcli.runs.checkpoint_reader.open_checkpoint(FOLDER).policy()",
         )
     layout = layout_of(checkpoint, policy)
     graph = DeployedPolicy(policy, layout.actions).eval().requires_grad_(False)

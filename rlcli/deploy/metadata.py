@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from rlcli.deploy.graph import DeployedPolicy
-from rlcli.runs.checkpoint import Checkpoint
 from rlcli.runs.checkpoint_manifest import ActionColumns, DeploymentRecord, LayoutRecord, ObservationColumns
+from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.run import RECORD
 
 SCHEMA = 2

@@ -7,8 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from rlcli.doctor.check import Check
+from rlcli.doctor.compute_and_graphics import check_isolated
 from rlcli.doctor.installation import entry_checks, installation_checks, metadata_checks
-from rlcli.doctor.isolated_checks import check_isolated
 from rlcli.doctor.machine import machine_checks
 from rlcli.doctor.settings import settings_checks
 from rlcli.registry import FORMATS, TASKS, TRAINERS

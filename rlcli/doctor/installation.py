@@ -122,7 +122,7 @@ def _mujoco_packages() -> Check:
         return Check("mujoco packages", "ok", _listed(first), details=first)
     newest = max((found for found in first.values() if found), key=release_numbers, default=None)
     wanted = f"mujoco=={first['mujoco'] or newest}" if newest else "mujoco"
-    # uninstall first: see isolated_checks.REINSTALL
+    # uninstall first: see compute_and_graphics.REINSTALL
     hint = f'pip uninstall -y {" ".join(TRIPLE)} && pip install "{wanted}"'
     return Check("mujoco packages", "broken", "; ".join(dict.fromkeys(bad)), hint, first)
 

@@ -27,7 +27,7 @@ from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
 from rlcli.scene.joint_setup import ActuatorNeed
 from rlcli.scene.scene import Scene
-from rlcli.sim.acceleration_stage import add_body_forces
+from rlcli.sim.acceleration_fields import add_body_forces
 from rlcli.sim.markers import Marker
 from rlcli.sim.selection import Field, Selection
 from rlcli.sim.tensor_state import require_matching_tensors, substate

@@ -198,7 +198,7 @@ def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
 
     from rlcli.random import derive
     from rlcli.rl.acting import random_policy, trained_policy, zero_policy
-    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.checkpoint_reader import open_checkpoint
     from rlcli.runs.restore import require_fit
 
     torch.set_num_threads(1)

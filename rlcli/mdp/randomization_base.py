@@ -12,9 +12,9 @@ from torch import Tensor
 
 from rlcli.errors import listing
 from rlcli.mdp.parameters import Entity
-from rlcli.mdp.ranges import Pair, Ranges
 from rlcli.mdp.term import Term
 from rlcli.mdp.term_helpers import column_numbers
+from rlcli.mdp.tunable_ranges import Pair, Ranges
 from rlcli.scene.model_fields import ModelField
 from rlcli.scene.names import NameProblem, match
 from rlcli.sim.rotations import from_euler, multiply

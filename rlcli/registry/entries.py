@@ -126,7 +126,8 @@ def find_entry(group: str, name: str, *, what: str) -> Entry:
     distributions = listing(sorted({f"{e.distribution} {e.version}" for e in entries}))
     similar = did_you_mean(name, [*names, *(e.qualified for e in entries)] if ":" in name else names)
     installed = f"installed: {listing(names)} (from {distributions})"
-    raise TaskError(f"no {what} '{name}'", hint=f"{similar} {installed}" if similar else installed)
+    hint = f"{similar} {installed}" if similar else f"{installed}; if its entry point is new, install the package again"
+    raise TaskError(f"no {what} '{name}'", hint=hint)
 
 
 def unreadable_distributions() -> list[Broken]:

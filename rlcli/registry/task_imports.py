@@ -13,8 +13,8 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
-from rlcli.registry.aliases import aliases_resolved
 from rlcli.registry.imports import contain_side_effects
+from rlcli.registry.module_aliases import aliases_resolved
 
 _imported: dict[tuple[Path, str], None] = {}
 """Imported task files, in order, with the name of the function that imported them."""

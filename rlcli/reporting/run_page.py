@@ -26,7 +26,7 @@ from rlcli.reporting.card_text import number
 from rlcli.reporting.curves import AXES, Curve, gather
 from rlcli.reporting.panels import choose
 from rlcli.reporting.task_card import Card, card, task_card
-from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.config_diff import as_text
 from rlcli.runs.restore import recorded_task, resolve_run
 from rlcli.runs.run import Run
@@ -136,7 +136,7 @@ def _layout(checkpoint: Path | None) -> dict[str, Any] | None:
 
 
 def _add_charts(curve: Curve, page: Page) -> None:
-    from rlcli.reporting.figures import legend_of, panel_svg
+    from rlcli.reporting.panel_plots import legend_of, panel_svg
 
     panels = choose([curve])
     if not panels:

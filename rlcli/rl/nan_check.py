@@ -16,13 +16,16 @@ from rlcli.sim.state_cache import is_finite
 LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint is kept"
 
 
-def require_finite(tensors: Iterable[tuple[str, Tensor]], iteration: int, axes: tuple[str, ...] = ()) -> None:
+def require_finite(
+    tensors: Iterable[tuple[str, Tensor]], iteration: int, axes: tuple[str, ...] = (), hint: str = LEARNER_HINT
+) -> None:
     """Check that all tensors are finite.
 
     Args:
         tensors: names and values in causal order: each tensor after those that it is computed from.
         iteration: number of the iteration, for the message.
         axes: names of the leading axes, such as `("step", "environment")`.
+        hint: what the user can do.
 
     Raises:
         DivergedError: with the first tensor that is not finite and the index of its first such value.
@@ -38,7 +41,7 @@ def require_finite(tensors: Iterable[tuple[str, Tensor]], iteration: int, axes: 
         raise DivergedError(
             f"{name} is not finite{count}{f' ({where})' if where else ''}, in iteration {iteration}; the tensors before"
             " it are finite",
-            hint=LEARNER_HINT,
+            hint=hint,
         )
 
 
@@ -56,6 +59,12 @@ def require_finite_learner(
     metrics: Mapping[str, float], modules: Mapping[str, nn.Module], iteration: int, hint: str = LEARNER_HINT
 ) -> None:
     """Check that the metrics of an update and all weights are finite.
+
+    Args:
+        metrics: metrics that must be finite, by name.
+        modules: modules whose weights are checked, by the name for the message.
+        iteration: number of the iteration, for the message.
+        hint: what the user can do.
 
     Raises:
         DivergedError: with the first metric or weight that is not finite.

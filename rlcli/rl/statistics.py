@@ -36,7 +36,7 @@ class EpisodeStatistics:
         self.total = 0
 
     def add(self, episodes: Episodes | None) -> None:
-        """Add the episodes that ended in a step."""
+        """Add the episodes that ended in a step; `replace(episodes, mask=...)` counts only some of them."""
         if episodes is None:
             return
         values = {"return": episodes.returns, **{f"term.{k}": v for k, v in episodes.reward_terms.items()}}

@@ -23,6 +23,9 @@ _RECENT_OBS = 256
 class BaseTrainer(ABC):
     """Trainer with an environment, episode statistics, recent observations and a report.
 
+    A subclass sets `spec`, implements `policy_tensors` and the members of `rlcli.rl.trainer.Trainer` that are missing
+    here, and returns the result of `make_report` from `iterate`.
+
     Args:
         env: the environment.
         torch_threads: threads of torch in the update. In the rollout torch has one thread, so that its thread pool does
@@ -36,23 +39,26 @@ class BaseTrainer(ABC):
         self.env, self.torch_threads = env, torch_threads
         env.final_obs_of = "truncated"
         self.statistics = EpisodeStatistics(env.config.episode_length_s)
-        self._recent_obs = torch.zeros(0, env.layout.size("policy"), device=env.device)
+        """Statistics of the episodes that end in the rollout: call `statistics.add(result.episodes)` in every step."""
+        self.recent_obs = torch.zeros(0, env.layout.size("policy"), device=env.device)
+        """Newest observations of the policy, at most 256 rows; `observations` of the group `trainer` in a checkpoint.
+        (n, d)"""
 
     @abstractmethod
-    def _policy_tensors(self) -> dict[str, Tensor]:
-        """Return copies of the policy's weights, by their names in a saved policy."""
+    def policy_tensors(self) -> dict[str, Tensor]:
+        """Return copies of the policy's weights on the CPU, by their names in a saved policy."""
 
     def policy(self) -> Policy:
         """Return the current policy, ready to be deployed, with a copy of the weights."""
         policy = Policy(self.spec)
-        policy.load_state_dict(self._policy_tensors())
+        policy.load_state_dict(self.policy_tensors())
         return policy.eval().requires_grad_(False)
 
-    def _keep_recent_obs(self, obs: Tensor) -> None:
+    def keep_recent_obs(self, obs: Tensor) -> None:
         """Keep the newest observations of the policy. (num_envs, d)"""
-        self._recent_obs = torch.cat([obs[:_RECENT_OBS], self._recent_obs])[:_RECENT_OBS]
+        self.recent_obs = torch.cat([obs[:_RECENT_OBS], self.recent_obs])[:_RECENT_OBS]
 
-    def _split_seconds(self, before: Mapping[str, float], rollout: float, update: float) -> dict[str, float]:
+    def split_seconds(self, before: Mapping[str, float], rollout: float, update: float) -> dict[str, float]:
         """Return the duration of each part of an iteration [s].
 
         Args:
@@ -63,7 +69,7 @@ class BaseTrainer(ABC):
         physics, step = (self.env.seconds[name] - before[name] for name in ("physics", "step"))
         return {"physics": physics, "task": step - physics, "policy": rollout - step, "update": update}
 
-    def _report(self, losses: Mapping[str, float], seconds: dict[str, float]) -> Report:
+    def make_report(self, losses: Mapping[str, float], seconds: dict[str, float]) -> Report:
         """Return the report of an iteration: episode statistics, metrics of the task and losses."""
         return Report({**self.statistics.flush(), **finite_values(self.env.extras()), **losses}, seconds)
 

@@ -19,8 +19,8 @@ from pydantic import Field
 
 from rlcli.errors import CheckpointError, UsageError, VerdictError
 from rlcli.runs.atomic_io import disk_errors, sync_folder, to_json, write_synced
-from rlcli.runs.checkpoint import FORMAT, Checkpoint, open_checkpoint, sha256
 from rlcli.runs.checkpoint_manifest import layout_of
+from rlcli.runs.checkpoint_reader import FORMAT, Checkpoint, open_checkpoint, sha256
 from rlcli.runs.run import Run, TaskRecord
 from rlcli.runs.safe_io import JSON_LIMIT, FileModel, Word, check_json, parse_json, read_file
 

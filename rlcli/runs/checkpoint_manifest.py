@@ -11,7 +11,7 @@ from pydantic import ConfigDict, Field, JsonValue, model_validator
 
 from rlcli.errors import CheckpointError
 from rlcli.rl.policy import Policy
-from rlcli.runs.checkpoint import Checkpoint
+from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.safe_io import FileModel, check_json
 
 Name = Annotated[str, Field(max_length=1000)]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import CheckpointError, UsageError
-from rlcli.runs.checkpoint import open_checkpoint, steps
+from rlcli.runs.checkpoint_reader import open_checkpoint, steps
 from rlcli.runs.provenance import differences
 from rlcli.runs.run import Run, create_run
 from rlcli.runs.run_diff import last_iteration

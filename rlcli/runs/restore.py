@@ -15,7 +15,7 @@ from rlcli.errors import CheckpointError, TaskError
 from rlcli.registry import TASKS, TaskSource, find_entry, folder_task, installed_task, python_task
 from rlcli.rl.policy import Policy
 from rlcli.runs import trusted_tasks
-from rlcli.runs.checkpoint import Checkpoint
+from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.run import Run
 from rlcli.runs.safe_io import read_errors, require_inside
 

@@ -16,7 +16,7 @@ from rlcli.runs.run import Run
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from rlcli.runs.checkpoint import Checkpoint
+    from rlcli.runs.checkpoint_reader import Checkpoint
 
 SECTIONS = ("configuration", "environment", "metrics", "weights", "policy")
 """Parts of the comparison, causes before their effects: a difference may explain those of later parts."""
@@ -208,14 +208,14 @@ def _policies(left: Run, right: Run, until: int | None) -> Section:
 
 
 def _common_steps(left: Run, right: Run, until: int | None) -> list[int]:
-    from rlcli.runs.checkpoint import steps
+    from rlcli.runs.checkpoint_reader import steps
 
     common = set(steps(left.checkpoints)) & set(steps(right.checkpoints))
     return sorted(step for step in common if until is None or step <= until)
 
 
 def _open_checkpoint(run: Run, step: int) -> Checkpoint:
-    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.checkpoint_reader import open_checkpoint
 
     return open_checkpoint(run.checkpoints / f"{step:012d}")
 

@@ -94,7 +94,7 @@ def find_checkpoint(
     Raises:
         CheckpointError: if there is no such checkpoint.
     """
-    from rlcli.runs.checkpoint import steps
+    from rlcli.runs.checkpoint_reader import steps
 
     folder = Path(reference)
     if os.path.isfile(folder / "manifest.json"):  # Path.is_file raises an error for a name that is too long
@@ -124,7 +124,7 @@ def find_checkpoint(
 
 def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Path, str]:
     """Return the newest valid checkpoint and the reason for the choice; warn of each newer, corrupt one."""
-    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.checkpoint_reader import open_checkpoint
 
     for skipped, step in enumerate(reversed(have)):
         folder = run.checkpoints / f"{step:012d}"

@@ -16,7 +16,7 @@ from rlcli.errors import TaskError
 from rlcli.scene.entity_data import EntityData
 from rlcli.scene.joint_setup import model_actuator_kind
 from rlcli.scene.names import match
-from rlcli.sim.acceleration_stage import sensor_columns
+from rlcli.sim.acceleration_fields import sensor_columns
 from rlcli.sim.column_views import as_index, id_tensor
 from rlcli.sim.engine import Engine
 from rlcli.sim.rotations import rotate, rotate_inverse

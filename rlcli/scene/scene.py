@@ -17,7 +17,7 @@ from rlcli.scene.joint_setup import SceneJoints
 from rlcli.scene.names import SceneProblem
 from rlcli.scene.sensor_builder import SensorBuilder, SensorSpec
 from rlcli.scene.terrain import Ground, add_ground, make_ground, terrain_problems
-from rlcli.sim.mujoco_log import quiet_mujoco
+from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 _OPTIONS = (
     "integrator", "cone", "jacobian", "solver", "tolerance", "ls_tolerance", "noslip_tolerance", "iterations",

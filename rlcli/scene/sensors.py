@@ -14,7 +14,7 @@ from rlcli.scene.entity import Entity
 from rlcli.scene.lazy_sensor import LazySensor
 from rlcli.scene.sensor_builder import CameraSensorSpec, ContactSensorSpec, RaySensorSpec, SensorSpec
 from rlcli.scene.terrain_heights import HeightTable
-from rlcli.sim.acceleration_stage import sensor_columns
+from rlcli.sim.acceleration_fields import sensor_columns
 from rlcli.sim.column_views import as_index
 from rlcli.sim.rotations import rotate
 from rlcli.sim.selection import Selection

@@ -23,7 +23,7 @@ import numpy as np
 from rlcli.errors import one_line
 from rlcli.machine import read_plain
 from rlcli.registry import chosen_model, model_file
-from rlcli.sim.mujoco_log import quiet_mujoco
+from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 _MAX_TEXT = 16 * 1024 * 1024
 _MAX_ASSET = 256 * 1024 * 1024

@@ -18,7 +18,7 @@ from rlcli.config.schema import SimConfig
 from rlcli.errors import did_you_mean
 from rlcli.machine import available_cores
 from rlcli.sim import divergence_report as report
-from rlcli.sim.acceleration_stage import ACCELERATION_FIELDS, force_sensors
+from rlcli.sim.acceleration_fields import ACCELERATION_FIELDS, force_sensors
 from rlcli.sim.batch_model import engine_call
 from rlcli.sim.batch_state import BatchState
 from rlcli.sim.mujoco_private import STATE_FIELDS, forward_of, without_profiler

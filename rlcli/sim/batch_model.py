@@ -17,8 +17,8 @@ from torch import Tensor
 from rlcli import machine
 from rlcli.errors import DeviceError, DivergedError, did_you_mean, one_line
 from rlcli.sim.divergence_report import MORE_MEMORY
-from rlcli.sim.mujoco_log import quiet_mujoco
 from rlcli.sim.mujoco_private import expand_disable_flags, expanded_fields, make_batch, without_profiler
+from rlcli.sim.quiet_mujoco import quiet_mujoco
 from rlcli.sim.selection import Selection, ids_of
 from rlcli.sim.skippable_work import skippable_flags
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rlcli.config.schema import SimConfig
 from rlcli.sim import warp_kernels
-from rlcli.sim.acceleration_stage import force_sensors
+from rlcli.sim.acceleration_fields import force_sensors
 from rlcli.sim.column_views import as_index
 from rlcli.sim.divergence_report import STATE_LIMIT, Divergence, StateLayout
 from rlcli.sim.mask_selection import MaskSelection

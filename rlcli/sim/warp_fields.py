@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 
-from rlcli.sim.acceleration_stage import ACCELERATION_FIELDS, force_sensors
+from rlcli.sim.acceleration_fields import ACCELERATION_FIELDS, force_sensors
 
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
 """Fields of the state, which every reset restores."""

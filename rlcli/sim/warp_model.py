@@ -17,7 +17,7 @@ from torch import Tensor
 from rlcli.config.schema import SimConfig
 from rlcli.errors import did_you_mean
 from rlcli.sim.capacity import required_capacity
-from rlcli.sim.mujoco_log import quiet_mujoco
+from rlcli.sim.quiet_mujoco import quiet_mujoco
 from rlcli.sim.selection import Selection
 from rlcli.sim.warp_memory import put_on_device
 

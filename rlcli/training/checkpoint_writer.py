@@ -21,7 +21,7 @@ from rlcli.replay.failure_cases import FOLDER
 from rlcli.replay.failure_recorder import FailureBatch, FailureRecorder
 from rlcli.rl.trainer import Rows, TrainerState
 from rlcli.runs.atomic_io import disk_errors, sync_folder, to_json, write_atomic, write_synced
-from rlcli.runs.checkpoint import FORMAT, LOG_FOLDER, Checkpoint, Shard, open_checkpoint, sha256, steps
+from rlcli.runs.checkpoint_reader import FORMAT, LOG_FOLDER, Checkpoint, Shard, open_checkpoint, sha256, steps
 from rlcli.runs.run import Run
 
 _SHARD_BYTES = 64 << 20

@@ -12,7 +12,7 @@ from rlcli.runs.run import Run
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
-    from rlcli.runs.checkpoint import Checkpoint
+    from rlcli.runs.checkpoint_reader import Checkpoint
 
 
 @dataclass(slots=True)

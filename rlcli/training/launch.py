@@ -182,7 +182,7 @@ def run_record(request: TrainingRequest, resolved: Resolved, device: str) -> dic
 
 def resume_run(request: TrainingRequest) -> Job | TrainingResult:
     """Open and lock a run to continue it; if it is finished and has no new budget, return its result instead."""
-    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.checkpoint_reader import open_checkpoint
     from rlcli.runs.restore import resolve_run
 
     run, folder, why = _find_checkpoint(request)
@@ -252,7 +252,7 @@ def setup_job(
 
 def _job_of_other_rank(message: dict[str, Any], request: TrainingRequest, resolved: Resolved | None) -> Job:
     """Return the job of another rank for the message of rank 0; other ranks do not write the run."""
-    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.checkpoint_reader import open_checkpoint
     from rlcli.runs.restore import resolve_run
 
     folder = Path(message["run"])
@@ -337,7 +337,7 @@ def _find_checkpoint(request: TrainingRequest) -> tuple[Run, Path | None, str]:
 
     The checkpoint is None if the run ended before its first checkpoint.
     """
-    from rlcli.runs.checkpoint import steps
+    from rlcli.runs.checkpoint_reader import steps
     from rlcli.runs.run_ref import find_checkpoint, find_run
 
     assert request.resume is not None

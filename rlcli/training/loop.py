@@ -14,7 +14,7 @@ from rlcli.errors import DivergedError, Stopped
 from rlcli.rl import distributed
 from rlcli.rl.budget import Budget
 from rlcli.rl.trainer import Report, Trainer
-from rlcli.runs import checkpoint
+from rlcli.runs import checkpoint_reader
 from rlcli.runs.run import Run
 from rlcli.training.checkpoint_writer import CheckpointWriter
 from rlcli.training.periodic_eval import PeriodicEval
@@ -187,7 +187,7 @@ class TrainLoop:
     def _stopped(self, message: str) -> Stopped:
         """Return the error of a stopped run, with the command that resumes it."""
         hint = f"rlcli train --resume {shlex.quote(str(self.run.folder))}"
-        have_checkpoint = checkpoint.steps(self.run.checkpoints)
+        have_checkpoint = checkpoint_reader.steps(self.run.checkpoints)
         return Stopped(message, exit_code=self.stop.exit_code, hint=hint if have_checkpoint else None)
 
 

@@ -19,7 +19,7 @@ from rlcli.replay.crash_dump import CrashDumper
 from rlcli.replay.failure_recorder import open_failure_recorder
 from rlcli.rl.budget import Budget
 from rlcli.rl.trainer import Trainer
-from rlcli.runs.checkpoint import steps
+from rlcli.runs.checkpoint_reader import steps
 from rlcli.runs.provenance import built_record, differences, environment_record
 from rlcli.runs.restore import resolve_run
 from rlcli.training.checkpoint_writer import CheckpointWriter, Keep, manifest_entries

@@ -14,7 +14,7 @@ from typing import Any
 from rlcli.config.dump import to_data, to_yaml
 from rlcli.errors import CheckpointError, DivergedError, RlcliError, UsageError
 from rlcli.evaluation.limits import require_success
-from rlcli.runs.index import newest_rows, overview
+from rlcli.runs.overview import newest_rows, overview
 from rlcli.runs.run import CONFIG, Run
 from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.loggers import read_metrics

@@ -12,7 +12,7 @@ from typing import Any
 from rlcli.config.load import Resolved
 from rlcli.errors import DivergedError, RlcliError, UsageError, did_you_mean, listing
 from rlcli.evaluation.limits import require_success
-from rlcli.runs.index import newest_rows, overview
+from rlcli.runs.overview import newest_rows, overview
 from rlcli.runs.run import Run, open_run
 from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.signals import StopRequest

@@ -13,10 +13,10 @@ from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved
 from rlcli.errors import CheckpointError, DependencyError
 from rlcli.reporting.curves import AXES, Curve, Line, gather
-from rlcli.reporting.figures import check_drawing, picture
+from rlcli.reporting.panel_plots import check_drawing, picture
 from rlcli.reporting.panels import choose
 from rlcli.runs.atomic_io import write_atomic
-from rlcli.runs.index import overview
+from rlcli.runs.overview import overview
 from rlcli.runs.run import open_run
 from rlcli.runs.study import create_study, read_study, runs_of
 from rlcli.training.launch import TrainingRequest, run_record

@@ -1,1 +1,1 @@
-"""Pictures of environments: offscreen video and a native window."""
+"""Pictures of environments: a native window, the browser, and offscreen videos."""

@@ -1,6 +1,7 @@
 """Interfaces between viewers and playback: the table of viewers, their protocol, and the state that they show.
 
-A new viewer is a module in this folder with a function of the protocol `Viewer`, and a line in `VIEWERS`.
+A new viewer is a module in this folder with a function of the protocol `Viewer`, and a line in `VIEWERS`. The section
+"A viewer" of CONTRIBUTING.md lists the other places that name the viewers.
 """
 
 from __future__ import annotations
@@ -22,7 +23,11 @@ REQUEST_KEYS: dict[str, tuple[int, str | None]] = {
     "newer checkpoint": (266, "PageUp"), "older checkpoint": (267, "PageDown"), "previous command": (268, None),
     "next command": (269, None), "raise command": (260, None), "lower command": (261, None),
 }  # fmt: skip
-"""Request of the playback -> its key: code in GLFW, name in Dear ImGui; None: the browser's viewer has no such key."""
+"""Request of the playback -> its key: code in GLFW, name in Dear ImGui (None: the browser's viewer has no such key).
+
+A viewer with other key codes has its own table in its module. The names of the requests are those of
+`Playback.requests`.
+"""
 
 Ready = Callable[[Sequence[str], str | None], None]
 """Receives lines of instructions for the user, and the viewer's address if it has one."""
@@ -34,12 +39,15 @@ class Viewer(Protocol):
     def __call__(self, playback: Playback, *, title: str, num_drawn: int, port: int, ready: Ready) -> None:
         """Show the playback in real time.
 
+        A viewer lets `KeyboardInterrupt` through: Ctrl-C ends the command. A viewer writes nothing to stdout, which is
+        for results; the caller prints the lines that `ready` receives.
+
         Args:
             playback: environments and policy.
             title: task and run, for the user.
-            num_drawn: number of environments in the picture.
-            port: port on the loopback interface, for a viewer that is a server; 0: any free port.
-            ready: called when the viewer is open.
+            num_drawn: number of environments in the picture: the shown one and those after it (`EnvGrid.others`).
+            port: port on the loopback interface; 0: any free port. A viewer that is not a server ignores it.
+            ready: the viewer calls it once, when it is open and before it draws the first picture.
 
         Raises:
             MachineError: if this machine cannot open the viewer.

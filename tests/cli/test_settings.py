@@ -1,13 +1,11 @@
 """User settings: their effects, their precedence, and the messages of a broken file."""
 
 import json
-import os
-import pty
-import subprocess
 import sys
 import typing
 
 import pytest
+from support.pseudo_terminal import run_on_terminal
 
 from rlcli.cli.ui import viewer_choice
 from rlcli.config.settings_file import read_settings
@@ -88,6 +86,9 @@ def test_preferred_viewer_applies_only_without_explicit_choice(monkeypatch):
         assert first(None, headless=True) == "none", "a file is written"
     with use_settings({"viewer": "native"}):
         assert first(None) == "none", "there is no display"
+    monkeypatch.setitem(viewer_choice.VIEWERS, "another", "another.module:run")
+    with use_settings({"viewer": "another"}):
+        assert first(None) == "another"
     with use_settings({"viewer": "none"}):
         assert first(None, port=8080) == "web", "a port is a viewer in the browser"
 
@@ -170,20 +171,10 @@ def test_settings_have_same_choices_as_flags():
     assert not {"tasks", "agent", "device", "seed"} & set(UserSettings.model_fields)
 
 
-def terminal_output(arguments, tmp_path, **variables):
-    """Return the output of a command on a terminal of 120 columns."""
-    leader, follower = pty.openpty()
-    env = {**os.environ, "TERM": "xterm", "COLUMNS": "120", **variables}
-    process = subprocess.Popen([sys.executable, "-m", "rlcli", *arguments], stdout=follower, env=env, cwd=tmp_path)
-    os.close(follower)
-    output = b""
-    try:
-        while chunk := os.read(leader, 65536):
-            output += chunk
-    except OSError:  # Linux raises this when the other end is closed
-        pass
-    os.close(leader)
-    assert process.wait() == 0
+def terminal_output(arguments, folder, **variables):
+    """Return the output of a command on a terminal."""
+    code, output = run_on_terminal(arguments, folder, **variables)
+    assert code == 0
     return output
 
 

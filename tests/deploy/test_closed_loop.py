@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rlcli.cli.app import main
-from rlcli.deploy import onboard_program
+from rlcli.deploy import verification_files
 from rlcli.runs.run_ref import find_checkpoint
 
 PUSHED = """
@@ -338,10 +338,10 @@ def test_model_with_mesh_files_is_written_as_binary(tmp_path):
     folder = tmp_path / "written"
     folder.mkdir()
     model = spec.compile()
-    file = onboard_program.write_model(spec, model, folder)
+    file = verification_files.write_model(spec, model, folder)
     assert list(folder.iterdir()) == [file]
     assert file.name == "model.mjb"
-    again = onboard_program.open_model(file)
+    again = verification_files.open_model(file)
     assert again.joint(0).name == "turn"
     np.testing.assert_array_equal(again.mesh_vert, model.mesh_vert)
 

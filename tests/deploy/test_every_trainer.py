@@ -8,6 +8,7 @@ import pytest
 
 from rlcli.cli.app import main
 from rlcli.deploy.export import FORMATS
+from rlcli.registry import OWN, TRAINERS, catalog
 from rlcli.rl.sb3.config import SPEC
 
 OFF_POLICY = (
@@ -50,6 +51,11 @@ for format_, output in zip(sys.argv[2::2], sys.argv[3::2]):
 
 def test_all_sb3_algorithms_are_covered():
     assert {*SB3} == {*SPEC.algorithms}
+
+
+def test_every_built_in_trainer_is_covered():
+    built_in = {entry.name for entry in catalog(TRAINERS)[0] if entry.distribution == OWN}
+    assert built_in <= {"sb3", *OTHERS}
 
 
 @pytest.mark.slow

@@ -120,7 +120,7 @@ def test_exported_file_runs_without_rlcli(newest, tmp_path, suffix):
     import numpy as np
 
     from rlcli.deploy.export import export
-    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.checkpoint_reader import open_checkpoint
 
     checkpoint, file = open_checkpoint(newest("cartpole sac")), tmp_path / f"policy{suffix}"
     export(checkpoint, file, {".onnx": "onnx", ".pt2": "torch"}[suffix])

@@ -22,7 +22,7 @@ from rlcli.deploy.export import export
 from rlcli.envs.make import make_env
 from rlcli.errors import VerdictError
 from rlcli.registry import find_task
-from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.restore import resolve_run
 from rlcli.runs.run import open_run
 from rlcli.runs.run_ref import find_run

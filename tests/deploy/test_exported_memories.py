@@ -11,7 +11,7 @@ from rlcli.deploy.export import FORMATS, export
 from rlcli.errors import UsageError
 from rlcli.rl.policy import Policy, PolicySpec
 from rlcli.rl.trainer import TrainerState
-from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.training.checkpoint_writer import write_checkpoint
 
 LAYOUT = {

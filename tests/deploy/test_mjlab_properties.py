@@ -5,7 +5,7 @@ import pytest
 
 from rlcli.deploy.export import export
 from rlcli.deploy.metadata import mjlab_properties
-from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint_reader import open_checkpoint
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import yaml
 from support.fenced import REPOSITORY
 
 from rlcli.config.schema import TaskConfig
-from rlcli.config.term_reference import term_entries
+from rlcli.config.term_docs import term_entries
 from rlcli.config.term_signatures import SECTIONS, params_model
 
 DOCS = REPOSITORY / "docs"
@@ -32,13 +32,18 @@ def test_committed_pages_equal_what_the_code_generates(reference):
     assert written <= set(now), "pages of modules that are gone"
 
 
+def test_every_built_in_trainer_is_in_the_guide(reference):
+    text = (DOCS / "guides" / "choose-a-trainer.md").read_text(encoding="utf-8")
+    assert [name for name in reference.TRAINERS if f"| `{name}` |" not in text] == []
+
+
 def test_every_key_of_every_term_has_a_meaning():
     silent = [f"{entry.name}.{key.name}" for entry in term_entries() for key in entry.keys if not key.description]
     assert silent == [], "add them to rlcli/mdp/term_keys.yaml"
 
 
 def test_every_meaning_is_of_a_key_that_exists():
-    from rlcli.config.term_reference import _key_texts
+    from rlcli.config.term_docs import _key_texts
 
     entries = term_entries()
     known = {key.name for entry in entries for key in entry.keys}

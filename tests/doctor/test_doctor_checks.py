@@ -5,9 +5,15 @@ import os
 
 import pytest
 
-from rlcli.doctor import isolated_checks
+from rlcli.doctor import compute_and_graphics
+from rlcli.doctor.compute_and_graphics import (
+    compute_checks,
+    gpu_checks,
+    graphics_check,
+    run_isolated,
+    shared_memory_check,
+)
 from rlcli.doctor.installation import installation_checks, violates_bounds
-from rlcli.doctor.isolated_checks import compute_checks, gpu_checks, graphics_check, run_isolated, shared_memory_check
 from rlcli.doctor.machine import machine_checks, memory_check
 from rlcli.doctor.settings import harmful_variables, settings_checks
 from rlcli.machine import memory_limit
@@ -107,7 +113,7 @@ def test_violates_bounds(wanted, found, bad):
 def test_mujoco_library_and_package_versions_differ():
     answer = {"torch": "2", "cuda": None, "threads": 2, "mujoco": "3.3.0", "mujoco_package": "4.0.0", "cores": [8, 8]}
     check = by_name(compute_checks(answer, ""))["mujoco"]
-    assert (check.state, check.hint) == ("broken", isolated_checks.REINSTALL)
+    assert (check.state, check.hint) == ("broken", compute_and_graphics.REINSTALL)
     assert "4.0.0" in check.found
     assert "3.3.0" in check.found
 
@@ -115,9 +121,9 @@ def test_mujoco_library_and_package_versions_differ():
 @pytest.mark.parametrize(
     ("reason", "hint"),
     [
-        ("ModuleNotFoundError: No module named 'mujoco._structs'", isolated_checks.REINSTALL),
+        ("ModuleNotFoundError: No module named 'mujoco._structs'", compute_and_graphics.REINSTALL),
         ("OSError: libtorch_cpu.so: no such file", "pip install --upgrade --force-reinstall torch"),
-        ("no answer within 30 s", isolated_checks.BUSY),
+        ("no answer within 30 s", compute_and_graphics.BUSY),
     ],
 )
 def test_failed_compute_check_has_matching_hint(reason, hint):
@@ -204,7 +210,7 @@ WARP = {"version": "1.19.0", "devices": ["H200"], "error": ""}
     ],
 )
 def test_gpu_checks_compare_driver_torch_and_warp(monkeypatch, change, state, said, hint):
-    monkeypatch.setattr(isolated_checks, "version", lambda _: "4.0.0")
+    monkeypatch.setattr(compute_and_graphics, "version", lambda _: "4.0.0")
     check = gpu_checks(({**GPU, "warp": WARP, **change}, ""))[0]
     assert (check.state, said in check.found) == (state, True), check.found
     assert hint is None or hint in check.hint

@@ -15,7 +15,7 @@ from test_bad_checkpoints import command, run_with_limits, snapshot
 from rlcli.cli.app import main
 from rlcli.errors import CheckpointError
 from rlcli.registry import find_task
-from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint_reader import open_checkpoint
 
 HELD = ("manifest.json", "policy.json", "policy.safetensors")
 

@@ -15,7 +15,7 @@ from support.fault_sizes import amount, chosen
 
 from rlcli.cli.app import main
 from rlcli.errors import CheckpointError
-from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint_reader import open_checkpoint
 
 SMALL = ("scene.num_envs=8", "sim.engine_threads=1", "agent.torch_threads=1", "--logger", "none", "-q")
 SAC = """

@@ -30,8 +30,8 @@ from rlcli.envs.make import make_env
 from rlcli.errors import CheckpointError
 from rlcli.registry import find_task
 from rlcli.rl.policy import load_policy
-from rlcli.runs.checkpoint import open_checkpoint
-from rlcli.training.import_checkpoint import read_rsl_rl, read_sb3
+from rlcli.runs.checkpoint_reader import open_checkpoint
+from rlcli.training.import_policy import read_rsl_rl, read_sb3
 
 ALGORITHMS = {"ppo": PPO, "a2c": A2C, "sac": SAC, "td3": TD3}
 OBSERVATIONS = 4
@@ -562,7 +562,7 @@ def test_tensor_that_is_not_a_plain_matrix_is_refused(name, form):
 
 
 def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
-    monkeypatch.setattr("rlcli.training.import_checkpoint.available_memory", lambda: 2**26)
+    monkeypatch.setattr("rlcli.training.import_policy.available_memory", lambda: 2**26)
     one = torch.zeros(1000, 1000)
     torch.save({"model_state_dict": {f"actor.{i}.weight": one for i in range(50)}}, "model.pt")
     assert "more than" in refused("rsl-rl", "model.pt")

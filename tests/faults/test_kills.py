@@ -17,7 +17,7 @@ from support.fault_sizes import SIZE, amount, chosen
 from support.run_comparison import assert_loads, assert_same_run, newest
 
 from rlcli.replay.trajectory import read_trajectory
-from rlcli.runs.checkpoint import steps
+from rlcli.runs.checkpoint_reader import steps
 
 SAC = """
 agents:

@@ -12,7 +12,7 @@ from support.fault_sizes import chosen
 from support.run_comparison import assert_loads, assert_same_run, newest
 
 from rlcli.errors import MachineError
-from rlcli.runs.checkpoint import steps
+from rlcli.runs.checkpoint_reader import steps
 from rlcli.runs.run import open_run
 from rlcli.training.loggers import read_metrics
 

@@ -11,7 +11,7 @@ from support.fault_sizes import SIZE, chosen
 from support.run_comparison import content, leftovers, newest, rows_of
 from support.small_trainings import AGENTS, ITERATIONS, Case, train
 
-from rlcli.runs.checkpoint import open_checkpoint, steps
+from rlcli.runs.checkpoint_reader import open_checkpoint, steps
 from rlcli.training import loop
 from rlcli.training.checkpoint_writer import Keep
 

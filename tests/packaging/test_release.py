@@ -14,6 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from support.fenced import REPOSITORY
+from support.source_copies import copy_sources
 from test_dependencies import pinned
 
 import rlcli
@@ -98,8 +99,7 @@ def test_no_dependency_has_copyleft_licence():
 def archives(tmp_path_factory):
     """The source archive, the wheel built from it, and a wheel built from another folder."""
     folder = tmp_path_factory.mktemp("archives")
-    ignored = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", ".hypothesis", "_build")
-    shutil.copytree(REPOSITORY, folder / "one" / "rlcli", ignore=ignored)
+    copy_sources(REPOSITORY, folder / "one" / "rlcli")
     shutil.copytree(folder / "one" / "rlcli", folder / "another" / "rlcli")
     for place in ("one", "another"):
         for junk in ("runs/cartpole/x/run.json", "rlcli/__pycache__/a.pyc", "docs/_build/x.html", "junk.txt"):
@@ -128,7 +128,7 @@ def test_source_archive_contents(archives):
     needed = ["LICENSE", "README.md", "CHANGELOG.md", "pyproject.toml", "constraints.txt", "Makefile", "rlcli/py.typed"]
     needed += ["docs/index.md", "docs/conf.py", "tests/conftest.py", "tasks/rlcli_tasks/index.json"]
     assert set(needed) <= names
-    assert not [name for name in names if re.search(r"__pycache__|\.pyc$|^runs/|_build|\.egg-info|junk\.txt", name)]
+    assert not [name for name in names if re.search(r"__pycache__|\.pyc$|^runs/|_build/|\.egg-info|junk\.txt", name)]
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from email.parser import Parser
 import pytest
 import yaml
 from support.fenced import REPOSITORY, Block, blocks, run_commands, shortened, success_rate, success_rates, write_files
+from support.source_copies import copy_sources
 
 import rlcli
 
@@ -24,8 +25,7 @@ pytestmark = pytest.mark.slow
 def build(source, folder):
     """Build a wheel from a copy of the sources, so that no build files are left in them."""
     copy = folder / "source" / source.name
-    ignored = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", "tests", ".*_cache", ".hypothesis")
-    shutil.copytree(source, copy, ignore=ignored)
+    copy_sources(source, copy, "tests")
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(copy)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -10,7 +10,7 @@ from support.saved_states import rehash, state_of
 
 from rlcli.errors import CheckpointError
 from rlcli.rl.trainer import Rows
-from rlcli.runs import checkpoint
+from rlcli.runs import checkpoint_reader
 from rlcli.training.checkpoint_writer import CheckpointWriter, Keep
 
 DIGEST = "0" * 64
@@ -46,7 +46,7 @@ def folder(good, tmp_path):
 
 
 def test_valid_checkpoint_is_read_completely(folder):
-    opened = checkpoint.open_checkpoint(folder)
+    opened = checkpoint_reader.open_checkpoint(folder)
     assert (opened.step, opened.iteration, opened.manifest["seed"]) == (300, 3, 7)
     state = opened.state()
     assert set(state.tensors) == {"policy", "trainer", "env", "rng"}
@@ -59,7 +59,7 @@ def test_valid_checkpoint_is_read_completely(folder):
 
 
 def test_tensors_refuses_a_part_above_its_limit(folder):
-    opened = checkpoint.open_checkpoint(folder)
+    opened = checkpoint_reader.open_checkpoint(folder)
     size = (folder / "env.safetensors").stat().st_size
     assert set(opened.tensors("env", size)) == {"x"}
     with pytest.raises(CheckpointError, match=r"env\.safetensors is too large"):
@@ -69,18 +69,18 @@ def test_tensors_refuses_a_part_above_its_limit(folder):
 
 
 def test_tensors_refuses_a_part_larger_than_memory(folder, monkeypatch):
-    monkeypatch.setattr(checkpoint, "available_memory", lambda: 90)
+    monkeypatch.setattr(checkpoint_reader, "available_memory", lambda: 90)
     with pytest.raises(CheckpointError, match=r"env\.safetensors is too large: .* at most 30 are read"):
-        checkpoint.open_checkpoint(folder).tensors("env")
+        checkpoint_reader.open_checkpoint(folder).tensors("env")
 
 
 def test_numbered_part_has_the_limit_of_its_kind(folder, monkeypatch):
     shutil.copy(folder / "env.safetensors", folder / "env.1.safetensors")
     edit_manifest(lambda m: m["files"].update({"env.1.safetensors": m["files"]["env.safetensors"]}))(folder)
-    monkeypatch.setitem(checkpoint._LIMITS, "env", 20)
+    monkeypatch.setitem(checkpoint_reader._LIMITS, "env", 20)
     for part in ("env", "env.1"):
         with pytest.raises(CheckpointError, match=rf"{part}\.safetensors is too large: .* at most 20 are read"):
-            checkpoint.open_checkpoint(folder).tensors(part)
+            checkpoint_reader.open_checkpoint(folder).tensors(part)
 
 
 def edit_manifest(change):
@@ -244,7 +244,7 @@ SHAPE = f"{HEADER}.shape"
 def test_corrupt_checkpoint_is_refused_with_the_reason(folder, damage, output):
     damage(folder)
     with pytest.raises(CheckpointError) as caught:
-        checkpoint.open_checkpoint(folder).verify(whole=True)
+        checkpoint_reader.open_checkpoint(folder).verify(whole=True)
     assert output in caught.value.message
     assert str(folder.parent) in caught.value.message
 
@@ -269,15 +269,15 @@ def test_corrupt_checkpoint_is_refused_with_the_reason(folder, damage, output):
 )
 def test_unusual_but_valid_checkpoint_is_read(folder, damage):
     damage(folder)
-    checkpoint.open_checkpoint(folder).verify(whole=True)
+    checkpoint_reader.open_checkpoint(folder).verify(whole=True)
 
 
 def test_log_files_with_different_columns_are_refused(folder):
     file = folder.parent / "logs/replay" / f"{12:012d}-{18:012d}.safetensors"
     data = safetensors.torch.save({"x": torch.zeros(6, 1)})
     file.write_bytes(data)
-    shard(1, size=len(data), sha256=checkpoint.sha256(data))(folder)
-    opened = checkpoint.open_checkpoint(folder).state().logs["replay"]
+    shard(1, size=len(data), sha256=checkpoint_reader.sha256(data))(folder)
+    opened = checkpoint_reader.open_checkpoint(folder).state().logs["replay"]
     assert set(opened.read(13, 15)) == {"x"}
     with pytest.raises(CheckpointError, match="'replay' differs in columns"):
         opened.read(10, 14)
@@ -287,21 +287,21 @@ def test_log_file_with_other_rows_than_its_name_is_refused(folder):
     file = folder.parent / "logs/replay" / f"{12:012d}-{18:012d}.safetensors"
     data = safetensors.torch.save({"x": torch.zeros(6, 1), "y": torch.zeros(5)})
     file.write_bytes(data)
-    shard(1, size=len(data), sha256=checkpoint.sha256(data))(folder)
+    shard(1, size=len(data), sha256=checkpoint_reader.sha256(data))(folder)
     with pytest.raises(CheckpointError, match=f"{file.name} is corrupt: 'y' lacks rows"):
-        checkpoint.open_checkpoint(folder).verify(whole=True)
+        checkpoint_reader.open_checkpoint(folder).verify(whole=True)
 
 
 @pytest.mark.parametrize("iteration", [None, "3", -1, True, 1.0])
 def test_checkpoint_without_an_iteration_cannot_be_resumed(folder, iteration):
     edit_manifest(lambda m: m.update(iteration=iteration))(folder)
     with pytest.raises(CheckpointError, match=r"manifest\.json is corrupt: iteration: expected a whole number"):
-        checkpoint.open_checkpoint(folder).iteration  # noqa: B018
+        checkpoint_reader.open_checkpoint(folder).iteration  # noqa: B018
 
 
 def test_verify_checks_only_the_policy_unless_whole(folder):
     (folder / "env.safetensors").write_bytes(b"gone")
-    opened = checkpoint.open_checkpoint(folder)
+    opened = checkpoint_reader.open_checkpoint(folder)
     opened.verify(whole=False)
     with pytest.raises(CheckpointError, match=r"env\.safetensors"):
         opened.verify(whole=True)
@@ -318,20 +318,20 @@ def test_open_checkpoint_refuses_other_folders(tmp_path, what):
     elif what == "empty":
         place.mkdir()
     with pytest.raises(CheckpointError, match=r"place is not a checkpoint: it has no manifest\.json"):
-        checkpoint.open_checkpoint(place)
+        checkpoint_reader.open_checkpoint(place)
 
 
 def test_checkpoint_in_a_renamed_folder_may_have_any_step(folder):
     for name in ("best", "300", "12345678901", "²" * 12):
         copy = folder.with_name(name)
         shutil.copytree(folder, copy)
-        assert checkpoint.open_checkpoint(copy).step == 300
+        assert checkpoint_reader.open_checkpoint(copy).step == 300
 
 
 def test_steps_ignores_links(folder):
     folder.with_name(f"{400:012d}").symlink_to(folder)
-    assert checkpoint.steps(folder.parent) == [100, 200, 300]
+    assert checkpoint_reader.steps(folder.parent) == [100, 200, 300]
     aside = folder.parent.with_name("aside")
     folder.parent.rename(aside)
     folder.parent.symlink_to(aside)
-    assert checkpoint.steps(folder.parent) == []
+    assert checkpoint_reader.steps(folder.parent) == []

@@ -16,7 +16,7 @@ import torch
 from support.saved_states import SPEC, rehash, state_of
 
 from rlcli.errors import CheckpointError, MachineError
-from rlcli.runs import checkpoint
+from rlcli.runs import checkpoint_reader
 from rlcli.training import checkpoint_writer
 
 
@@ -27,7 +27,7 @@ def saved(tmp_path):
 
 
 def load_all(folder):
-    opened = checkpoint.open_checkpoint(folder)
+    opened = checkpoint_reader.open_checkpoint(folder)
     return opened.policy(), opened.state()
 
 
@@ -37,7 +37,7 @@ def test_checkpoint_round_trip(saved):
     assert saved.name == "000000000768"
     assert (saved.parent / "latest").read_text() == "000000000768\n"
     assert not (saved.parent / "latest").is_symlink()
-    for part in checkpoint.PARTS:
+    for part in checkpoint_reader.PARTS:
         for name, value in wanted.tensors[part].items():
             assert torch.equal(value, state.tensors[part][name])
     assert torch.equal(policy.log_std, wanted.tensors["policy"]["log_std"])
@@ -114,7 +114,7 @@ class Bomb:
         return (os.system, ("touch executed",))
 
 
-@pytest.mark.parametrize("part", checkpoint.PARTS)
+@pytest.mark.parametrize("part", checkpoint_reader.PARTS)
 @pytest.mark.parametrize("kind", ["pickle", "torch"])
 def test_pickle_with_a_matching_hash_is_not_executed(saved, part, kind, monkeypatch):
     monkeypatch.chdir(saved.parent)
@@ -151,7 +151,7 @@ def change_policy(folder, change):
 def test_weights_that_do_not_fit_are_named(saved, change, message):
     change_policy(saved, change)
     with pytest.raises(CheckpointError, match=message):
-        checkpoint.open_checkpoint(saved).policy()
+        checkpoint_reader.open_checkpoint(saved).policy()
 
 
 def test_critic_that_is_not_finite_is_named(saved):
@@ -176,7 +176,7 @@ def test_invalid_policy_description_is_refused(saved, change):
     (saved / "policy.json").write_text(json.dumps({**SPEC, **change}))
     rehash(saved, "policy.json")
     with pytest.raises(CheckpointError, match=r"policy\.(json|safetensors)"):
-        checkpoint.open_checkpoint(saved).policy()
+        checkpoint_reader.open_checkpoint(saved).policy()
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EDQUOT])
@@ -206,7 +206,7 @@ def test_interrupted_save_leaves_no_files(saved, monkeypatch):
     monkeypatch.setattr(os, "fsync", interrupt)
     with pytest.raises(KeyboardInterrupt):
         checkpoint_writer.write_checkpoint(saved.parent, 900, state_of(1), {})
-    assert checkpoint.steps(saved.parent) == [768]
+    assert checkpoint_reader.steps(saved.parent) == [768]
     assert not list(saved.parent.glob(".tmp-*"))
 
 
@@ -221,10 +221,10 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from support.saved_states import state_of
-from rlcli.runs import checkpoint
+from rlcli.runs import checkpoint_reader
 from rlcli.training import checkpoint_writer
 folder = Path(sys.argv[1])
-step = max(checkpoint.steps(folder), default=0)
+step = max(checkpoint_reader.steps(folder), default=0)
 print("go", flush=True)
 while True:
     step += 1
@@ -245,11 +245,11 @@ def test_kill_while_saving_leaves_a_valid_last_checkpoint(tmp_path):
         child.send_signal(signal.SIGKILL)
         child.wait()
         child.stdout.close()
-        steps = checkpoint.steps(folder)
+        steps = checkpoint_reader.steps(folder)
         if steps:
             load_all(folder / f"{steps[-1]:012d}")
             assert (folder / "latest").read_text().strip() in {f"{s:012d}" for s in steps[-2:]}
-    assert checkpoint.steps(folder)
+    assert checkpoint_reader.steps(folder)
     (folder / ".tmp-1-dead").mkdir(exist_ok=True)
     (folder / ".latest.tmp-1").touch()
     checkpoint_writer.remove_temporary_files(folder)
@@ -262,7 +262,7 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from support.saved_states import state_of
 from rlcli.errors import MachineError
-from rlcli.runs import checkpoint
+from rlcli.runs import checkpoint_reader
 from rlcli.training import checkpoint_writer
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
@@ -289,5 +289,5 @@ def test_steps_are_sorted_and_other_folders_ignored(tmp_path):
         (tmp_path / name / "manifest.json").touch()
     (tmp_path / "000000000099").mkdir()  # no manifest: not complete
     (tmp_path / "latest").touch()
-    assert checkpoint.steps(tmp_path) == [2, 10, 1000000000000]
-    assert checkpoint.steps(tmp_path / "nowhere") == []
+    assert checkpoint_reader.steps(tmp_path) == [2, 10, 1000000000000]
+    assert checkpoint_reader.steps(tmp_path / "nowhere") == []

@@ -8,7 +8,7 @@ import pytest
 
 from rlcli.errors import CheckpointError
 from rlcli.runs import safe_io
-from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.safe_io import parse_json, read_file, read_tail, refuse_links
 
 

@@ -9,7 +9,7 @@ import torch
 
 from rlcli.replay.failure_cases import FOLDER
 from rlcli.replay.trajectory import read_trajectory
-from rlcli.runs.checkpoint import Checkpoint, open_checkpoint, steps
+from rlcli.runs.checkpoint_reader import Checkpoint, open_checkpoint, steps
 from rlcli.runs.run import open_run
 from rlcli.training.loggers import read_metrics
 

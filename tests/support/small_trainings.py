@@ -18,7 +18,7 @@ from rlcli.errors import Stopped
 from rlcli.random import derive
 from rlcli.registry import find_task, load_object
 from rlcli.replay.failure_recorder import open_failure_recorder
-from rlcli.runs.checkpoint import open_checkpoint, steps
+from rlcli.runs.checkpoint_reader import open_checkpoint, steps
 from rlcli.runs.run import Run
 from rlcli.training import loop
 from rlcli.training.checkpoint_writer import CheckpointWriter, Keep, drop_after

@@ -1,4 +1,8 @@
-"""`rlcli play` as a separate process, with its output."""
+"""`rlcli play` as a separate process, with its output.
+
+`Playing` waits until the viewer prints an address, so it fits viewers that are servers. For a viewer that draws in the
+terminal see `support.pseudo_terminal`.
+"""
 
 import os
 import re

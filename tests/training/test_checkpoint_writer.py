@@ -9,7 +9,7 @@ from support.saved_states import state_of
 
 from rlcli.errors import MachineError
 from rlcli.rl.trainer import Rows
-from rlcli.runs import checkpoint
+from rlcli.runs import checkpoint_reader
 from rlcli.training import checkpoint_writer
 from rlcli.training.checkpoint_writer import CheckpointWriter, Keep
 
@@ -46,7 +46,7 @@ def save_all(folder, keep, iterations, best=None):
 )
 def test_first_best_and_newest_checkpoints_are_kept(folder, keep, best, remaining):
     save_all(folder, keep, range(13), best)
-    assert checkpoint.steps(folder) == [100 * iteration for iteration in remaining]
+    assert checkpoint_reader.steps(folder) == [100 * iteration for iteration in remaining]
     assert sorted(file.name for file in folder.iterdir()) == [*(f"{100 * i:012d}" for i in remaining), "latest"]
 
 
@@ -56,7 +56,7 @@ def test_newest_is_set_by_save_and_by_resume(folder):
     writer.save(state_of(), 3, 300)
     assert writer.newest == (3, 300)
     writer.wait()
-    opened = checkpoint.open_checkpoint(folder / f"{300:012d}")
+    opened = checkpoint_reader.open_checkpoint(folder / f"{300:012d}")
     assert (opened.iteration, opened.step, opened.manifest["seed"]) == (3, 300, 1)
     assert CheckpointWriter(folder, Keep(), {}, resumed=opened).newest == (3, 300)
 
@@ -74,11 +74,11 @@ def test_save_does_not_block_while_a_checkpoint_is_written(folder, monkeypatch):
     writer = CheckpointWriter(folder, Keep(), {})
     writer.save(state_of(), 1, 100)
     assert started.wait(30)
-    assert checkpoint.steps(folder) == []
+    assert checkpoint_reader.steps(folder) == []
     go.set()
     writer.save(state_of(), 2, 200)
     writer.wait()
-    assert checkpoint.steps(folder) == [100, 200]
+    assert checkpoint_reader.steps(folder) == [100, 200]
 
 
 def test_write_error_is_raised_once_by_check(folder):
@@ -107,7 +107,7 @@ def state_with(total, size=10):
 
 
 def rows_of(folder, step):
-    rows = checkpoint.open_checkpoint(folder / f"{step:012d}").state().logs["replay"]
+    rows = checkpoint_reader.open_checkpoint(folder / f"{step:012d}").state().logs["replay"]
     return rows.first, rows.stop, rows.read(rows.first, rows.stop)["x"].flatten().tolist()
 
 
@@ -129,7 +129,7 @@ def test_pruning_removes_unneeded_rows(folder):
     for iteration in range(8):
         writer.save(state_with(5 * iteration), iteration, 100 * iteration)
     writer.wait()
-    assert checkpoint.steps(folder) == [0, 700]
+    assert checkpoint_reader.steps(folder) == [0, 700]
     assert sorted(file.name[:12] for file in (folder / "logs/replay").iterdir()) == [f"{n:012d}" for n in (25, 30)]
     assert rows_of(folder, 700) == (25, 35, [float(r) for r in range(25, 35)])
 
@@ -139,7 +139,7 @@ def test_resume_from_older_checkpoint_rewrites_later_rows(folder):
     for iteration in range(1, 5):
         writer.save(state_with(6 * iteration), iteration, 100 * iteration)
     writer.wait()
-    resumed = checkpoint.open_checkpoint(folder / f"{200:012d}")
+    resumed = checkpoint_reader.open_checkpoint(folder / f"{200:012d}")
     assert checkpoint_writer.drop_after(folder, 200) == [300, 400]
     assert sorted(file.name[:12] for file in (folder / "logs/replay").iterdir()) == [f"{n:012d}" for n in (0, 6)]
     writer = CheckpointWriter(folder, Keep(), {}, resumed=resumed)

@@ -5,12 +5,13 @@ import torch
 
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
-from rlcli.registry import find_task, load_object
+from rlcli.registry import OWN, TRAINERS, catalog, find_task, load_entry, load_object
+from rlcli.trainers import TrainerSpec
 from rlcli.training.loop import _with_rates
 
 OFF_POLICY = "train_freq: 32, gradient_steps: 1, learning_starts: 24, batch_size: 16, buffer_size: 512"
 AGENTS = {
-    "ppo": "trainer: ppo, algorithm: ppo, num_steps: 32, max_iterations: 2",
+    "ppo ppo": "trainer: ppo, algorithm: ppo, num_steps: 32, max_iterations: 2",
     "sb3 ppo": "trainer: sb3, algorithm: ppo, n_steps: 32, num_minibatches: 2, max_iterations: 2",
     "sb3 a2c": "trainer: sb3, algorithm: a2c, n_steps: 32, max_iterations: 2",
     **{
@@ -52,6 +53,11 @@ def first_iteration(tmp_path, agent):
     report = trainer.iterate()
     env.close()
     return _with_rates(report, trainer.steps_per_iteration)
+
+
+def test_every_built_in_algorithm_is_covered():
+    specs = {entry.name: load_entry(entry, TrainerSpec) for entry in catalog(TRAINERS)[0] if entry.distribution == OWN}
+    assert {*AGENTS} == {f"{trainer} {algorithm}" for trainer, spec in specs.items() for algorithm in spec.algorithms}
 
 
 @pytest.mark.parametrize("agent", AGENTS)

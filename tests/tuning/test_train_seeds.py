@@ -11,7 +11,7 @@ import pytest
 from support.run_comparison import content, newest, rows_of
 
 from rlcli.errors import UsageError
-from rlcli.runs.index import overview, overviews
+from rlcli.runs.overview import overview, overviews
 from rlcli.runs.run_ref import list_runs
 from rlcli.runs.study import read_seeds
 

@@ -106,7 +106,7 @@ class RlGamesTrainer(BaseTrainer):
         """Reset the environment to its first episodes."""
         obs = self.env.reset(seed=self.env.seed)
         self.agent.obs = self.agent.obs_to_tensors(self.vec.observe(obs))
-        self._keep_recent_obs(obs["policy"])
+        self.keep_recent_obs(obs["policy"])
 
     def iterate(self) -> Report:
         """Collect a rollout, then update."""
@@ -115,9 +115,9 @@ class RlGamesTrainer(BaseTrainer):
         total = time.perf_counter() - begin
         self.iteration += 1
         self.env_steps += self.steps_per_iteration
-        self._keep_recent_obs(self.agent.obs["obs"])
+        self.keep_recent_obs(self.agent.obs["obs"])
         require_finite_learner(losses, self._modules(), self.iteration, _LEARNER_HINT)
-        return self._report(losses, self._split_seconds(before, total - update, update))
+        return self.make_report(losses, self.split_seconds(before, total - update, update))
 
     @property
     def steps_per_iteration(self) -> int:
@@ -130,7 +130,7 @@ class RlGamesTrainer(BaseTrainer):
 
     def state(self) -> TrainerState:
         """Return a copy of everything that the next iteration depends on."""
-        rest = {"observations": self._recent_obs.clone(), "dones": self.agent.dones.clone()}
+        rest = {"observations": self.recent_obs.clone(), "dones": self.agent.dones.clone()}
         for part, module in self._modules().items():
             rest |= {f"{part}.{name}": value.detach().clone() for name, value in module.state_dict().items()}
         for name, optimizer in self._optimizers().items():
@@ -142,7 +142,7 @@ class RlGamesTrainer(BaseTrainer):
             "epoch": self.agent.epoch_num,
             "statistics": self.statistics.state(),
         }
-        tensors = {"policy": self._policy_tensors(), "trainer": rest, "env": self.env.state_dict(), "rng": rng_state()}
+        tensors = {"policy": self.policy_tensors(), "trainer": rest, "env": self.env.state_dict(), "rng": rng_state()}
         return TrainerState(tensors, values)
 
     def load(self, state: TrainerState) -> None:
@@ -158,7 +158,7 @@ class RlGamesTrainer(BaseTrainer):
         self.agent.frame = self.env_steps
         self.statistics.load(values["statistics"])
         self.agent.obs = self.agent.obs_to_tensors(self.vec.observe(self.env.load_state_dict(state.tensors["env"])))
-        self._recent_obs = rest["observations"].to(self.env.device)
+        self.recent_obs = rest["observations"].to(self.env.device)
         load_rng_state(state.tensors["rng"])
 
     # --- settings ---

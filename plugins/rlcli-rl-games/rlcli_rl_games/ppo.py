@@ -127,7 +127,8 @@ class PpoTrainer(RlGamesTrainer):
                 names[name] = f"actor.{name.removeprefix('actor_mlp.')}"
         return names
 
-    def _policy_tensors(self) -> dict[str, Tensor]:
+    def policy_tensors(self) -> dict[str, Tensor]:
+        """Return copies of the policy's weights, by their names in a saved policy."""
         weights = self.agent.model.a2c_network.state_dict()
         tensors = {ours: weights[theirs].detach().clone() for theirs, ours in self._names().items()}
         return {**tensors, "log_std": weights["sigma"].detach().clone(), **self._normalizer_tensors()}

@@ -124,7 +124,8 @@ class SacTrainer(RlGamesTrainer):
         agent = self.agent
         return {"actor": agent.actor_optimizer, "critic": agent.critic_optimizer, "alpha": agent.log_alpha_optimizer}
 
-    def _policy_tensors(self) -> dict[str, Tensor]:
+    def policy_tensors(self) -> dict[str, Tensor]:
+        """Return copies of the policy's weights, by their names in a saved policy."""
         last, tensors = 2 * len(self.spec.hidden), {}
         for name, value in self.agent.model.sac_network.actor.state_dict().items():
             _, index, kind = name.split(".")

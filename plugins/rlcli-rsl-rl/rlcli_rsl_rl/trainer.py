@@ -75,7 +75,7 @@ class RslRlTrainer(BaseTrainer):
             _log.warning(f"trainer rsl-rl ignores the setting {key}; remove it")
         obs = self.env.reset(seed=self.env.seed)
         self._obs = self._adapter.observations(obs)
-        self._keep_recent_obs(obs["policy"])
+        self.keep_recent_obs(obs["policy"])
 
     def iterate(self) -> Report:
         """Collect experience, then update."""
@@ -89,11 +89,11 @@ class RslRlTrainer(BaseTrainer):
         self.iteration += 1
         self.env_steps += self.steps_per_iteration
         metrics = self._metrics(losses)
-        return self._report(metrics, self._split_seconds(before, collected - begin, updated - collected))
+        return self.make_report(metrics, self.split_seconds(before, collected - begin, updated - collected))
 
     def state(self) -> TrainerState:
         """Return a copy of everything that the next iteration depends on."""
-        rest = {"observations": self._recent_obs.clone()}
+        rest = {"observations": self.recent_obs.clone()}
         for part, module in self._modules().items():
             rest |= {f"{part}.{name}": value.detach().clone() for name, value in module.state_dict().items()}
         for name, optimizer in self._optimizers().items():
@@ -113,7 +113,7 @@ class RslRlTrainer(BaseTrainer):
             average = self._rnd_reward_average()
             if average is not None and average.avg is not None:
                 rest["rnd_average"] = average.avg.detach().clone()
-        tensors = {"policy": self._policy_tensors(), "trainer": rest, "env": self.env.state_dict(), "rng": rng_state()}
+        tensors = {"policy": self.policy_tensors(), "trainer": rest, "env": self.env.state_dict(), "rng": rng_state()}
         return TrainerState(tensors, values)
 
     def load(self, state: TrainerState) -> None:
@@ -137,7 +137,7 @@ class RslRlTrainer(BaseTrainer):
         self.iteration, self.env_steps = values["iteration"], values["env_steps"]
         self.statistics.load(values["statistics"])
         self._obs = self._adapter.observations(self.env.load_state_dict(state.tensors["env"]))
-        self._recent_obs = rest["observations"].to(self.env.device)
+        self.recent_obs = rest["observations"].to(self.env.device)
         load_rng_state(state.tensors["rng"])
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
@@ -177,7 +177,7 @@ class RslRlTrainer(BaseTrainer):
             self._obs = self._adapter.observations(step.obs)
             self.alg.process_env_step(self._obs, reward, step.terminated | step.truncated, extras)
             self.statistics.add(step.episodes)
-        self._keep_recent_obs(self._obs["policy"])
+        self.keep_recent_obs(self._obs["policy"])
         self.alg.compute_returns(self._obs)
 
     def _value(self, obs: dict[str, Tensor]) -> Tensor:
@@ -230,7 +230,7 @@ class RslRlTrainer(BaseTrainer):
             return distribution.log_std_param.detach().clamp(low, high)
         return distribution.std_param.detach().clamp(math.exp(low), math.exp(high)).log()
 
-    def _policy_tensors(self) -> dict[str, Tensor]:
+    def policy_tensors(self) -> dict[str, Tensor]:
         """Return copies of the policy's weights, by their names in a saved policy."""
         weights = self.alg.get_policy().state_dict()
         tensors = {ours: weights[theirs].detach().clone() for theirs, ours in self._names().items()}

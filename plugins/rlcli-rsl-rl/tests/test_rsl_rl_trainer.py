@@ -296,7 +296,7 @@ def test_ignored_settings_are_reported_once(caplog):
         (["agent.actor={hidden_dims: [4]}"], "agents.rsl-rl", "older form"),
         (["agent.algorithm.desired_kl=null"], "agents.rsl-rl", "desired_kl"),
         (["agent.algorithm.class_name=Distillation"], "algorithm", "teacher"),
-        (["agent.clip_actions=1.0", "agent.action_bound=2.0"], "agents.rsl-rl", "one thing"),
+        (["agent.clip_actions=1.0", "agent.action_bound=2.0"], "agents.rsl-rl", "two names of one setting"),
     ],
 )
 def test_invalid_settings_are_refused_without_heavy_imports(overrides, place, words):
@@ -385,7 +385,7 @@ def test_checkpoint_of_other_trainer_is_refused_with_names(tmp_path, capsys, mon
     (step / "manifest.json").write_text(json.dumps({**manifest, "trainer": "sb3"}))
     error = rlcli(capsys, "train", "--resume", run, "--max-iterations", 2, code=5).err
     assert "a checkpoint of trainer 'sb3'" in error
-    assert "one of 'rsl-rl'" in error
+    assert "the run's agent uses 'rsl-rl'" in error
 
 
 def test_init_from_other_trainer_with_same_policy_form(tmp_path, capsys, monkeypatch):

@@ -164,7 +164,7 @@ def _find(reference: str, runs: Path) -> tuple[Run, int | None]:
 
 
 def _require_step(run: Run, step: int) -> None:
-    from rlcli.runs.checkpoint import steps
+    from rlcli.runs.checkpoint_reader import steps
 
     have = steps(run.checkpoints)
     if step not in have:

@@ -13,7 +13,7 @@ from rlcli.errors import UsageError, listing
 
 if TYPE_CHECKING:
     from rlcli.deploy.closed_loop import ClosedLoopResult, ReferenceEnv
-    from rlcli.runs.checkpoint import Checkpoint
+    from rlcli.runs.checkpoint_reader import Checkpoint
     from rlcli.runs.policy_ref import Choice
     from rlcli.runs.run import Run
 
@@ -46,7 +46,7 @@ def command(
             Export the best checkpoint of the newest run to one Python file.
     """
     from rlcli.deploy.export import BUNDLE, check_target, export
-    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.checkpoint_reader import open_checkpoint
     from rlcli.runs.run_ref import default_runs_dir
 
     if task is None and checkpoint is None:
@@ -84,7 +84,7 @@ def _default_file(choice: Choice, format_: str) -> Path:
 
 def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | None) -> ReferenceEnv:
     from rlcli.deploy.closed_loop import open_reference
-    from rlcli.deploy.onboard_program import check_overwrites
+    from rlcli.deploy.verification_files import check_overwrites
     from rlcli.runs.trusted_tasks import named_task
 
     if choice.run is None and choice.bundle is None:

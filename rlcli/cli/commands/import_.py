@@ -20,7 +20,7 @@ from rlcli.registry.formats import known_formats, load_format, missing_formats, 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
     from rlcli.formats import Imported
-    from rlcli.training.import_checkpoint import ImportedPolicy
+    from rlcli.training.import_policy import ImportedPolicy
 
 _log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ def sb3(
             Import a policy with normalised observations.
     """
     resolved = _resolve(task, agent, activation, action_bound)
-    from rlcli.training.import_checkpoint import read_sb3
+    from rlcli.training.import_policy import read_sb3
 
     bound = 1.0 if action_bound is None else action_bound
     policy = read_sb3(file, activation=activation, action_bound=bound, normalizer=normalizer)
@@ -92,7 +92,7 @@ def rsl_rl(
             Import a policy with tanh layers.
     """
     resolved = _resolve(task, agent, activation, action_bound)
-    from rlcli.training.import_checkpoint import read_rsl_rl
+    from rlcli.training.import_policy import read_rsl_rl
 
     policy = read_rsl_rl(file, activation=activation, action_bound=action_bound)
     _create_run("rsl-rl", file, policy, resolved, runs_dir, name)
@@ -117,7 +117,7 @@ def _create_run(
 ) -> None:
     """Write an imported policy as a run."""
     from rlcli.runs.run_ref import default_runs_dir
-    from rlcli.training.import_checkpoint import create_imported_run
+    from rlcli.training.import_policy import create_imported_run
 
     record = {"imported": {"form": form, "file": file.name, "algorithm": policy.algorithm}}
     run = create_imported_run(policy, resolved, record, runs_dir or default_runs_dir(), name)

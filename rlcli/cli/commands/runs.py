@@ -15,7 +15,7 @@ from rlcli.errors import did_you_mean, listing
 from rlcli.safe_text import shorten
 
 if TYPE_CHECKING:
-    from rlcli.runs.index import Overview
+    from rlcli.runs.overview import Overview
 
 _COLUMNS = [
     "RUN", "STATE", "PROGRESS", "RETURN", "SUCCESS", "BEST", "EVAL", "AGE", "TRAINED", "SIZE", "AGENT", "SEED",
@@ -42,7 +42,7 @@ def command(
         rlcli runs cartpole --limit 5
             List the five newest runs of cartpole.
     """
-    from rlcli.runs.index import overviews
+    from rlcli.runs.overview import overviews
     from rlcli.runs.run_ref import default_runs_dir
 
     folder = runs_dir or default_runs_dir()

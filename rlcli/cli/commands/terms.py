@@ -9,7 +9,7 @@ import typer
 from rlcli.cli.ui.console import console
 
 if TYPE_CHECKING:
-    from rlcli.config.term_reference import TermEntry
+    from rlcli.config.term_docs import TermEntry
 
 
 def command(
@@ -30,7 +30,7 @@ def command(
         rlcli terms joint_vel_l1
             Describe one term with its keys.
     """
-    from rlcli.config.term_reference import term_entries
+    from rlcli.config.term_docs import term_entries
     from rlcli.errors import did_you_mean
     from rlcli.registry import find_task
 
@@ -58,13 +58,13 @@ def _print_lines(entries: list[TermEntry]) -> None:
 
 
 def _signature(entry: TermEntry) -> list[str]:
-    from rlcli.config.term_reference import yaml_text
+    from rlcli.config.term_docs import yaml_text
 
     return [f"{key.name}: {key.type}" + ("" if key.required else f" = {yaml_text(key.default)}") for key in entry.keys]
 
 
 def _print_details(entry: TermEntry) -> None:
-    from rlcli.config.term_reference import yaml_text
+    from rlcli.config.term_docs import yaml_text
 
     console.data(f"{entry.name} ({entry.section})\n{entry.summary}\n")
     rows = [

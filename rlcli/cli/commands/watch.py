@@ -9,7 +9,7 @@ from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import RunRef, RunsDir
 
 if TYPE_CHECKING:
-    from rlcli.runs.index import Overview
+    from rlcli.runs.overview import Overview
     from rlcli.runs.run import Run
     from rlcli.training.progress import Progress
 
@@ -47,7 +47,7 @@ def _follow(run: Run) -> Overview:
     """Show the run until it ends; return its final state."""
     from rlcli.cli.ui.progress_view import TrainingView
     from rlcli.errors import CheckpointError
-    from rlcli.runs.index import overview_of, state_of
+    from rlcli.runs.overview import overview_of, state_of
     from rlcli.runs.run import open_run
 
     printed = None
@@ -70,7 +70,7 @@ def _follow(run: Run) -> Overview:
 
 
 def _progress(run: Run) -> Progress | None:
-    from rlcli.runs.index import count, newest_rows, times
+    from rlcli.runs.overview import count, newest_rows, times
     from rlcli.training.progress import progress_from_metrics
 
     rows = newest_rows(run)
@@ -89,7 +89,7 @@ def _report(final: Overview) -> None:
 
 
 def _document(run: Run) -> None:
-    from rlcli.runs.index import overview_of
+    from rlcli.runs.overview import overview_of
 
     document: dict[str, Any] = overview_of(run).document()
     progress = _progress(run)

@@ -93,7 +93,7 @@ def _runs(ctx: typer.Context) -> Iterator[Offer]:
 
 
 def _checkpoint_names(ctx: typer.Context, run: str) -> list[str]:
-    from rlcli.runs.checkpoint import steps
+    from rlcli.runs.checkpoint_reader import steps
     from rlcli.runs.run_ref import find_run
 
     try:

@@ -11,7 +11,7 @@ from rlcli.cli.ui.console import console
 from rlcli.cli.ui.progress_view import LiveView
 from rlcli.cli.ui.tables import flow
 from rlcli.errors import Stopped
-from rlcli.runs.index import Overview, overview
+from rlcli.runs.overview import Overview, overview
 from rlcli.tuning.train_seeds import METRICS, StudyResult
 
 _LINE_EVERY_S = 10.0

@@ -34,7 +34,7 @@ def require_viewer(viewer: str | None, port: int | None, *, drawn: bool) -> None
         raise UsageError(
             f"--viewer {viewer} opens a viewer, but --video and --record only write files", hint="leave one out"
         )
-    if port is not None and (drawn or viewer in ("native", "none")):
+    if port is not None and (drawn or viewer not in (None, "auto", "web")):
         raise UsageError("--port is an option of the web viewer", hint="add --viewer web")
 
 
@@ -82,7 +82,7 @@ def choose_viewers(viewer: str | None, port: int | None, *, headless: bool) -> l
     if console.json:
         return [("none", "--json is given without --viewer")]
     preferred = setting("viewer") if viewer is None else None
-    if preferred in ("web", "none") or (preferred == "native" and has_display()):
+    if preferred in (*VIEWERS, "none") and (preferred != "native" or has_display()):
         return [(preferred, "viewer in your settings")]
     in_terminal = all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stdout))
     display = "no display" if not has_display() else "no window"
@@ -156,7 +156,7 @@ def _open(session: Session, name: str, reason: str, port: int | None, drawn: int
 
 
 def _playback(session: Session) -> Playback:
-    from rlcli.runs.checkpoint import open_checkpoint
+    from rlcli.runs.checkpoint_reader import open_checkpoint
     from rlcli.viewer.checkpoints import RunCheckpoints
     from rlcli.viewer.playback import Playback
 

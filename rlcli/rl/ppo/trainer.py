@@ -69,7 +69,7 @@ class PpoTrainer(BaseTrainer):
     def start(self) -> None:
         """Reset the environment to its first episodes."""
         self.collector.set_obs(self.env.reset(seed=self.env.seed))
-        self._keep_recent_obs(self.collector.obs["policy"])
+        self.keep_recent_obs(self.collector.obs["policy"])
 
     def iterate(self) -> Report:
         """Collect a rollout, then update."""
@@ -81,7 +81,7 @@ class PpoTrainer(BaseTrainer):
             # if the policy caused the divergence, name its first tensor that is not finite instead
             require_finite(self.collector.rollout_dependencies(), self.iteration + 1)
             raise
-        self._keep_recent_obs(self.collector.obs["policy"])
+        self.keep_recent_obs(self.collector.obs["policy"])
         collected = self._timestamp()
         torch.set_num_threads(self.learner.torch_threads)
         self.learner.decay_learning_rate(remaining_budget(self.config, self))  # before the iteration is counted
@@ -96,11 +96,11 @@ class PpoTrainer(BaseTrainer):
         total = time.perf_counter() - begin
         if isinstance(collected, float):
             rollout = collected - begin
-            seconds = self._split_seconds(before, rollout, total - rollout)
+            seconds = self.split_seconds(before, rollout, total - rollout)
         else:  # on a GPU the parts of a replayed rollout cannot be timed
             update = collected.elapsed_time(updated) / 1e3
             seconds = {"rollout": total - update, "update": update}
-        return self._report(losses, seconds)
+        return self.make_report(losses, seconds)
 
     def _timestamp(self) -> Any:
         """Return the time [s]; on a GPU a CUDA event in its stream of work, which forces no host sync."""
@@ -114,8 +114,8 @@ class PpoTrainer(BaseTrainer):
 
     def state(self) -> TrainerState:
         """Return a copy of everything that the next iteration depends on."""
-        trainer = _copies({**self._learner_tensors(), "observations": self._recent_obs})
-        tensors = {"policy": self._policy_tensors(), "trainer": trainer}
+        trainer = _copies({**self._learner_tensors(), "observations": self.recent_obs})
+        tensors = {"policy": self.policy_tensors(), "trainer": trainer}
         values = {
             "policy": self.spec.model_dump(),
             "iteration": self.iteration,
@@ -147,7 +147,7 @@ class PpoTrainer(BaseTrainer):
         with torch.no_grad():
             for name, value in self._learner_tensors().items():
                 value.copy_(saved[name])
-        self._recent_obs = saved["observations"].to(self.device)
+        self.recent_obs = saved["observations"].to(self.device)
         self.collector.iteration, self.env_steps = values["iteration"], values["env_steps"]
         if values["processes"] != self.process_group.world_size:
             self.collector.episode_start.fill_(1.0)
@@ -173,7 +173,8 @@ class PpoTrainer(BaseTrainer):
         if self.collector.normalizer is not None:
             self.collector.normalizer.load_state_dict(below(policy, "normalizer."))
 
-    def _policy_tensors(self) -> dict[str, Tensor]:
+    def policy_tensors(self) -> dict[str, Tensor]:
+        """Return copies of the policy's weights, by their names in a saved policy."""
         normalizer = _module_tensors("normalizer", self.collector.normalizer)
         return _copies({**self.networks.policy_tensors(), **normalizer})
 

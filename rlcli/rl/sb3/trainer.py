@@ -89,7 +89,7 @@ class Sb3Trainer(BaseTrainer):
         obs = self.env.reset(seed=self.env.seed)["policy"]
         self.model._last_obs = obs.numpy()
         self.model._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
-        self._keep_recent_obs(obs)
+        self.keep_recent_obs(obs)
 
     def iterate(self) -> Report:
         """Collect experience, then update."""
@@ -115,7 +115,7 @@ class Sb3Trainer(BaseTrainer):
             # if the policy caused the divergence, name its first tensor that is not finite instead
             require_finite(self._rollout_dependencies(), self.iteration + 1)
             raise
-        self._keep_recent_obs(torch.as_tensor(self.model._last_obs))
+        self.keep_recent_obs(torch.as_tensor(self.model._last_obs))
         collected = time.perf_counter()
         torch.set_num_threads(self.torch_threads)
         if self.config.schedule == "linear":
@@ -129,19 +129,19 @@ class Sb3Trainer(BaseTrainer):
         updated = time.perf_counter()
         metrics = self._losses()
         self._adapt_learning_rate(metrics.get("Loss/kl"))
-        return self._report(metrics, self._split_seconds(before, collected - begin, updated - collected))
+        return self.make_report(metrics, self.split_seconds(before, collected - begin, updated - collected))
 
     def state(self) -> TrainerState:
         """Return a copy of everything that the next iteration depends on."""
         weights = self.model.policy.state_dict()
         rest = {f"weights.{name}": value.clone() for name, value in weights.items() if name not in self._actor_names}
-        rest["observations"] = self._recent_obs.clone()
+        rest["observations"] = self.recent_obs.clone()
         for name, optimizer in self._optimizers().items():
             rest |= optimizer_tensors(optimizer, f"optimizer.{name}.")
         if getattr(self.model, "log_ent_coef", None) is not None:
             rest["log_ent_coef"] = self.model.log_ent_coef.detach().clone()
         tensors = {
-            "policy": self._policy_tensors(),
+            "policy": self.policy_tensors(),
             "trainer": rest,
             "env": {**self.env.state_dict(), "episode_starts": torch.tensor(self.model._last_episode_starts)},
             "rng": rng_state(),
@@ -169,7 +169,7 @@ class Sb3Trainer(BaseTrainer):
             load_optimizer(optimizer, rest, f"optimizer.{name}.")
         if "log_ent_coef" in rest:
             self.model.log_ent_coef.data.copy_(rest["log_ent_coef"])
-        self._recent_obs = rest.get("observations", self._recent_obs)
+        self.recent_obs = rest.get("observations", self.recent_obs)
         if "replay" in state.logs:
             self.model.replay_buffer.load_rows(state.logs["replay"])
         self.iteration, self.model.num_timesteps = values["iteration"], values["env_steps"]
@@ -180,7 +180,8 @@ class Sb3Trainer(BaseTrainer):
         self.model._last_obs = self.env.load_state_dict(state.tensors["env"])["policy"].numpy()
         load_rng_state(state.tensors["rng"])
 
-    def _policy_tensors(self) -> dict[str, Tensor]:
+    def policy_tensors(self) -> dict[str, Tensor]:
+        """Return copies of the policy's weights, by their names in a saved policy."""
         weights = self.model.policy.state_dict()
         tensors = {name: weights[key].clone() for key, name in self._actor_names.items()}
         if self.normalizer is not None:

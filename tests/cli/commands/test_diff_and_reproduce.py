@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save
 
-from rlcli.runs.checkpoint import sha256
+from rlcli.runs.checkpoint_reader import sha256
 from rlcli.runs.run_diff import SECTIONS
 
 pytestmark = pytest.mark.usefixtures("empty_folder")

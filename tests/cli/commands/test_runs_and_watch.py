@@ -17,7 +17,7 @@ import pytest
 
 from rlcli.cli.commands.runs import age, size
 from rlcli.runs.eval_store import write_evaluation
-from rlcli.runs.index import overviews
+from rlcli.runs.overview import overviews
 from rlcli.runs.run import create_run, is_locked, open_run
 
 pytestmark = pytest.mark.usefixtures("empty_folder")

@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from rlcli.viewer.protocol import VIEWERS
+
 HEAVY = ("torch", "mujoco", "numpy", "stable_baselines3", "gymnasium")
 PROGRAM = f"""
 import atexit, sys
@@ -67,7 +69,7 @@ def test_completion_of_commands_options_and_tasks(offered):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (("play", "--viewer", ""), ["auto", "native", "web", "none"]),
+        (("play", "--viewer", ""), ["auto", *VIEWERS, "none"]),
         (("play", "cartpole", "--policy", "z"), ["zero"]),
         (("train", "cartpole", "--logger", "t"), ["tensorboard", "trackio"]),
         (("train", "--device", "c"), ["cpu", "cuda"]),
@@ -150,6 +152,6 @@ COMP_WORDS=(rlcli train ./no); COMP_CWORD=2; _rlcli_completion rlcli ./no train;
     assert done.stdout.splitlines() == [
         "complete -o default -F _rlcli_completion rlcli",
         "cartpole-camera cartpole-direct",
-        "native none",
+        " ".join(name for name in (*VIEWERS, "none") if name.startswith("n")),
         "0",
     ]

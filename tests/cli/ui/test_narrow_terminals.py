@@ -1,18 +1,11 @@
 """Output on a terminal of 40 columns is complete, and output in a pipe is plain text."""
 
-import os
-import pty
 import re
-import struct
-import subprocess
-import sys
 
 import pytest
+from support.pseudo_terminal import run_on_terminal
 
 from rlcli.cli.app import COMMANDS
-
-fcntl = pytest.importorskip("fcntl", reason="pseudo-terminals need Unix")
-termios = pytest.importorskip("termios")
 
 STYLES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -22,26 +15,7 @@ def narrow(here):
     """Return a function that runs a command on a terminal of 40 columns and returns (exit code, lines)."""
 
     def run(*arguments):
-        leader, follower = pty.openpty()
-        fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 40, 0, 0))
-        env = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
-        process = subprocess.Popen(
-            [sys.executable, "-m", "rlcli", *arguments],
-            stdin=follower,
-            stdout=follower,
-            stderr=follower,
-            cwd=here,
-            env=env | {"TERM": "xterm-256color"},
-        )
-        os.close(follower)
-        output = b""
-        try:
-            while chunk := os.read(leader, 65536):
-                output += chunk
-        except OSError:  # Linux raises this when the other end is closed
-            pass
-        os.close(leader)
-        code = process.wait()
+        code, output = run_on_terminal(arguments, here, columns=40)
         return code, STYLES.sub("", output.decode()).replace("\r\n", "\n").split("\n")
 
     return run

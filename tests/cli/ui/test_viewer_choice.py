@@ -13,8 +13,10 @@ from pathlib import Path
 
 import pytest
 import yaml
+from support.fenced import REPOSITORY
 from support.worlds import CRITTER, CRITTER_TASK
 
+from rlcli.cli.commands import play
 from rlcli.cli.ui import viewer_choice
 from rlcli.errors import DependencyError, MachineError
 from rlcli.viewer.protocol import VIEWERS, Viewer
@@ -70,7 +72,7 @@ def test_port_selects_web_viewer(monkeypatch):
     assert names("auto", 9000) == ["web"]
 
 
-@pytest.mark.parametrize("viewer", ["web", "none"])
+@pytest.mark.parametrize("viewer", [*(name for name in VIEWERS if name != "native"), "none"])
 def test_explicit_viewer_is_chosen(viewer):
     assert viewer_choice.choose_viewers(viewer, None, headless=True) == [(viewer, "--viewer is given")]
 
@@ -81,6 +83,14 @@ def test_viewers_have_protocol_parameters(place):
     run = getattr(importlib.import_module(module), function)
     expected = [name for name in inspect.signature(Viewer.__call__).parameters if name != "self"]
     assert list(inspect.signature(run).parameters) == expected
+
+
+def test_help_and_pages_name_every_viewer():
+    guides = REPOSITORY / "docs" / "guides"
+    for name in viewer_choice.CHOICES:
+        assert name in play.command.__doc__.partition("viewer: ")[2].partition("port: ")[0]
+        assert f"| `{name}`" in (guides / "play.md").read_text(encoding="utf-8")
+    assert f"auto, {', '.join(VIEWERS)}, none" in (guides / "settings.md").read_text(encoding="utf-8")
 
 
 def test_play_prints_viewer_and_reason(cli):
@@ -97,9 +107,12 @@ def test_play_prints_viewer_and_reason(cli):
     ("arguments", "message"),
     [
         (("--viewer", "wbe"), "did you mean 'web'"),
-        (("--viewer", "browser"), "auto, native, web, none"),
-        (("--viewer", "none", "--port", "8080"), "--port is an option of the web viewer"),
-        (("--viewer", "native", "--port", "0"), "--port is an option of the web viewer"),
+        (("--viewer", "browser"), ", ".join(("auto", *VIEWERS, "none"))),
+        *(
+            (("--viewer", name, "--port", "0"), "--port is an option of the web viewer")
+            for name in (*VIEWERS, "none")
+            if name != "web"
+        ),
         (("--viewer", "web", "--port", "70000"), "'--port'"),
         (("--viewer", "web", "--video", "x.gif"), "leave one out"),
         (("--port", "0", "--video", "x.gif"), "--port is an option of the web viewer"),

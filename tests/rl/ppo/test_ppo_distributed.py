@@ -18,7 +18,7 @@ from rlcli.envs.make import make_env
 from rlcli.registry import find_task
 from rlcli.rl.distributed import _exit_code
 from rlcli.rl.ppo.trainer import PpoTrainer
-from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.run_ref import list_runs
 
 AGENT = """

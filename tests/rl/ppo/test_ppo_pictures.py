@@ -19,7 +19,7 @@ from rlcli.registry import find_task
 from rlcli.rl.cnn import Vision, VisionSpec, WideConv
 from rlcli.rl.policy import PolicySpec
 from rlcli.rl.ppo.trainer import PpoTrainer
-from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint_reader import open_checkpoint
 
 MODEL = """
 <mujoco><worldbody><body name="cart"><joint name="slide" type="slide" axis="0 1 0" damping="20"/>

@@ -13,7 +13,7 @@ from rlcli.envs.make import make_env
 from rlcli.evaluation.evaluate import evaluate
 from rlcli.registry import find_task
 from rlcli.rl.ppo.trainer import PpoTrainer
-from rlcli.runs.checkpoint import open_checkpoint
+from rlcli.runs.checkpoint_reader import open_checkpoint
 
 
 @pytest.fixture

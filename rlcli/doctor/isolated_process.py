@@ -1,4 +1,4 @@
-"""`python -m rlcli.doctor CHECK`: run one check that may crash the process, and print its result as a line of JSON."""
+"""`python -m rlcli.doctor.isolated_process CHECK`: run a check that may crash, and print its result as JSON."""
 
 from __future__ import annotations
 

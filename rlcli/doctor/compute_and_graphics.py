@@ -146,8 +146,8 @@ _KNOWN = ("enable", "enabled", "on", "true", "1", "glx", "wgl", "cgl")
 
 
 def run_isolated(check_name: str, timeout_s: float) -> Answer:
-    """Run a check in a separate process (`rlcli.doctor.__main__`) and return its result, or None and the reason."""
-    command = [sys.executable, "-m", "rlcli.doctor", check_name]
+    """Run a check in a separate process (`isolated_process.py`) and return its result, or None and the reason."""
+    command = [sys.executable, "-m", "rlcli.doctor.isolated_process", check_name]
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     try:
         done = subprocess.run(

@@ -1,0 +1,33 @@
+"""`rlcli` as a separate process on a pseudo-terminal, for output that depends on a terminal. It needs Unix."""
+
+import fcntl
+import os
+import pty
+import struct
+import subprocess
+import sys
+import termios
+
+
+def run_on_terminal(arguments, folder, *, columns=120, **variables):
+    """Run a command on a terminal and return (exit code, output of stdout and stderr as bytes)."""
+    leader, follower = pty.openpty()
+    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    kept = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rlcli", *arguments],
+        stdin=follower,
+        stdout=follower,
+        stderr=follower,
+        cwd=folder,
+        env={**kept, "TERM": "xterm-256color", **variables},
+    )
+    os.close(follower)
+    output = b""
+    try:
+        while chunk := os.read(leader, 65536):
+            output += chunk
+    except OSError:  # Linux raises this when the other end is closed
+        pass
+    os.close(leader)
+    return process.wait(), output
