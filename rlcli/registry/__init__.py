@@ -23,7 +23,7 @@ from rlcli.registry.imports import load_entry
 from rlcli.registry.models import chosen_model, model_file
 from rlcli.registry.packages import installed_task, is_offered, package_folder, packaged_task, task_of_file
 from rlcli.registry.task_imports import import_file, load_module, load_object
-from rlcli.registry.task_source import TaskSource
+from rlcli.registry.task_location import TaskSource
 
 __all__ = [
     "FORMATS",

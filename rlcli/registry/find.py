@@ -11,7 +11,7 @@ from rlcli.registry.entries import TASKS, catalog, find_entry
 from rlcli.registry.folders import folder_task, python_task
 from rlcli.registry.formats import find_in_formats, require_format
 from rlcli.registry.packages import installed_task, task_of_file
-from rlcli.registry.task_source import TaskSource
+from rlcli.registry.task_location import TaskSource
 
 
 def find_task(name: str) -> TaskSource:

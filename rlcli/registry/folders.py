@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rlcli.errors import TaskError, listing
 from rlcli.registry.formats import find_in_formats, require_format
-from rlcli.registry.task_source import TaskSource
+from rlcli.registry.task_location import TaskSource
 
 
 def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:

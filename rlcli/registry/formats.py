@@ -15,7 +15,7 @@ from rlcli.errors import DependencyError, TaskError
 from rlcli.formats import FormatSpec
 from rlcli.registry.entries import FORMATS, OWN, Entry, catalog, find_entry
 from rlcli.registry.imports import load_entry, load_spec
-from rlcli.registry.task_source import TaskSource
+from rlcli.registry.task_location import TaskSource
 
 _log = logging.getLogger(__name__)
 
