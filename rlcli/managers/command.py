@@ -112,7 +112,7 @@ class CommandManager(TensorState):
         knobs = {name: knob for knob in self.knobs() for name in (f"{knob.term}.{knob.name}", knob.name)}
         if name not in knobs:
             names = [knob.name for knob in self.knobs()]
-            known = f"commands: {listing(names)}" if names else "the task has no commands"
+            known = f"commands: {listing(names)}" if names else "leave out --command: the task has no commands"
             near = did_you_mean(name, names)
             raise UsageError(f"no command '{name}'", hint=f"{near} {known}" if near else known)
         if value is not None and not math.isfinite(value):

@@ -59,6 +59,7 @@ class CurriculumManager(TensorState):
 
     def _store(self, term: BoundTerm, value: Tensor | float | None) -> None:
         if isinstance(value, Tensor):
-            self._values[term.name].copy_(value if value.dim() < 2 else value.float().mean())
+            own = self._values[term.name]
+            own.copy_(value if value.shape in (own.shape, ()) else value.float().mean())
         elif value is not None:
             self._values[term.name].fill_(value)

@@ -124,14 +124,12 @@ def goal_in_world(entity: Entity, command: Command) -> Tensor:
         goal: Tensor = data.root_pos_w + rotate(data.root_quat_w, command.command[:, :3])
         return goal
 
-    return _once(entity, ("goal position", command.command), compute)
+    return _once(entity, command, ("goal position",), compute)
 
 
 def goal_quat_in_world(entity: Entity, command: Command) -> Tensor:
     """Return the quaternion of a pose command in the world frame; the command is in the root's. (num_envs, 4)"""
-    return _once(
-        entity, ("goal quat", command.command), lambda: multiply(entity.data.root_quat_w, command.command[:, 3:7])
-    )
+    return _once(entity, command, ("goal quat",), lambda: multiply(entity.data.root_quat_w, command.command[:, 3:7]))
 
 
 def distance_to_goal(entity: Entity, bodies: Columns, command: Command) -> Tensor:
@@ -140,7 +138,7 @@ def distance_to_goal(entity: Entity, bodies: Columns, command: Command) -> Tenso
     def compute() -> Tensor:
         return length(single(entity.data.body_pos_w[:, bodies], "body") - goal_in_world(entity, command))
 
-    return _once(entity, ("distance", id(bodies), command.command), compute)
+    return _once(entity, command, ("distance", id(bodies)), compute)
 
 
 def angle_to_goal(entity: Entity, bodies: Columns, command: Command) -> Tensor:
@@ -150,12 +148,12 @@ def angle_to_goal(entity: Entity, bodies: Columns, command: Command) -> Tensor:
         orientation = single(entity.data.body_quat_w[:, bodies], "body").contiguous()
         return turn_between(orientation, goal_quat_in_world(entity, command))
 
-    return _once(entity, ("angle", id(bodies), command.command), compute)
+    return _once(entity, command, ("angle", id(bodies)), compute)
 
 
-def _once(entity: Entity, key: tuple[object, ...], compute: Callable[[], Tensor]) -> Tensor:
+def _once(entity: Entity, command: Command, key: tuple[object, ...], compute: Callable[[], Tensor]) -> Tensor:
     """Return a value that is computed once for all terms of a step; do not write to the value."""
-    value: Tensor = entity.sim.once_per_goal((entity.name, *key), compute)
+    value: Tensor = entity.sim.once_per_goal((entity.name, command, *key), command.command, compute)
     return value
 
 

@@ -42,7 +42,7 @@ class SimData:
         """Number of updates; a cached value with an older stamp is out of date."""
         self.command_stamp = 0
         """Number of updates of the commands."""
-        self._goals: dict[tuple[object, ...], tuple[int, int, Tensor]] = {}
+        self._goals: dict[tuple[object, ...], tuple[tuple[int, int, int], Tensor]] = {}
         self._saved_at, self._summed = -1, (-1, 0.0)
         self._moved: Selection | None = None
         self._derived: dict[str, tuple[int, Tensor]] = {}
@@ -122,12 +122,15 @@ class SimData:
             self._derived[name] = (self.stamp, value)
         return value
 
-    def once_per_goal(self, key: tuple[object, ...], compute: Callable[[], Tensor]) -> Tensor:
-        """Return a value of the state and the commands, which is computed once for all terms of a step."""
-        state, commands, value = self._goals.get(key, (-1, -1, None))
-        if value is None or state != self.stamp or commands != self.command_stamp:
+    def once_per_goal(self, key: tuple[object, ...], command: Tensor, compute: Callable[[], Tensor]) -> Tensor:
+        """Return a value of the state and a command, which is computed once for all terms of a step."""
+        # torch counts its own writes to a tensor; commands that managers write through numpy change `command_stamp`
+        writes = 0 if command.is_inference() else command._version
+        stamps = (self.stamp, self.command_stamp, writes)
+        found, value = self._goals.get(key, (None, None))
+        if value is None or found != stamps:
             value = compute()
-            self._goals[key] = (self.stamp, self.command_stamp, value)
+            self._goals[key] = (stamps, value)
         return value
 
     def derived_columns(self, name: str, columns: Columns) -> Tensor:

@@ -53,7 +53,7 @@ def test_tensor_in_the_file_is_accepted(place):
 
 @pytest.mark.parametrize("data", [b"\xff" * 100, b"text, and no model"])
 def test_invalid_onnx_file_is_refused(data):
-    with pytest.raises(CheckpointError, match="not an ONNX file"):
+    with pytest.raises(CheckpointError, match="not a valid ONNX file"):
         require_self_contained(data, Path("policy.onnx"))
 
 

@@ -190,7 +190,7 @@ def test_penalties_grow_after_4500_steps(env):
         env.curriculum_manager.advance(torch.tensor(step))
         assert pay(env)["joint_vel"] == pytest.approx(weight / 30, rel=1e-3), step
     weights = [f"Curriculum/{name}" for name in ("action_rate", "joint_vel")]
-    assert [env.curriculum_manager.values()[name] for name in weights] == pytest.approx([-5e-3, -1e-3])
+    assert [env.extras()[name] for name in weights] == pytest.approx([-5e-3, -1e-3])
     env.curriculum_manager.advance(torch.tensor(0))
 
 

@@ -397,7 +397,7 @@ def test_user_curriculum_changes_reward_weight(cfg):
         step = env.step(torch.zeros(3, 1))
         weight = 1.0 if number <= 6 else -3.0  # the first episodes end after six steps
         assert torch.allclose(step.reward, 0.02 * weight * commands)
-    assert env.curriculum_manager.values() == {"Curriculum/heavier": -3.0}
+    assert env.extras() == {"Curriculum/heavier": -3.0}
 
 
 @pytest.mark.parametrize(

@@ -168,17 +168,7 @@ def _show(findings: Findings, horizon: str) -> None:
         console.table(columns, [_step_cells(row) for row in findings.stepped], "environment, random actions")
     if findings.trained:
         shares = list(dict.fromkeys(name for row in findings.trained for name in row.shares))
-        columns = [
-            "ENVS",
-            horizon,
-            "MINIBATCHES",
-            "ENGINE",
-            "TORCH",
-            "WORKERS",
-            "MS",
-            "STEPS/S",
-            *map(str.upper, shares),
-        ]
+        columns = ["ENVS", horizon, "MINIBATCHES", "ENGINE", "TORCH", "WORKERS", "MS", "STEPS/S"]
         rows = [_training_cells(row, shares) for row in findings.trained]
         console.data("")
         console.table([*columns, *map(str.upper, shares), "SPREAD", "MEMORY", ""], rows, "training, one iteration")
