@@ -153,7 +153,7 @@ def angle_to_goal(entity: Entity, bodies: Columns, command: Command) -> Tensor:
 
 def _once(entity: Entity, command: Command, key: tuple[object, ...], compute: Callable[[], Tensor]) -> Tensor:
     """Return a value that is computed once for all terms of a step; do not write to the value."""
-    value: Tensor = entity.sim.once_per_goal((entity.name, command, *key), command.command, compute)
+    value: Tensor = entity.sim.once_per_goal((entity.name, id(command), *key), command.command, compute)
     return value
 
 

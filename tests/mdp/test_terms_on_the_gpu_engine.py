@@ -79,7 +79,7 @@ class _Repeated:
             engine=engine, qpos=self._rows(env.sim.qpos), qvel=self._rows(env.sim.qvel), stamp=0,
             derived_field=lambda name: self._rows(env.sim.derived_field(name)),
             derived_columns=lambda name, columns: self._rows(env.sim.derived_columns(name, columns)),
-            once_per_goal=lambda key, compute: compute(),
+            once_per_goal=lambda key, command, compute: compute(),
         )  # fmt: skip
         self.entities = {name: Entity(name, e.config, engine, self.sim) for name, e in env.entities.items()}
 
