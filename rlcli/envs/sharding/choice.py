@@ -13,6 +13,9 @@ from rlcli.machine import available_cores
 ENVS_PER_WORKER = 256
 """Smallest number of environments for which a further process pays: below it, its fixed cost per step outweighs it."""
 
+FEWEST_CORES = 4
+"""Fewest cores with which `auto` uses several processes: on fewer, physics already takes most of a step."""
+
 
 def number_of_workers(resolved: Resolved, device: str) -> int:
     """Return the number of processes that step the environments of a task.
@@ -28,7 +31,7 @@ def number_of_workers(resolved: Resolved, device: str) -> int:
         cores = resolved.task.sim.engine_threads or available_cores()
         # a renderer for each process would need several times the memory
         has_camera = any(isinstance(sensor, CameraSensorConfig) for sensor in scene.sensors.values())
-        if reason is not None or has_camera or has_untested_code(resolved):
+        if reason is not None or has_camera or cores < FEWEST_CORES or has_untested_code(resolved):
             return 1
         return max(1, min(cores, scene.num_envs // ENVS_PER_WORKER))
     if reason is None and scene.num_envs < 2 * scene.workers:
