@@ -8,11 +8,13 @@ from rlcli.config.load import Resolved
 from rlcli.config.schema import CameraSensorConfig
 from rlcli.envs.sharding.own_code import has_untested_code
 from rlcli.errors import ConfigError
-from rlcli.machine import available_cores
+from rlcli.machine import available_cores, available_memory
 
 ENVS_PER_WORKER = 256
 """Smallest number of environments for which a further process pays: below it, its fixed cost per step outweighs it."""
 
+FREE_MEMORY_PER_WORKER = 1 << 30
+"""Free memory for each process that `auto` starts [bytes]; a process takes about a quarter of it."""
 FEWEST_CORES = 4
 """Fewest cores with which `auto` uses several processes: on fewer, physics already takes most of a step."""
 
@@ -33,7 +35,7 @@ def number_of_workers(resolved: Resolved, device: str) -> int:
         has_camera = any(isinstance(sensor, CameraSensorConfig) for sensor in scene.sensors.values())
         if reason is not None or has_camera or cores < FEWEST_CORES or has_untested_code(resolved):
             return 1
-        return max(1, min(cores, scene.num_envs // ENVS_PER_WORKER))
+        return max(1, min(cores, scene.num_envs // ENVS_PER_WORKER, available_memory() // FREE_MEMORY_PER_WORKER))
     if reason is None and scene.num_envs < 2 * scene.workers:
         reason = f"{scene.num_envs} environments are too few; each worker needs two"
     if reason is not None:
