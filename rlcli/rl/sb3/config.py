@@ -25,6 +25,15 @@ class NetworkConfig(StrictModel):
     """On-policy: whether initial weights are orthogonal, as by default in SB3; else they are torch's."""
 
 
+class OffPolicyNetworkConfig(NetworkConfig):
+    """Networks of actor and critics of an off-policy algorithm."""
+
+    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (256, 256)
+    """Widths of the hidden layers."""
+    activation: Literal["elu", "relu", "tanh", "silu"] = "relu"
+    """Activation between layers."""
+
+
 class Sb3Config(AgentConfig):
     """Settings of all algorithms, with SB3's names."""
 
@@ -122,7 +131,7 @@ class OffPolicyConfig(Sb3Config):
     """Environment steps with random actions before the first update."""
     tau: Annotated[float, Field(gt=0, le=1)] = 0.005
     """Weight of the new network in each update of a target network: target = tau new + (1 - tau) target."""
-    policy: NetworkConfig = NetworkConfig(hidden=(256, 256), activation="relu")
+    policy: OffPolicyNetworkConfig = OffPolicyNetworkConfig()
     """Networks of actor and critic."""
 
     @model_validator(mode="after")

@@ -9,6 +9,7 @@ from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
 from rlcli.rl.policy import Normalizer, Policy
+from rlcli.rl.sb3.config import DdpgConfig, SacConfig, Td3Config
 from rlcli.rl.sb3.trainer import Sb3Trainer
 
 AGENTS = {
@@ -197,3 +198,9 @@ def test_policy_is_rebuilt_from_its_spec(tmp_path):
         rebuilt.load_state_dict(state.tensors["policy"])
         obs = torch.randn(5, 4)
         assert torch.equal(rebuilt(obs), trainer.policy()(obs))
+
+
+@pytest.mark.parametrize("settings", [SacConfig, Td3Config, DdpgConfig])
+def test_networks_of_off_policy_algorithms_keep_their_defaults_if_one_key_is_set(settings):
+    policy = settings.model_validate({"trainer": "sb3", "policy": {"activation": "elu"}}).policy
+    assert (policy.hidden, policy.activation) == ((256, 256), "elu")
