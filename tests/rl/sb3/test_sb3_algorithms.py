@@ -202,5 +202,5 @@ def test_policy_is_rebuilt_from_its_spec(tmp_path):
 
 @pytest.mark.parametrize("settings", [SacConfig, Td3Config, DdpgConfig])
 def test_networks_of_off_policy_algorithms_keep_their_defaults_if_one_key_is_set(settings):
-    policy = settings.model_validate({"trainer": "sb3", "policy": {"activation": "elu"}}).policy
+    policy = settings.model_validate({"trainer": "sb3", "max_iterations": 1, "policy": {"activation": "elu"}}).policy
     assert (policy.hidden, policy.activation) == ((256, 256), "elu")
