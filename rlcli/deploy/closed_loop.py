@@ -191,7 +191,7 @@ def verify(
     _log.info(f"{file.name} controls plain MuJoCo with {model.name} for {episodes} episodes")
     differing = deployment_differences(checkpoint, env.layout.record(), reference.deployment, _may_randomize(env))
     space: dict[str, Any] = {"__name__": "run_policy"}
-    exec(compile(code, "run_policy.py", "exec"), space)  # the generated code, not the file: that may be the user's own
+    exec(compile(code, "run_policy.py", "exec"), space)  # not the run_policy.py on disk, which the user may have changed
     controller, policy = space["Controller"](file), checkpoint.policy()
     initial = env.state_dict()
     seed_generators(derive(_SEED, "task"))
@@ -230,7 +230,7 @@ def verify(
 
 
 def _may_randomize(env: VecEnv) -> bool:
-    """Return whether the task may draw gains or the initial state at random: an event does more than reset."""
+    """Return whether the task may randomise gains or the initial state: an event does more than reset."""
     events = [event for event in env.config.events.values() if event is not None]
     return isinstance(env, DirectEnv) or not all(event.func.startswith("reset_") for event in events)
 

@@ -120,7 +120,7 @@ class _Signal:
 
 
 class _Noise(_Signal):
-    """Gaussian noise, drawn in every step."""
+    """Gaussian noise, sampled in every step."""
 
     def __call__(self, signal: Tensor, is_first: Tensor) -> Tensor:
         env, count = self.env, len(self.columns)
@@ -209,7 +209,7 @@ _STEPS = 1 << 32
 
 
 def _keys(env: VecEnv, counters: Tensor) -> random.Keys:
-    """Return the keys of random draws by random stream and counter. (num_envs,)"""
+    """Return the keys of random numbers by random stream and counter. (num_envs,)"""
     ids = np.arange(env.num_envs) % (env.engine.shared_streams or env.num_envs)
     return random.row_keys(env.seed, ids, counters.cpu().numpy())
 

@@ -85,7 +85,7 @@ def read_evaluation(run: Run, step_name: str) -> dict[str, Any] | None:
         document = read_json(run.folder, f"{FOLDER}/{file.name}", _LIMIT)
     except FileNotFoundError:
         return None
-    check_json(_EvaluationRecord, document, file, hint="run rlcli eval again to replace the file")
+    check_json(_EvaluationRecord, document, file, hint="run `rlcli eval` again to replace the file")
     if document.get("success", 0) is None:
         del document["success"]
     return document

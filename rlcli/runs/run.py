@@ -313,4 +313,5 @@ def _create_numbered_folder(parent: Path, stem: str) -> Path:
         with contextlib.suppress(FileExistsError):
             folder.mkdir()
             return folder
-    raise OSError(errno.EEXIST, "too many runs of this name", str(parent / stem))
+    message = f"{stem} and {stem}-2 to {stem}-9999 all exist; use another --name"
+    raise OSError(errno.EEXIST, message, str(parent / stem))

@@ -1,4 +1,4 @@
-"""Model of the CPU engine's worlds, and the model fields that differ between them."""
+"""Model of the CPU engine's worlds (one per environment), and the model fields that differ between worlds."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _MIN_STATES_PER_ENV = 3
 
 
 class BatchModel:
-    """Base of the CPU engine: its worlds, and the model fields that differ between them.
+    """Base of the CPU engine: its worlds (one per environment), and the model fields that differ between worlds.
 
     Raises:
         DeviceError: for more worlds than the machine's memory holds.
@@ -61,7 +61,8 @@ class BatchModel:
     def expand(self, name: str) -> Tensor:
         """Return a model field with a value for every world."""
         if name not in MODEL_FIELDS:
-            raise ValueError(f"'{name}' cannot differ between worlds; {did_you_mean(name, MODEL_FIELDS) or ''}")
+            near = did_you_mean(name, MODEL_FIELDS)
+            raise ValueError(f"'{name}' cannot differ between environments" + (f"; {near}" if near else ""))
         values = torch.from_numpy(self._batch.expand(name))
         if not values.is_floating_point():
             self._skip_nothing()

@@ -1,4 +1,4 @@
-"""Model of the GPU engine's worlds on its device, and the model fields that differ between them."""
+"""Model of the GPU engine's worlds (one per environment), and the model fields that differ between worlds."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ class WarpModel:
             owner, attribute = self._owner(name)
             if not self.can_expand(name):
                 suggestion = did_you_mean(attribute, _batched_fields(owner))
-                raise ValueError(f"'{name}' cannot differ between worlds; {suggestion or ''}")
+                text = f"'{name}' cannot differ between environments"
+                raise ValueError(text + (f"; {suggestion}" if suggestion else ""))
             array = getattr(owner, attribute)
             values = np.repeat(array.numpy()[:1], self.num_envs, axis=0)
             wide = wp.array(values, dtype=array.dtype, device=self._device)

@@ -59,7 +59,7 @@ class Comparison:
     task: str
     threshold: Threshold
     trial: int
-    """Number of the best trial."""
+    """Index of the best trial."""
     seeds: Sequence[int]
     trainings: list[Training] = field(default_factory=list)
     stop_code: int | None = None
@@ -131,7 +131,7 @@ def compare(
     """
     best = sweep.best()
     if best is None:
-        raise CheckpointError(f"{sweep.folder} has no finished trial yet", hint="see rlcli sweep show")
+        raise CheckpointError(f"{sweep.folder} has no finished trial yet", hint="see `rlcli sweep show`")
     threshold = read_threshold(until or "success=0.99")
     comparison = Comparison(sweep.folder, sweep.settings["task"], threshold, best.number, seeds)
     with _request_of_sweep(sweep, request) as base:
@@ -212,7 +212,7 @@ def _train(
             _log.warning("%s, seed %s: %s", arm, seed, training.error.message)
     reached = training.reached
     time_taken = "" if reached is None else f" after {reached.seconds:.1f} s, {reached.step:,} steps"
-    _log.info("%s, seed %s: %s%s", arm, seed, training.state, time_taken)
+    _log.info("%s, seed %s: %s%s", arm, seed, training.outcome, time_taken)
     return training
 
 

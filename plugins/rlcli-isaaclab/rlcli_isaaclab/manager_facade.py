@@ -112,5 +112,5 @@ class RewardSettings:
 def _find_term(terms: Any, name: str, kind: str) -> Any:
     found = {term.name: term.instance for term in terms}
     if name not in found:
-        raise NameProblem(f"no {kind} '{name}'; choose from {listing(found)}")
+        raise NameProblem(f"no {kind} '{name}'; {kind}s: {listing(found)}")
     return found[name]

@@ -45,7 +45,8 @@ class Data:
             return getattr(self._data, _DATA_NAMES.get(name, name))
         except AttributeError:
             known = [n for n in (*dir(type(self)), *dir(self._data), *_DATA_NAMES) if not n.startswith("_")]
-            raise AttributeError(f"data has no '{name}'; {did_you_mean(name, known) or listing(known, 60)}") from None
+            hint = did_you_mean(name, known) or f"its attributes: {listing(known, 60)}"
+            raise AttributeError(f"data has no '{name}'; {hint}") from None
 
     def _expand_to_envs(self, row: Tensor) -> Tensor:
         return row if row.dim() == 3 else row.expand(self._env.num_envs, *row.shape)

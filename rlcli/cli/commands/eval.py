@@ -58,8 +58,10 @@ def command(
     limits, words = read_limits(fail_under, fail_over), overrides or []
     request = sessions.PolicyRequest(task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir)
     if compare:
-        if checkpoint is not None or policy != "trained" or record is not None:
-            raise UsageError("--compare takes policies as arguments only", hint="rlcli eval --compare RUN1 RUN2")
+        given = {"--checkpoint": checkpoint is not None, "--policy": policy != "trained", "--record": record is not None}
+        for option in [option for option, is_given in given.items() if is_given]:
+            hint = "name the policies as arguments: `rlcli eval --compare RUN1 RUN2`"
+            raise UsageError(f"--compare cannot be combined with {option}", hint=hint)
         _compare(request, episodes, limits)
         return
     sessions.check_record(record, record_mode)

@@ -1,4 +1,4 @@
-"""Engine of a sharded environment: the worlds of all shards, for observers, recordings and reports."""
+"""Engine of a sharded environment: the worlds (one per environment) of all shards, for observers, recordings and reports."""
 
 from __future__ import annotations
 
