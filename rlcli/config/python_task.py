@@ -151,7 +151,9 @@ class _PlainData:
             return self.plain(value.tolist(), path)
         if isinstance(value, Sequence | set | frozenset):
             return [self.plain(item, (*path, index)) for index, item in enumerate(value)]
-        self._problem(path, f"type {type(value).__name__} cannot be written to YAML; use numbers, text, lists or mappings")
+        self._problem(
+            path, f"type {type(value).__name__} cannot be written to YAML; use numbers, text, lists, mappings"
+        )
         return None
 
     def _term(self, term: object, path: tuple[str | int, ...]) -> str:
@@ -255,7 +257,7 @@ def _module_of(entry: object) -> str:
 
 
 def _object(entry: object) -> Any:
-    """Import the object of a reference; return other objects, and names of YAML files, unchanged."""
+    """Import the object of a reference `module:name`; return other objects, and names of YAML files, unchanged."""
     if not isinstance(entry, str):
         return entry
     return entry if entry.endswith((".yaml", ".yml")) else load_object(entry)

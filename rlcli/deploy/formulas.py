@@ -1,6 +1,7 @@
 """Formulas of observation and action terms.
 
-A formula is plain data (JSON). A program without rlcli evaluates it with the values of MjData. A formula is one of these. Every value is a row of float32.
+A formula is plain data (JSON); a program without rlcli evaluates it with the values of MjData. A formula is one of
+these. Every value is a row of float32.
 
 - A list of numbers.
 - `{"field": NAME, "at": [...]}`: elements of a flattened field of MjData.

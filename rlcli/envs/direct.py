@@ -143,9 +143,9 @@ class DirectTask:
         return IdSelection(ids, self.env.seed, episodes[ids], key, device, self.env.stream_ids)
 
     def selection(self, mask: Tensor, name: str) -> Selection | None:
-        """Return a selection of the environments where `mask` (num_envs,) is true, for random numbers during an episode.
+        """Return a selection of the environments where `mask` (num_envs,) is true, for random numbers in an episode.
 
-        Return None if there is no such environment. The numbers depend only on the seed, the environment, its episode, the
+        Return None if there is no such environment. They depend only on the seed, the environment, its episode, the
         step in that episode and `name`. A GPU never returns None, because a test of the mask would force a host sync.
         """
         env = self.env
@@ -371,7 +371,7 @@ class DirectEnv(VecEnv):
         return {"policy": obs, "critic": states} if self.task.num_states else {"policy": obs}
 
     def _reset_stale(self, env_ids: Tensor) -> None:
-        """Replacement of the task's `reset_idx`, for calls by the task itself.
+        """Replace the task's `reset_idx`, for calls by the task itself.
 
         OIGE tasks call it at the start of `pre_physics_step` for each environment whose flag is set. Environments that
         the framework has just reset only get their flags cleared; all others are reset.

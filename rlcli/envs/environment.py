@@ -45,7 +45,7 @@ class Environment(ABC):
     episode_length_buf: Tensor
     """Steps of the running episode. (num_envs,) int64"""
     episode_index: Tensor
-    """Number of episodes before the running one; it selects the random numbers of the running episode. (num_envs,) int64"""
+    """Number of episodes before the running one; the random numbers depend on it. (num_envs,) int64"""
     default_state: dict[str, Tensor]
     """Joint state at the start of episodes, before reset events. qpos (nq,), qvel (nv,)"""
     engine: EngineView

@@ -76,7 +76,7 @@ class VecEnv(Workflow):
         self.episode_length_buf = self._counters.lengths
         """Steps of the running episode. (num_envs,) int64"""
         self.episode_index = self._counters.indices
-        """Number of episodes before the running one; it selects the random numbers of the running episode. (num_envs,) int64"""
+        """Number of episodes before the running one; the random numbers depend on it. (num_envs,) int64"""
         self._guard = DivergenceGuard(self)
         self._build(shared_streams)
 

@@ -69,7 +69,7 @@ class Workflow(Environment):
         return torch.zeros(0, self.num_envs, device=self.device)
 
     def _before_reset(self, ended: Selection) -> None:
-        """Called before the environments of ended episodes are reset, for example to update the curriculum."""
+        """Do what must happen before the environments of ended episodes are reset: update the curriculum."""
 
     @abstractmethod
     def _reset_workflow(self, selection: Selection) -> None:

@@ -96,7 +96,7 @@ def read_limits(fail_under: Sequence[str] | None, fail_over: Sequence[str] | Non
     return list(limits.values())
 
 
-def require_success(resolved: Resolved, keys: Iterable[str], instead: str) -> None:
+def require_success(resolved: Resolved, keys: Iterable[str], instead: str = "--fail-under return=X") -> None:
     """Check that the task defines success if a key needs it.
 
     Args:

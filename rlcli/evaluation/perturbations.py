@@ -173,7 +173,7 @@ class _Push:
         names = [*floating, *joints]
         found = match(sweep.element, names, "entity or joint")
         if len(found) != 1:
-            raise NameProblem(f"the pattern matches {len(found)}: {listing(names[i] for i in found)}", "name one")
+            raise NameProblem(f"the pattern matches several names: {listing(names[i] for i in found)}", "choose one")
         name = names[found[0]]
         self._root, self._joint = floating.get(name), joints.get(name)
 

@@ -1,4 +1,4 @@
-"""Commands: goals for the policy. Each environment samples its own goals at the start of an episode and at intervals."""
+"""Commands: goals for the policy. Each environment samples them at the start of an episode and at intervals."""
 
 from __future__ import annotations
 

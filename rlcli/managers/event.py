@@ -93,8 +93,8 @@ class EventManager(TensorState):
     def interval(self, select: Select, running: Tensor, fired: Callback) -> None:
         """Count one step of the `running` episodes (1 or 0), and fire the events that are due.
 
-        `select` selects environments; their random numbers depend on the current step. `fired` is called after each event with its
-        environments. Global timers also run where no episode does.
+        `select` selects environments; their random numbers depend on the current step. `fired` is called after each
+        event with its environments. Global timers also run where no episode does.
         """
         for instance in self._updating:
             instance.update(select, running)

@@ -234,7 +234,7 @@ class _Clip(Stage):
 
 
 class _Filter(Stage):
-    """Base class of filters with past values `past`, (num_envs, m, k), a state which is 0 at the start of an episode."""
+    """Base class of filters that keep values `past`, (num_envs, m, k), which are 0 at the start of an episode."""
 
     _past: Tensor
 

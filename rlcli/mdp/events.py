@@ -1,4 +1,4 @@
-"""Event terms. Each acts on a `Selection` of environments; random numbers depend only on seed, term, environment and episode."""
+"""Event terms. Each acts on a `Selection` of environments; samples depend only on seed, term, environment, episode."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class Replay:
 
 
 def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool = False) -> list[int]:
-    """Return the numbers of the episodes to replay, one or all; none for a file of engine calls.
+    """Return the indices of the episodes to replay, one or all; none for a file of engine calls.
 
     Raises:
         UsageError: if the file does not hold the episode.
@@ -76,7 +76,7 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
             raise UsageError(message, hint="`rlcli autopsy RUN N --video FILE.mp4` renders a case of a run")
         return []
     if episode is not None and episode >= count:
-        raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"the file has {count}, counted from 0")
+        raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"it has {count} episodes, from 0")
     if not count:
         raise UsageError(f"{trajectory.file} has no episodes", hint="record with --record-mode all")
     return list(range(count)) if episode is None else [episode]

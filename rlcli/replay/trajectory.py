@@ -254,7 +254,7 @@ class Header(_Strict):
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """The checked content of a file."""
+    """Content of a trajectory file, after all checks."""
 
     file: Path
     header: Header

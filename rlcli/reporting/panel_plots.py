@@ -1,4 +1,4 @@
-"""Pictures of learning curves, plotted with matplotlib: without a window, and with the same bytes for the same curves."""
+"""Plots of learning curves, made with matplotlib: without a window, and with the same bytes for the same curves."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Choice:
             return named
         if not record.get("distribution"):
             message = f"{self.folder} is a policy for '{record['name']}', which was not an installed task"
-            raise CheckpointError(message, hint=f"name the task's folder: `rlcli play FOLDER --checkpoint {self.folder}`")
+            raise CheckpointError(message, hint=f"name its folder: `rlcli play FOLDER --checkpoint {self.folder}`")
         return recorded_task(record, f"the task of {self.folder}")
 
 

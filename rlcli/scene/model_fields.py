@@ -1,4 +1,4 @@
-"""Model fields that may differ between environments: their elements, their values, and the constants derived from them."""
+"""Model fields that may differ between environments: their elements, values, and the constants derived from them."""
 
 from __future__ import annotations
 

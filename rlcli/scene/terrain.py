@@ -280,7 +280,7 @@ def _read_heights(file: Path) -> NDArray[Any]:
     with file.open("rb") as opened:
         size = os.fstat(opened.fileno()).st_size
         if size > _MAX_HEIGHTS * 8 + _MAX_HEADER:
-            raise ValueError(f"the file has {size:,} bytes; give at most {_MAX_HEIGHTS:,} heights")
+            raise ValueError(f"the file is too large ({size:,} bytes); give at most {_MAX_HEIGHTS:,} heights")
         try:
             return np.asarray(np.lib.format.read_array(opened, allow_pickle=False, max_header_size=_MAX_HEADER))
         except (MemoryError, RecursionError, SyntaxError, TokenError) as error:  # errors of a malicious header

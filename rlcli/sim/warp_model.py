@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from rlcli.config.schema import SimConfig
-from rlcli.errors import did_you_mean
+from rlcli.errors import suggestion
 from rlcli.sim.capacity import required_capacity
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 from rlcli.sim.selection import Selection
@@ -63,9 +63,8 @@ class WarpModel:
         if name not in self._expanded:
             owner, attribute = self._owner(name)
             if not self.can_expand(name):
-                suggestion = did_you_mean(attribute, _batched_fields(owner))
-                text = f"'{name}' cannot differ between environments"
-                raise ValueError(text + (f"; {suggestion}" if suggestion else ""))
+                near = suggestion(attribute, _batched_fields(owner))
+                raise ValueError(f"'{name}' cannot differ between environments{near}")
             array = getattr(owner, attribute)
             values = np.repeat(array.numpy()[:1], self.num_envs, axis=0)
             wide = wp.array(values, dtype=array.dtype, device=self._device)

@@ -53,7 +53,7 @@ def compare_trajectories(
     """Report the first difference of two trajectories, if they are not equal bit for bit.
 
     Args:
-        env: an environment with their layout.
+        env: an environment with the layout of the trajectories.
         trajectories: both trajectories, equally long.
         message: message without the values, which are appended.
         hint: hint of the finding.

@@ -49,7 +49,7 @@ CHECKS: dict[str, Check] = {
     "engines": portability_checks.engines,
     "captured": portability_checks.captured,
 }
-"""Name -> check, in the order in which they run. The first line of a check's docstring is the requirement that it tests."""
+"""Name -> check, in the order in which they run. The first line of a check's docstring is its requirement."""
 
 _DIRECT_ONLY = ("observation-after-reset",)
 

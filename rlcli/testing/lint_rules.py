@@ -149,7 +149,7 @@ def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
         value = float(rewards[0])
         yield error_at(
             "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf",
-            f"is {value:g} in every step of every fixed policy, and no episode is terminated: there is nothing to learn",
+            f"is {value:g} in every step of all fixed policies, and no episode ends early: there is nothing to learn",
             "compute the reward from the state or the action",
             {"value": value},
         )

@@ -47,7 +47,7 @@ def explanation(findings: Findings) -> list[str]:
         lines = [f"{reason} {_describe(present)}"]
     else:
         lines = [f"{_describe(best)},", f"instead of {_describe(present)}, measured in alternation"]
-    lines.append("all settings in the comparison have the same samples and gradient steps per iteration, so they train equally")
+    lines.append("all compared settings have the same samples and gradient steps per iteration, so they train equally")
     if findings.unsteady:
         lines.append("the machine was busy, so the measurements vary: end other programs and measure again")
     return lines

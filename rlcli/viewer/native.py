@@ -82,7 +82,7 @@ def captions(view: View) -> tuple[str, str]:
     if view.checkpoint is not None:
         rows["checkpoint"] = f"{view.checkpoint}"
     for number, knob in enumerate(view.knobs):
-        value = f"{view.held[knob.name]:g}" if knob.name in view.held else "random"
+        value = f"{view.held[knob.name]:g}" if knob.name in view.held else "from the task"
         rows[f"{'> ' if number == view.knob else ''}{knob.name}"] = value
     if view.message:
         rows[""] = view.message[:80]
@@ -109,9 +109,8 @@ def _require_windows() -> None:
     if window is None:
         messages = [" ".join(str(warning.message).split()) for warning in caught]
         why = "; ".join(messages) or "GLFW does not start"
-        raise MachineError(
-            f"the window cannot be opened: {why}", hint="--viewer web shows it in the browser, --video FILE.mp4 renders to a file"
-        )
+        hint = "--viewer web opens the browser, --video FILE.mp4 renders to a file"
+        raise MachineError(f"the window cannot be opened: {why}", hint=hint)
     glfw.destroy_window(window)
 
 

@@ -287,8 +287,8 @@ def run_in_real_time(playback: Playback, is_open: Callable[[], bool], draw: Call
     Args:
         playback: environments and policy.
         is_open: returns whether the viewer is still open.
-        draw: renders the present state. It runs in the simulation's thread between two calls of `advance`, so it may read
-            `playback.env`. Another thread of a viewer may read only `playback.view`.
+        draw: renders the present state. It runs in the simulation's thread between two calls of `advance`, so it may
+            read `playback.env`. Another thread of a viewer may read only `playback.view`.
     """
     before, refreshed = time.perf_counter(), 0.0
     while is_open():

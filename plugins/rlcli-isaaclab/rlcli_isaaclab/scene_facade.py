@@ -214,7 +214,7 @@ class Scene(Mapping[str, Any]):
             return sensors[name]
         if name == "terrain" and self.terrain is not None:
             return self.terrain
-        raise KeyError(f"no '{name}' in the scene; choose from {listing([*self.articulations, *sensors])}")
+        raise KeyError(f"no '{name}' in the scene; entities and sensors: {listing([*self.articulations, *sensors])}")
 
     def __iter__(self) -> Iterator[str]:
         return iter([*self.articulations, *self.sensors])
@@ -229,7 +229,7 @@ class Scene(Mapping[str, Any]):
             NameProblem: if a name matches nothing.
         """
         if cfg.name not in self:
-            hint = did_you_mean(cfg.name, list(self)) or f"choose from {listing(self)}"
+            hint = did_you_mean(cfg.name, list(self)) or f"entities and sensors: {listing(self)}"
             raise NameProblem(f"no '{cfg.name}' in the scene", hint)
         element = self[cfg.name]
         for kind in ("joint", "body"):

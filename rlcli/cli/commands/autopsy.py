@@ -45,7 +45,7 @@ def command(
     """List or show the recorded failed and outlier episodes of a training.
 
     Options:
-        case: Show this case, by its index in the list. [default: list all]
+        case: Show this case, by its number in the list, from 0. [default: list all]
         sort: Order of the list: when, return, length or kind.
         steps: Number of last steps of a case to show.
         video: Render the last seconds of the case to FILE.mp4 or FILE.gif. Without FILE: autopsy.mp4.
@@ -87,7 +87,8 @@ def _refuse_bundle(folder: str, case: int | None) -> None:
 
     open_bundle(Path(folder))
     why = (
-        f"a bundle has no episodes of training; run `rlcli eval --checkpoint {folder} --record FILE --record-mode failed`"
+        "a bundle has no episodes of training; to record some, run"
+        f" `rlcli eval --checkpoint {folder} --record FILE --record-mode failed`"
         " records new ones"
     )
     if case is not None:
@@ -217,7 +218,7 @@ def _print_contacts(contacts: Sequence[Contact]) -> None:
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
-    """Return values as a text of bars with eight heights; average neighbours if there are more than `width`; `?` is not finite."""
+    """Return values as bars of eight heights; average neighbours if there are more than `width`; `?` is not finite."""
     if len(values) > width:
         edges = [round(i * len(values) / width) for i in range(width + 1)]
         values = [sum(values[a:b]) / (b - a) for a, b in itertools.pairwise(edges)]

@@ -58,9 +58,9 @@ def command(
     limits, words = read_limits(fail_under, fail_over), overrides or []
     request = sessions.PolicyRequest(task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir)
     if compare:
-        given = {"--checkpoint": checkpoint is not None, "--policy": policy != "trained", "--record": record is not None}
-        for option in [option for option, is_given in given.items() if is_given]:
-            hint = "name the policies as arguments: `rlcli eval --compare RUN1 RUN2`"
+        given = {"--checkpoint": checkpoint, "--policy": policy if policy != "trained" else None, "--record": record}
+        for option in [option for option, value in given.items() if value is not None]:
+            hint = "name the policies as arguments: rlcli eval --compare RUN1 RUN2"
             raise UsageError(f"--compare cannot be combined with {option}", hint=hint)
         _compare(request, episodes, limits)
         return

@@ -48,7 +48,7 @@ def command(
         video: Write one episode to FILE.mp4 or FILE.gif, without a window; without FILE into the run. After an
             episode that is terminated within 5 s the next episodes follow.
         viewer: auto, native (a window), web (the browser) or none (printed values). auto is a window if there is a
-            display, else the browser if started from a terminal, else printed values. [default: the settings' viewer, or
+            display, else the browser if started from a terminal, else none. [default: the settings' viewer, or
             auto]
         port: Port of --viewer web, on this machine only; 0 takes any free port. [default: 8080]
         drawn: Number of environments to show, side by side on the grid.
@@ -96,7 +96,7 @@ def _check_record(record: Path | None, mode: str, video: Path | None, commands: 
     from rlcli.evaluation.session import check_record
 
     if record is not None and video is not None:
-        raise UsageError("--record and --video cannot be combined", hint="run `rlcli replay FILE --video` for a video of a recording")
+        raise UsageError("--record and --video cannot be combined", hint="`rlcli replay FILE --video` renders FILE")
     if record is not None and commands:
         raise UsageError("leave out --record or --command: `rlcli replay` cannot repeat commanded episodes")
     check_record(record, mode)

@@ -18,7 +18,8 @@ def command(
 ) -> None:
     """List the terms (observation, action, reward, event ... functions) that a task file can use.
 
-    The list has the name of each term, and its keys, types and defaults. An exact name prints the meaning of each key, with its unit, and an example.
+    The list has the name of each term, and its keys, types and defaults. An exact name prints the meaning of each
+    key, with its unit, and an example.
 
     Options:
         pattern: Text in the name, section or summary of the terms. [default: all terms]

@@ -127,7 +127,7 @@ def _source(task: str | None, request: TrainingRequest, seed: int | None, seeds:
 
     if request.resume is None:
         if task is None:
-            raise UsageError("no task given", hint="run `rlcli train TASK` (`rlcli list-tasks` shows the tasks), or give --resume RUN")
+            raise UsageError("no task given", hint="name a task (`rlcli list-tasks` shows all), or give --resume RUN")
         return named_task(task)
     source = None if task is None or "=" in task else named_task(task)
     changes = [word for word in [task, *request.overrides] if word and "=" in word]

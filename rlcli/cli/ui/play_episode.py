@@ -107,11 +107,10 @@ def _print_origin(session: Session, start: EpisodeStart, env_id: int, episode: i
         names, more = ", ".join(start.reasons[:_MAX_REASONS]), len(start.reasons) - _MAX_REASONS
         causes = f"{names} and {more} more" if more > 0 else names
         count = start.episodes_before
-        earlier = f"{count} earlier episodes" if count > 1 else "earlier episode"
-        affects = "they affect" if count > 1 else "it affects"
-        console.info(
-            f"first ran the {earlier} of this environment, because {affects} this episode through {causes}"
+        earlier, affect = (
+            (f"{count} earlier episodes", "they affect") if count > 1 else ("earlier episode", "it affects")
         )
+        console.info(f"first ran the {earlier} of this environment, because {affect} this episode through {causes}")
 
 
 def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) -> dict[str, Any]:

@@ -71,7 +71,7 @@ def choose_viewers(viewer: str | None, port: int | None, *, headless: bool) -> l
     if viewer == "native" and not has_display():
         raise MachineError(
             "there is no display for a window",
-            hint="--viewer web shows it in the browser, --video FILE.mp4 renders to a file, --viewer none prints values",
+            hint="--viewer web opens the browser, --video FILE.mp4 renders to a file, --viewer none prints values",
         )
     if viewer not in (None, "auto"):
         return [(str(viewer), "--viewer is given")]

@@ -317,7 +317,7 @@ class ShardedEnv(Environment):
         return {name: self._joined_metric([part[name] for part in parts]) for name in parts[0]}
 
     def _joined_metric(self, parts: Sequence[Tensor]) -> Tensor:
-        """Return the values of all environments; for a value that each shard computes once, the mean over environments."""
+        """Return the values of all environments; for one value per shard, the mean over environments."""
         if parts[0].dim():
             return join(parts)
         counts = torch.tensor([shard.count for shard in self._shards], dtype=torch.float64)

@@ -158,7 +158,7 @@ class _GlobalGenerators:
             raise TaskError(
                 f"the task uses the global random generator of {used[0]}; with several workers its results would"
                 " depend on their number",
-                hint="set scene.workers: 1, or take random numbers from the selection (`selection.uniform`, `self.draws`)",
+                hint="set scene.workers: 1, or use the selection's random numbers (`selection.uniform`, `self.draws`)",
             )
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""Reward terms of the robot's root body (its base): survival, posture, velocity tracking, progress. (num_envs,) each."""
+"""Reward terms of the robot's root body (its base): survival, posture, tracking, progress. (num_envs,) each."""
 
 from __future__ import annotations
 
