@@ -229,7 +229,7 @@ def test_state_dict_restores_curriculum(tmp_path):
         ("rewards.alife.weight", "'rewards' has no 'alife'"),
         ("reward.alive.weight", "did you mean 'rewards'"),
         ("rewards.alive.func", "'rewards.alive' has no 'func'"),
-        ("rewards.alive", "is not a number"),
+        ("rewards.alive", "must name a number"),
         ("rewards.alive.weight.0", "does not exist"),
         ("sim.dt", "the task has no 'sim'"),
         ("terminations.time_out.time_out", "has no 'time_out'"),

@@ -87,9 +87,8 @@ def _refuse_bundle(folder: str, case: int | None) -> None:
 
     open_bundle(Path(folder))
     why = (
-        "a bundle has no episodes of training; to record some, run"
+        "a bundle has no episodes of training; to record new ones, run"
         f" `rlcli eval --checkpoint {folder} --record FILE --record-mode failed`"
-        " records new ones"
     )
     if case is not None:
         raise UsageError(f"no case {case} in {folder}", hint=why)

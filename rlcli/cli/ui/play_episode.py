@@ -108,7 +108,7 @@ def _print_origin(session: Session, start: EpisodeStart, env_id: int, episode: i
         causes = f"{names} and {more} more" if more > 0 else names
         count = start.episodes_before
         earlier, affect = (
-            (f"{count} earlier episodes", "they affect") if count > 1 else ("earlier episode", "it affects")
+            (f"{count} earlier episodes", "they affect") if count > 1 else ("episode before", "it affects")
         )
         console.info(f"first ran the {earlier} of this environment, because {affect} this episode through {causes}")
 
