@@ -128,12 +128,6 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str | None:
     return f"did you mean {' or '.join(repr(match) for match in close)}?" if close else None
 
 
-def suggestion(name: str, candidates: Iterable[str]) -> str:
-    """Return `; did you mean 'x'?`, to be appended to a message; an empty text if no candidate is similar."""
-    near = did_you_mean(name, candidates)
-    return f"; {near}" if near else ""
-
-
 def one_line(error: BaseException, limit: int | None = None) -> str:
     """Return the message of an error on one line, cut to `limit` characters; its class name if it has no message."""
     return " ".join(str(error).split())[:limit] or type(error).__name__

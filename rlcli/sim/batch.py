@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rlcli.config.schema import SimConfig
-from rlcli.errors import suggestion
+from rlcli.errors import did_you_mean
 from rlcli.machine import available_cores
 from rlcli.sim import divergence_report as report
 from rlcli.sim.acceleration_fields import ACCELERATION_FIELDS, force_sensors
@@ -97,7 +97,9 @@ class BatchEngine(BatchState):
         """Return a live view of an MjData field; from now on, `step` computes the stage of a derived field."""
         if name not in self._fields:
             if name not in DATA_FIELDS:
-                raise ValueError(f"'{name}' is not an MjData field{suggestion(name, DATA_FIELDS)}")
+                raise ValueError(
+                    f"'{name}' is not an MjData field; {did_you_mean(name, DATA_FIELDS) or 'see mujoco/mjdata.h'}"
+                )
             if name in FIELDS_OF_SKIPPED_WORK:
                 self._skip_nothing()
             with warnings.catch_warnings(action="ignore"):  # torch warns about the read-only arrays of derived fields

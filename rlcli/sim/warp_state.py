@@ -14,7 +14,7 @@ import warp as wp
 from torch import Tensor
 
 from rlcli.config.schema import SimConfig
-from rlcli.errors import suggestion
+from rlcli.errors import did_you_mean
 from rlcli.sim.tensor_state import require_matching_tensors, substate
 from rlcli.sim.warp_fields import FORCE, INPUTS, KINEMATICS, STATE, VELOCITY, FieldStages
 from rlcli.sim.warp_model import WarpModel
@@ -56,7 +56,9 @@ class WarpState(WarpModel):
                 names = [f.name for f in dataclasses.fields(self._data)]
                 if name in names:
                     raise ValueError(f"field '{name}' of MuJoCo Warp's data has no value for each environment")
-                raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data{suggestion(name, names)}")
+                raise ValueError(
+                    f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, names) or 'see mujoco_warp.Data'}"
+                )
             saved = self._substep_values()
             self._fields[name] = wp.to_torch(array)
             if name in INPUTS:  # it still has the model's value

@@ -310,7 +310,7 @@ def hold_command(env: VecEnv, name: str, value: float | None) -> None:
     """
     manager = _commands(env)
     if manager is None:
-        raise UsageError(f"no command '{name}'", hint="leave it out: the task has no commands")
+        raise UsageError(f"no command '{name}'", hint="leave out --command")
     manager.hold(name, value)
 
 
