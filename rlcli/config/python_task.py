@@ -151,8 +151,7 @@ class _PlainData:
             return self.plain(value.tolist(), path)
         if isinstance(value, Sequence | set | frozenset):
             return [self.plain(item, (*path, index)) for index, item in enumerate(value)]
-        kind = type(value).__name__
-        self._problem(path, f"a value of type {kind} cannot be written to YAML; use numbers, text, lists or mappings")
+        self._problem(path, f"type {type(value).__name__} has no YAML form; use numbers, text, lists or mappings")
         return None
 
     def _term(self, term: object, path: tuple[str | int, ...]) -> str:

@@ -249,8 +249,7 @@ class Checkpoint:
                     rows = slice(max(start, shard.start) - shard.start, min(end, shard.stop) - shard.start)
                     parts.append({column: values[rows] for column, values in columns.items()})
             if any(set(part) != set(parts[0]) for part in parts):
-                message = f"{self.folder}/manifest.json is corrupt: the parts of '{name}' have different columns"
-                raise CheckpointError(f"{message}; use another checkpoint, RUN@step:N")
+                raise CheckpointError(f"{self.folder}: the parts of '{name}' have different columns; use RUN@step:N")
             return {column: torch.cat([part[column] for part in parts]) for column in parts[0]} if parts else {}
 
         return Rows(first, stop, read)

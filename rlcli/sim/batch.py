@@ -97,9 +97,8 @@ class BatchEngine(BatchState):
         """Return a live view of an MjData field; from now on, `step` computes the stage of a derived field."""
         if name not in self._fields:
             if name not in DATA_FIELDS:
-                raise ValueError(
-                    f"'{name}' is not an MjData field; {did_you_mean(name, DATA_FIELDS) or 'see mujoco/mjdata.h'}"
-                )
+                hint = did_you_mean(name, DATA_FIELDS) or "see mujoco/mjdata.h"
+                raise ValueError(f"'{name}' is not an MjData field; {hint}")
             if name in FIELDS_OF_SKIPPED_WORK:
                 self._skip_nothing()
             with warnings.catch_warnings(action="ignore"):  # torch warns about the read-only arrays of derived fields

@@ -56,9 +56,8 @@ class WarpState(WarpModel):
                 names = [f.name for f in dataclasses.fields(self._data)]
                 if name in names:
                     raise ValueError(f"field '{name}' of MuJoCo Warp's data has no value for each environment")
-                raise ValueError(
-                    f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, names) or 'see mujoco_warp.Data'}"
-                )
+                hint = did_you_mean(name, names) or "see mujoco_warp.Data"
+                raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {hint}")
             saved = self._substep_values()
             self._fields[name] = wp.to_torch(array)
             if name in INPUTS:  # it still has the model's value

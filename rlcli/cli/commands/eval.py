@@ -60,8 +60,7 @@ def command(
     if compare:
         given = {"--checkpoint": checkpoint, "--policy": policy if policy != "trained" else None, "--record": record}
         for option in [option for option, value in given.items() if value is not None]:
-            hint = "name the policies as arguments: rlcli eval --compare RUN1 RUN2"
-            raise UsageError(f"--compare cannot be combined with {option}", hint=hint)
+            raise UsageError(f"--compare cannot be combined with {option}", hint="use rlcli eval --compare RUN1 RUN2")
         _compare(request, episodes, limits)
         return
     sessions.check_record(record, record_mode)
