@@ -42,7 +42,7 @@ def make(
     Args:
         task: name of an installed task, or the path of a task folder.
         num_envs: number of environments; None takes the task's own.
-        seed: seed of every random draw.
+        seed: seed of all random numbers.
         device: `cpu`, or `cuda` for MuJoCo Warp.
         overrides: `key.path=value`, as on the command line.
 
@@ -80,13 +80,13 @@ def train(
         seed: seed of the training.
         device: `auto`, `cpu` or `cuda`.
         overrides: `key.path=value`; `agent.key=value` changes the agent.
-        runs_dir: folder of the runs; None takes the setting, or `runs`.
+        runs_dir: folder of the runs; None: the environment variable RLCLI_RUNS_DIR, else `runs`.
         name: part of the name of the run's folder.
         resume: run to resume.
         on_progress: receives the progress after each iteration.
 
     Raises:
-        RlcliError: as the command `rlcli train` ends with.
+        RlcliError: in every case in which `rlcli train` would end with an error.
     """
     request = TrainingRequest(
         Path(runs_dir or default_runs_dir()),
@@ -125,7 +125,7 @@ def evaluate(
     """Evaluate a policy and return the summary that `rlcli eval --json` prints.
 
     Args:
-        checkpoint: run or checkpoint; None takes the newest run of the task, else the policy that comes with it.
+        checkpoint: run or checkpoint; None takes the newest run of the task, else the policy shipped with the task.
         task: task to evaluate in; None takes the task of the run.
         episodes: number of episodes.
         num_envs: number of environments; None takes the task's own.
@@ -159,7 +159,7 @@ def load_policy(
 
     Args:
         env: environment in which the policy acts.
-        checkpoint: run or checkpoint; None takes the newest run of the task, else the policy that comes with it.
+        checkpoint: run or checkpoint; None takes the newest run of the task, else the policy shipped with the task.
         stochastic: sample actions instead of taking the mean.
         runs_dir: folder of the runs.
 

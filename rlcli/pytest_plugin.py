@@ -34,7 +34,7 @@ def rlcli_check() -> Callable[..., list[Finding]]:
         findings = check_task(task, agent=agent, overrides=overrides, only=only)
         errors = [str(finding) for finding in findings if finding.severity == "error"]
         if errors:
-            pytest.fail("\n".join([f"task '{task}' fails rlcli check:", *errors]), pytrace=False)
+            pytest.fail("\n".join([f"task '{task}' fails `rlcli check`:", *errors]), pytrace=False)
         return findings
 
     return check

@@ -1,7 +1,7 @@
-"""Counter-based random numbers: a draw depends on (seed, stream, environment, counter, index) and nothing else.
+"""Counter-based random numbers: each number depends on (seed, stream, environment, counter, index) and nothing else.
 
 Environment 7 therefore draws the same numbers for any number of environments and threads, and for any order in which
-other environments reset or draw. The mixing function is the finaliser of SplitMix64 (Steele, Lea and Flood 2014,
+other environments reset or sample. The mixing function is the finaliser of SplitMix64 (Steele, Lea and Flood 2014,
 https://doi.org/10.1145/2660193.2660195).
 """
 

@@ -43,7 +43,7 @@ def open_task(
         cfg: changes of the configuration: a mapping with dotted or nested keys, `{"episode_length_s": 3.0}`; or a list
             of overrides, `["episode_length_s=3.0"]`; or a whole configuration that replaces the task's own.
         agent: the agent whose patch of the task is applied; None: the default agent.
-        seed: seed of all random draws, until `reset` gets another one.
+        seed: seed of all random numbers, until `reset` gets another one.
         device: cpu, cuda or cuda:N.
     """
     if isinstance(cfg, Resolved):
@@ -92,7 +92,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     """Gymnasium vector environment of the observation group `policy`. Each step returns new float32 arrays.
 
     The autoreset mode decides what `step` returns when an episode ends. The episodes are the same in each mode, because
-    the start state of an episode depends only on the environment and the number of the episode:
+    the start state of an episode depends only on the environment and the index of the episode:
     - SAME_STEP: `step` returns the first observation of the next episode; the last one is in `info["final_obs"]`;
     - NEXT_STEP: `step` returns the last observation; the next step ignores the action, has reward 0 and returns the
       first observation of the next episode;

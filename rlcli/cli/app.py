@@ -237,8 +237,8 @@ def _agent_models() -> set[type[BaseModel]]:
 
 
 _FOREIGN_OPTIONS = {
-    "task": "the task is named without an option, as in: rlcli train cartpole",
-    "load-run": "--checkpoint RUN names a run or one of its checkpoints; rlcli train --resume RUN continues a run",
+    "task": "the task is named without an option, as in `rlcli train cartpole`",
+    "load-run": "--checkpoint RUN names a run or one of its checkpoints; `rlcli train --resume RUN` continues a run",
     "enable-cameras": "leave it out: cameras of a task need no option",
 }
 """Option of another program -> what to write for rlcli."""

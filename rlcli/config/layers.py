@@ -201,7 +201,8 @@ def parse_address(text: str) -> tuple[str, ...]:
 
 def _index(target: list[Any], step: str | int, taken: Path) -> int:
     if not str(step).isdecimal() or int(step) >= len(target):
-        raise LookupError(f"'{taken[-1]}' is a list of {len(target)} items: give an index from 0 instead of '{step}'")
+        allowed = f"give an index from 0 to {len(target) - 1}" if target else "it has no items to change"
+        raise LookupError(f"'{taken[-1]}' is a list of length {len(target)} without item '{step}'; {allowed}")
     return int(step)
 
 

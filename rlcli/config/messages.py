@@ -99,7 +99,7 @@ def _message(
     if kind == "extra_forbidden":
         return f"unknown key '{path[-1]}'", _suggest_key(str(path[-1]), _fields(model, path[:-1]), locations), path
     if kind == "union_tag_not_found":
-        return "missing key 'kind'", f"one of {listing(_tags(model, path))}", path
+        return "missing key 'kind'", f"allowed: {listing(_tags(model, path))}", path
     if kind == "union_tag_invalid":
         tag, expected = items[0]["ctx"]["tag"], items[0]["ctx"]["expected_tags"].replace(", ", " or ")
         similar = did_you_mean(tag, _tags(model, path))

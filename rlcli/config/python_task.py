@@ -99,7 +99,7 @@ def to_task(value: Any, label: str, root: FilePath) -> PythonTask:
             return to_task(value(), label, root)
         task = PythonTask(value)
     if not isinstance(task.data, TaskConfig | Mapping):
-        found = f"expected a TaskConfig, found a {type(task.data).__name__}"
+        found = f"expected a TaskConfig, found a value of type {type(task.data).__name__}"
         raise ConfigError([Problem(label, "", found, "a TaskConfig, or a function that returns one")])
     task.data = _PlainData(task.terms, label).read(task.data)
     return task
@@ -115,7 +115,7 @@ def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
         value = value.__rlcli_agent__(notes)
     plain = _PlainData({}, "agent").plain(value, ())
     if not isinstance(plain, dict):
-        raise TypeError(f"the agent is a {type(value).__name__}; write a mapping of settings")
+        raise TypeError(f"the agent is of type {type(value).__name__}; write a mapping of settings")
     return plain
 
 
@@ -151,7 +151,7 @@ class _PlainData:
             return self.plain(value.tolist(), path)
         if isinstance(value, Sequence | set | frozenset):
             return [self.plain(item, (*path, index)) for index, item in enumerate(value)]
-        self._problem(path, f"a {type(value).__name__} cannot be written to YAML; use numbers, text, lists or mappings")
+        self._problem(path, f"type {type(value).__name__} has no YAML form; use numbers, text, lists or mappings")
         return None
 
     def _term(self, term: object, path: tuple[str | int, ...]) -> str:
@@ -255,7 +255,7 @@ def _module_of(entry: object) -> str:
 
 
 def _object(entry: object) -> Any:
-    """Import the object of a reference; return other objects, and names of YAML files, unchanged."""
+    """Import the object of a reference `module:name`; return other objects, and names of YAML files, unchanged."""
     if not isinstance(entry, str):
         return entry
     return entry if entry.endswith((".yaml", ".yml")) else load_object(entry)

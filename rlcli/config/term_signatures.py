@@ -157,7 +157,7 @@ def signature_of(term: Any, name: str) -> Signature:
         file, source = inspect.getsourcefile(term), inspect.getsource(term)
         node = ast.parse(textwrap.dedent(source)).body[0]
     except (OSError, TypeError, SyntaxError, IndexError):
-        raise SignatureError("the term's source cannot be read; define it at the top of a file") from None
+        raise SignatureError("its source code cannot be read; define the term in a .py file, at module level") from None
     call: ast.stmt | None = node
     if isinstance(node, ast.ClassDef):
         call = constructor(SourceClass(Path(file or "?"), node), ClassSearch())

@@ -23,7 +23,10 @@ from rlcli.registry.imports import load_spec
 from rlcli.trainers import TrainerSpec
 
 PATCHES = ("agents", "play")
-"""Keys of a task file that contain patches of the task. They are merged before the patches are applied."""
+"""Keys of a task file whose values patch the task.
+
+Changes to these values from a --config file or an override are made first; then the patches are applied.
+"""
 _DEVICES = ("cpu", "cuda")
 
 

@@ -69,7 +69,10 @@ class ReferenceEnv:
 
 @dataclass(slots=True)
 class ClosedLoopResult:
-    """Result of the closed-loop check. Differences are relative to max(1, |value|)."""
+    """Result of the closed-loop check: the exported policy against the environment.
+
+    A difference between two values is divided by max(1, |value|).
+    """
 
     model: Path
     program: Path
@@ -191,7 +194,8 @@ def verify(
     _log.info(f"{file.name} controls plain MuJoCo with {model.name} for {episodes} episodes")
     differing = deployment_differences(checkpoint, env.layout.record(), reference.deployment, _may_randomize(env))
     space: dict[str, Any] = {"__name__": "run_policy"}
-    exec(compile(code, "run_policy.py", "exec"), space)  # the generated code, not the file: that may be the user's own
+    # the code generated here, not the run_policy.py on disk, which the user may have changed
+    exec(compile(code, "run_policy.py", "exec"), space)
     controller, policy = space["Controller"](file), checkpoint.policy()
     initial = env.state_dict()
     seed_generators(derive(_SEED, "task"))
@@ -230,7 +234,7 @@ def verify(
 
 
 def _may_randomize(env: VecEnv) -> bool:
-    """Return whether the task may draw gains or the initial state at random: an event does more than reset."""
+    """Return whether the task may randomise gains or the initial state: an event does more than reset."""
     events = [event for event in env.config.events.values() if event is not None]
     return isinstance(env, DirectEnv) or not all(event.func.startswith("reset_") for event in events)
 
@@ -259,6 +263,7 @@ class _PlainMujocoRunner:
         self._plan = controller.metadata["deployment"]
         closed = [c for control in self._plan["controls"] if control["closed"] for c in control["ctrl"]]
         self._closed = np.zeros(model.nu, dtype=bool)
+        """Controls that a formula in the policy's metadata computes, by index of the control."""
         try:
             self._closed[closed] = True
             self._bounds = _control_bounds(controller, model)

@@ -99,7 +99,7 @@ def _bind(env: DirectEnv, section: str, number: int, entry: Mapping[str, Any]) -
     path = (section, f"{entry['func']}_{number}")
     signature = env.resolved.vocabulary.find(section, entry["func"])
     if signature is None:
-        raise ConfigError([Problem(section, ".".join(path), f"no term '{entry['func']}'; rlcli terms lists all")])
+        raise ConfigError([Problem(section, ".".join(path), f"no term '{entry['func']}'; `rlcli terms` lists all")])
     checked = params_model(signature, section).model_validate(dict(entry), strict=False)
     base = ObservationConfig if section == "observations" else ActionConfig
     term = env._binder.bind(section, path, base.model_construct(**dict(checked)))

@@ -151,8 +151,8 @@ def _require_equal(run: PolicyFunction, graph: DeployedPolicy, observations: Ten
                 difference = relative_difference(found[name], values)
                 if found[name].shape != values.shape or not bool((difference <= TOLERANCE).all()):
                     raise VerdictError(
-                        f"{file} is not kept: at batch {batch} its '{name}' differs from the policy's by"
-                        f" {float(difference.max()):.3g}, allowed is {TOLERANCE:g}",
+                        f"{file} was not kept: with batch size {batch} its output '{name}' differs from the policy's"
+                        f" by a relative {float(difference.max()):.3g}; at most {TOLERANCE:g} is allowed",
                         hint="please report it with the versions of torch, onnx and onnxruntime",
                     )
                 worst = max(worst, float(difference.max()))

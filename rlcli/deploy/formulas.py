@@ -1,11 +1,13 @@
-"""Formulas of observation and action terms: plain data from which code without rlcli computes them from MjData.
+"""Formulas of observation and action terms.
 
-A formula is one of these. Every value is a row of float32.
+A formula is plain data (JSON); a program without rlcli evaluates it with the values of MjData. A formula is one of
+these. Every value is a row of float32.
 
 - A list of numbers.
 - `{"field": NAME, "at": [...]}`: elements of a flattened field of MjData.
 - `{"given": NAME, "at": [...]}`: elements of an input. Inputs are `last_action`, `steps` (of the episode),
-  `command/NAME`, and the policy's outputs `action` and `command`.
+  `command/NAME` (a command of the task, such as a target velocity), and the policy's outputs `action` (raw) and
+  `command` (with scale, offset and limits).
 - `{"op": NAME, "of": [formulas]}`: an operation; `deployed/run_policy.py` implements all of them.
 
 A term without a formula can only be computed by its own code.
@@ -288,7 +290,7 @@ def _ee_to_object(env: VecEnv, entity: Entity, sites: Columns, object: Entity) -
 
 
 def _generated_commands(env: VecEnv, command: CommandTerm) -> Formula:
-    terms = getattr(env, "command_manager").terms  # noqa: B009 (only managed environments have commands)
+    terms = getattr(env, "command_manager").terms  # noqa: B009 (only manager-based environments have commands)
     return given(next(f"command/{term.name}" for term in terms if term.instance is command))
 
 

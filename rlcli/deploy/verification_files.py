@@ -71,7 +71,7 @@ def check_overwrites(policy: Path) -> None:
     except OSError:  # a folder, or no permission
         is_exported = False
     if not is_exported:
-        message = f"--verify would overwrite {model}, which is not a file of rlcli export"
+        message = f"--verify would overwrite {model}, which is not a file of `rlcli export`"
         raise UsageError(message, hint="give an --output in an empty folder")
 
 

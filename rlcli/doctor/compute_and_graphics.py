@@ -27,7 +27,7 @@ _PACKAGES = "apt install libegl1 libosmesa6"
 _OFF = ("disable", "disabled", "off", "false", "0")
 _ANSWER_BYTES = 100_000
 _LATE = "no answer within"
-BUSY = "if the machine is busy: rlcli doctor --probe-timeout 120"
+BUSY = "if the machine is busy: `rlcli doctor --probe-timeout 120`"
 REINSTALL = f"pip uninstall -y {' '.join(TRIPLE)} && pip install mujoco"
 """Uninstall first: the three packages share files, so upgrading one removes files that another has just written."""
 
@@ -120,14 +120,14 @@ def graphics_check(answers: dict[str, Answer]) -> Check:
     """Check which OpenGL backends can render an image, and which one rlcli would use."""
     works = [name for name, (answer, _) in answers.items() if answer is not None]
     fails = {name: reason for name, (answer, reason) in answers.items() if answer is None}
-    text = f"{', '.join(works) or 'nothing'} can draw"
+    text = f"{', '.join(works) or 'nothing'} can render"
     text += "".join(f"; {name} cannot ({reason})" for name, reason in fails.items())
     details: dict[str, Any] = {"drawn": {name: name in works for name in answers}, "used": None}
     wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
     if wanted in _OFF:
         return Check("graphics", "ok", f"switched off by MUJOCO_GL={wanted}; {text}", details=details)
     if wanted in answers and wanted not in works:
-        return Check("graphics", "broken", f"MUJOCO_GL={wanted} cannot draw; {text}", "unset MUJOCO_GL", details)
+        return Check("graphics", "broken", f"MUJOCO_GL={wanted} cannot render; {text}", "unset MUJOCO_GL", details)
     if wanted and wanted not in (*answers, *_KNOWN):
         found = f"MuJoCo does not start with MUJOCO_GL={wanted}; {text}"
         return Check("graphics", "broken", found, "unset MUJOCO_GL", details)

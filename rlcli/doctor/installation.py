@@ -191,7 +191,7 @@ def _remedy(entry: Entry, reason: str) -> str:
     """Return the hint for a broken plugin."""
     if entry.distribution == "rlcli":
         return "pip install --upgrade --force-reinstall rlcli"
-    late = "; if the machine is busy: rlcli doctor --probe-timeout 120" if " within " in reason else ""
+    late = "; if the machine is busy: `rlcli doctor --probe-timeout 120`" if " within " in reason else ""
     return f"pip uninstall {entry.distribution}, or exclude it with RLCLI_PLUGINS; report it to its authors{late}"
 
 

@@ -40,7 +40,7 @@ def memory_check(free: int, limit: int | None) -> Check:
 def _cores() -> Check:
     """Report the cores of this process."""
     cores, quota = available_cores(), core_quota()
-    found = f"{cores} of {os.cpu_count()} for this process, the default of engine_threads"
+    found = f"{cores} of {os.cpu_count()} cores for this process; engine_threads defaults to {cores}"
     details = {"cores": os.cpu_count(), "available": cores, "quota": quota}
     if quota is not None:
         found += f"; its control group allows {quota:g}"
@@ -75,5 +75,5 @@ def _text() -> Check:
     text = f"{where}, " + ", ".join(f"{what} {name}" for what, name in encodings.items())
     if all(name.lower().replace("-", "") in ("utf8", "none") for name in encodings.values()):
         return Check("text", "ok", text, details=dict(encodings))
-    text = f"{text}: other characters are printed as \\u...."
+    text = f"{text}: characters that this encoding lacks are printed as \\u...."
     return Check("text", "warning", text, "export PYTHONUTF8=1 PYTHONIOENCODING=utf-8", dict(encodings))

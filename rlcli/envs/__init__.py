@@ -1,1 +1,1 @@
-"""Environments: the environment loop and its two workflows, managed and direct."""
+"""Environments: the environment loop and its two workflows, manager-based and direct."""

@@ -182,7 +182,7 @@ class _Drive:
     """Factor from the value of a joint to the control; None: 1."""
 
     def controls_for(self, values: Tensor) -> Tensor:
-        """Return the controls for joint values. (n, num_dof) -> (n, k)"""
+        """Return the controls (ctrl) of the k actuators that command joint values. (n, num_dof) -> (n, k)"""
         driven = values if self.joints is None else values[:, self.joints]
         return driven if self.factor is None else driven * self.factor
 

@@ -53,8 +53,8 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
         scene: the scene, with everything that the task adds.
         binder: collects the names that do not resolve.
         device: device of the engine.
-        seed: seed of the terrain's draws.
-        streams: number of the random stream of each environment. (num_envs,) int64
+        seed: seed of the terrain's random numbers.
+        streams: index of the random stream of each environment. (num_envs,) int64
 
     Raises:
         ConfigError: if there is no model in which further names could be looked up.
@@ -131,7 +131,7 @@ def _default_state(engine: Engine, entities: dict[str, Entity]) -> dict[str, Ten
 
 
 def _select_all(engine: Engine) -> Selection:
-    """Return a selection of all environments; it must not be used for draws."""
+    """Return a selection of all environments; its seed and counters are 0: do not draw random numbers from it."""
     mask = torch.ones(engine.num_envs, dtype=torch.bool, device=engine.device)
     counters = torch.zeros(engine.num_envs, dtype=torch.int64, device=engine.device)
     selection = engine.select(mask, 0, engine.as_field(counters))

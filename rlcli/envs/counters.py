@@ -77,7 +77,7 @@ class EpisodeCounters(TensorState):
         """Count the episodes that end. Return where an episode ends, and where it ends by time-out alone."""
         failed, late = self._as_field(terminated), self._as_field(truncated)
         finished = failed | late
-        self.index_field += finished  # before the selection, which keys the draws of the next episode by this counter
+        self.index_field += finished  # before the selection, whose random numbers depend on this counter
         return finished, late > failed
 
     def reset(self, selection: Selection) -> None:

@@ -72,7 +72,7 @@ class DirectTask:
         self.progress_buf = torch.zeros(n, dtype=torch.int64, device=self.device)
         """Steps of the running episode. (num_envs,) int64"""
         self.extras: dict[str, Any] = {}
-        """Numbers and tensors to log, by name. The metric `Task/<name>` is their mean, once an iteration.
+        """Values and tensors to log, by name. The metric `Task/<name>` is their mean, once an iteration.
 
         `rlcli eval` logs means over episodes, of the means over their steps, for tensors with one row for each
         environment.
@@ -93,7 +93,7 @@ class DirectTask:
     def reset(self, selection: Selection) -> None:
         """Write start states; the selected environments are in their default state.
 
-        Draw from the selection and write through it: `entity.write_joint_positions(selection, ...)`,
+        Take random numbers from the selection and write through it: `entity.write_joint_positions(selection, ...)`,
         `selection.write(...)`. A GPU captures this hook as part of the step. A task defines this hook or `reset_idx`,
         not both.
         """
@@ -143,9 +143,9 @@ class DirectTask:
         return IdSelection(ids, self.env.seed, episodes[ids], key, device, self.env.stream_ids)
 
     def selection(self, mask: Tensor, name: str) -> Selection | None:
-        """Return a selection of the environments where `mask` (num_envs,) is true, for draws during an episode.
+        """Return a selection of the environments where `mask` (num_envs,) is true, for random numbers in an episode.
 
-        Return None if there is no such environment. Draws depend only on the seed, the environment, its episode, the
+        Return None if there is no such environment. They depend only on the seed, the environment, its episode, the
         step in that episode and `name`. A GPU never returns None, because a test of the mask would force a host sync.
         """
         env = self.env
@@ -239,7 +239,7 @@ class DirectEnv(VecEnv):
         return self.task.extras
 
     def metric_values(self) -> dict[str, Tensor]:
-        """Return the task's `extras`: numbers and tensors."""
+        """Return the task's `extras`: values and tensors."""
         found = {}
         for name, value in self._extras().items():
             if isinstance(value, Tensor) and value.numel():
@@ -263,7 +263,7 @@ class DirectEnv(VecEnv):
         return found
 
     def episode_dependencies(self) -> list[str]:
-        """Return the task itself: its class may keep any state, and draw from any generator."""
+        """Return the task itself: its class may keep any state, and use any random generator."""
         return [*super().episode_dependencies(), f"the class {type(self.task).__name__}"]
 
     def _before_full_reset(self) -> None:
@@ -371,10 +371,10 @@ class DirectEnv(VecEnv):
         return {"policy": obs, "critic": states} if self.task.num_states else {"policy": obs}
 
     def _reset_stale(self, env_ids: Tensor) -> None:
-        """Handle the task's own calls of `reset_idx`, which this method replaces.
+        """Replace the task's `reset_idx`, for calls by the task itself.
 
-        Tasks in the style of OIGE call it at the start of `pre_physics_step` for every set flag. The framework has
-        reset those environments already, so the method only clears the flags for them.
+        OIGE tasks call it at the start of `pre_physics_step` for each environment whose flag is set. Environments that
+        the framework has just reset only get their flags cleared; all others are reset.
         """
         stale = env_ids[~self._fresh[env_ids]]
         self.task.reset_buf[env_ids] = 0

@@ -26,7 +26,7 @@ class Environment(ABC):
     resolved: Resolved
     config: TaskConfig
     seed: int
-    """Seed of every random draw."""
+    """Seed of all random numbers."""
     device: torch.device
     num_envs: int
     step_dt: float
@@ -45,7 +45,7 @@ class Environment(ABC):
     episode_length_buf: Tensor
     """Steps of the running episode. (num_envs,) int64"""
     episode_index: Tensor
-    """Number of episodes before the running one; random streams are keyed by it. (num_envs,) int64"""
+    """Number of episodes before the running one; the random numbers depend on it. (num_envs,) int64"""
     default_state: dict[str, Tensor]
     """Joint state at the start of episodes, before reset events. qpos (nq,), qvel (nv,)"""
     engine: EngineView
@@ -54,7 +54,10 @@ class Environment(ABC):
     @property
     @abstractmethod
     def local(self) -> VecEnv:
-        """The environment that this process steps, with its terms and managers: all of it, or a part."""
+        """The environments that this process steps, with their terms and managers.
+
+        They are all environments, or this process's share of them if there are several processes.
+        """
 
     @property
     def workers(self) -> int:
@@ -66,8 +69,8 @@ class Environment(ABC):
         """Start a new episode everywhere, and return observations by group. (num_envs, d) float32
 
         Args:
-            seed: seed of every draw from now on, as in a new environment; None: the random streams continue.
-            episode: with a seed, the number of the episode that begins. The state that earlier episodes would have left
+            seed: seed of all random numbers from now on, as in a new environment; None: the random streams continue.
+            episode: with a seed, the index of the episode that begins. The state that earlier episodes would have left
                 in the terms of `episode_dependencies` is missing then.
         """
 
@@ -120,11 +123,11 @@ class Environment(ABC):
 
     @abstractmethod
     def extras(self) -> dict[str, float]:
-        """Return further numbers to log: the task's values of the last step, and new divergences by cause."""
+        """Return further values to log: the task's values of the last step, and new divergences by cause."""
 
     @abstractmethod
     def step_metrics(self) -> dict[str, Tensor]:
-        """Return the task's own numbers to log, for `StepObserver.on_step`. (num_envs,) each
+        """Return one value per environment, for evaluation and for observers (`StepObserver.on_step`). (num_envs,) each
 
         They are of the state before resets. `Episodes.metrics` has the metrics of commands, as means over episodes.
         """

@@ -95,5 +95,5 @@ class Layout:
 
 
 def _finite_pairs(pairs: tuple[tuple[float, float], ...] | None) -> list[list[float | None]] | None:
-    """Return pairs for JSON, which has no infinity: None instead."""
+    """Return the pairs with None for each infinite value, because JSON has no infinity; None if there are no pairs."""
     return [[x if math.isfinite(x) else None for x in pair] for pair in pairs or ()] or None

@@ -29,7 +29,7 @@ def make_env(
 
     Args:
         task: a resolved task, or a `TaskConfig` built in Python.
-        seed: seed of every random draw.
+        seed: seed of all random numbers.
         device: device of the engine and of all tensors.
         root: folder of the models of a `TaskConfig`; by default the working directory.
         shared_streams: see `VecEnv`.

@@ -214,7 +214,7 @@ class ManagedEnv(VecEnv):
         return selection
 
     def _select_by_step(self, mask: Field) -> Selection | None:
-        """Return a selection whose draws are keyed by the step."""
+        """Return a selection whose random numbers depend on the current step."""
         return self.engine.select(mask, self.seed, self._counters.common_step.expand(self.num_envs).contiguous())
 
     def _compute_observations(self) -> dict[str, Tensor]:

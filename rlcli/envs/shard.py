@@ -14,13 +14,13 @@ class Shard:
     """Consecutive environments, among all environments of a task."""
 
     first: int
-    """Number of the first environment."""
+    """Index of the first environment."""
     count: int
     """Number of environments."""
     total: int
     """Number of environments of all shards."""
     counters: Tensor | None = field(default=None, compare=False)
-    """Memory for the lengths and the numbers of this shard's running episodes; None: new memory. (2, count) int64"""
+    """Lengths and indices of this shard's running episodes, written in place; None: new tensors. (2, count) int64"""
 
     @property
     def rows(self) -> slice:

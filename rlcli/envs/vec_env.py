@@ -1,4 +1,4 @@
-"""Environment loop of managed and direct tasks.
+"""Environment loop of manager-based and direct tasks.
 
 Autoreset is same-step: the observation returned with a finished episode is the first one of the next episode, and
 `final_obs` has the last observation. `terminated` and `truncated` are always separate tensors.
@@ -32,11 +32,11 @@ from rlcli.sim.tensor_state import means
 class VecEnv(Workflow):
     """`num_envs` copies of a task, stepped together.
 
-    The constructor compiles the model and resolves every name of the configuration (phase 2 of validation).
+    The constructor compiles the model and resolves every name of the configuration.
 
     Args:
         resolved: a validated configuration.
-        seed: seed of every random draw of the environment.
+        seed: seed of all random numbers of the environment.
         device: device of the engine and of all tensors.
         shared_streams: environments i and i % shared_streams draw the same random numbers; 0: every environment has its
             own stream.
@@ -76,7 +76,7 @@ class VecEnv(Workflow):
         self.episode_length_buf = self._counters.lengths
         """Steps of the running episode. (num_envs,) int64"""
         self.episode_index = self._counters.indices
-        """Number of episodes before the running one; random streams are keyed by it. (num_envs,) int64"""
+        """Number of episodes before the running one; the random numbers depend on it. (num_envs,) int64"""
         self._guard = DivergenceGuard(self)
         self._build(shared_streams)
 
@@ -88,7 +88,7 @@ class VecEnv(Workflow):
         distinct = shared_streams or self.shard.total
         streams = self._counters.ids % distinct
         self.stream_ids = streams.numpy(force=True) if shared_streams or self.shard.first else None
-        """Number of each environment's random stream; None: the number of its row. (num_envs,)"""
+        """Index of each environment's random stream; None: the index of its row. (num_envs,)"""
         built = build_simulation(scene, self._binder, self.device, self.seed, streams)
         built.engine.shared_streams = shared_streams
         if built.engine.replayable is not None:
@@ -175,7 +175,7 @@ class VecEnv(Workflow):
 
         Raises:
             ValueError: for another shape.
-            DivergedError: for a number that is not finite.
+            DivergedError: for a value that is not finite.
         """
         if action.shape != shape:
             raise ValueError(f"action has shape {tuple(action.shape)}; pass shape {shape}")
@@ -303,7 +303,7 @@ class VecEnv(Workflow):
             actuator.compute()
 
     def extras(self) -> dict[str, float]:
-        """Return further numbers to log: the task's values of the last step, and new divergences by cause."""
+        """Return further values to log: the task's values of the last step, and new divergences by cause."""
         return {**means(self.metric_values()), **self.divergence_metrics()}
 
     def divergence_metrics(self) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Hooks of the environment loop that a workflow (managed or direct) implements, with their defaults."""
+"""Hooks of the environment loop that a workflow (manager-based or direct) implements, with their defaults."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rlcli.sim.selection import Selection
 
 
 class Workflow(Environment):
-    """Base class of the environment loop, with the parts that differ between managed and direct tasks.
+    """Base class of the environment loop, with the parts that differ between manager-based and direct tasks.
 
     `VecEnv` calls the hooks whose names begin with an underscore; the other methods are for users of the environment.
     """
@@ -69,7 +69,7 @@ class Workflow(Environment):
         return torch.zeros(0, self.num_envs, device=self.device)
 
     def _before_reset(self, ended: Selection) -> None:
-        """Use the episodes that end, before their environments are reset."""
+        """Do what must happen before the environments of ended episodes are reset: update the curriculum."""
 
     @abstractmethod
     def _reset_workflow(self, selection: Selection) -> None:
@@ -95,7 +95,10 @@ class Workflow(Environment):
         return self._compute_observations()
 
     def metric_values(self) -> dict[str, Tensor]:
-        """Return the task's own numbers of the last step, whose means are logged. (num_envs, ...) or any shape"""
+        """Return the values of the last step that the training log averages. (num_envs, ...) or any shape
+
+        They are the `extras` of a direct task, or the values of the curriculum.
+        """
         return {}
 
     @abstractmethod
@@ -115,9 +118,9 @@ class Workflow(Environment):
         return ["scene.terrain"] if self.terrain is not None else []
 
     def step_metrics(self) -> dict[str, Tensor]:
-        """Return the task's own numbers to log, for `StepObserver.on_step`. (num_envs,) each
+        """Return one value per environment, for evaluation and for observers (`StepObserver.on_step`). (num_envs,) each
 
-        The numbers describe the state before resets. `Episodes.metrics` has the metrics of commands, as means over
+        The values describe the state before resets. `Episodes.metrics` has the metrics of commands, as means over
         episodes.
         """
         return {}
@@ -127,5 +130,5 @@ class Workflow(Environment):
         return []
 
     def markers(self) -> list[Marker]:
-        """Return the shapes to draw beside the bodies. Viewers call it; a step does not."""
+        """Return the shapes that viewers show beside the bodies. Viewers call it; a step does not."""
         return []

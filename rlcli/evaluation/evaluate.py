@@ -89,7 +89,7 @@ def evaluate(
     on_step: Callable[[StepResult], None] = lambda _: None,
     groups: int = 1,
 ) -> Evaluation:
-    """Run exactly `episodes` episodes; each environment contributes a number that is fixed beforehand.
+    """Run exactly `episodes` episodes; the share of each environment is fixed beforehand.
 
     Counting the first episodes that finish in any environment would favour short episodes.
 

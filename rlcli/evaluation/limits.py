@@ -81,7 +81,9 @@ class Limit:
 
 
 def read_limits(fail_under: Sequence[str] | None, fail_over: Sequence[str] | None = None) -> list[Limit]:
-    """Parse the `KEY=X` of `--fail-under` and `--fail-over`; the last one for a key wins.
+    """Parse the `KEY=X` of `--fail-under` and `--fail-over`.
+
+    If an option is repeated with the same key, its last value counts.
 
     Raises:
         UsageError: for any other text.
@@ -94,14 +96,19 @@ def read_limits(fail_under: Sequence[str] | None, fail_over: Sequence[str] | Non
     return list(limits.values())
 
 
-def require_success(resolved: Resolved, keys: Iterable[str]) -> None:
+def require_success(resolved: Resolved, keys: Iterable[str], instead: str = "--fail-under return=X") -> None:
     """Check that the task defines success if a key needs it.
+
+    Args:
+        resolved: the task.
+        keys: keys of an evaluation, such as `success` or `return`.
+        instead: options without `success`, for the hint.
 
     Raises:
         UsageError: if it does not.
     """
     if any(key.partition(".")[0] == "success" for key in keys) and resolved.task.success is None:
-        raise UsageError("the task defines no success", hint="add `success:` to its YAML, or use return=X")
+        raise UsageError("the task defines no success", hint=f"add `success:` to its YAML, or write {instead}")
 
 
 def failures(summary: Mapping[str, Any], limits: Iterable[Limit]) -> list[str]:

@@ -165,7 +165,7 @@ def _axes(env: VecEnv, field: str, sweep: Sweep) -> list[int] | None:
     """Return the columns of an element's row that are changed; None: all.
 
     Raises:
-        NameProblem: if a row has several values and all would be set to one number.
+        NameProblem: if a row has several values, and all would be set to the same value.
     """
     if field == "geom_friction":
         return [0]  # sliding friction; the other two are torsional and rolling friction

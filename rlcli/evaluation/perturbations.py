@@ -120,7 +120,7 @@ class _Signal:
 
 
 class _Noise(_Signal):
-    """Gaussian noise, drawn in every step."""
+    """Gaussian noise, sampled in every step."""
 
     def __call__(self, signal: Tensor, is_first: Tensor) -> Tensor:
         env, count = self.env, len(self.columns)
@@ -173,7 +173,7 @@ class _Push:
         names = [*floating, *joints]
         found = match(sweep.element, names, "entity or joint")
         if len(found) != 1:
-            raise NameProblem(f"the pattern matches {len(found)}: {listing(names[i] for i in found)}", "name one")
+            raise NameProblem(f"the pattern matches several names: {listing(names[i] for i in found)}", "choose one")
         name = names[found[0]]
         self._root, self._joint = floating.get(name), joints.get(name)
 
@@ -209,7 +209,7 @@ _STEPS = 1 << 32
 
 
 def _keys(env: VecEnv, counters: Tensor) -> random.Keys:
-    """Return the keys of random draws by random stream and counter. (num_envs,)"""
+    """Return the keys of random numbers by random stream and counter. (num_envs,)"""
     ids = np.arange(env.num_envs) % (env.engine.shared_streams or env.num_envs)
     return random.row_keys(env.seed, ids, counters.cpu().numpy())
 

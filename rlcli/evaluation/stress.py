@@ -202,7 +202,7 @@ def score(summary: Summary) -> tuple[float, float]:
 
 
 def one_each(resolved: Resolved, episodes: int) -> Resolved:
-    """Return the task with one environment for each episode, unless the user has set the number."""
+    """Return the task with one environment for each episode, unless the user has set the number of environments."""
     if "scene.num_envs" in explicit_values(resolved):
         return resolved
     return resolved.with_num_envs(min(episodes, MAX_ENVS))

@@ -244,7 +244,7 @@ def _is_helper(value: object) -> bool:
 
 
 def _is_stateful(value: object) -> bool:
-    """Return whether a value has a state that cannot be saved: a generator, a stream, a file."""
+    """Return whether a value cannot be saved: an iterator, a numpy RandomState, a thread, an open file."""
     if isinstance(value, Iterator | np.random.RandomState | threading.Thread):
         return True
     odd = isinstance(value, dict) and any(isinstance(v, Tensor) and not isinstance(k, str) for k, v in value.items())

@@ -1,4 +1,4 @@
-"""Commands: goals for the policy. Each environment draws its own at the start of an episode and at intervals."""
+"""Commands: goals for the policy. Each environment samples them at the start of an episode and at intervals."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class CommandManager(TensorState):
             names = [knob.name for knob in self.knobs()]
             known = f"commands: {listing(names)}" if names else "leave out --command: the task has no commands"
             near = did_you_mean(name, names)
-            raise UsageError(f"no command '{name}'", hint=f"{near} {known}" if near else known)
+            raise UsageError(f"the task has no command '{name}'", hint=f"{near} {known}" if near else known)
         if value is not None and not math.isfinite(value):
             raise UsageError(f"command '{name}' cannot be {value}", hint="give a finite number")
         knob = knobs[name]
@@ -181,7 +181,7 @@ class CommandManager(TensorState):
     def compute(self, select: Select, running: Tensor) -> None:
         """Count one step of the `running` episodes (1 or 0), resample commands that are due, and update all commands.
 
-        `select` selects environments, with draws keyed by the step.
+        `select` selects environments; their random numbers depend on the current step.
         """
         for number, term in enumerate(self.terms):
             left = self._steps_left[number]
@@ -209,14 +209,14 @@ class CommandManager(TensorState):
 
 def _require_marker(term: BoundTerm, marker: Marker, num_envs: int) -> None:
     if not isinstance(marker, Arrow | Sphere | Frame):
-        raise term.error(f"markers() returned a {type(marker).__name__}; return Arrow, Sphere or Frame")
+        raise term.error(f"markers() returned a value of type {type(marker).__name__}; return Arrow, Sphere or Frame")
     for name, value in marker._asdict().items():
         expected = (num_envs, _COLUMNS.get(name, 0))
         if name in _COLUMNS and (not isinstance(value, Tensor) or value.shape != expected):
-            found = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+            found = f"of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"of type {type(value).__name__}"
             field = f"{type(marker).__name__}.{name}"
             raise term.error(f"markers() returned {field} {found}; return a tensor of shape {expected}")
 
 
-# Two streams: the first command of an episode is keyed by the episode's number, later ones by the step's.
+# Two random streams: the first command of an episode depends on the episode's index, later ones on the step's.
 _FIRST, _NEXT = np.uint64(0x434D_4446_5253), np.uint64(0x434D_444E_5854)

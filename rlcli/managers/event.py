@@ -66,7 +66,7 @@ class EventManager(TensorState):
     def before_full_reset(self, all_envs: Selection) -> None:
         """Forget when reset events fired, and draw the global timers, before all environments are reset.
 
-        The draws of `all_envs` are keyed by the step.
+        The random numbers of `all_envs` depend on the current step.
         """
         self._fired_at.fill_(_NEVER)
         for term, left in self._intervals:
@@ -93,8 +93,8 @@ class EventManager(TensorState):
     def interval(self, select: Select, running: Tensor, fired: Callback) -> None:
         """Count one step of the `running` episodes (1 or 0), and fire the events that are due.
 
-        `select` selects environments, with draws keyed by the step. `fired` is called after each event with its
-        environments. Global timers also run where no episode does.
+        `select` selects environments; their random numbers depend on the current step. `fired` is called after each
+        event with its environments. Global timers also run where no episode does.
         """
         for instance in self._updating:
             instance.update(select, running)
@@ -136,5 +136,5 @@ def _is_global(term: BoundTerm) -> bool:
 
 
 _NEVER = -(1 << 62)
-# Two streams: the first interval of an episode is keyed by the episode's number, later ones by the step's.
+# Two random streams: the first interval of an episode depends on the episode's index, later ones on the step's.
 _FIRST, _NEXT = np.uint64(0x5449_4D45_5231), np.uint64(0x5449_4D45_5232)

@@ -43,7 +43,7 @@ class ObservationManager(TensorState):
         num_envs: number of environments.
         step_dt: control period [s].
         device: device of the buffers.
-        select_all: returns a selection of all environments, with draws keyed by the step.
+        select_all: returns a selection of all environments; its random numbers depend on the current step.
         tunable: the settings that a curriculum changes.
         watch: notes values that are not finite; None: check them at once.
     """
@@ -84,7 +84,7 @@ class ObservationManager(TensorState):
     def compute_final(self, rows: Selection | None = None) -> dict[str, Tensor]:
         """Return the observations in separate buffers; histories, delays and filters do not advance.
 
-        rows: the environments whose observations are read, with draws keyed by the step; None: all.
+        rows: the environments whose observations are read; None: all. Random numbers depend on the current step.
         """
         draws = self._draws(_FINAL)
         for name, group in self.groups.items():
@@ -132,7 +132,7 @@ class ObservationManager(TensorState):
         self._fresh = None
 
     def _draws(self, salt: np.uint64) -> Draws:
-        all_envs = functools.cache(self._select_all)  # made at the first draw of a step
+        all_envs = functools.cache(self._select_all)  # made when a step first needs random numbers
         return lambda stream: all_envs().stream(stream ^ salt)
 
     def _fill(self, group: _Group, views: list[Tensor], draws: Draws, *, advance: bool) -> None:

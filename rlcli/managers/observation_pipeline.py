@@ -20,7 +20,7 @@ from rlcli.managers.tunable import TunableValues
 from rlcli.sim.selection import Selection, in_place
 
 Draws = Callable[[np.uint64], Selection]
-"""Returns a selection of all environments that draws from a stream, keyed by the step."""
+"""Returns a selection of all environments with the random numbers of a stream at the current step."""
 Sampler = Callable[[Selection], Tensor]
 """Draws one row for each environment of a selection."""
 
@@ -38,7 +38,7 @@ class Stage:
             value: of all environments.
             draws: gives random streams.
             fresh: environments whose episode has just begun; None: none, as far as the host can see.
-            advance: whether the memory advances.
+            advance: whether histories, delays and filters advance by a step.
         """
         raise NotImplementedError
 
@@ -46,7 +46,7 @@ class Stage:
         """Start new episodes."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the memory of the stage; it is written in place."""
+        """Return the tensors that the stage keeps from step to step; they are written in place."""
         return {}
 
 
@@ -67,7 +67,7 @@ class Pipeline:
         assert isinstance(config, schema.ObservationConfig)
         self.term = term
         self.shape = shape
-        """Shape of the term's value in one environment; the columns are its numbers in row-major order."""
+        """Shape of the term's value in one environment; the columns are its elements in row-major order."""
         self.width = width = math.prod(shape)
         self.history = group.history or config.history or 1
         self._num_envs, self._step_dt, self._device, self._tunable = num_envs, step_dt, device, tunable
@@ -113,9 +113,15 @@ class Pipeline:
                 self._frames.copy_(view)
 
     def write_rows(self, view: Tensor, rows: Selection, salt: np.uint64) -> None:
-        """Compute the selected rows of a term without a memory, and write them to its columns.
+        """Compute a term for the selected environments only; for terms that do not depend on earlier steps.
 
-        Draws are keyed by the selection. view (num_envs, size)
+        Random numbers come from the streams of the selection.
+
+        Args:
+            view: columns of the term in the observations. (num_envs, size)
+            rows: the selected environments.
+            salt: combined with the stream of each random operation by xor, so that final observations do not get the
+                random numbers of ordinary ones.
         """
         value = rows.read(self.term.call().reshape(view.shape)).float()
         for stage in self._stages:
@@ -128,7 +134,7 @@ class Pipeline:
         return [*resets([self.term]), *(stage.reset for stage in self._stages if type(stage).reset is not Stage.reset)]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the memory of the pipeline, by name."""
+        """Return the tensors that the pipeline keeps from step to step, by name."""
         found = {
             f"{number}.{name}": tensor
             for number, stage in enumerate(self._stages)
@@ -144,7 +150,7 @@ class Pipeline:
         return self._tunable.get((*self.term.path, *key.split(".")), value)
 
     def _columns(self, key: str, value: float | list[float]) -> Tensor:
-        """Return a setting with one number for all columns, or one for each. () or (width,)"""
+        """Return a setting with one value for all columns, or one for each. () or (width,)"""
         setting = self._setting(key, value)
         if not isinstance(setting, Tensor):
             setting = torch.tensor(value, dtype=torch.float32, device=self._device)
@@ -228,7 +234,7 @@ class _Clip(Stage):
 
 
 class _Filter(Stage):
-    """Base class of filters with the memory `past`, (num_envs, m, k), which is 0 at the start of an episode."""
+    """Base class of filters that keep values `past`, (num_envs, m, k), which are 0 at the start of an episode."""
 
     _past: Tensor
 

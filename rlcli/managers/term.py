@@ -42,7 +42,7 @@ class BoundTerm:
     elements: dict[str, list[str]]
     """Selector parameter -> the names of the selected elements."""
     stream: np.uint64
-    """Number of the term's random stream."""
+    """Index of the term's random stream."""
     memory: TermState | None = None
     """State of a class term of a task's own, if the class has no `state_dict`."""
 
@@ -52,7 +52,7 @@ class BoundTerm:
         return self.call
 
     def error(self, message: str, *keys: str) -> ShapeError:
-        """Return an error about a value of the term, or about one of its keys that does not fit the value."""
+        """Return a ShapeError for what the term returned; with `keys`, for the setting under these keys."""
         return ShapeError([self.resolved.problem((*self.path, *keys), message)])
 
     def require_finite(self, values: Tensor, what: str) -> None:
@@ -69,7 +69,7 @@ class BoundTerm:
             )
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the state of a term with a memory."""
+        """Return what the term keeps from step to step; empty for a term without state."""
         if hasattr(self.call, "state_dict"):
             state: dict[str, Tensor] = self.call.state_dict()
             return state
@@ -285,5 +285,5 @@ def check_shape(term: BoundTerm, value: object, expected: tuple[int, ...]) -> No
     shape = tuple(value.shape) if isinstance(value, Tensor) else None
     if shape == expected:
         return
-    found = f"a tensor of shape {shape}" if shape is not None else f"a {type(value).__name__}"
+    found = f"a tensor of shape {shape}" if shape is not None else f"a value of type {type(value).__name__}"
     raise term.error(f"'{term.config.func}' returned {found}; return a tensor of shape {expected}")

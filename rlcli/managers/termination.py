@@ -52,6 +52,6 @@ class TerminationManager:
         return {name: ended.read_view(fired) for name, fired in self.fired.items()}
 
     def reset(self, selection: Selection) -> None:
-        """Reset the terms with a memory."""
+        """Reset the terms that keep values from step to step."""
         for reset in self._term_resets:
             reset(selection)

@@ -39,10 +39,12 @@ class TunableValues:
         return self._tensors.get(path, default)
 
     def open(self, address: str) -> Tensor:
-        """Return the tensor of the setting at a dotted address, in the shape of the setting. Terms bound later read it.
+        """Make a setting changeable: return its tensor, in the shape of the setting.
+
+        Terms that are bound after this call read the tensor instead of the fixed value.
 
         Raises:
-            NameProblem: if the address is not a number that may change.
+            NameProblem: if the address does not name a number, or a list of numbers, that may change.
         """
         path = parse_address(address)
         value: Any = self._task

@@ -27,7 +27,7 @@ class NullCommand(Term):
         self.command = torch.zeros(self.env.num_envs, 0, device=self.env.device)
 
     def resample(self, selection: Selection) -> None:
-        """Do nothing: there is nothing to draw."""
+        """Do nothing: the command is not random."""
 
     def update(self) -> None:
         """Do nothing: the command is empty."""
@@ -137,7 +137,7 @@ class UniformVelocity(_VelocityCommand):
 
     @property
     def limits(self) -> list[Range]:
-        """Ranges of the draws. [m/s, m/s, rad/s]"""
+        """Ranges of the samples. [m/s, m/s, rad/s]"""
         return [(low, high) for low, high in self._ranges]
 
     def tensors(self) -> dict[str, Tensor]:
@@ -166,7 +166,7 @@ class NormalVelocity(_VelocityCommand):
 
     @property
     def limits(self) -> list[Range]:
-        """Range of 95 % of the draws: two standard deviations about the mean. [m/s, m/s, rad/s]"""
+        """Range of 95 % of the samples: two standard deviations about the mean. [m/s, m/s, rad/s]"""
         return [(mean - 2.0 * std, mean + 2.0 * std) for mean, std in zip(self.mean, self.std, strict=True)]
 
 

@@ -1,4 +1,4 @@
-"""Event terms. Each acts on a `Selection` of environments; draws depend only on seed, term, environment and episode."""
+"""Event terms. Each acts on a `Selection` of environments; samples depend only on seed, term, environment, episode."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def push_by_setting_velocity(
     linear_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
     angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
-    """Add uniform draws to the root's velocity, world frame [m/s, rad/s]: one range for each axis."""
+    """Add uniform samples to the root's velocity, world frame [m/s, rad/s]: one range for each axis."""
     push = selection.uniform(*_bounds(env, *linear_velocity, *angular_velocity), (6, 1)).squeeze(2)
     linear, angular = entity.read_root_velocity(selection)
     entity.write_root_velocity(selection, linear + push[:, :3], angular + push[:, 3:])
@@ -209,7 +209,7 @@ def apply_external_force_torque(
 ) -> None:
     """Apply a constant force [N] and torque [N m] to bodies, world frame.
 
-    Each component is drawn from the range. The wrench lasts until the next draw or reset.
+    Each component is drawn from the range. The wrench lasts until the next sample or reset.
     """
     wrench = entity.engine.field("xfrc_applied").view(env.num_envs, -1)
     columns = _wrench_columns(entity, bodies)
@@ -263,7 +263,7 @@ def _drawn_wrench(env: ManagedEnv, selection: Selection, bodies: int, force: Pai
 
 
 def _bounds(env: ManagedEnv, *pairs: Pair) -> tuple[Tensor, Tensor]:
-    """Return the lower and upper ends of ranges, for draws of shape (rows, ranges, k). (ranges, 1) each"""
+    """Return the lower and upper ends of ranges, for samples of shape (rows, ranges, k). (ranges, 1) each"""
     for pair in pairs:
         if isinstance(pair, Tensor):
             low, high = Ranges(env.device, *pairs).now()

@@ -109,7 +109,7 @@ class FieldRandomization(DrawingTerm):
 
 @dataclass(kw_only=True, eq=False)
 class DrawKeys(DrawingTerm):
-    """Base class of terms with the three keys of a draw."""
+    """Base class of terms with the keys `distribution`, `operation` and `shared`."""
 
     distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform"
     operation: Literal["add", "scale", "set"] = "scale"
@@ -124,7 +124,7 @@ class RangeKeys(DrawKeys):
 
 
 class Randomization(RangeKeys, FieldRandomization):
-    """Base class of terms that draw all numbers of an element from one range."""
+    """Base class of terms that draw all values of an element (a body, geom, joint ...) from the same range."""
 
 
 @dataclass(kw_only=True, eq=False)

@@ -32,5 +32,5 @@ class Ranges:
 
 @functools.lru_cache(maxsize=1024)
 def _table(device: torch.device, *pairs: tuple[float, float]) -> Tensor:
-    """Return the numbers on the device; cached, as a captured step must not make new tensors. (ranges, 2)"""
+    """Return the range ends on the device; cached, as a captured step must not make new tensors. (ranges, 2)"""
     return torch.tensor(pairs, dtype=torch.float32, device=device)

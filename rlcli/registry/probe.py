@@ -1,7 +1,7 @@
 """Details of tasks for `list-tasks`, read from a cache that `list-tasks --probe` fills.
 
 A distribution may ship the details as `index.json` in its top-level package, as the built-in tasks do. The details of
-other tasks are in the user's cache folder, keyed by distribution, version and the time at which it was installed.
+other tasks are in the user's cache folder, under the distribution's name, version and time of installation.
 """
 
 from __future__ import annotations

@@ -215,7 +215,7 @@ def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase
 
 
 def _geom_name(model: mujoco.MjModel, index: int) -> str:
-    """Return a geom's name, or its number and its body's name."""
+    """Return a geom's name, or its index and its body's name."""
     name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, index)
     if name:
         return str(name)

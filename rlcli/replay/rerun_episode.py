@@ -1,6 +1,6 @@
 """Run one episode of an evaluation again from its seed: the episode K of environment E of `rlcli eval`.
 
-A random number depends on the seed, the term, the environment and the number of its episode. If nothing else connects
+A random number depends on the seed, the term, the environment and the index of its episode. If nothing else connects
 the episodes of a task, episode K starts at once. Other tasks have commands and intervals that follow the clock of all
 episodes, noise, curricula, or terms with a state. Then the episodes before K are run first, in all environments as in
 the evaluation, and the reasons are reported.
@@ -35,7 +35,7 @@ class EpisodeStart:
     """States of the generators that all environments share, before any step."""
 
     def shared_draws(self) -> bool:
-        """Return whether the task has drawn from global generators; then `num_envs` changes the episode."""
+        """Return whether the task has used global random generators; then `num_envs` changes the episode."""
         return _has_drawn(self.generators)
 
 
@@ -46,7 +46,7 @@ def start_episode(env: VecEnv, act: Act, env_id: int, episode: int, *, drawn_act
         env: new environments.
         act: the policy.
         env_id: the environment of the episode.
-        episode: its number, from 0.
+        episode: its index, from 0.
         drawn_actions: whether the policy is stochastic.
 
     Raises:

@@ -37,9 +37,9 @@ class Difference:
 
     env: int
     episode: int | None
-    """Number of the episode in a recording; None for engine calls."""
+    """Index of the episode in a recording; None for engine calls."""
     step: int
-    """Number of the state in the episode, or of the engine call, from 0."""
+    """Index of the state in the episode, or of the engine call, from 0."""
     field: str
     recorded: list[float]
     replayed: list[float]
@@ -64,7 +64,7 @@ class Replay:
 
 
 def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool = False) -> list[int]:
-    """Return the numbers of the episodes to replay, one or all; none for a file of engine calls.
+    """Return the indices of the episodes to replay, one or all; none for a file of engine calls.
 
     Raises:
         UsageError: if the file does not hold the episode.
@@ -73,10 +73,10 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
     if trajectory.header.kind != "recording":
         if episode is not None or filmed:
             message = "a dump has no complete episodes: --episode and --video need a recording"
-            raise UsageError(message, hint="rlcli autopsy RUN N --video FILE.mp4 draws a case of a run")
+            raise UsageError(message, hint="`rlcli autopsy RUN N --video FILE.mp4` renders a case of a run")
         return []
     if episode is not None and episode >= count:
-        raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"the file has {count}, counted from 0")
+        raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"it has {count} episodes, from 0")
     if not count:
         raise UsageError(f"{trajectory.file} has no episodes", hint="record with --record-mode all")
     return list(range(count)) if episode is None else [episode]
@@ -108,7 +108,7 @@ def replay_episodes(
         recording: the recording.
         env: an environment of its configuration.
         episodes: numbers of the episodes to compare.
-        before_step: called with the number of each step.
+        before_step: called with the index of each step.
 
     Raises:
         CheckpointError: if the recording does not fit the environment.

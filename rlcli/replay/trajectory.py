@@ -73,9 +73,9 @@ class Episode(_Strict):
     """One recorded episode."""
 
     env: Count
-    """Number of the environment."""
+    """Index of the environment."""
     index: Count
-    """Number of the episode in its environment, counted from 0."""
+    """Index of the episode in its environment, from 0."""
     begin: Count
     """Number of steps in the recording before the episode; 0 in a failure file."""
     length: int = Field(ge=1, le=2**53)
@@ -117,7 +117,7 @@ class DivergencePoint(_Strict):
     """The physics step in which a simulation diverged, and the value that showed it."""
 
     call: Count
-    """Number of the engine call in the file."""
+    """Index of the engine call in the file."""
     substep: Count
     """Physics step of that call, counted from 0."""
     time: float
@@ -150,7 +150,7 @@ class World(_Strict):
     """For each call but the first: whether it started from the final state of the previous call, apart from controls
     and forces. False if an event changed the state in between."""
     first: Count
-    """Number of the first call of the last environment step."""
+    """Index of the first call of the last environment step."""
     diverged_at: DivergencePoint | None
     """None if it did not diverge, or if one world alone does not reproduce the divergence."""
 
@@ -254,7 +254,7 @@ class Header(_Strict):
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """The checked content of a file."""
+    """Content of a trajectory file, after all checks."""
 
     file: Path
     header: Header

@@ -1,4 +1,4 @@
-"""Heat map of a stress test: one number for each pair of values of two sweeps."""
+"""Heat map of a stress test: one value for each pair of values of two sweeps."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Axis(NamedTuple):
 class HeatMap:
     """Map with a row for each value of the first sweep and a column for each value of the second.
 
-    If there are further sweeps, a cell has the smallest number over all their values.
+    If there are further sweeps, a cell has the smallest value over all their values.
     """
 
     title: str
@@ -39,12 +39,12 @@ class HeatMap:
     columns: Axis
     cells: tuple[tuple[float, ...], ...]
     low: float
-    """Number at the lower end of the colour scale."""
+    """Value at the lower end of the colour scale."""
     high: float
-    """Number at the upper end of the colour scale."""
+    """Value at the upper end of the colour scale."""
 
     def share(self, value: float) -> float:
-        """Return the position of a number on the colour scale, from 0 to 1."""
+        """Return the position of a value on the colour scale, from 0 to 1."""
         return 1.0 if self.high <= self.low else min(1.0, max(0.0, (value - self.low) / (self.high - self.low)))
 
 
@@ -72,7 +72,7 @@ def heat_map(
         title: metric and policy.
         sweeps: one or more sweeps; a single one gives a map with one row.
         values: the metric at each point of the grid.
-        scale: numbers at the ends of the colour scale; None: the smallest and the largest value.
+        scale: values at the ends of the colour scale; None: the smallest and the largest value.
     """
     scale = scale or (min(values.values()), max(values.values()))
     *row_sweeps, column_sweep = sweeps[:2]
@@ -91,7 +91,7 @@ def _axis(sweep: Sweep) -> Axis:
 
 
 def draw(file: Path, maps: Sequence[HeatMap]) -> None:
-    """Draw maps side by side.
+    """Plot maps side by side.
 
     Raises:
         MachineError: if the file cannot be written.

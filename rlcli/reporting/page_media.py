@@ -1,4 +1,4 @@
-"""Evaluation and video for a run's page: taken from the run's folder, or made if they are missing."""
+"""Evaluation and video for the HTML report of a run: taken from the run's folder, or made if they are missing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 
 _EPISODES = 200
 _MAX_VIDEO_S = 20.0
-"""Longest video that is made for a page [s]."""
+"""Longest video that is made for a report [s]."""
 _MAX_VIDEO_BYTES = 24 * 2**20
 
 
@@ -25,7 +25,7 @@ class PageMedia:
     """Evaluation and video of one checkpoint. The environment is built when it is first needed.
 
     Args:
-        page: the page to which they are added.
+        page: the report to which evaluation and video are added.
         run: the run.
         checkpoint: the checkpoint's folder.
         schema: schema version of the command line's JSON documents.
@@ -83,7 +83,7 @@ class PageMedia:
         from rlcli.viewer.record_video import record_episode
 
         frames, fps, backend = record_episode(session.env, session.act, file, longest_s=_MAX_VIDEO_S)
-        _log.info(f"{file}: {frames} frames, {fps:g} a second, drawn with {backend}")
+        _log.info(f"{file}: {frames} frames, {fps:g} a second, rendered with {backend}")
         return self._read_video(file)
 
     def _add_older_video(self, why: str) -> str:

@@ -1,4 +1,4 @@
-"""Pictures of learning curves, drawn with matplotlib: without a window, and with the same bytes for the same curves."""
+"""Plots of learning curves, made with matplotlib: without a window, and with the same bytes for the same curves."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _STYLE = Path(__file__).resolve().parent.parent / "templates" / "report" / "curv
 
 
 def check_drawing() -> None:
-    """Check that pictures can be drawn.
+    """Check that pictures can be plotted.
 
     Raises:
         DependencyError: if matplotlib is not installed.
@@ -86,7 +86,7 @@ def scatter(
 
     Args:
         columns: (name, value of each trial, whether the axis is logarithmic) of each setting; values that are not
-            numbers are drawn at equal distances.
+            numbers are plotted at equal distances.
         values: the result of each trial.
         label: name of the result.
         title: title of the picture.
@@ -183,7 +183,7 @@ def _lines(axes: Any, items: Sequence[Item]) -> None:
 
 
 def _stack(axes: Any, items: Sequence[Item]) -> None:
-    """Draw shares as stacked bands; they are scaled down if several causes of one episode sum to more than 1."""
+    """Plot shares as stacked bands; they are scaled down if several causes of one episode sum to more than 1."""
     if not items:
         return
     grid = max((item.line.x for item in items), key=len)

@@ -141,7 +141,7 @@ def _add_charts(curve: Curve, page: Page) -> None:
     panels = choose([curve])
     if not panels:
         page.missing["charts"] = "There are no learning curves yet: no episode has ended."
-    with _part(page, "charts", "The learning curves are not drawn", RlcliError):
+    with _part(page, "charts", "The learning curves are not plotted", RlcliError):
         page.charts = [
             Chart(panel.title, panel_svg(panel, AXES["steps"], f"chart{position}"), legend_of(panel))
             for position, panel in enumerate(panels)

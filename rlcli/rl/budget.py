@@ -11,7 +11,10 @@ from rlcli.rl.trainer import Trainer
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Limits of a whole training, at least one of them. A resumed run trains the rest."""
+    """Limits of a whole training; at least one is set.
+
+    Work before a resumption counts, so a resumed run trains only what is left.
+    """
 
     max_iterations: int | None
     max_steps: int | None

@@ -23,7 +23,7 @@ def require_finite(
 
     Args:
         tensors: names and values in causal order: each tensor after those that it is computed from.
-        iteration: number of the iteration, for the message.
+        iteration: index of the iteration, for the message.
         axes: names of the leading axes, such as `("step", "environment")`.
         hint: what the user can do.
 
@@ -63,7 +63,7 @@ def require_finite_learner(
     Args:
         metrics: metrics that must be finite, by name.
         modules: modules whose weights are checked, by the name for the message.
-        iteration: number of the iteration, for the message.
+        iteration: index of the iteration, for the message.
         hint: what the user can do.
 
     Raises:

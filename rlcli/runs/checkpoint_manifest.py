@@ -251,7 +251,7 @@ def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: o
         checkpoint: the checkpoint.
         layout: the environment's layout, as plain JSON.
         deployment: the environment's description, as `rlcli.deploy.env_description.describe` returns it.
-        randomized: do not compare gains and the start state, because the task draws them at random.
+        randomized: do not compare gains and the start state, because the task randomises them.
     """
     saved_layout, saved = checkpoint.manifest.get("layout"), checkpoint.manifest.get("deployment")
     found = list(_differing_keys(saved_layout, layout, "layout"))

@@ -142,7 +142,7 @@ class Checkpoint:
 
     @property
     def iteration(self) -> int:
-        """Number of the last finished iteration when the checkpoint was written."""
+        """Index of the last finished iteration when the checkpoint was written."""
         return check_json(_Iteration, self.manifest, self.folder / "manifest.json").iteration
 
     def json(self, name: str) -> dict[str, Any]:
@@ -239,7 +239,7 @@ class Checkpoint:
             raise CheckpointError(f"{self.folder}/manifest.json is corrupt: '{name}' lacks rows; use RUN@step:N")
         size, limit = sum(shard.size for shard in shards), available_memory() // 3
         if size > limit:
-            raise CheckpointError(f"{self.folder}: free some memory: '{name}' needs {size:,} of {limit:,} bytes")
+            raise CheckpointError(f"{self.folder}: '{name}' needs {size:,} bytes (limit {limit:,}); free some memory")
 
         def read(start: int, end: int) -> dict[str, Tensor]:
             parts = []
@@ -249,7 +249,7 @@ class Checkpoint:
                     rows = slice(max(start, shard.start) - shard.start, min(end, shard.stop) - shard.start)
                     parts.append({column: values[rows] for column, values in columns.items()})
             if any(set(part) != set(parts[0]) for part in parts):
-                raise CheckpointError(f"{self.folder}/manifest.json is corrupt: '{name}' differs in columns")
+                raise CheckpointError(f"{self.folder}: the parts of '{name}' have different columns; use RUN@step:N")
             return {column: torch.cat([part[column] for part in parts]) for column in parts[0]} if parts else {}
 
         return Rows(first, stop, read)
@@ -260,7 +260,7 @@ class Checkpoint:
         columns = _tensors(data, file)
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
-                raise CheckpointError(f"{file} is corrupt: '{column}' lacks rows; use RUN@step:N")
+                raise CheckpointError(f"{file} is corrupt: rows of '{column}' are missing; use RUN@step:N")
         return columns
 
     def _data(self, name: str, limit: int) -> bytes:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rlcli.config.load import Resolved
 
 CATEGORIES = ("physics", "MDP", "agent", "cosmetic")
-"""Categories of keys. physics: the simulation between two actions. MDP: observations, rewards, random draws, and the
+"""Categories of keys. physics: the simulation between two actions. MDP: observations, rewards, random numbers, and the
 ends of episodes. agent: the policy and its training. cosmetic: rendering, names, threads and files kept on disk; no
 result depends on them."""
 

@@ -74,8 +74,9 @@ def read_evaluation(run: Run, step_name: str) -> dict[str, Any] | None:
     """Return the newest evaluation of a run's checkpoint; None if there is none.
 
     These entries are checked: `episodes`, `seed`, `return` and `length` (mean, std, low, high; for a single episode low
-    and high are None), `reward_terms` (the same by name), `terminations` (rate, low, high by name), `diverged`,
-    `diverged_by`. `success` (rate, low, high) is missing for a task without a success condition.
+    and high are None), `reward_terms` (the same for each term, by name), `terminations` (rate, low, high for each
+    term, by name), `diverged`, `diverged_by`. `success` (rate, low, high) is missing for a task without a success
+    condition.
 
     Raises:
         CheckpointError: if the file is malformed.
@@ -85,7 +86,7 @@ def read_evaluation(run: Run, step_name: str) -> dict[str, Any] | None:
         document = read_json(run.folder, f"{FOLDER}/{file.name}", _LIMIT)
     except FileNotFoundError:
         return None
-    check_json(_EvaluationRecord, document, file, hint="run rlcli eval again to replace the file")
+    check_json(_EvaluationRecord, document, file, hint="run `rlcli eval` again to replace the file")
     if document.get("success", 0) is None:
         del document["success"]
     return document

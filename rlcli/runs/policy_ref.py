@@ -52,7 +52,7 @@ class Choice:
             return named
         if not record.get("distribution"):
             message = f"{self.folder} is a policy for '{record['name']}', which was not an installed task"
-            raise CheckpointError(message, hint=f"name the task's folder: rlcli play FOLDER --checkpoint {self.folder}")
+            raise CheckpointError(message, hint=f"name its folder: `rlcli play FOLDER --checkpoint {self.folder}`")
         return recorded_task(record, f"the task of {self.folder}")
 
 
@@ -100,7 +100,7 @@ def _has_only_shipped(named: TaskSource | None, runs_dir: Path) -> bool:
 
 def _shipped(named: TaskSource | None) -> Choice:
     if named is None:
-        raise UsageError("--checkpoint shipped needs a task", hint="name the task: rlcli play TASK")
+        raise UsageError("--checkpoint shipped needs a task", hint="name the task: `rlcli play TASK`")
     if named.policy is None:
         raise CheckpointError(f"{named.name} ships no policy", hint=f"rlcli train {named.name} trains one")
     owner = f"{named.distribution} {named.version}" if named.distribution else str(named.root)

@@ -26,7 +26,7 @@ def require_reproducible(run: Run) -> None:
     if device != "cpu":
         raise UsageError(
             f"{run.folder} was trained on {device}, where sums have no fixed order: it cannot be reproduced bit by bit",
-            hint="train again with other seeds, and compare the policies with rlcli eval",
+            hint="train again with other seeds, and compare the policies with `rlcli eval`",
         )
     if processes != 1:
         raise UsageError(f"{run.folder} was trained by {processes} processes; choose a run of one process")

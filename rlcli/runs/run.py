@@ -313,4 +313,4 @@ def _create_numbered_folder(parent: Path, stem: str) -> Path:
         with contextlib.suppress(FileExistsError):
             folder.mkdir()
             return folder
-    raise OSError(errno.EEXIST, "too many runs of this name", str(parent / stem))
+    raise OSError(errno.EEXIST, f"{stem} and {stem}-2 to {stem}-9999 all exist; use another --name", str(parent / stem))

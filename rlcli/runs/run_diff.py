@@ -57,7 +57,7 @@ def first_difference(sections: Iterable[Section]) -> tuple[str, Difference] | No
 
 
 def last_iteration(run: Run) -> int:
-    """Return the number of the last iteration in a run's metrics; 0 if there is none."""
+    """Return the index of the last iteration in a run's metrics; 0 if there is none."""
     return max((row["iteration"] for row in read_rows(run, strict=True)), default=0)
 
 

@@ -103,7 +103,7 @@ def find_checkpoint(
     run, why = find_run(name, runs_dir, task)
     have = steps(run.checkpoints)
     if not have:
-        raise CheckpointError(f"{run.folder} has no complete checkpoint; rlcli train makes one")
+        raise CheckpointError(f"{run.folder} has no complete checkpoint; run `rlcli train` to make one")
     if not which:
         return run, *_newest_valid(run, have, why, whole)
     if which == "best":

@@ -209,7 +209,7 @@ def require_inside(folder: Path, file: Path) -> None:
 
 
 def refuse_links(folder: Path) -> None:
-    """Check that a folder of a run has no links: a write through one would change files outside the run.
+    """Check that a folder of a run has no links: a write through a link would change files outside the run.
 
     Raises:
         CheckpointError: with the first link.

@@ -63,7 +63,7 @@ def _archive(data: bytes, where: str) -> zipfile.ZipFile:
         archive = zipfile.ZipFile(io.BytesIO(data))
         members = archive.infolist()
     except Exception as error:  # zipfile raises many types of errors for malformed numbers
-        raise CheckpointError(f"{where} is not a valid zip file; save it again: {one_line(error)}") from None
+        raise CheckpointError(f"{where} is not a valid zip file: {one_line(error)}; save it again") from None
     if len(members) > _MAX_MEMBERS:
         raise CheckpointError(f"{where} has {len(members)} members; at most {_MAX_MEMBERS} are allowed")
     seen: set[str] = set()

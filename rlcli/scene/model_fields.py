@@ -1,4 +1,4 @@
-"""Model fields that may differ between worlds: their elements, their values, and the constants derived from them."""
+"""Model fields that may differ between environments: their elements, values, and the constants derived from them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FIELDS: dict[str, str] = {
     **dict.fromkeys(("pair_friction", "pair_solref", "pair_solimp", "pair_margin", "pair_gap"), "Pairs"),
     **dict.fromkeys(("opt.gravity",), ""),
 }
-"""Field -> kind of element of its rows; '' for the whole world. All other fields are the same in all worlds."""
+"""Field -> kind of element of its rows; '' for the whole model. All other fields are the same in all environments."""
 
 DERIVED_FROM = {
     *("qpos0", "qpos_spring", "body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat"),
@@ -43,16 +43,16 @@ DERIVED_FROM = {
 
 
 class ModelField:
-    """Some elements of a model field in every world, and their original values.
+    """Some elements of a model field in every environment, and their original values.
 
     Args:
         entity: the entity that has the elements.
         name: name of the field.
-        elements: index into the entity's names of that kind; None for a field of the whole world.
+        elements: index into the entity's names of that kind; None for a field of the whole model.
         axes: selected values of each element; None for all.
 
     Raises:
-        ValueError: for a field that cannot differ between worlds, or an axis that it does not have.
+        ValueError: for a field that cannot differ between environments, or an axis that it does not have.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class ModelField:
             raise NameProblem(f"{name} has no axis {bad[0]}", f"give axes from 0 to {self.width - 1}")
         self.axes = list(range(self.width)) if axes is None else list(axes)
         self.values = _expand(engine, name).view(engine.num_envs, -1)
-        """Values of the field in every world, flattened. (num_envs, n)"""
+        """Values of the field in every environment, flattened. (num_envs, n)"""
         columns = [i * self.width + axis for i in ids for axis in self.axes]
         self.columns = as_index(columns, engine.device)
         self.shape = (len(ids), len(self.axes))
@@ -77,11 +77,11 @@ class ModelField:
         """Values of the compiled model. (elements, axes)"""
 
     def write(self, selection: Selection, values: Tensor) -> None:
-        """Set the selected worlds' values. (rows, elements, axes)"""
+        """Set the selected environments' values. (rows, elements, axes)"""
         selection.write(self.values, values.to(self.values.dtype).flatten(1), self.columns)
 
     def read(self, selection: Selection) -> Tensor:
-        """Return the selected worlds' values. (rows, elements, axes)"""
+        """Return the selected environments' values. (rows, elements, axes)"""
         return selection.read(self.values, self.columns).view(-1, *self.shape)
 
 
@@ -100,7 +100,7 @@ def model_rows(engine: Engine, name: str) -> np.ndarray:
     """Return the values of a field in the compiled model, one element per row. (elements, values each)
 
     Raises:
-        ValueError: for a field that cannot differ between worlds.
+        ValueError: for a field that cannot differ between environments.
     """
     if name not in FIELDS:
         suggestion = did_you_mean(name, FIELDS)

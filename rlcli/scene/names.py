@@ -64,7 +64,7 @@ def match_values(values: Mapping[str, Value], names: Sequence[str], what: str) -
         for position in match(pattern, names, what):
             if position in owner:
                 raise NameProblem(
-                    f"'{owner[position]}' and '{pattern}' both match {what} '{names[position]}'; narrow one"
+                    f"'{owner[position]}' and '{pattern}' both match {what} '{names[position]}'; narrow one of them"
                 )
             owner[position] = pattern
             found[position] = value

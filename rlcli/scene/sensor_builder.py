@@ -19,7 +19,7 @@ _FOUND_AND_FORCE = (1 << int(_CONTACT_DATA.mjCONDATA_FOUND)) | (1 << int(_CONTAC
 _NET_FORCE = 3
 """Reduction `netforce` of a contact sensor, which adds up all contacts in the world frame."""
 _DRAWN_GROUPS = (0, 1, 2)
-"""Geom groups that viewers draw by default."""
+"""Geom groups that viewers show by default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +187,7 @@ class SensorBuilder:
         used_groups = {int(geom.group) for geom in self._spec.geoms if geom.name not in names}
         free_groups = [group for group in _DRAWN_GROUPS if group not in used_groups]
         if not free_groups:
-            message = f"the entities have geoms in all groups that are drawn: {listing(map(str, _DRAWN_GROUPS))}"
+            message = f"the entities have geoms in all groups that are rendered: {listing(map(str, _DRAWN_GROUPS))}"
             raise SceneProblem(path, message, "leave one group free for the ground in the MJCF, or write sees: all")
         for geom in ground:
             geom.group = free_groups[0]

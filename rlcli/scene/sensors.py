@@ -30,9 +30,9 @@ _STATE_NAMES = (*_TIMES, *_FLAGS, "force_history")
 class ContactSensor(TensorState):
     """Net contact forces on k bodies, and how long each body has been in contact or in the air.
 
-    Times are whole environment steps. The step in which contact begins counts as the last of the air time and as the
-    first of the contact time. All times are 0 at the start of an episode, so that the first step of an episode sets
-    neither `first_contact` nor `first_air`.
+    Times are in seconds, multiples of the environment step. The step in which contact begins counts as the last of the
+    air time and as the first of the contact time. All times are 0 at the start of an episode, so that the first step of
+    an episode sets neither `first_contact` nor `first_air`.
     """
 
     def __init__(self, spec: ContactSensorSpec, sim: SimData) -> None:

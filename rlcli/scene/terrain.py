@@ -138,7 +138,7 @@ class Terrain:
         config: configuration of the terrain.
         origins: start positions of the environments; this object updates them. (num_envs, 3) [m]
         seed: seed of the start levels.
-        streams: number of the random stream of each environment; equal numbers have the same start. (num_envs,)
+        streams: index of the random stream of each environment; equal indices have the same start. (num_envs,)
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class Terrain:
         return len(self.origins)
 
     def start(self, seed: int) -> None:
-        """Move every environment to its start level, which depends only on the seed and its number."""
+        """Move every environment to its start level, which depends only on the seed and the environment's index."""
         keys = random.row_keys(seed, self._streams, np.zeros_like(self._streams))
         self.levels.copy_(torch.from_numpy(random.integers(keys, _START, 0, 1, self._start_levels)[:, 0]))
         self._env_origins.copy_(self.origins[self.levels, self.types])
@@ -280,7 +280,7 @@ def _read_heights(file: Path) -> NDArray[Any]:
     with file.open("rb") as opened:
         size = os.fstat(opened.fileno()).st_size
         if size > _MAX_HEIGHTS * 8 + _MAX_HEADER:
-            raise ValueError(f"the file has {size:,} bytes; give at most {_MAX_HEIGHTS:,} heights")
+            raise ValueError(f"the file is too large ({size:,} bytes); give at most {_MAX_HEIGHTS:,} heights")
         try:
             return np.asarray(np.lib.format.read_array(opened, allow_pickle=False, max_header_size=_MAX_HEADER))
         except (MemoryError, RecursionError, SyntaxError, TokenError) as error:  # errors of a malicious header

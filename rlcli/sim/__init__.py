@@ -1,1 +1,1 @@
-"""Physics engines that step many worlds of one model, and selections of these worlds."""
+"""Physics engines that step many worlds of one model (one per environment), and selections of these worlds."""

@@ -53,7 +53,7 @@ class BatchEngine(BatchState):
         super().__init__(model, num_envs, threads, persistent=config.external_forces)
         self.shared_streams = 0
         self.stream_ids: NDArray[np.int64] | None = None
-        """Number of each world's random stream; None: the number of the world. (num_envs,)"""
+        """Index of each world's random stream; None: the index of the world. (num_envs,)"""
         self.device = torch.device("cpu")
         self.divergence_causes: dict[str, int] = {}
         self.described_divergences: list[report.Divergence] = []
@@ -68,10 +68,10 @@ class BatchEngine(BatchState):
             self.state_layout, self._rows, self._batch.warning, self._expanded, self._max_velocity
         )
         self._bound_inputs: list[NDArray[np.float64]] = []
-        """Bound fields of the state, without positions and velocities, to which terms may write."""
+        """Fields in use of the state, without positions and velocities, to which terms may write."""
         self._substep_fields = config.derived_fields == "substep"
         self.step_stage = _NONE
-        """Stage (mjtStage) that is computed after the last substep, for the bound fields."""
+        """Stage (mjtStage) that is computed after the last substep, for the fields in use."""
         # start states get everything that `mj_forward` computes, including the warm start
         self._forward_stage = _ACC if self._substep_fields else _NONE
         self._forward_rows = forward_of(self._batch)
@@ -97,7 +97,8 @@ class BatchEngine(BatchState):
         """Return a live view of an MjData field; from now on, `step` computes the stage of a derived field."""
         if name not in self._fields:
             if name not in DATA_FIELDS:
-                raise ValueError(f"'{name}' is not an MjData field; {did_you_mean(name, DATA_FIELDS) or ''}")
+                hint = did_you_mean(name, DATA_FIELDS) or "see mujoco/mjdata.h"
+                raise ValueError(f"'{name}' is not an MjData field; {hint}")
             if name in FIELDS_OF_SKIPPED_WORK:
                 self._skip_nothing()
             with warnings.catch_warnings(action="ignore"):  # torch warns about the read-only arrays of derived fields
@@ -204,7 +205,7 @@ class BatchEngine(BatchState):
         return bad, causes
 
     def forward(self, selection: Selection) -> None:
-        """Compute the bound derived fields of the selected worlds."""
+        """Compute the derived fields in use of the selected worlds."""
         if self._external is not None:
             selection.write(self._external, 0.0)  # no contact has acted on a start state yet
         if self._forward_stage == _NONE:
@@ -217,7 +218,7 @@ class BatchEngine(BatchState):
             field[index] = values
 
     def _forces(self, selection: Selection) -> list[tuple[Tensor, Any]]:
-        """Return the bound fields of the acceleration stage, and the index of the selected worlds' values in each."""
+        """Return the fields in use of the acceleration stage, and the index of the selected worlds' values in each."""
         ids = ids_of(selection)
         return [
             (field, ids if name in ACCELERATION_FIELDS else (ids[:, None], self._force_sensors))
@@ -266,7 +267,8 @@ class BatchEngine(BatchState):
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of the worlds' state.
 
-        It includes the bound fields of the last substep, which a forward pass from the state cannot restore.
+        They include the fields in use (requested with `field`) of the last substep, which MuJoCo's mj_forward cannot
+        compute from the state.
         """
         substep = {f"substep.{name}": value.clone() for name, value in self._fields.items() if self._of_substep(name)}
         return {**super().state_dict(), **substep}
@@ -275,7 +277,7 @@ class BatchEngine(BatchState):
         """Restore the state returned by `state_dict()`, and compute derived fields again.
 
         Raises:
-            ValueError: for a model field that cannot differ between worlds, or that has another shape.
+            ValueError: for a model field that cannot differ between environments, or that has another shape.
         """
         super().load_state_dict(state)
         substep = substate(state, "substep.")
@@ -291,7 +293,7 @@ class BatchEngine(BatchState):
         """Do nothing: Python frees threads and memory."""
 
     def _forward_all(self) -> None:
-        """Compute the bound fields of every world from its state; fields of the last substep keep their values."""
+        """Compute the fields in use of every world from its state; fields of the last substep keep their values."""
         saved = {name: value.clone() for name, value in self._fields.items() if self._of_substep(name)}
         with engine_call():
             self._batch.forward(stage=self._forward_stage)

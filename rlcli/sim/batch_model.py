@@ -1,4 +1,4 @@
-"""Model of the CPU engine's worlds, and the model fields that differ between them."""
+"""Model of the CPU engine's worlds (one per environment), and the model fields that differ between worlds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rlcli import machine
-from rlcli.errors import DeviceError, DivergedError, did_you_mean, one_line
+from rlcli.errors import DeviceError, DivergedError, did_you_mean, listing, one_line
 from rlcli.sim.divergence_report import MORE_MEMORY
 from rlcli.sim.mujoco_private import expand_disable_flags, expanded_fields, make_batch, without_profiler
 from rlcli.sim.quiet_mujoco import quiet_mujoco
@@ -34,7 +34,7 @@ _MIN_STATES_PER_ENV = 3
 
 
 class BatchModel:
-    """Base of the CPU engine: its worlds, and the model fields that differ between them.
+    """Base of the CPU engine: its worlds (one per environment), and the model fields that differ between worlds.
 
     Raises:
         DeviceError: for more worlds than the machine's memory holds.
@@ -61,7 +61,8 @@ class BatchModel:
     def expand(self, name: str) -> Tensor:
         """Return a model field with a value for every world."""
         if name not in MODEL_FIELDS:
-            raise ValueError(f"'{name}' cannot differ between worlds; {did_you_mean(name, MODEL_FIELDS) or ''}")
+            hint = did_you_mean(name, MODEL_FIELDS) or f"fields that can: {listing(sorted(MODEL_FIELDS))}"
+            raise ValueError(f"'{name}' cannot differ between environments; {hint}")
         values = torch.from_numpy(self._batch.expand(name))
         if not values.is_floating_point():
             self._skip_nothing()

@@ -31,7 +31,7 @@ class BatchState(BatchModel):
         mujoco.mj_getState(model, mujoco.MjData(model), self._default, INTEGRATION_STATE)
         self.history = StateHistory(self._rows, self.state_layout.columns("ctrl").stop, self._default, 1)
         self._fields: dict[str, Tensor] = {}
-        """Bound fields of MjData."""
+        """Fields of MjData that are in use (requested with `field`)."""
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
@@ -81,7 +81,7 @@ class BatchState(BatchModel):
         """Restore the state returned by `state_dict()`.
 
         Raises:
-            ValueError: for a model field that cannot differ between worlds, or that has another shape.
+            ValueError: for a model field that cannot differ between environments, or that has another shape.
         """
         self._state.copy_(state["state"])
         width = self.history.width

@@ -44,7 +44,7 @@ class Divergence:
     """Divergence of the simulation of one environment."""
 
     env: int
-    """Number of the environment."""
+    """Index of the environment."""
     cause: str
     """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, `qvel out of bounds`, or `engine error`."""
     detail: str = ""
@@ -207,7 +207,7 @@ class DivergenceReporter:
         """Describe the divergence of a world.
 
         Args:
-            env: number of the world.
+            env: index of the world.
             cause: cause of the divergence.
             before: state of the world before the step. (nstate,)
             error: error message of the engine.

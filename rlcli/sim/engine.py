@@ -1,4 +1,4 @@
-"""Protocol of engines, which step many worlds of one model on a CPU or a GPU."""
+"""Protocol of engines, which step many worlds of one model (one per environment) on a CPU or a GPU."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class ReplayableView(EngineView, Protocol):
 
     @property
     def step_stage(self) -> int:
-        """Stage (mjtStage) that is computed after the last physics step of a call, for the bound fields."""
+        """Stage (mjtStage) that is computed after the last physics step of a call, for the fields in use."""
 
     @property
     def own_constants(self) -> bool:
@@ -155,7 +155,7 @@ class Engine(EngineView, Protocol):
         Args:
             mask: the worlds. (num_envs,) bool
             seed: seed of the selection's random numbers.
-            counters: number of each world's random sequence, usually its episode. (num_envs,) int64
+            counters: index of each world's random sequence, usually its episode. (num_envs,) int64
         """
 
     def rays(
@@ -184,7 +184,7 @@ class Engine(EngineView, Protocol):
         """Restore the state returned by `state_dict()`."""
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return the model and the data of one world, for drawing and debugging."""
+        """Return the model and the data of one world, for viewers and debugging."""
 
     def close(self) -> None:
         """Free threads and memory."""
@@ -194,7 +194,7 @@ class ReplayableEngine(Engine, ReplayableView, Protocol):
     """Engine whose worlds have integration states on the CPU, from which it steps again bit for bit."""
 
     stream_ids: NDArray[np.int64] | None
-    """Number of each world's random stream; None: the number of the world. (num_envs,)"""
+    """Index of each world's random stream; None: the index of the world. (num_envs,)"""
 
     def set_state_row(self, env: int, row: NDArray[np.float64]) -> None:
         """Set the integration state of a world; derived fields keep their values."""

@@ -1,7 +1,7 @@
-"""Arrows, spheres and frames that viewers draw in every environment; they are not part of the physics.
+"""Arrows, spheres and frames that viewers show in every environment; they are not part of the physics.
 
-The method `markers()` of a command term returns markers. It is called when a viewer draws, never in a step. Positions
-are in the same frame as `entity.data.root_pos_w`, one row per environment; a position that is not finite is not drawn.
+The method `markers()` of a command term returns markers. It is called when a viewer renders, never in a step. Positions
+are in the same frame as `entity.data.root_pos_w`, one row per environment; a position that is not finite is not shown.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ACTUAL: Color = (0.1, 0.3, 1.0, 1.0)
 
 
 class Arrow(NamedTuple):
-    """Arrow, which is not drawn if its length is at most its radius."""
+    """Arrow, which is not shown if its length is at most its radius."""
 
     start: Tensor
     """Start point. (num_envs, 3) [m]"""

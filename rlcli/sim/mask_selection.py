@@ -25,7 +25,7 @@ class MaskSelection:
     Args:
         mask: the selected environments. (num_envs,) bool
         seed: seed of the random numbers.
-        counters: number of each environment's random sequence, usually its episode. (num_envs,)
+        counters: index of each environment's random sequence, usually its episode. (num_envs,)
         stream_key: the stream to draw from, a result of `rlcli.random.stream`.
         shared_streams: environments i and i % shared_streams draw the same random numbers; 0: every environment has
             its own stream.

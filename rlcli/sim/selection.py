@@ -129,10 +129,10 @@ class IdSelection:
     Args:
         ids: the selected environments, sorted. (rows,)
         seed: seed of the random numbers.
-        counters: number of each row's random sequence, usually its episode. (rows,)
+        counters: index of each row's random sequence, usually its episode. (rows,)
         stream_key: the stream to draw from, a result of `rlcli.random.stream`.
         device: device of the random numbers; None: the CPU.
-        stream_ids: number of each environment's random stream; None: its id. (num_envs,)
+        stream_ids: index of each environment's random stream; None: its id. (num_envs,)
     """
 
     ids: NDArray[np.int64]

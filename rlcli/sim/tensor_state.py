@@ -26,13 +26,13 @@ class TensorState:
 
 
 def mean_of(values: Tensor) -> Tensor:
-    """Return the mean of some values; equal values have themselves as their mean, without a rounding error. ()"""
+    """Return the mean of all values as a scalar tensor; if all are equal, exactly that value, without rounding. ()"""
     values = values.flatten().float()
     return torch.where((values == values[0]).all(), values[0], values.mean())
 
 
 def means(values: Mapping[str, Tensor]) -> dict[str, float]:
-    """Return the means of some tensors as numbers."""
+    """Return the means of some tensors as floats."""
     return {name: float(mean_of(value)) if value.dim() else float(value) for name, value in values.items()}
 
 

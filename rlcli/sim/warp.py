@@ -103,7 +103,7 @@ class WarpEngine(WarpState):
         """Return the worlds that diverged in the last step, (num_envs,) bool.
 
         Their state before the step has been restored, with controls and warm start set to 0. This call also restores
-        their bound derived fields, which terms read.
+        their derived fields in use, which terms read.
         """
         with self._launching():
             for name, last in self._last_derived.items():
@@ -111,7 +111,7 @@ class WarpEngine(WarpState):
         return self._diverged
 
     def forward(self, selection: Selection) -> None:
-        """Compute the bound derived fields; those of the acceleration stage only in the selected worlds.
+        """Compute the derived fields in use; those of the acceleration stage only in the selected worlds.
 
         The present state of the selected worlds is saved, and restored if they diverge in the next step.
         """
@@ -218,7 +218,7 @@ class WarpEngine(WarpState):
         with self._launching():
             self._update_velocities()
             mjw.forward(self._model, self._data)
-        # a forward pass computes all worlds: restore those that are not selected
+        # the computation covers all worlds: restore those that are not selected
         for name, old in before.items():
             now = self.field(name)
             new = now.clone()

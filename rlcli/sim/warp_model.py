@@ -1,4 +1,4 @@
-"""Model of the GPU engine's worlds on its device, and the model fields that differ between them."""
+"""Model of the GPU engine's worlds (one per environment), and the model fields that differ between worlds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import warp as wp
 from torch import Tensor
 
 from rlcli.config.schema import SimConfig
-from rlcli.errors import did_you_mean
+from rlcli.errors import did_you_mean, listing
 from rlcli.sim.capacity import required_capacity
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 from rlcli.sim.selection import Selection
@@ -63,8 +63,9 @@ class WarpModel:
         if name not in self._expanded:
             owner, attribute = self._owner(name)
             if not self.can_expand(name):
-                suggestion = did_you_mean(attribute, _batched_fields(owner))
-                raise ValueError(f"'{name}' cannot differ between worlds; {suggestion or ''}")
+                known = sorted(_batched_fields(owner))
+                hint = did_you_mean(attribute, known) or f"fields that can: {listing(known)}"
+                raise ValueError(f"'{name}' cannot differ between environments; {hint}")
             array = getattr(owner, attribute)
             values = np.repeat(array.numpy()[:1], self.num_envs, axis=0)
             wide = wp.array(values, dtype=array.dtype, device=self._device)

@@ -1,4 +1,4 @@
-"""Fields of the GPU engine's worlds: bound, derived from the state, and saved in checkpoints."""
+"""Fields of the GPU engine's worlds: in use, derived from the state, and saved in checkpoints."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class WarpState(WarpModel):
     def __init__(self, model: mujoco.MjModel, num_envs: int, config: SimConfig, device: str) -> None:
         super().__init__(model, num_envs, config, device)
         self._fields: dict[str, Tensor] = {}
-        """Bound fields of the data."""
+        """Fields of the data that are in use (requested with `field`)."""
         self._start_inputs: dict[str, Tensor] = {}
         """Default values of bound `INPUTS`, which a reset restores."""
         self._last_derived: dict[str, Tensor] = {}
@@ -54,7 +54,10 @@ class WarpState(WarpModel):
             array = getattr(self._data, name, None)
             if not isinstance(array, wp.array) or array.ndim == 0 or array.shape[0] != self.num_envs:
                 names = [f.name for f in dataclasses.fields(self._data)]
-                raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {did_you_mean(name, names) or ''}")
+                if name in names:
+                    raise ValueError(f"field '{name}' of MuJoCo Warp's data has no value for each environment")
+                hint = did_you_mean(name, names) or "see mujoco_warp.Data"
+                raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {hint}")
             saved = self._substep_values()
             self._fields[name] = wp.to_torch(array)
             if name in INPUTS:  # it still has the model's value
@@ -139,7 +142,7 @@ class WarpState(WarpModel):
             mjw.com_vel(self._model, self._data)
 
     def _derive(self) -> None:
-        """Compute the bound derived fields from the state, except those of the acceleration stage."""
+        """Compute the derived fields in use from the state, except those of the acceleration stage."""
         m, d = self._model, self._data
         if VELOCITY not in self._derived:
             if KINEMATICS in self._derived:
@@ -161,11 +164,11 @@ class WarpState(WarpModel):
             mjw.sensor_vel(m, d)
 
     def _of_substep(self) -> list[str]:
-        """Return the bound fields that have values of the last substep, which the state does not determine."""
+        """Return the fields in use that have values of the last substep, which the state does not determine."""
         stages = {name: self._stages.stages_of(name) for name in self._fields}
         return [name for name, groups in stages.items() if FORCE in groups or (self._substep_fields and groups)]
 
     def _substep_values(self) -> dict[str, Tensor]:
-        """Return copies of the values of the last substep, which a forward pass would overwrite."""
+        """Return copies of the values of the last substep, which MuJoCo's mj_forward would overwrite."""
         names = [*self._of_substep(), "qacc_warmstart"]
         return {name: self._fields[name].clone() for name in names if name in self._fields}

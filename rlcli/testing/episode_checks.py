@@ -34,7 +34,7 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     env, other = subject.env(episode_steps=12), subject.env(episode_steps=12)
     first, second, third = (record_outputs(one, random_actions(one, subject.bound, 30)) for one in (env, other, env))
     message = "differs between two new environments, one seed and one set of actions"
-    hint = "draw from the selection (uniform, normal, choice) or from self.draws(env_ids) instead of torch.rand, numpy"
+    hint = "use the selection (uniform, normal, choice) or self.draws(env_ids) instead of torch.rand, numpy"
     findings = list(compare_trajectories(env, (first, second), message, f"{hint} or time"))
     if not findings:
         message = "differs between a new environment, and the same one after reset(seed), with one set of actions"
@@ -53,7 +53,7 @@ def compare_trajectories(
     """Report the first difference of two trajectories, if they are not equal bit for bit.
 
     Args:
-        env: an environment with their layout.
+        env: an environment with the layout of the trajectories.
         trajectories: both trajectories, equally long.
         message: message without the values, which are appended.
         hint: hint of the finding.

@@ -1,4 +1,7 @@
-"""Runner of the contract checks. A check that raises an error gives a finding, and the others still run."""
+"""Runner of the checks of a task's contract: what trainers and checkpoints rely on (shapes, seeds, resets ...).
+
+An error in a check becomes a finding, and the other checks still run.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +49,7 @@ CHECKS: dict[str, Check] = {
     "engines": portability_checks.engines,
     "captured": portability_checks.captured,
 }
-"""Name -> check, in the order in which they run. The first line of a check's docstring is the clause."""
+"""Name -> check, in the order in which they run. The first line of a check's docstring is its requirement."""
 
 _DIRECT_ONLY = ("observation-after-reset",)
 

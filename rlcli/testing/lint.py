@@ -34,7 +34,7 @@ def lint_task(
     ignore: Sequence[str] = (),
     on_rule: Callable[[str, list[Remark]], None] = lambda name, remarks: None,
 ) -> list[Remark]:
-    """Run a task with scripted, untrained agents and apply the rules to their rollouts.
+    """Run a task with fixed policies and apply the rules to their rollouts.
 
     Args:
         task: a name from `list-tasks`, or a folder with a `task.yaml`.

@@ -1,4 +1,4 @@
-"""Scripted agents (zero, random, bang-bang, sine) and their recorded rollouts, which the linter checks."""
+"""Fixed policies (zero, random, bang-bang, sine) and their recorded rollouts, which the linter checks."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from rlcli.testing.task_under_test import TaskUnderTest, element_names
 NUM_ENVS = 16
 MAX_STEPS = 1000
 """Longest rollout if no duration is given [steps]."""
-ScriptedAgent = Callable[[int], Tensor]
+FixedPolicy = Callable[[int], Tensor]
 """Step -> action (num_envs, a)."""
 
 SWITCH_S = 0.25
-"""Mean time between sign changes of the bang-bang agent [s]."""
+"""Mean time between sign changes of the bang-bang policy [s]."""
 SINE_HZ = (0.25, 2.0)
-"""Frequencies of the sine agent [Hz]."""
+"""Frequencies of the sine policy [Hz]."""
 
 
-def zero(env: VecEnv, bound: float) -> ScriptedAgent:
-    """Return an agent that always sends a zero action."""
+def zero(env: VecEnv, bound: float) -> FixedPolicy:
+    """Return a policy that always sends a zero action."""
     return lambda step: torch.zeros(env.num_envs, env.layout.action_size)
 
 
-def uniform(env: VecEnv, bound: float) -> ScriptedAgent:
-    """Return an agent that draws each action uniformly within the bound."""
+def uniform(env: VecEnv, bound: float) -> FixedPolicy:
+    """Return a policy that samples each action uniformly within the bound."""
     generator = torch.Generator().manual_seed(0)
     shape = (env.num_envs, env.layout.action_size)
     return lambda step: (torch.rand(shape, generator=generator) * 2.0 - 1.0) * bound
 
 
-def bang_bang(env: VecEnv, bound: float) -> ScriptedAgent:
-    """Return an agent whose columns are at the bound and change sign at random times."""
+def bang_bang(env: VecEnv, bound: float) -> FixedPolicy:
+    """Return a policy whose columns are at the bound and change sign at random times."""
     generator = torch.Generator().manual_seed(1)
     shape = (env.num_envs, env.layout.action_size)
     sign = torch.where(torch.rand(shape, generator=generator) < 0.5, -1.0, 1.0)
@@ -55,8 +55,8 @@ def bang_bang(env: VecEnv, bound: float) -> ScriptedAgent:
     return act
 
 
-def sine(env: VecEnv, bound: float) -> ScriptedAgent:
-    """Return an agent of sines as high as the bound, each column with its own frequency and phase."""
+def sine(env: VecEnv, bound: float) -> FixedPolicy:
+    """Return a policy of sines as high as the bound, each column with its own frequency and phase."""
     generator = torch.Generator().manual_seed(2)
     frequency, phase = torch.rand(2, env.num_envs, env.layout.action_size, generator=generator).unbind(0)
     low, high = SINE_HZ
@@ -64,13 +64,13 @@ def sine(env: VecEnv, bound: float) -> ScriptedAgent:
     return lambda step: bound * torch.sin(2.0 * math.pi * phase + turn * step)
 
 
-SCRIPTED_AGENTS: dict[str, Callable[[VecEnv, float], ScriptedAgent]] = {
+FIXED_POLICIES: dict[str, Callable[[VecEnv, float], FixedPolicy]] = {
     "zero": zero,
     "random": uniform,
     "bang-bang": bang_bang,
     "sine": sine,
 }
-"""Name -> factory of the agent, in the order in which they run."""
+"""Name -> factory of the policy, in the order in which they run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +88,9 @@ class Episode:
 
 @dataclass(slots=True)
 class Rollout:
-    """Rollout of one agent in a task. Tensors are (steps, num_envs, ...)."""
+    """Rollout of one fixed policy in a task. Tensors are (steps, num_envs, ...)."""
 
-    agent: str
+    policy: str
     env: VecEnv
     reward: Tensor
     over: Tensor
@@ -109,9 +109,9 @@ class Rollout:
     error: Exception | None = None
 
 
-def record_rollout(env: VecEnv, agent: str, bound: float, steps: int) -> Rollout:
-    """Run a scripted agent from `reset(seed=0)` for some steps, or until an error is raised, and record the rollout."""
-    act, limits = SCRIPTED_AGENTS[agent](env, bound), agent == "random"
+def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollout:
+    """Run a fixed policy from `reset(seed=0)` for some steps, or until an error is raised, and record the rollout."""
+    act, limits = FIXED_POLICIES[policy](env, bound), policy == "random"
     steps_of: defaultdict[str, list[Tensor]] = defaultdict(list)
     terms: defaultdict[str, list[Tensor]] = defaultdict(list)
     obs: defaultdict[str, list[Tensor]] = defaultdict(list)
@@ -141,7 +141,7 @@ def record_rollout(env: VecEnv, agent: str, bound: float, steps: int) -> Rollout
     episodes += [Episode(length, total, False, False) for length, total in running if length]
     count = max(1, physics.steps)
     return Rollout(
-        agent,
+        policy,
         env,
         reward=_stack(steps_of["reward"], env),
         over=_stack(steps_of["over"], env),
@@ -213,7 +213,7 @@ class _PhysicsObserver(StepObserver):
 
 
 class RolloutEvidence:
-    """Rollouts of the scripted agents, recorded on first use, and environments for further measurements."""
+    """Rollouts of the fixed policies, recorded on first use, and environments for further measurements."""
 
     def __init__(self, subject: TaskUnderTest, seconds: float | None) -> None:
         self.subject = subject
@@ -224,10 +224,10 @@ class RolloutEvidence:
 
     @property
     def rollouts(self) -> list[Rollout]:
-        """One rollout of each agent."""
+        """One rollout of each policy."""
         if self._rollouts is None:
             bound = self.subject.bound
-            self._rollouts = [record_rollout(self.env(), name, bound, self.steps) for name in SCRIPTED_AGENTS]
+            self._rollouts = [record_rollout(self.env(), name, bound, self.steps) for name in FIXED_POLICIES]
         return self._rollouts
 
     @property

@@ -1,4 +1,4 @@
-"""Rules of the linter: each finds one obstacle to learning in the recorded rollouts of scripted agents."""
+"""Rules of the linter: each finds one obstacle to learning in the recorded rollouts of fixed policies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rlcli.config.schema import AgentConfig
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.testing.findings import error_text
-from rlcli.testing.lint_rollouts import MAX_STEPS, SCRIPTED_AGENTS, RolloutEvidence, record_rollout
+from rlcli.testing.lint_rollouts import FIXED_POLICIES, MAX_STEPS, RolloutEvidence, record_rollout
 from rlcli.testing.task_under_test import observation_parts
 from rlcli.testing.timestep_checks import energy_drift
 
@@ -53,7 +53,7 @@ warning_at = partial(Remark, "", "warning")
 
 
 def runs_without_error(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that the task raises no error under any agent."""
+    """Check that the task raises no error under any fixed policy."""
     seen = set()
     for rollout in evidence.rollouts:
         if rollout.error is None:
@@ -62,7 +62,7 @@ def runs_without_error(evidence: RolloutEvidence) -> Iterator[Remark]:
         if text not in seen:
             seen.add(text)
             step = len(rollout.reward)
-            message = f"the {rollout.agent} agent was stopped after {step} steps by {text}"
+            message = f"the {rollout.policy} policy was stopped after {step} steps by {text}"
             hint = "correct the code that raises it; `rlcli check` finds more details"
             yield error_at(evidence.subject.location(rollout.error), message, hint, {"step": step})
 
@@ -72,19 +72,19 @@ EARLY = 5
 
 
 def early_resets(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that few episodes end in their first steps, at least under one agent."""
+    """Check that few episodes end in their first steps, at least under one fixed policy."""
     shares = {}
     for rollout in evidence.rollouts:
         complete = [e for e in rollout.episodes if e.ended or e.steps > EARLY]
         early = [e for e in complete if e.steps <= EARLY < rollout.env.max_episode_length]
-        shares[rollout.agent] = (len(early) / len(complete) if complete else 0.0, early)
+        shares[rollout.policy] = (len(early) / len(complete) if complete else 0.0, early)
     share, early = min(shares.values(), key=lambda found: found[0])
     if share >= 0.1:
         causes = Counter(cause for episode in early for cause in episode.causes)
         names = ", ".join(name for name, _ in causes.most_common(2)) or "a reset"
         yield error_at(
             f"terminations: {names}",
-            f"{share:.0%} of the episodes end within {EARLY} steps, under every agent",
+            f"{share:.0%} of the episodes end within {EARLY} steps, under every fixed policy",
             "choose start states that the termination allows (narrower reset ranges), or widen its limits",
             {"share": share, "steps": EARLY},
         )
@@ -101,7 +101,7 @@ def _weighted_terms(evidence: RolloutEvidence) -> list[str]:
 
 
 def silent_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that every reward term with a weight is not always 0 under all agents."""
+    """Check that every reward term with a weight is not always 0 under all fixed policies."""
     if evidence.steps < min(evidence.subject.resolved.task.max_episode_length, MAX_STEPS):
         return  # a term may be other than 0 only at the end of an episode, which a shorter rollout does not reach
     steps = sum(rollout.reward.numel() for rollout in evidence.rollouts)
@@ -110,7 +110,7 @@ def silent_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
         if values and not any(bool(v.any()) for v in values):
             yield warning_at(
                 f"rewards.{name}",
-                f"is 0 in all {steps} steps of {len(evidence.rollouts)} agents",
+                f"is 0 in all {steps} steps of {len(evidence.rollouts)} fixed policies",
                 "check its thresholds, joints and sensors, give it a softer slope, or remove it",
                 {"steps": steps},
             )
@@ -134,14 +134,14 @@ def dominant_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
             others = ", ".join(other for other in active if other != name)
             yield warning_at(
                 f"rewards.{name}",
-                f"is {min(found):.1%} or more of the reward's size under every agent: {others} have no effect",
+                f"is {min(found):.1%} or more of the reward's size under every fixed policy: {others} have no effect",
                 "lower its weight, or raise the weights of the others",
                 {"share": min(found)},
             )
 
 
 def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that the reward depends on the agent's actions."""
+    """Check that the reward depends on the actions."""
     rewards = torch.cat([rollout.reward.flatten() for rollout in evidence.rollouts])
     if any(bool(rollout.terminated.any()) for rollout in evidence.rollouts) or not rewards.numel():
         return  # with terminations a constant reward still rewards long episodes
@@ -149,7 +149,7 @@ def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
         value = float(rewards[0])
         yield error_at(
             "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf",
-            f"is {value:g} in every step of every agent, and no episode is terminated: there is nothing to learn",
+            f"is {value:g} in every step of all fixed policies, and no episode ends early: there is nothing to learn",
             "compute the reward from the state or the action",
             {"value": value},
         )
@@ -169,7 +169,7 @@ def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
     gamma = discount_of(evidence.subject.resolved.agent)
     gamma = 0.99 if gamma is None else gamma
     horizon = min(1.0 / max(1.0 - gamma, 1e-6), float(task.max_episode_length))
-    good = _quantile(running, 0.9)  # a trained policy should reach what scripted agents reach in 10 % of their steps
+    good = _quantile(running, 0.9)  # a trained policy should reach what fixed policies reach in 10 % of their steps
     last = float(terminal.median())
     if good * horizon >= last:
         return
@@ -198,13 +198,13 @@ LARGE, SMALL = 100.0, 0.01
 
 
 def constant_observations(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that every observation column varies under the agents; of a picture, at least one pixel."""
+    """Check that every observation column varies under the fixed policies; of a picture, at least one pixel."""
     for where, values in _columns(evidence):
         if bool((values == values[:, :1]).all()):
             low = float(values.min())
             value = f"is {low:g}" if len(values) == 1 else "is the same"
             hint = "leave the column out, or compute it from the state"
-            yield error_at(where, f"{value} in every step of every agent", hint, {"value": low})
+            yield error_at(where, f"{value} in every step of every fixed policy", hint, {"value": low})
 
 
 def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -239,7 +239,7 @@ SATURATED = 0.8
 
 def saturated_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that random actions within the bound mostly stay within the limits of the actuators."""
-    (rollout,) = [rollout for rollout in evidence.rollouts if rollout.agent == "random"]
+    (rollout,) = [rollout for rollout in evidence.rollouts if rollout.policy == "random"]
     for name, share in rollout.limited.items():
         if share >= SATURATED:
             yield warning_at(
@@ -298,16 +298,16 @@ def timestep(evidence: RolloutEvidence) -> Iterator[Remark]:
     dt = evidence.subject.resolved.task.sim.dt
     where = f"sim.dt = {dt:g} s"
     hint = "take a smaller sim.dt (and more decimation), more damping or armature, or lower gains and stiffnesses"
-    diverged = {rollout.agent: rollout.diverged for rollout in evidence.rollouts if rollout.diverged}
+    diverged = {rollout.policy: rollout.diverged for rollout in evidence.rollouts if rollout.diverged}
     if diverged:
-        agents = ", ".join(diverged)
-        message = f"the simulation diverged {sum(diverged.values())} times (agents: {agents})"
+        names = ", ".join(diverged)
+        message = f"the simulation diverged {sum(diverged.values())} times (fixed policies: {names})"
         yield error_at(where, message, hint, {"diverged": sum(diverged.values())})
         return
     env = evidence.env(8)
     env.reset(seed=0)
     for step in range(5):
-        env.step(SCRIPTED_AGENTS["random"](env, evidence.subject.bound)(step))
+        env.step(FIXED_POLICIES["random"](env, evidence.subject.bound)(step))
     drift = energy_drift(env)
     if drift.relative > DRIFT:
         message = f"after {drift.seconds:.2g} s without actuators the model's energy differs from that with steps of"

@@ -63,7 +63,7 @@ def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
     make, reason = warning_at, ""
     if draws_globally:
         reason = "; the task draws from torch, numpy or random, whose numbers depend on the number of environments"
-        hint = "use the selection's draws, or self.draws(env_ids); else runs with other numbers of environments differ"
+        hint = "use random numbers of the selection or of self.draws(env_ids); else results depend on num_envs"
     elif subject.resolved.task.curriculum:
         reason = "; this may be intended for a curriculum that averages over episodes"
         hint = "use a schedule over steps, if the curriculum should not depend on the number of environments"
@@ -112,7 +112,7 @@ def policy(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the policy that the task ships can be read, and fits the task."""
     folder = subject.source.policy
     if folder is None:
-        raise NotRunError("the task ships no policy; rlcli export --format bundle writes one")
+        raise NotRunError("the task ships no policy; `rlcli export --format bundle` writes one")
     try:
         bundle = open_bundle(folder)
         bundle.policy()

@@ -25,9 +25,9 @@ class Recording:
     obs: list[dict[str, Tensor]] = field(default_factory=list)
     """Copies, beginning with the observations of the reset. [group -> (num_envs, d)]"""
     late_writes: dict[str, int] = field(default_factory=dict)
-    """Name of a tensor that was changed during the next step -> number of the first such step."""
+    """Name of a tensor that was changed during the next step -> index of the first such step."""
     shared: dict[str, int] = field(default_factory=dict)
-    """Name of a tensor that shares memory with its predecessor -> number of the first such step."""
+    """Name of a tensor that shares memory with its predecessor -> index of the first such step."""
     error: Exception | None = None
 
 

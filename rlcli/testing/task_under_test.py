@@ -125,7 +125,7 @@ def column_names(env: VecEnv, group: str) -> list[str]:
 
 
 def element_names(elements: Sequence[str], size: int) -> list[str]:
-    """Return the names of a term's columns; their numbers if the term does not have one name for each."""
+    """Return the names of a term's columns; their indices if the term does not have one name for each."""
     return list(elements) if len(elements) == size else [str(number) for number in range(size)]
 
 

@@ -155,7 +155,7 @@ def create_imported_run(
         table = "\n".join(f"  {a:<18}{b:<14}{c}" for a, b, c in rows)
         raise CheckpointError(
             f"the policy in {record['imported']['file']} does not fit {resolved.source.name}:\n{table}",
-            hint="give the task the same observation and action columns in the same order; see rlcli show TASK",
+            hint="give the task the same observation and action columns in the same order; see `rlcli show TASK`",
         )
     entries = {
         "seed": 0,
@@ -209,7 +209,7 @@ _Layer = tuple[Tensor, Tensor]
 
 
 def _layers(weights: Mapping[str, Tensor], prefix: str, file: Path) -> list[_Layer]:
-    """Return the linear layers of an `nn.Sequential` with activations between them, in the order of their numbers."""
+    """Return the linear layers of an `nn.Sequential` with activations between them, in the order of their indices."""
     numbers = {n.removeprefix(prefix).partition(".")[0] for n in weights if n.startswith(prefix)}
     if not all(number.isdecimal() and number.isascii() and len(number) < 4 for number in numbers):
         found = ", ".join(sorted(numbers))[:200]

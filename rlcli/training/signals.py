@@ -30,7 +30,7 @@ class StopRequest(StepObserver):
     """
 
     signal: int | None = None
-    """Number of the first signal; None: no signal yet."""
+    """Number (such as SIGINT) of the first signal; None: no signal yet."""
     can_interrupt: bool = False
     """Whether an iteration may be interrupted in the middle."""
     ends_process: bool = False

@@ -1,6 +1,6 @@
 """Speed of a task on this machine, and the sizes and threads with the shortest training iterations.
 
-Only settings that learn alike are compared: they have the same number of samples in an iteration, and the same number
+Only settings that train equally are compared: they have the same number of samples in an iteration, and the same number
 and size of gradient steps. Then the time of an iteration decides the time to a solution. More steps per second with
 fewer gradient steps per sample would be no gain.
 """
@@ -383,7 +383,7 @@ def _powers(most: int) -> list[int]:
 
 
 def _fastest(rows: list[Trained]) -> Trained:
-    """Return the fastest measurement among settings that learn alike."""
+    """Return the fastest measurement among settings that train equally."""
     measured = [row for row in rows if row.alike and row.seconds is not None]
     return min(measured, key=lambda row: row.seconds or math.inf)
 

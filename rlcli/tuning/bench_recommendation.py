@@ -1,4 +1,4 @@
-"""Recommendation of a benchmark, as a `--config` file with the measurements in comments."""
+"""The settings that `rlcli bench` recommends, as a `--config` file with the measurements in comments."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def explanation(findings: Findings) -> list[str]:
     if present is None or best is None:
         return []
     if best is present:
-        reason = "no setting that learns alike is faster than the present sizes and threads:"
+        reason = "the present sizes and threads are the fastest of the settings that train equally:"
         lines = [f"{reason} {_describe(present)}"]
     else:
         lines = [f"{_describe(best)},", f"instead of {_describe(present)}, measured in alternation"]
-    lines.append("compared at the same samples and gradient steps per iteration, so that training learns alike")
+    lines.append("all compared settings have the same samples and gradient steps per iteration, so they train equally")
     if findings.unsteady:
         lines.append("the machine was busy, so the measurements vary: end other programs and measure again")
     return lines

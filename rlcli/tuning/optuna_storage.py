@@ -65,7 +65,7 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
             return optuna.create_study(**study, direction=settings["direction"], load_if_exists=True)
         except KeyError:
             where = without_password(storage) if storage else folder
-            raise CheckpointError(f"there is no sweep '{name}' in {where}; see rlcli sweep show") from None
+            raise CheckpointError(f"there is no sweep '{name}' in {where}; see `rlcli sweep show`") from None
 
 
 @contextlib.contextmanager

@@ -118,8 +118,8 @@ def read_objective(text: str) -> Objective:
     if found is None or not 0.0 < number < 1e12:
         raise UsageError(
             f"--objective '{text}' is not valid",
-            hint="return, success, length, reward_terms.NAME or terminations.NAME; @30s after 30 s of training, @2e6"
-            " after 2,000,000 steps",
+            hint="write return, success, length, reward_terms.NAME or terminations.NAME, optionally with a time:"
+            " success@30s (after 30 s of training) or success@2e6 (after 2,000,000 steps)",
         )
     if found[2] is None:
         return Objective(found[1])

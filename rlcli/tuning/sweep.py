@@ -1,4 +1,7 @@
-"""Sweeps: trials in a storage of Optuna, shared by any number of processes; each trial is a run in the folder."""
+"""Sweeps: search for good settings with Optuna.
+
+Any number of processes share the trials; each trial is a run in the sweep's folder.
+"""
 
 from __future__ import annotations
 
@@ -281,13 +284,13 @@ def find_sweep(words: Sequence[str], runs: Path, storage: str | None) -> Sweep:
     if len(found) > 1:
         raise UsageError(f"several tasks have a sweep '{words[0]}'", hint=f"name one: {listing(map(str, found))}")
     if not found:
-        hint = f"sweeps: {listing(map(str, known))}" if known else "rlcli sweep TASK --param ... starts one"
+        hint = f"sweeps: {listing(map(str, known))}" if known else "`rlcli sweep TASK --param ...` starts one"
         raise CheckpointError(f"no sweep{f' {words[0]!r}' if words else ''} in {runs}", hint=hint)
     return read_sweep(found[0], storage)
 
 
 def draw_sweep(sweep: Sweep) -> Path:
-    """Draw the values of the trials over each parameter to a file in the sweep's folder.
+    """Plot the values of the trials over each parameter in a file in the sweep's folder.
 
     Raises:
         UsageError: if no trial is complete yet.
@@ -296,7 +299,7 @@ def draw_sweep(sweep: Sweep) -> Path:
     check_drawing()
     done = [trial for trial in sweep.trials() if trial.state.name == "COMPLETE"]
     if not done:
-        raise UsageError("nothing to draw: wait until a trial is complete")
+        raise UsageError("nothing to plot: wait until a trial is complete")
     panels = [("trial", [trial.number for trial in done], False)]
     panels += [(p.key, [sweep.values(trial)[p.key] for trial in done], p.log) for p in sweep.parameters]
     values = [trial.value for trial in done if trial.value is not None]  # a finished trial has a value

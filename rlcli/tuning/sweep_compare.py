@@ -25,8 +25,8 @@ from rlcli.tuning.time_to_threshold import Reached, Threshold, median, read_thre
 
 _log = logging.getLogger(__name__)
 
-ARMS = ("default", "best")
-"""The task's own settings, and the settings of the best trial."""
+ARMS = {"default": "the task's own settings", "best": "best trial"}
+"""Name in JSON -> name in messages."""
 
 
 @dataclass(slots=True)
@@ -59,7 +59,7 @@ class Comparison:
     task: str
     threshold: Threshold
     trial: int
-    """Number of the best trial."""
+    """Index of the best trial."""
     seeds: Sequence[int]
     trainings: list[Training] = field(default_factory=list)
     stop_code: int | None = None
@@ -71,11 +71,11 @@ class Comparison:
         return next((one.error.exit_code for one in self.trainings if one.error is not None), 0)
 
     def training(self, seed: int, arm: str) -> Training | None:
-        """Return the training with a seed and an arm; None if it has not run."""
+        """Return the training with a seed and settings (a name in ARMS); None if it has not run."""
         return next((one for one in self.trainings if (one.seed, one.arm) == (seed, arm)), None)
 
     def medians(self) -> dict[str, dict[str, float | None]]:
-        """Return arm -> medians of seconds and steps, for arms that were trained with all seeds."""
+        """Return the medians of seconds and steps, for settings that were trained with all seeds."""
         medians = {}
         for arm in ARMS:
             times = [one.time() for one in self.trainings if one.arm == arm]
@@ -131,22 +131,22 @@ def compare(
     """
     best = sweep.best()
     if best is None:
-        raise CheckpointError(f"{sweep.folder} has no finished trial yet", hint="see rlcli sweep show")
+        raise CheckpointError(f"{sweep.folder} has no finished trial yet", hint="see `rlcli sweep show`")
     threshold = read_threshold(until or "success=0.99")
     comparison = Comparison(sweep.folder, sweep.settings["task"], threshold, best.number, seeds)
     with _request_of_sweep(sweep, request) as base:
         resolved, _ = base.resolve()
         if resolved.task.success is None and until is None:
             raise UsageError("the task defines no success, so --until is needed", hint="add --until return=X")
-        require_success(resolved, [threshold.key])
+        require_success(resolved, [threshold.key], "--until return=X")
         if resolved.agent is not None and not resolved.agent.eval_interval:
             base.overrides.append("agent.eval_interval=1")
         base.overrides.append(f"agent.eval_episodes={episodes}")
         changes: dict[str, list[str]] = {"default": [], "best": sweep.overrides(sweep.values(best))}
         with stop:
             for turn, seed in enumerate(seeds):
-                # alternate, so that a slow period of the machine affects both arms
-                for arm in ARMS if turn % 2 == 0 else ARMS[::-1]:
+                # alternate, so that a slow period of the machine affects both settings
+                for arm in ARMS if turn % 2 == 0 else reversed(ARMS):
                     if stop.signal is not None:
                         break
                     training = _train(comparison, replace(base, seed=seed), arm, changes[arm], stop)
@@ -182,7 +182,7 @@ def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[Traini
 def _train(
     comparison: Comparison, request: TrainingRequest, arm: str, changes: Sequence[str], stop: StopRequest
 ) -> Training:
-    """Train one arm until the threshold is reached, the budget is spent, or a signal arrives."""
+    """Train with one of the settings until the threshold is reached, the budget is spent, or a signal arrives."""
     seed, threshold = request.seed, comparison.threshold
     name = "compare-default" if arm == "default" else f"compare-trial-{comparison.trial:04d}"
     training = Training(arm, seed, _run_folder(comparison.sweep, f"{name}-seed-{seed}", request, changes))
@@ -197,7 +197,7 @@ def _train(
     if training.reached is None and run.state == "diverged":
         training.error = DivergedError(f"{training.folder}: {run.reason}")
     elif training.reached is None and run.state != "finished":
-        _log.info("%s, seed %s: %s", arm, seed, training.folder)
+        _log.info("%s, seed %s: %s", ARMS[arm], seed, training.folder)
         process = start_training(training.folder, device)
         try:
             while not process.has_ended():
@@ -209,10 +209,11 @@ def _train(
         training.reached = time_of_run()
         if process.has_failed and stop.signal is None:
             training.error = process.error()
-            _log.warning("%s, seed %s: %s", arm, seed, training.error.message)
+            _log.warning("%s, seed %s: %s", ARMS[arm], seed, training.error.message)
     reached = training.reached
     time_taken = "" if reached is None else f" after {reached.seconds:.1f} s, {reached.step:,} steps"
-    _log.info("%s, seed %s: %s%s", arm, seed, training.state, time_taken)
+    outcome = "training failed" if training.error else f"threshold {training.state}"
+    _log.info("%s, seed %s: %s%s", ARMS[arm], seed, outcome, time_taken)
     return training
 
 

@@ -44,13 +44,13 @@ def check_parameters(request: TrainingRequest, parameters: Sequence[Parameter], 
     for index in range(max(len(parameter.bounds) for parameter in parameters)):
         bounds = [p.override(p.bounds[min(index, len(p.bounds) - 1)]) for p in parameters]
         resolved, _ = request.resolve(bounds)
-    require_success(resolved, [objective.key])
+    require_success(resolved, [objective.key], "--objective return")
     group, _, name = objective.key.partition(".")
     task = resolved.task
     groups: dict[str, Mapping[str, Any]] = {"reward_terms": task.rewards, "terminations": task.terminations}
     names = [key for key, term in groups.get(group, {}).items() if term is not None]
     if names and name not in names:
-        hint = did_you_mean(name, names) or f"there are: {listing(names)}"
+        hint = did_you_mean(name, names) or f"its terms: {listing(names)}"
         raise UsageError(f"--objective {objective.key}: the task has no such term", hint=hint)
     return resolved
 

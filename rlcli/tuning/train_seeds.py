@@ -154,7 +154,7 @@ def _csv(lines: dict[str, Line]) -> str:
 
 
 def _picture(folder: Path, curves: list[Curve]) -> Path | None:
-    """Draw the aggregated curves; return None without matplotlib."""
+    """Plot the aggregated curves; return None without matplotlib."""
     try:
         check_drawing()
     except DependencyError:

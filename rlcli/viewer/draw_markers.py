@@ -1,4 +1,4 @@
-"""Drawing of markers as geoms of a MuJoCo scene, for all viewers."""
+"""Markers as geoms of a MuJoCo scene, for all viewers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def add_markers(
     Args:
         scene: the scene, which may contain other geoms.
         markers: markers of all environments.
-        numbers: the environments to draw.
+        numbers: indices of the environments to show.
         offsets: displacement of each of them in the picture. (len(numbers), 3) [m]
     """
     for marker in markers:

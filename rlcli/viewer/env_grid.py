@@ -1,4 +1,4 @@
-"""Drawing of further environments beside the selected one, on the grid of `env_spacing`, and of all their markers."""
+"""Display of further environments beside the selected one, on the grid of `env_spacing`, and of all their markers."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def run(playback: Playback, *, title: str, num_drawn: int, port: int, ready: Rea
     try:
         handle = mujoco.viewer.launch_passive(model, data, key_callback=partial(press, playback), show_left_ui=False)
     except RuntimeError as error:
-        hint = "start it as: mjpython -m rlcli play ..., or --viewer web" if sys.platform == "darwin" else None
+        hint = "start it as `mjpython -m rlcli play ...`, or add --viewer web" if sys.platform == "darwin" else None
         raise MachineError(f"the window cannot be opened: {error}", hint=hint) from error
     drawing = set(threading.enumerate()) - before
     try:
@@ -82,7 +82,7 @@ def captions(view: View) -> tuple[str, str]:
     if view.checkpoint is not None:
         rows["checkpoint"] = f"{view.checkpoint}"
     for number, knob in enumerate(view.knobs):
-        value = f"{view.held[knob.name]:g}" if knob.name in view.held else "as drawn"
+        value = f"{view.held[knob.name]:g}" if knob.name in view.held else "from the task"
         rows[f"{'> ' if number == view.knob else ''}{knob.name}"] = value
     if view.message:
         rows[""] = view.message[:80]
@@ -109,9 +109,8 @@ def _require_windows() -> None:
     if window is None:
         messages = [" ".join(str(warning.message).split()) for warning in caught]
         why = "; ".join(messages) or "GLFW does not start"
-        raise MachineError(
-            f"the window cannot be opened: {why}", hint="--viewer web shows it in the browser, --video draws offscreen"
-        )
+        hint = "--viewer web opens the browser, --video FILE.mp4 renders to a file"
+        raise MachineError(f"the window cannot be opened: {why}", hint=hint)
     glfw.destroy_window(window)
 
 

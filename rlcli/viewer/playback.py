@@ -159,7 +159,7 @@ class Playback:
         self._due = 0.0
 
     def show(self, shown: int) -> None:
-        """Show another environment; numbers wrap around."""
+        """Show another environment; indices wrap around."""
         self.shown = shown % self.env.num_envs
         self._push = None
 
@@ -280,15 +280,15 @@ class Playback:
 
 
 def run_in_real_time(playback: Playback, is_open: Callable[[], bool], draw: Callable[[], None]) -> None:
-    """Advance and draw 60 times a second until the viewer is closed.
+    """Advance and render 60 times a second until the viewer is closed.
 
     Viewers use this loop and do not call `Playback.advance`.
 
     Args:
         playback: environments and policy.
         is_open: returns whether the viewer is still open.
-        draw: draws the present state. It runs in the simulation's thread between two calls of `advance`, so it may read
-            `playback.env`. Another thread of a viewer may read only `playback.view`.
+        draw: renders the present state. It runs in the simulation's thread between two calls of `advance`, so it may
+            read `playback.env`. Another thread of a viewer may read only `playback.view`.
     """
     before, refreshed = time.perf_counter(), 0.0
     while is_open():

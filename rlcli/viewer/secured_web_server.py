@@ -143,7 +143,10 @@ def _status(port: int, headers: dict[str, str]) -> int:
 
 
 def _serve_with_checks(server: Any, port: int) -> Any:
-    """Return the `serve` of `websockets` with access control before the viewer's own handling of a request."""
+    """Return a replacement for `websockets.serve`.
+
+    The replacement refuses forbidden requests before the viewer handles them, and sets the headers of every response.
+    """
     serve, own_headers = server.serve, response_headers(port)
 
     def serve_checked(*arguments: Any, process_request: Any, process_response: Any, **settings: Any) -> Any:

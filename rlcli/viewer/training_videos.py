@@ -26,7 +26,7 @@ class TrainingVideos(StepObserver):
     Between videos only the idle environment remains: the OpenGL context is freed.
 
     Args:
-        make_env: builds an environment of one world, before the first video.
+        make_env: builds a single environment, before the first video.
         folder: folder of the videos `STEP.mp4`.
         interval: iterations between videos.
         stopping: returns whether a stop of the training was requested.
@@ -50,7 +50,7 @@ class TrainingVideos(StepObserver):
         try:
             with undisturbed():
                 if self._env is None:
-                    seed_generators(0)  # some tasks draw while they are built: the same numbers at any iteration
+                    seed_generators(0)  # some tasks sample random numbers while they are built
                     self._env = self._make_env()
                     self._env.observers.add(self)
                 seed_generators(self._env.seed)

@@ -99,10 +99,10 @@ def test_set_creates_mappings_with_override_origin():
 @pytest.mark.parametrize(
     ("path", "said"),
     [
-        (("l", "2"), "'l' is a list of 2 items: give an index from 0 instead of '2'"),
-        (("l", "-1"), "'l' is a list of 2 items: give an index from 0 instead of '-1'"),
-        (("l", "x"), "'l' is a list of 2 items: give an index from 0 instead of 'x'"),
-        (("l", "2", "y"), "'l' is a list of 2 items: give an index from 0 instead of '2'"),
+        (("l", "2"), "'l' is a list of length 2 without item '2'; give an index from 0 to 1"),
+        (("l", "-1"), "'l' is a list of length 2 without item '-1'; give an index from 0 to 1"),
+        (("l", "x"), "'l' is a list of length 2 without item 'x'; give an index from 0 to 1"),
+        (("l", "2", "y"), "'l' is a list of length 2 without item '2'; give an index from 0 to 1"),
         (("n", "x"), "'n' is a value, not a mapping"),
         (("n", "x", "y"), "'n' is a value, not a mapping"),
         (("l", "0", "y"), "'0' is a value, not a mapping"),

@@ -89,7 +89,7 @@ def test_override_of_list_item_by_index(task):
 @pytest.mark.parametrize("index", ["1", "-1", "x", "²"])
 def test_override_of_missing_index_is_refused(problems_of, index):
     (said,) = problems_of(TASK, f"rewards.near.joints.{index}=hinge")
-    assert "is a list of 1" in said
+    assert "is a list of length 1" in said
 
 
 def test_quoted_key_may_contain_dot(task):

@@ -188,7 +188,7 @@ def test_function_that_is_no_term_is_refused(root):
     for term, said in (
         (positional, "must be keyword-only"),
         (untyped, "has no annotation"),
-        (abs, "source cannot be read"),
+        (abs, "source code cannot be read"),
     ):
         with pytest.raises(ConfigError, match=said):
             make_env(cartpole(rewards={"own": RewardConfig(func=term, weight=1.0)}), root=root)
@@ -214,7 +214,7 @@ def test_folder_with_python_task_is_found(root):
 
 def test_object_that_is_no_configuration_is_refused(root):
     write_task(root, "TASK = 3\nBROKEN = lambda: 1 / 0\n")
-    with pytest.raises(ConfigError, match="expected a TaskConfig, found a int"):
+    with pytest.raises(ConfigError, match="expected a TaskConfig, found a value of type int"):
         resolve(find_task(str(root)))
     with pytest.raises(TaskError, match=r"ZeroDivisionError: division by zero \(.*task\.py"):
         resolve(find_task(f"{root / 'task.py'}:BROKEN"))

@@ -147,7 +147,7 @@ class Fussy:
     [
         (
             {"rewards": {"bad": {"func": "scalar", "weight": 1.0}}},
-            "rewards.bad: 'scalar' returned a float; return {}(3,)",
+            "rewards.bad: 'scalar' returned a value of type float; return {}(3,)",
         ),
         (
             {"rewards": {"bad": {"func": "column", "weight": 1.0}}},

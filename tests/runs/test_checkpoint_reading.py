@@ -279,7 +279,7 @@ def test_log_files_with_different_columns_are_refused(folder):
     shard(1, size=len(data), sha256=checkpoint_reader.sha256(data))(folder)
     opened = checkpoint_reader.open_checkpoint(folder).state().logs["replay"]
     assert set(opened.read(13, 15)) == {"x"}
-    with pytest.raises(CheckpointError, match="'replay' differs in columns"):
+    with pytest.raises(CheckpointError, match="the parts of 'replay' have different columns"):
         opened.read(10, 14)
 
 

@@ -103,7 +103,7 @@ def test_exported_bundle_has_the_evaluation_of_the_run(cli, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     without = cli("export", "cartpole", "--format", "bundle", "--output", "one", "--json")
     assert without.json["metadata"]["evaluation"] is None
-    assert "the bundle has no evaluation" in without.err
+    assert "the bundle contains no evaluation" in without.err
     cli("eval", "cartpole", "--episodes", 4, "--num-envs", 4)
     made = cli("export", "cartpole", "--format", "bundle", "--json").json
     assert Path(made["file"]) == only_run() / "exports" / "policy"

@@ -276,7 +276,9 @@ def test_unknown_field_error_suggests_name():
     engine = engine_of(model_of(), 1)
     with pytest.raises(ValueError, match=r"'qvle' is not an MjData field; did you mean .*'qvel'"):
         engine.field("qvle")
-    with pytest.raises(ValueError, match=r"'body_masss' cannot differ between worlds; did you mean .*'body_mass'"):
+    with pytest.raises(
+        ValueError, match=r"'body_masss' cannot differ between environments; did you mean .*'body_mass'"
+    ):
         engine.expand("body_masss")
 
 

@@ -326,9 +326,11 @@ def test_markers_are_limited_by_scene_size(tmp_path):
 
 
 WRONG = {
-    "returned a dict; return Arrow, Sphere or Frame": lambda n: {},
+    "returned a value of type dict; return Arrow, Sphere or Frame": lambda n: {},
     r"returned Sphere.center of shape \(3,\); return a tensor of shape \(4, 3\)": lambda n: Sphere(torch.zeros(3)),
-    r"returned Arrow.end a list; return a tensor of shape \(4, 3\)": lambda n: Arrow(torch.zeros(n, 3), [0, 0, 1]),
+    r"returned Arrow.end of type list; return a tensor of shape \(4, 3\)": lambda n: Arrow(
+        torch.zeros(n, 3), [0, 0, 1]
+    ),
     r"returned Frame.quat of shape \(4, 3\); return a tensor of shape \(4, 4\)": lambda n: Frame(
         torch.zeros(n, 3), torch.zeros(n, 3)
     ),

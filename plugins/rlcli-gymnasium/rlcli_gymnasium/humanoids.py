@@ -31,7 +31,7 @@ class _Humanoid(GymnasiumTask):
     reads = ("xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 
     def columns(self) -> list[Tensor]:
-        """Return pose without x and y, velocity, inertias and velocities of bodies, actuator and contact forces."""
+        """Return qpos without x and y; qvel; inertia and velocity of each body; actuator forces; contact forces."""
         field = self.field
         return [
             field.qpos[:, 2:],

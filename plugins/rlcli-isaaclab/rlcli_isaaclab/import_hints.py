@@ -39,7 +39,7 @@ _UNSUPPORTED = {
     "DirectRLEnv": "write a DirectRLEnv as a direct task: docs/guides/isaac-lab.md, 'A DirectRLEnv'",
     "DirectMARLEnv": "rlcli has no multi-agent tasks",
     "ActionTerm": "write your own action as a class for rlcli: docs/guides/isaac-lab.md, 'What is what'",
-    "AppLauncher": "there is no app to launch: use rlcli train, play and eval instead of your scripts",
+    "AppLauncher": "there is no app to launch; instead of your scripts use `rlcli train`, `play` and `eval`",
     "SimulationContext": "rlcli steps the simulation: terms read its state from env.scene",
     "InteractiveScene": "rlcli builds the scene of your InteractiveSceneCfg: terms read it from env.scene",
 }

@@ -30,7 +30,7 @@ class ManagerFacade:
 
 
 class ActionManagerFacade(ManagerFacade):
-    """Action manager."""
+    """Action manager with Isaac Lab's attributes."""
 
     @property
     def total_action_dim(self) -> int:
@@ -43,7 +43,7 @@ class ActionManagerFacade(ManagerFacade):
 
 
 class TerminationManagerFacade(ManagerFacade):
-    """Termination manager."""
+    """Termination manager with Isaac Lab's attributes."""
 
     @property
     def dones(self) -> Tensor:
@@ -59,7 +59,7 @@ class TerminationManagerFacade(ManagerFacade):
 
 
 class CommandManagerFacade(ManagerFacade):
-    """Command manager."""
+    """Command manager with Isaac Lab's attributes."""
 
     def get_command(self, name: str) -> Tensor:
         """Return the current command. (num_envs, k)"""
@@ -72,7 +72,7 @@ class CommandManagerFacade(ManagerFacade):
 
 
 class RewardManagerFacade(ManagerFacade):
-    """Reward manager."""
+    """Reward manager with Isaac Lab's attributes."""
 
     def __init__(self, manager: Any, tunable: Any) -> None:
         super().__init__(manager)
@@ -112,5 +112,5 @@ class RewardSettings:
 def _find_term(terms: Any, name: str, kind: str) -> Any:
     found = {term.name: term.instance for term in terms}
     if name not in found:
-        raise NameProblem(f"no {kind} '{name}'; choose from {listing(found)}")
+        raise NameProblem(f"no {kind} '{name}'; {kind}s: {listing(found)}")
     return found[name]

@@ -167,7 +167,7 @@ class CommandTerm(ManagerTermBase):
         return {}
 
     def set_debug_vis(self, debug_vis: bool) -> bool:
-        """Do nothing: commands are not drawn. Returns False."""
+        """Do nothing: commands are not shown. Returns False."""
         return False
 
     def _update_metrics(self) -> None:

@@ -66,7 +66,8 @@ class ManagerBasedRLEnv(gymnasium.Env):
                     f"env has no '{name}' yet: use it only in reset() and __call__(), not in __init__()"
                 )
             known = [n for n in (*dir(type(self)), *dir(self.managed)) if not n.startswith("_")]
-            raise AttributeError(f"env has no '{name}'; {did_you_mean(name, known) or listing(sorted(set(known)), 60)}")
+            hint = did_you_mean(name, known) or f"its attributes: {listing(sorted(set(known)), 60)}"
+            raise AttributeError(f"env has no '{name}'; {hint}")
         return getattr(self.managed, name)
 
     @property

@@ -45,7 +45,8 @@ class Data:
             return getattr(self._data, _DATA_NAMES.get(name, name))
         except AttributeError:
             known = [n for n in (*dir(type(self)), *dir(self._data), *_DATA_NAMES) if not n.startswith("_")]
-            raise AttributeError(f"data has no '{name}'; {did_you_mean(name, known) or listing(known, 60)}") from None
+            hint = did_you_mean(name, known) or f"its attributes: {listing(known, 60)}"
+            raise AttributeError(f"data has no '{name}'; {hint}") from None
 
     def _expand_to_envs(self, row: Tensor) -> Tensor:
         return row if row.dim() == 3 else row.expand(self._env.num_envs, *row.shape)
@@ -213,7 +214,7 @@ class Scene(Mapping[str, Any]):
             return sensors[name]
         if name == "terrain" and self.terrain is not None:
             return self.terrain
-        raise KeyError(f"no '{name}' in the scene; choose from {listing([*self.articulations, *sensors])}")
+        raise KeyError(f"no '{name}' in the scene; entities and sensors: {listing([*self.articulations, *sensors])}")
 
     def __iter__(self) -> Iterator[str]:
         return iter([*self.articulations, *self.sensors])
@@ -228,7 +229,7 @@ class Scene(Mapping[str, Any]):
             NameProblem: if a name matches nothing.
         """
         if cfg.name not in self:
-            hint = did_you_mean(cfg.name, list(self)) or f"choose from {listing(self)}"
+            hint = did_you_mean(cfg.name, list(self)) or f"entities and sensors: {listing(self)}"
             raise NameProblem(f"no '{cfg.name}' in the scene", hint)
         element = self[cfg.name]
         for kind in ("joint", "body"):

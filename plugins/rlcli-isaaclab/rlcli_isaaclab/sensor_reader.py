@@ -22,7 +22,7 @@ def read_sensor(kind: str, item: Node, prims: Mapping[str, str]) -> dict[str, An
     parts = [part for part in prim.split("/") if part]
     entity = next((name for name, last in prims.items() if last in parts), None)
     if entity is None:
-        hint = f"there are {listing(prims)}"
+        hint = f"prims: {listing(prims)}"
         item.report.problem((*item.key, "prim_path"), f"'{prim}' is not inside an entity", hint)
         return None
     inside = parts[parts.index(prims[entity]) + 1 :]

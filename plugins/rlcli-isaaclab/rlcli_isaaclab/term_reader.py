@@ -50,7 +50,7 @@ class TermReader:
         name = ACTIONS.get(kind)
         signature = builtin_terms("actions").get(name or "")
         if name is None or signature is None:
-            near = did_you_mean(kind, ACTIONS) or f"there are {listing(ACTIONS)}"
+            near = did_you_mean(kind, ACTIONS) or f"actions: {listing(ACTIONS)}"
             self.report.problem(node.key, f"the action '{kind}' has no counterpart in rlcli", near)
             return {"func": "joint_effort"}
         node.skip("debug_vis")
@@ -422,7 +422,7 @@ def _builtin_name(function: Any) -> str | None:
 
 def _find_signature(terms: Mapping[str, Signature], name: str) -> Signature:
     if name not in terms:
-        raise ConfigError([Problem("configuration", "commands", f"no term '{name}'", f"choose from {listing(terms)}")])
+        raise ConfigError([Problem("configuration", "commands", f"no term '{name}'", f"terms: {listing(terms)}")])
     return terms[name]
 
 

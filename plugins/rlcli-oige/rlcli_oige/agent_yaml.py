@@ -42,7 +42,7 @@ _IGNORED = {
     "score_to_win": "training runs until its budget is used",
     "save_best_after": "the best checkpoint is always kept",
     "print_stats": "",
-    "player": "use rlcli play",
+    "player": "use `rlcli play`",
     "seq_length": "sequences are always whole rollouts",
     "games_to_track": "",
     "max_frames": "",
@@ -173,8 +173,12 @@ class _Translator(YamlTranslator):
                 self.note((*at, key), "mapped", "actor.activation, critic.activation")
             elif key == "d2rl" and value:
                 self.problem((*at, key), "d2rl networks are not supported; remove this key")
-            elif key in ("d2rl", "initializer", "regularizer"):
-                self.note((*at, key), "mapped" if key == "initializer" else "ignored", "init")
+            elif key == "initializer":
+                self.note((*at, key), "mapped", "init")
+            elif key == "d2rl":
+                self.note((*at, key), "ignored", "it is false: the networks are plain MLPs, as in rlcli")
+            elif key == "regularizer":
+                self.note((*at, key), "ignored", "rlcli has no regularizer of weights")
             else:
                 self.problem((*at, key), f"unknown key '{key}'; remove it")
         for network in ("actor", "critic"):

@@ -196,7 +196,7 @@ def _check_gate(
         key for key in (*needed, *(("frequency_interval",) if gate == "on_interval" else ())) if key not in entry
     ]
     if missing:
-        problem(at, f"missing {listing(missing)}", "add each of these keys")
+        problem(at, f"missing keys: {listing(missing)}", "add each of these keys")
         return
     for key, known in (("operation", OPERATIONS), ("distribution", tuple(DISTRIBUTIONS)), ("schedule", SCHEDULES)):
         if key in entry and entry[key] not in known:

@@ -88,7 +88,7 @@ class Stage:
             if prefix in self.prims:
                 return self.prims[prefix]
             prefix = prefix.rpartition("/")[0]
-        raise TaskError(f"no prim at '{path}'", hint=f"choose from {listing(self.prims)}")
+        raise TaskError(f"no prim at '{path}'", hint=f"prims: {listing(self.prims)}")
 
     def define(self, path: str, pos: Any, quat: Any) -> Prim:
         """Add a prim."""

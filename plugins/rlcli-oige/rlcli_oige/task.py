@@ -208,7 +208,7 @@ class World:
         self._env.pause(True)
 
     def render(self) -> None:
-        """Do nothing: viewers draw by themselves."""
+        """Do nothing: viewers render by themselves."""
 
     def get_physics_dt(self) -> float:
         """Return the physics time step [s]."""
@@ -256,7 +256,7 @@ class EnvHandle:
         return self.world.current_time_step_index
 
     def render(self, *args: Any, **kwargs: Any) -> None:
-        """Do nothing: viewers draw by themselves."""
+        """Do nothing: viewers render by themselves."""
 
     create_viewport_render_product = render
 

@@ -34,7 +34,8 @@ def find_class(folder: Path, name: str) -> tuple[Path, str]:
     where = "task.py" if own.is_file() else "any Python file of the folder"
     if not tasks:
         raise LookupError(f"no task class in {where}; name the class '{name}Task'")
-    raise LookupError(f"several task classes; name one of them '{name}Task': {listing(cls for _, cls in tasks)}")
+    found = listing(cls for _, cls in tasks)
+    raise LookupError(f"found several task classes: {found}; rename the right one to '{name}Task'")
 
 
 def _classes(file: Path) -> list[tuple[str, list[str]]]:

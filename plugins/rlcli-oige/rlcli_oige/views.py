@@ -314,7 +314,8 @@ class RigidPrimView(XFormPrimView):
 
     def enable_gravities(self, indices: Any = None) -> None:
         """Turn gravity on."""
-        self._set_gravity_compensation(0.0, indices)
+        if self.env.engine.model.ngravcomp:  # else the model has no gravity compensation, so gravity is on
+            self._set_gravity_compensation(0.0, indices)
 
     def disable_gravities(self, indices: Any = None) -> None:
         """Turn gravity off."""
@@ -322,8 +323,9 @@ class RigidPrimView(XFormPrimView):
 
     def _set_gravity_compensation(self, compensation: float, indices: Any) -> None:
         if not self.env.engine.model.ngravcomp:  # MuJoCo skips gravity compensation in a model without it
-            hint = "call disable_gravities in the file of the task's class"
-            raise TaskError(f"view '{self.name}': gravity cannot be turned off", hint=hint)
+            why = "the model was built without gravity compensation, because the task's file does not mention"
+            hint = "move this call into the file of the task's class"
+            raise TaskError(f"view '{self.name}': {why} disable_gravities", hint=hint)
         field = self.env.engine.expand("body_gravcomp")
         for which, body in enumerate(self._bodies):
             rows, _ = self._rows_of(which, indices)

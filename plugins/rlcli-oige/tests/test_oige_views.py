@@ -74,7 +74,7 @@ def test_disabled_gravity_stops_fall_and_enabled_restarts_it(tmp_path):
 
 
 def test_disable_gravities_outside_task_file_is_refused(env):
-    with pytest.raises(TaskError, match="view 'box_view': gravity cannot be turned off"):
+    with pytest.raises(TaskError, match="view 'box_view': the model was built without gravity compensation"):
         env.task._boxes.disable_gravities()
 
 

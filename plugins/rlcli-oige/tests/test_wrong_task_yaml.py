@@ -109,13 +109,13 @@ NOISE = f"{BLOCK}.randomization_params.observations.on_reset"
         (
             {"randomization_params": {"observations": {"on_reset": without("distribution")}}},
             NOISE,
-            "missing distribution",
+            "missing keys: distribution",
             None,
         ),
         (
             noise("on_interval"),
             f"{BLOCK}.randomization_params.observations.on_interval",
-            "missing frequency_interval",
+            "missing keys: frequency_interval",
             None,
         ),
         (noise(operation="add"), f"{NOISE}.operation", "unknown operation 'add'", "additive"),
@@ -213,7 +213,7 @@ def test_find_class_chooses_matching_class(tmp_path, files, expected):
 
 def test_ambiguous_classes_are_listed(tmp_path):
     (tmp_path / "a.py").write_text("class ReachTask(RLTask): pass\nclass PushTask(RLTask): pass\n")
-    with pytest.raises(LookupError, match=r"several task classes; name one of them 'ArmTask': .*ReachTask"):
+    with pytest.raises(LookupError, match=r"several task classes: .*ReachTask.*rename the right one to 'ArmTask'"):
         find_class(tmp_path, "Arm")
 
 

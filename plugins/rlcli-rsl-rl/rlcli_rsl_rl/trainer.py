@@ -280,8 +280,9 @@ def _groups(env: Environment, config: RunnerConfig) -> dict[str, list[str]]:
                 hint = f"groups of the task: {', '.join(have)}"
                 raise agent_error(env, ("obs_groups", name), f"no observation group '{group}'", hint)
         if allowed[name] == "actor" and groups != ["policy"]:
-            message = f"the policy acts on the group policy alone, found {', '.join(groups)}"
-            raise agent_error(env, ("obs_groups", name), message, "put the terms into observations.policy")
+            message = f"the actor can read only the observation group 'policy', found {', '.join(groups)}"
+            hint = "move the terms of the other groups into observations.policy, and write [policy] here"
+            raise agent_error(env, ("obs_groups", name), message, hint)
         if allowed[name] in sets:
             sets[allowed[name]] = list(groups)
     return sets

@@ -45,16 +45,16 @@ def command(
     """List or show the recorded failed and outlier episodes of a training.
 
     Options:
-        case: Show this case, by its number in the list. [default: list all]
+        case: Show this case, by its number in the list, from 0. [default: list all]
         sort: Order of the list: when, return, length or kind.
         steps: Number of last steps of a case to show.
-        video: Draw the last seconds of the case to FILE.mp4 or FILE.gif. Without FILE: autopsy.mp4.
+        video: Render the last seconds of the case to FILE.mp4 or FILE.gif. Without FILE: autopsy.mp4.
 
     Examples:
         rlcli autopsy latest --sort return
             List the recorded episodes of the newest run, worst return first.
         rlcli autopsy latest 0 --video case.mp4
-            Show the first case and draw its last seconds.
+            Show the first case and render its last seconds.
     """
     require_known(sort, list(_SORT_KEYS), "--sort", "orders")
     if video is not None and case is None:
@@ -87,8 +87,8 @@ def _refuse_bundle(folder: str, case: int | None) -> None:
 
     open_bundle(Path(folder))
     why = (
-        f"a bundle has no episodes of training; rlcli eval --checkpoint {folder} --record FILE --record-mode failed"
-        " records new ones"
+        "a bundle has no episodes of training; to record new ones, run"
+        f" `rlcli eval --checkpoint {folder} --record FILE --record-mode failed`"
     )
     if case is not None:
         raise UsageError(f"no case {case} in {folder}", hint=why)
@@ -144,10 +144,10 @@ def _print_case(
         from rlcli.viewer.replay_video import film_case
 
         frames, fps, backend = film_case(staged, video)
-        console.info(f"{frames} frames at {fps:g} per second, drawn with {backend}")
+        console.info(f"{frames} frames at {fps:g} per second, rendered with {backend}")
         console.data(str(video))
     if error is not None:
-        console.info(f"no contacts: {error.message}{f'; {error.hint}' if error.hint else ''}")
+        console.info(f"contacts cannot be shown: {error.message}{f'; {error.hint}' if error.hint else ''}")
     console.document(
         "autopsy",
         run=str(run.folder),
@@ -217,7 +217,7 @@ def _print_contacts(contacts: Sequence[Contact]) -> None:
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
-    """Draw values as bars of eight heights; average neighbours if there are more than `width`; `?` is not finite."""
+    """Return values as bars of eight heights; average neighbours if there are more than `width`; `?` is not finite."""
     if len(values) > width:
         edges = [round(i * len(values) / width) for i in range(width + 1)]
         values = [sum(values[a:b]) / (b - a) for a, b in itertools.pairwise(edges)]

@@ -58,8 +58,9 @@ def command(
     limits, words = read_limits(fail_under, fail_over), overrides or []
     request = sessions.PolicyRequest(task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir)
     if compare:
-        if checkpoint is not None or policy != "trained" or record is not None:
-            raise UsageError("--compare takes policies as arguments only", hint="rlcli eval --compare RUN1 RUN2")
+        given = {"--checkpoint": checkpoint, "--policy": policy if policy != "trained" else None, "--record": record}
+        for option in [option for option, value in given.items() if value is not None]:
+            raise UsageError(f"--compare cannot be combined with {option}", hint="use rlcli eval --compare RUN1 RUN2")
         _compare(request, episodes, limits)
         return
     sessions.check_record(record, record_mode)

@@ -134,7 +134,7 @@ def _export_bundle(saved: Checkpoint, run: Run | None, output: Path) -> None:
     check_bundle_target(output)
     evaluation = None if run is None else read_evaluation(run, saved.folder.name)
     if run is not None and evaluation is None:
-        console.info(f"the bundle has no evaluation; rlcli eval --checkpoint {saved.folder} makes one")
+        console.info(f"the bundle contains no evaluation: `rlcli eval --checkpoint {saved.folder}`, then export again")
     bundle = write_bundle(saved, output, run, evaluation)
     size = sum(file.stat().st_size for file in bundle.folder.iterdir())
     _report(saved.folder, "bundle", bundle.folder, size, metadata=bundle.manifest)

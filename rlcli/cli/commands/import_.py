@@ -128,7 +128,7 @@ def _create_run(
         f"{form} {policy.algorithm}: {spec['observation_size']} observations, hidden layers {hidden}"
         f" ({spec['activation']}), {spec['action_size']} actions {bound}"
     )
-    console.info(f"next: rlcli play --checkpoint {run}, or rlcli train {resolved.source.name} --init-from {run}")
+    console.info(f"next: `rlcli play --checkpoint {run}` or `rlcli train {resolved.source.name} --init-from {run}`")
     console.data(str(run))
     console.document("import", form=form, run=str(run), algorithm=policy.algorithm, policy=spec)
 

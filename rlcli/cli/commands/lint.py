@@ -1,4 +1,8 @@
-"""`rlcli lint`: rules for a task that a policy can learn, applied to episodes of scripted agents."""
+"""`rlcli lint`: find what makes a task hard to learn.
+
+The linter runs simple fixed policies (zero, random, bang-bang, sine) and checks their rollouts with one rule for each
+obstacle. `rlcli.testing.lint_rules.RULES` contains all rules.
+"""
 
 from __future__ import annotations
 
@@ -21,10 +25,13 @@ def command(
     ignore: Annotated[list[str] | None, typer.Option(metavar="RULE")] = None,
     agent: Agent = None,
 ) -> None:
-    """Find what makes a task hard to learn. Rewards, resets, observations, actions, time step, discount.
+    """Find what makes a task hard to learn: run simple fixed policies, and check their episodes.
+
+    The policies are zero, random, bang-bang and sine actions. The rules check rewards, resets, observations, actions,
+    the time step and the discount. The report has one line for each rule, with its name.
 
     Options:
-        seconds: Simulated time for which each scripted agent acts [s]. [default: an episode, at most 1000 steps]
+        seconds: Simulated time for which each fixed policy acts [s]. [default: an episode, at most 1000 steps]
         only: Run only this rule; repeatable.
         ignore: Leave this rule out; repeatable.
 
@@ -32,7 +39,7 @@ def command(
         rlcli lint cartpole
             Run all rules on an installed task.
         rlcli lint ./my_task --only dominant-reward --seconds 5
-            Run one rule on five simulated seconds of each agent.
+            Run one rule on five simulated seconds of each policy.
     """
     from rlcli.runs.trusted_tasks import named_task
 

@@ -48,7 +48,7 @@ def command(
         near = did_you_mean(pattern.lower(), by_name)
         console.info(f"no task's name or summary contains '{pattern}'; {near or 'rlcli list-tasks shows all'}")
     for bad in broken:
-        console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed; see rlcli doctor")
+        console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed; see `rlcli doctor`")
     for name in unknown_wanted():
         console.warn(
             f"{plugins_chosen_by()} names '{name}', but no installed distribution of that name has tasks or trainers;"
@@ -86,7 +86,7 @@ def _show(rows: list[tuple[Entry, Details]], shared: set[str]) -> None:
                 _number(known.num_envs),
                 known.agent or "",
                 known.status,
-                known.summary or ("" if known.broken else "(rlcli list-tasks --probe shows more)"),
+                known.summary or ("" if known.broken else "(`rlcli list-tasks --probe` shows more)"),
             ]
             for entry, known in rows
         ],

@@ -1,4 +1,4 @@
-"""`rlcli play`: a policy in a window, in the browser, as a video, or as numbers."""
+"""`rlcli play`: a policy in a window, in the browser, as a video, or as printed values."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ def command(
     Options:
         video: Write one episode to FILE.mp4 or FILE.gif, without a window; without FILE into the run. After an
             episode that is terminated within 5 s the next episodes follow.
-        viewer: auto, native (a window), web (the browser) or none (numbers). auto is a window if there is a
-            display, else the browser if started from a terminal, else numbers. [default: the settings' viewer, or
+        viewer: auto, native (a window), web (the browser) or none (printed values). auto is a window if there is a
+            display, else the browser if started from a terminal, else none. [default: the settings' viewer, or
             auto]
         port: Port of --viewer web, on this machine only; 0 takes any free port. [default: 8080]
-        drawn: Number of environments to draw, side by side on the grid.
+        drawn: Number of environments to show, side by side on the grid.
         commands: Hold commands of the task, such as vx=0.5,wz=0; repeatable. A wrong name lists the valid ones.
         env: With --episode: environment whose episode of an evaluation is repeated.
-        episode: With --env: number of the episode in that environment, counted from 0.
+        episode: With --env: index of the episode in that environment, from 0.
 
     Examples:
         rlcli play cartpole --viewer web
@@ -96,14 +96,14 @@ def _check_record(record: Path | None, mode: str, video: Path | None, commands: 
     from rlcli.evaluation.session import check_record
 
     if record is not None and video is not None:
-        raise UsageError("--record and --video cannot be combined", hint="rlcli replay FILE --video draws a recording")
+        raise UsageError("--record and --video cannot be combined", hint="`rlcli replay FILE --video` renders FILE")
     if record is not None and commands:
-        raise UsageError("leave out --record or --command: rlcli replay cannot repeat commanded episodes")
+        raise UsageError("leave out --record or --command: `rlcli replay` cannot repeat commanded episodes")
     check_record(record, mode)
 
 
 def _prepare(session: Session, drawn: int, commands: dict[str, float]) -> None:
-    """Check that there are enough environments to draw, and hold the commands."""
+    """Check that there are enough environments to show, and hold the commands."""
     available = session.env.num_envs
     if drawn > available:
         raise UsageError(f"--show {drawn}, but there are {available} environments", hint=f"--num-envs {drawn}")
@@ -138,7 +138,7 @@ def _video(session: Session, file: Path, drawn: int) -> None:
         summary = evaluate(session.env, filming.act, session.env.num_envs, end_video).summary()
     frames, fps, backend = filming.writer.frames, filming.writer.fps, filming.renderer.backend
     which = "environment 0" if drawn == 1 else f"environments 0 to {drawn - 1}"
-    console.info(f"{frames} frames of {which} at {fps:g} per second, drawn with {backend}")
+    console.info(f"{frames} frames of {which} at {fps:g} per second, rendered with {backend}")
     console.data(str(file))
     video = {"video": str(file), "frames": frames, "fps": fps, "gl": backend}
     console.document("play", **session.policy.record(), **video, **summary)

@@ -29,7 +29,7 @@ def command(
     x: Annotated[str, choice("AXIS", "steps", "iterations", "time")] = "steps",
     runs_dir: RunsDir = None,
 ) -> None:
-    """Draw learning curves of runs. Several seeds become their interquartile mean with a 95 % interval.
+    """Plot learning curves of runs. Several seeds become their interquartile mean with a 95 % interval.
 
     Options:
         runs: Runs by folder or name, latest, or a task: all of its runs.
@@ -40,9 +40,9 @@ def command(
 
     Examples:
         rlcli plot latest
-            Draw the curves of the newest run into its folder.
+            Plot the curves of the newest run into its folder.
         rlcli plot cartpole --metrics return,Loss -o curves.svg
-            Draw the return and the losses of all runs of cartpole.
+            Plot the return and the losses of all runs of cartpole.
     """
     from rlcli.reporting.panel_plots import FORMATS, check_drawing
     from rlcli.runs.run_ref import default_runs_dir, find_runs
@@ -78,9 +78,9 @@ def _choose_panels(curves: list[Curve], names: list[str] | None, x: str) -> list
 
     panels = choose(curves, names, x)
     if not panels:
-        raise UsageError("nothing to draw: no episode has ended yet", hint="--metrics Loss draws the losses")
+        raise UsageError("nothing to plot: no episode has ended yet", hint="--metrics Loss plots the losses")
     if len(panels) > _MAX_PANELS:
-        console.warn(f"drawing the first {_MAX_PANELS} of {len(panels)} panels; choose others with --metrics")
+        console.warn(f"plotting the first {_MAX_PANELS} of {len(panels)} panels; choose others with --metrics")
     return panels[:_MAX_PANELS]
 
 

@@ -25,15 +25,15 @@ def command(
 
     Options:
         file: Recording of eval or play (--record), crash dump of a diverged simulation, or failure case of a run.
-        episode: Number of the episode to replay, counted from 0. [default: all]
-        video: Draw one episode (that of --episode, else the first) to FILE.mp4 or FILE.gif. Without FILE:
+        episode: Index of the episode to replay, from 0. [default: all]
+        video: Render one episode (that of --episode, else the first) to FILE.mp4 or FILE.gif. Without FILE:
             replay.mp4.
 
     Examples:
         rlcli replay episodes.safetensors
             Replay all episodes of a recording and compare them.
         rlcli replay episodes.safetensors --episode 3 --video episode.mp4
-            Replay one episode and draw it.
+            Replay one episode and render it.
     """
     video = video_file(video, "replay.mp4")
     import torch

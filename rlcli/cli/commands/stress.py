@@ -54,13 +54,13 @@ def command(
         worst: Number of further points at which to search for a worse variant.
         against: Baseline that is evaluated too: lqr, zero or random.
         fail_under: Exit with code 9 if the mean is below X in any variant, such as success=0.9; repeatable.
-        output: Draw the heat map to FILE.png or FILE.svg.
+        output: Write the heat map to FILE.png or FILE.svg.
 
     Examples:
         rlcli stress latest --sweep body_mass=0.5:2
             Evaluate the newest run with half to twice the mass, in five steps.
         rlcli stress cartpole --sweep action_delay=0:3 --against lqr -o map.png
-            Compare it with an LQR controller under delays, and draw the map.
+            Compare it with an LQR controller under delays, and write the map.
     """
     from rlcli.evaluation.limits import read_limits, require_success
     from rlcli.evaluation.session import PolicyRequest, baseline, find_policy, split_overrides

@@ -62,7 +62,7 @@ def command(
         pruner: median (stop trials that learn worse than most) or none.
         storage: URL of a database that several machines share. [default: a journal file in the sweep's folder]
         name: Name of the sweep; a command with the same name resumes or joins it.
-        plot: With show: draw the trials to a file in the sweep's folder.
+        plot: With show: plot the trials in a file in the sweep's folder.
         seeds: With compare: seeds of the trainings, such as 0..2 or 1,5,9.
         until: With compare: value of success, return or length at which a training ends. [default: success=0.99]
         seed: Seed of each trial and of the search.
@@ -103,7 +103,7 @@ def command(
 
 
 def _show(request: TrainingRequest, storage: str | None, plot: bool) -> None:
-    """Print the trials of a sweep, and draw them with --plot."""
+    """Print the trials of a sweep, and plot them with --plot."""
     from rlcli.cli.ui.sweep_tables import print_sweep
     from rlcli.tuning.sweep import draw_sweep, find_sweep
 

@@ -1,4 +1,4 @@
-"""`rlcli terms [PATTERN]`: the terms that a task may name, with their keys, types and defaults."""
+"""`rlcli terms [PATTERN]`: the terms (observation, action, reward, event ... functions) that a task file can use."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ def command(
     pattern: Annotated[str | None, typer.Argument()] = None,
     task: Annotated[str | None, typer.Option("--task", metavar="TASK")] = None,
 ) -> None:
-    """List the terms for the sections of a task file: names, keys, types and defaults.
+    """List the terms that a task file can use: its observations, actions, rewards, events and more.
 
-    An exact name prints the meaning of each key, with its unit, and an example.
+    The list has the name of each term, and its keys, types and defaults. An exact name prints the meaning of each
+    key, with its unit, and an example.
 
     Options:
         pattern: Text in the name, section or summary of the terms. [default: all terms]
@@ -26,7 +27,7 @@ def command(
 
     Examples:
         rlcli terms track_lin_vel
-            List the terms whose name or summary contains a text.
+            List the terms whose name or summary contains `track_lin_vel`.
         rlcli terms joint_vel_l1
             Describe one term with its keys.
     """
@@ -43,7 +44,7 @@ def command(
         _print_lines(entries)
     if not entries:
         near = did_you_mean(pattern or "", [entry.name for entry in term_entries("", term_files)])
-        console.info(f"no term's name or summary contains '{pattern}'; {near or 'rlcli terms lists all'}")
+        console.info(f"no term's name or summary contains '{pattern}'; {near or 'run `rlcli terms` to list all terms'}")
     console.document("terms", terms=[entry.document() for entry in exact or entries])
 
 

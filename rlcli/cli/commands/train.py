@@ -47,7 +47,7 @@ def command(
     """Train a policy.
 
     Options:
-        seed: Seed of all random numbers; -1 draws one and records it. [default: 42]
+        seed: Seed of all random numbers; -1 picks a random one and records it. [default: 42]
         seeds: Train one run for each of several seeds, in one study folder: 0..4 or 1,5,9.
         jobs: With --seeds: number of trainings at a time. [default: 1]
         gpus: Number of processes on this machine, one GPU each; each has its own num_envs environments. [default: 1
@@ -127,7 +127,7 @@ def _source(task: str | None, request: TrainingRequest, seed: int | None, seeds:
 
     if request.resume is None:
         if task is None:
-            raise UsageError("no task given", hint="rlcli train TASK (rlcli list-tasks shows tasks), or --resume RUN")
+            raise UsageError("no task given", hint="name a task (`rlcli list-tasks` shows all), or give --resume RUN")
         return named_task(task)
     source = None if task is None or "=" in task else named_task(task)
     changes = [word for word in [task, *request.overrides] if word and "=" in word]
@@ -139,7 +139,7 @@ def _source(task: str | None, request: TrainingRequest, seed: int | None, seeds:
         raise UsageError(
             f"a resumed run keeps its configuration: {', '.join(changes)} cannot be given with --resume"
             " (--max-iterations and --max-steps can)",
-            hint="--init-from starts a new run with its weights",
+            hint="to change them, start a new run with the old run's weights: --init-from RUN",
         )
     return source
 

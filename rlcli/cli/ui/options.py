@@ -26,7 +26,7 @@ def choice(metavar: str, *names: str, help: str | None = None) -> Any:
 
 
 def draw_seed(seed: int) -> int:
-    """Return the seed; -1 draws one."""
+    """Return the seed; for -1, a random one."""
     if seed != -1:
         return seed
     import secrets
@@ -41,7 +41,7 @@ _POLICY_TASK = "Task: its newest run is used, else the policy shipped with the t
 _OVERRIDES = "Overrides of settings; agent.KEY=VALUE changes the chosen agent."
 _AGENT = "Agent of the task. [default: the task's]"
 _CONFIG = "YAML file merged over the task; its key `agent` changes the chosen agent."
-_SEED = "Seed of all random numbers; -1 draws one and records it."
+_SEED = "Seed of all random numbers; -1 picks a random one and records it."
 _TASK_FOLDER = "Folder of the task's code, if the task is not installed and its folder has moved."
 _RUNS_DIR = "Folder of runs. [default: RLCLI_RUNS_DIR, the settings' runs_dir, or runs]"
 _RECORD_MODE = "Episodes to record: all, succeeded, failed, or separate (one file each for the last two)."

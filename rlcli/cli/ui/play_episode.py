@@ -61,8 +61,8 @@ def play_episode(
     Args:
         session: environments and policy.
         env_id: the environment of the episode.
-        episode: number of the episode in this environment, counted from 0.
-        video: file to draw the episode to.
+        episode: index of the episode in this environment, from 0.
+        video: file for the video of the episode.
         record: file to record the episode to.
         watch: opens a viewer at the start of the episode; returns whether there was one.
     """
@@ -82,7 +82,7 @@ def play_episode(
         with film(session, video, env_id) as filming:
             last = run_episode(session.env, filming.act, start.obs, env_id)
         frames, fps, backend = filming.writer.frames, filming.writer.fps, filming.renderer.backend
-        console.info(f"{frames} frames at {fps:g} per second, drawn with {backend}")
+        console.info(f"{frames} frames at {fps:g} per second, rendered with {backend}")
     elif record is not None:
         with session.env.observers.added(EpisodeRecorder(session.env, 1, env_id=env_id)) as recorder:
             last = run_episode(session.env, session.act, start.obs, env_id)
@@ -106,9 +106,11 @@ def _print_origin(session: Session, start: EpisodeStart, env_id: int, episode: i
     if start.episodes_before:
         names, more = ", ".join(start.reasons[:_MAX_REASONS]), len(start.reasons) - _MAX_REASONS
         causes = f"{names} and {more} more" if more > 0 else names
-        console.info(
-            f"ran the {start.episodes_before} episodes before it first, because they affect it through {causes}"
+        count = start.episodes_before
+        earlier, affect = (
+            (f"{count} earlier episodes", "they affect") if count > 1 else ("episode before", "it affects")
         )
+        console.info(f"first ran the {earlier} of this environment, because {affect} this episode through {causes}")
 
 
 def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) -> dict[str, Any]:
@@ -129,7 +131,7 @@ def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) ->
 
 @dataclass(slots=True)
 class Filming:
-    """Policy that also draws the states of its environment to a video."""
+    """Policy that also renders the states of its environment to a video."""
 
     session: Session
     env_id: int
@@ -138,7 +140,7 @@ class Filming:
     renderer: Renderer
     writer: VideoWriter
     ended: bool = False
-    """Whether drawing has ended."""
+    """Whether rendering has ended."""
 
     @property
     def length_s(self) -> float:
@@ -146,7 +148,7 @@ class Filming:
         return self.writer.frames * self.stride * self.session.env.step_dt
 
     def act(self, obs: Tensor) -> Tensor:
-        """Draw the state if a frame is due; return the action. obs: (num_envs, obs_size)"""
+        """Render the state if a frame is due; return the action. obs: (num_envs, obs_size)"""
         env = self.session.env
         if not self.ended and int(env.episode_length_buf[self.env_id]) % self.stride == 0:
             self.writer.add(self.renderer.picture(env, self.env_id))

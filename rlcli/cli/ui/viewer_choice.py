@@ -71,7 +71,7 @@ def choose_viewers(viewer: str | None, port: int | None, *, headless: bool) -> l
     if viewer == "native" and not has_display():
         raise MachineError(
             "there is no display for a window",
-            hint="--viewer web shows it in the browser, --video FILE.mp4 draws offscreen, --viewer none prints numbers",
+            hint="--viewer web opens the browser, --video FILE.mp4 renders to a file, --viewer none prints values",
         )
     if viewer not in (None, "auto"):
         return [(str(viewer), "--viewer is given")]
@@ -101,10 +101,10 @@ def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn
         session: environments and policy.
         viewers: the viewers to try, in this order.
         port: port of the web viewer; None: 8080.
-        drawn: number of environments in the picture.
+        drawn: number of environments to show.
 
     Returns:
-        Whether a viewer was opened; if not, the caller prints numbers.
+        Whether a viewer was opened; if not, the caller prints values.
 
     Raises:
         MachineError, DependencyError: if the last viewer does not work.

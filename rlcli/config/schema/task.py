@@ -42,7 +42,7 @@ class SimConfig(StrictModel):
     """Number of CPU threads that step the physics; null: one for each core that this process may use."""
     forces_after_reset: bool = True
     """true: compute accelerations and forces also for the start state of an episode; false: they are 0 until the first
-    step. On a GPU, false saves one forward pass over all environments in each step if terms read them."""
+    step. On a GPU, false saves one mj_forward of all environments in each step if terms read them."""
     derived_fields: Literal["current", "substep"] = "current"
     """State that MuJoCo's derived fields (xpos, cvel, sensordata, ...) belong to. current: the state after the
     environment step; substep: the state before the last physics step, as after `mj_step`, which saves computing them

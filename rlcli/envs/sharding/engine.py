@@ -34,7 +34,7 @@ class Shards(Protocol):
 
 
 class ShardedEngine:
-    """Engine with the worlds of all shards. Their state is copied from the processes at each call.
+    """Engine with the worlds of all shards, one per environment. Their state is copied from the processes at each call.
 
     Args:
         shards: the shards.

@@ -52,7 +52,7 @@ class ShardedEnv(Environment):
     Args:
         resolved: a validated configuration.
         workers: number of processes that step environments, with this one.
-        seed: seed of every random draw of the environment.
+        seed: seed of all random numbers of the environment.
         shared_streams: see `VecEnv`.
 
     Raises:
@@ -167,11 +167,11 @@ class ShardedEnv(Environment):
         """Do nothing: a CPU raises errors in the step."""
 
     def extras(self) -> dict[str, float]:
-        """Return further numbers to log: the task's values of the last step, and new divergences by cause."""
+        """Return further values to log: the task's values of the last step, and new divergences by cause."""
         return {**means(self._metric_values()), **sums(self.call_all(_divergence_metrics))}
 
     def step_metrics(self) -> dict[str, Tensor]:
-        """Return the task's own numbers to log; see `Environment.step_metrics`. (num_envs,) each"""
+        """Return one value per environment; see `Environment.step_metrics`. (num_envs,) each"""
         parts = self.call_all(_step_metrics)
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
@@ -250,7 +250,7 @@ class ShardedEnv(Environment):
     # --- a step in all processes ---
 
     def _begin(self) -> None:
-        """Choose the memory of the next result, and tell the shards for which observers to stop."""
+        """Choose the shared buffer (slot) of the next result, and set the stages at which shards wait for observers."""
         self._require_whole()
         self._slot = (self._slot + 1) % SLOTS
         self._command[:2] = self._slot, Needs.of(self.observers).value
@@ -319,7 +319,7 @@ class ShardedEnv(Environment):
         return {name: self._joined_metric([part[name] for part in parts]) for name in parts[0]}
 
     def _joined_metric(self, parts: Sequence[Tensor]) -> Tensor:
-        """Return the values of all environments; for a number that each shard computes, the mean over environments."""
+        """Return the values of all environments; for one value per shard, the mean over environments."""
         if parts[0].dim():
             return join(parts)
         counts = torch.tensor([shard.count for shard in self._shards], dtype=torch.float64)

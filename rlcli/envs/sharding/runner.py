@@ -1,4 +1,7 @@
-"""Steps of one shard: it reads actions from shared memory and writes the results there."""
+"""Runner of one shard, the part of the environments that one process steps.
+
+The runner reads actions from shared memory and writes the results there.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ class Stage(enum.IntEnum):
     AFTER_PHYSICS = 2
     ON_STEP = 3
     QUARANTINED = 4
-    """`on_divergence` for states that events or resets wrote."""
+    """`on_divergence` for environments that an event or a reset put out of bounds."""
     DONE = 5
 
 
@@ -76,7 +79,7 @@ class Columns:
 
 
 def counter_specs(total: int) -> dict[str, ArraySpec]:
-    """Return the shared tensors that an environment needs while it is built; they come first in the file."""
+    """Return the shared tensors that an environment needs while it is built; they come first in the shared file."""
     return {"counters": ArraySpec((2, total), torch.int64)}
 
 
@@ -107,7 +110,7 @@ class ShardRunner:
 
     Args:
         env: the environments of the shard.
-        number: number of the shard.
+        number: index of the shard.
         arrays: the shared tensors.
         stop: called with a stage and its content at each stage that an observer of the main process needs, and at the
             end. It returns when the shard may continue.

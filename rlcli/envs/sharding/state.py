@@ -11,12 +11,16 @@ from rlcli.envs.shard import Shard
 
 
 def environment_dim(shapes: Sequence[torch.Size]) -> int | None:
-    """Return the dimension of environments, in which the shapes of the shards differ; None: there is none."""
+    """Return the environment dimension of a tensor, from its shapes in the shards; None if no dimension differs.
+
+    `split` gives the first and the last shard different sizes, so the environment dimension is the only one in which
+    the shapes differ.
+    """
     return next((dim for dim, sizes in enumerate(zip(*shapes, strict=True)) if len(set(sizes)) > 1), None)
 
 
 def join(parts: Sequence[Tensor]) -> Tensor:
-    """Join the tensors of all shards, in order; a tensor without a dimension of environments is the first shard's."""
+    """Join the tensors of all shards, in order; without an environment dimension, return the first shard's tensor."""
     dim = environment_dim([part.shape for part in parts])
     return parts[0] if dim is None else torch.cat(list(parts), dim=dim)
 
@@ -33,7 +37,7 @@ def split_state(
 
     Args:
         state: the joined state.
-        present: shapes of the present state's tensors in each shard, by name.
+        present: shapes of the current state's tensors in each shard, by name.
         shards: the shards.
     """
     parts: list[dict[str, Tensor]] = [{} for _ in shards]
@@ -45,5 +49,5 @@ def split_state(
 
 
 def _first_dim(value: Tensor, total: int) -> int | None:
-    """Return the dimension of environments of a tensor that the present state does not have."""
+    """Return the environment dimension of a tensor that the current state does not contain."""
     return 0 if value.shape[:1] == (total,) else None

@@ -46,7 +46,7 @@ class Job:
     has_own_code: bool
     """Whether the task has code that is not tested with several workers."""
     generator_state: Tensor
-    """State of torch's global generator at the start: a task may draw from it while it is built."""
+    """State of torch's global generator at the start: a task may use it while it is built."""
 
 
 def main(connection: int, arrays: int) -> None:
@@ -142,13 +142,13 @@ class _Worker:
 
 
 class _GlobalGenerators:
-    """Check that a task does not draw from the global random generators: each process has its own."""
+    """Check that a task does not use the global random generators: each process has its own."""
 
     def __init__(self) -> None:
         self._states = self._read()
 
     def require_unused(self) -> None:
-        """Check that no number has been drawn since this object was made.
+        """Check that no random number has been drawn since this object was made.
 
         Raises:
             TaskError: with the library whose generator was used.
@@ -156,9 +156,9 @@ class _GlobalGenerators:
         used = [name for name, state in self._read().items() if state != self._states[name]]
         if used:
             raise TaskError(
-                f"the task draws from the global random generator of {used[0]}; with several workers its results would"
+                f"the task uses the global random generator of {used[0]}; with several workers its results would"
                 " depend on their number",
-                hint="set scene.workers: 1, or draw from the selection (`selection.uniform`, `self.draws`)",
+                hint="set scene.workers: 1, or use the selection's random numbers (`selection.uniform`, `self.draws`)",
             )
 
     @staticmethod

@@ -32,7 +32,7 @@ class Worker:
     """One worker process.
 
     Args:
-        number: number of its shard.
+        number: index of its shard.
         arrays: descriptor of the file of the shared tensors.
     """
 
@@ -79,7 +79,7 @@ class Worker:
 
     @property
     def pid(self) -> int:
-        """Number of the process."""
+        """Process id."""
         return self._process.pid
 
     def has_ended(self) -> bool:
@@ -116,7 +116,7 @@ class Workers:
     """All worker processes of an environment; they end with this object.
 
     Args:
-        count: number of processes; they start to import at once.
+        count: number of processes; each starts now and imports its modules before `build` sends its job.
     """
 
     def __init__(self, count: int) -> None:

@@ -1,9 +1,9 @@
 """Event terms that randomise the model: masses, friction, gains, ... differ between environments.
 
-Each draw is relative to the value in the compiled model, so repeated draws do not add up. `operation: add` gives
-original + draw, `scale` gives original x draw, `set` gives the draw itself. `range` is `[low, high]` for the
+Each sample is relative to the value in the compiled model, so repeated samples do not add up. `operation: add` gives
+original + sample, `scale` gives original x sample, `set` gives the sample itself. `range` is `[low, high]` for the
 distributions `uniform` and `loguniform`, and `[mean, std]` for `gaussian`. A list of pairs has one pair for each axis.
-A curriculum may change ranges. Axes and elements are drawn independently; with `shared` all elements get the same draw.
+A curriculum may change ranges. Axes and elements are drawn independently; with `shared` all elements get the same one.
 Values that cannot be negative are clipped.
 """
 

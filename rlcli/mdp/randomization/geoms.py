@@ -48,7 +48,7 @@ class RandomizeGeomFriction(AxisRandomization, GeomTerm):
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeGeomSize(AxisRandomization, GeomTerm):
-    """Random sizes of geoms [m], one draw for all numbers of a geom.
+    """Random sizes of geoms [m], one sample for all values of a geom.
 
     Meshes, height fields and planes have no size to change.
     """

@@ -1,4 +1,4 @@
-"""Reward terms of the base: survival, posture, velocity tracking and progress. (num_envs,) each."""
+"""Reward terms of the robot's root body (its base): survival, posture, tracking, progress. (num_envs,) each."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class IsTerminatedTerm(Term):
                 raise ValueError(f"no termination '{name}'; terminations: {', '.join(known) or 'none'}")
 
     def __call__(self) -> Tensor:
-        """Return the number. (num_envs,)"""
+        """Return the number of terminations. (num_envs,)"""
         manager = self.env.termination_manager
         fired = torch.zeros_like(manager.terminated, dtype=torch.float32)
         for name in self.terms:

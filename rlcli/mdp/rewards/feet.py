@@ -224,7 +224,7 @@ class GaitReward(EntityTerm):
         known = [name.removeprefix(f"{self.entity.name}/") for name in self.sensor.names]
         for name in [name for pair in self.synced_feet_pairs for name in pair]:
             if name not in known:
-                raise ValueError(f"the sensor has no body '{name}'; choose from {', '.join(known)}")
+                raise ValueError(f"the sensor has no body '{name}'; its bodies: {', '.join(known)}")
         (a, b), (c, d) = [[known.index(name) for name in pair] for pair in self.synced_feet_pairs]
         self._in_phase = ((a, b), (c, d))
         self._out_of_phase = ((a, c), (b, d), (a, d), (c, b))

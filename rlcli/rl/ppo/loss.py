@@ -51,8 +51,14 @@ def minibatch_loss(
         L_clip   = mean( min( r_t A_t, clip(r_t, 1 - clip_range, 1 + clip_range) A_t ) )            (7)
         loss     = - ( L_clip - value_coef * L_value + entropy_coef * entropy )                     (9)
 
+    Two further terms are added to the loss if the agent uses them:
+
+        tell_coef x mean squared error of the auxiliary layer `teller`, which predicts the critic's observation
+            (standardised, clipped to +-3) from the actor's last hidden layer
+        bounds_coef x mean over samples of the squared part of |mean action| above bounds_margin
+
     Args:
-        networks: actor and critic.
+        networks: actor, critic and auxiliary layer.
         config: coefficients and clipping.
         batch: the samples. (n, ...)
         obs: inputs of the actor's network. (n, d)

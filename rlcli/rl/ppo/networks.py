@@ -43,6 +43,7 @@ class ActorCritic(nn.Module):
         self.memory = Lstm(obs_size, cells) if cells else None
         self.vision, obs_size = _make_cnn(vision, obs_size, config.actor, config.init)
         self.actor = _mlp(cells[-1] if cells else obs_size, config.actor, action_size, config.init, gain=0.01)
+        # auxiliary layer of the loss `tell_coef`; no part of the policy
         self.teller = nn.Linear(config.actor.hidden[-1], critic_obs_size) if config.tell_coef else None
         if config.std == "log":
             self.log_std = nn.Parameter(torch.full((action_size,), math.log(config.init_std)))

@@ -157,7 +157,7 @@ def test_untrusted_task_code_is_not_run(trained, cli, monkeypatch, tmp_path):
     (Path("coin") / "task.py").write_text("import pathlib; pathlib.Path('executed').touch()")
     shown = cli("autopsy", trained, "0")
     assert shown.code == 0
-    assert "no contacts: " in shown.err
+    assert "contacts cannot be shown: " in shown.err
     assert "code that you have not used on this machine" in shown.err
     assert "REWARD PER STEP" in shown.out
     assert cli("autopsy", trained).code == 0

@@ -121,7 +121,7 @@ def test_play_prints_viewer_and_reason(cli):
         (("--command", "vx"), "--command 'vx' is not NAME=NUMBER"),
         (("--command", "vx=fast"), "--command 'vx=fast' is not NAME=NUMBER"),
         (("--command", ""), "is not NAME=NUMBER"),
-        (("--command", "vx=1"), "no command 'vx'; hint: the task has no commands"),
+        (("--command", "vx=1"), "the task has no command 'vx'; hint: leave out --command"),
         (("--command", "vx=1", "--record", "x.safetensors"), "leave out --record or --command"),
     ],
 )
