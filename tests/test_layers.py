@@ -50,7 +50,7 @@ LIGHT = [
     "training/signals.py",
     *(f"rl/{name}/config.py" for name in TRAINERS),
     "rl/distributed.py",
-    "evaluation/stress_params.py",
+    "evaluation/stress_sweeps.py",
     "reporting/heat_map.py",
 ]
 """Modules that are imported before a configuration has been checked."""

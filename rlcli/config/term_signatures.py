@@ -21,7 +21,7 @@ from typing import Any, Literal, Union
 from pydantic import ConfigDict, Field, create_model
 
 from rlcli.config import schema
-from rlcli.config.source_classes import ClassSearch, SourceClass, constructor, last_name, parse
+from rlcli.config.unimported_classes import ClassSearch, SourceClass, constructor, last_name, parse
 
 SECTIONS: dict[str, type[schema.TermConfig]] = {
     "actions": schema.ActionConfig,

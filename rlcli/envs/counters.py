@@ -8,11 +8,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from rlcli.envs.shard import Shard
+from rlcli.envs.shard_range import Shard
 from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.sim.engine import Engine
+from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Field, Selection, in_place
-from rlcli.sim.tensor_state import TensorState
 
 
 class EpisodeCounters(TensorState):

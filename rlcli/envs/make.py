@@ -7,7 +7,7 @@ from pathlib import Path
 from rlcli.config.load import Resolved, resolve
 from rlcli.config.python_task import source_of
 from rlcli.config.schema import TaskConfig
-from rlcli.envs.shard import Shard
+from rlcli.envs.shard_range import Shard
 from rlcli.envs.vec_env import VecEnv
 from rlcli.machine import restore_garbage_collection
 from rlcli.registry import load_object

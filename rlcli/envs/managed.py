@@ -25,12 +25,12 @@ from rlcli.managers.observation_pipeline import Pipeline
 from rlcli.managers.reward import RewardManager
 from rlcli.managers.term import BoundTerm
 from rlcli.managers.termination import TerminationManager
-from rlcli.scene.joint_setup import ActuatorNeed
+from rlcli.scene.joint_and_actuator_setup import ActuatorNeed
 from rlcli.scene.scene import Scene
 from rlcli.sim.acceleration_fields import add_body_forces
 from rlcli.sim.markers import Marker
+from rlcli.sim.saved_tensors import require_matching_tensors, substate
 from rlcli.sim.selection import Field, Selection
-from rlcli.sim.tensor_state import require_matching_tensors, substate
 
 _STATELESS = ("functools", "rlcli.mdp.")
 """Modules of terms whose episodes do not depend on earlier ones."""

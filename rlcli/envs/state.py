@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import torch
 from torch import Tensor
 
-from rlcli.sim.tensor_state import require_matching_tensors, substate
+from rlcli.sim.saved_tensors import require_matching_tensors, substate
 
 if TYPE_CHECKING:
     from rlcli.envs.vec_env import VecEnv

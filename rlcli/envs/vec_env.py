@@ -18,15 +18,15 @@ from rlcli.envs.build import build_simulation, grid, open_scene
 from rlcli.envs.counters import EpisodeCounters
 from rlcli.envs.divergence import DivergenceGuard
 from rlcli.envs.observers import Observers
-from rlcli.envs.shard import Shard
+from rlcli.envs.shard_range import Shard
 from rlcli.envs.state import load_state, save_state
 from rlcli.envs.step import Episodes, StepRecord, StepResult
 from rlcli.envs.workflow import Workflow
 from rlcli.machine import require_device
 from rlcli.managers.term import Binder
 from rlcli.sim.engine import Engine
+from rlcli.sim.saved_tensors import means
 from rlcli.sim.selection import Field, Selection
-from rlcli.sim.tensor_state import means
 
 
 class VecEnv(Workflow):

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import listing
-from rlcli.evaluation.stress_params import PHYSICAL, Sweep, unknown_parameter
+from rlcli.evaluation.stress_sweeps import PHYSICAL, Sweep, unknown_parameter
 from rlcli.scene.entity import KINDS
 from rlcli.scene.model_fields import DERIVED_FROM, FIELDS
 from rlcli.scene.names import NameProblem, match

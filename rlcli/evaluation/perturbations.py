@@ -19,7 +19,7 @@ from rlcli.envs.observers import StepObserver
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import UsageError, listing
 from rlcli.evaluation.model_perturbations import ModelPerturbation
-from rlcli.evaluation.stress_params import SIGNALS, Sweep
+from rlcli.evaluation.stress_sweeps import SIGNALS, Sweep
 from rlcli.scene.names import NameProblem, match
 
 Act = Callable[[Tensor], Tensor]

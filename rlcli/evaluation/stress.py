@@ -20,7 +20,7 @@ from rlcli.evaluation.evaluate import Evaluation, evaluate
 from rlcli.evaluation.limits import Limit
 from rlcli.evaluation.perturbations import Perturbations
 from rlcli.evaluation.session import PolicyInTask, make_actor
-from rlcli.evaluation.stress_params import Point, Sweep, by_name, describe_point, grid
+from rlcli.evaluation.stress_sweeps import Point, Sweep, by_name, describe_point, grid
 from rlcli.random import derive
 from rlcli.rl.acting import Act
 from rlcli.rl.rng import seed_generators

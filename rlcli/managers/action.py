@@ -11,8 +11,8 @@ from torch import Tensor
 
 from rlcli.errors import ConfigError
 from rlcli.managers.term import BoundTerm, resets
+from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Field, Selection, in_place
-from rlcli.sim.tensor_state import TensorState
 
 
 @dataclass(frozen=True, slots=True)

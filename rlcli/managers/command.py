@@ -16,8 +16,8 @@ from rlcli.errors import UsageError, did_you_mean, listing
 from rlcli.managers.term import BoundTerm, resets
 from rlcli.managers.tunable import TunableValues
 from rlcli.sim.markers import Arrow, Frame, Marker, Sphere
+from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
-from rlcli.sim.tensor_state import TensorState
 
 Select = Callable[[Tensor], Selection | None]
 _COLUMNS = {"start": 3, "end": 3, "center": 3, "position": 3, "quat": 4}

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from rlcli.managers.term import BoundTerm
 from rlcli.managers.tunable import TunableValues
+from rlcli.sim.saved_tensors import TensorState, mean_of
 from rlcli.sim.selection import Selection
-from rlcli.sim.tensor_state import TensorState, mean_of
 
 
 class CurriculumManager(TensorState):

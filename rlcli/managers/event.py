@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from rlcli.managers.term import BoundTerm, resets
+from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
-from rlcli.sim.tensor_state import TensorState
 
 Select = Callable[[Tensor], Selection | None]
 Callback = Callable[[Selection], None]

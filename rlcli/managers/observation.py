@@ -14,9 +14,9 @@ from rlcli.config.schema import ObservationGroupConfig
 from rlcli.managers.observation_pipeline import Draws, Pipeline
 from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.managers.tunable import TunableValues
+from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
 from rlcli.sim.state_cache import is_finite
-from rlcli.sim.tensor_state import TensorState
 
 
 @dataclass(slots=True)

@@ -11,8 +11,8 @@ from torch import Tensor
 from rlcli.managers.term import BoundTerm, check_shape, first_value, resets
 from rlcli.managers.termination import DIVERGED
 from rlcli.managers.tunable import TunableValues
+from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Field, Selection, in_place
-from rlcli.sim.tensor_state import TensorState
 
 
 class RewardManager(TensorState):

@@ -16,11 +16,11 @@ from rlcli.managers.action import CommandMap
 from rlcli.mdp.term import JointTerm
 from rlcli.mdp.term_helpers import column_numbers
 from rlcli.scene.actuators import JointCommand
-from rlcli.scene.kinematics import Jacobian
+from rlcli.scene.jacobian import Jacobian
 from rlcli.scene.names import NameProblem, match_values
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotation_vector
+from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection, one_column
-from rlcli.sim.tensor_state import TensorState
 from rlcli.task import Bodies, Joints, Range
 
 

@@ -16,8 +16,8 @@ from rlcli.mdp.term import BodyTerm, JointTerm, Term
 from rlcli.mdp.tunable_ranges import Pair, Ranges
 from rlcli.scene.names import NameProblem
 from rlcli.sim.rotations import from_euler, multiply, random_quaternion
+from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
-from rlcli.sim.tensor_state import TensorState
 from rlcli.task import Bodies, Joints, Range
 
 

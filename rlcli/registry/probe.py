@@ -26,7 +26,7 @@ from rlcli.machine import available_cores
 from rlcli.registry import OWN, TASKS, Entry, package_folder
 
 TIMEOUT_S = 30.0
-_BUILDER = "rlcli.envs.task_index"
+_BUILDER = "rlcli.envs.describe_plugins"
 """Module that loads the tasks. It runs in a separate process because plugins may hang or crash, and because the layer
 `envs` must not be imported from here."""
 

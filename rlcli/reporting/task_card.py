@@ -20,8 +20,8 @@ from rlcli.config.layers import leaves
 from rlcli.config.load import Resolved
 from rlcli.config.messages import dotted
 from rlcli.config.schema import ObservationConfig, ObservationGroupConfig, TaskConfig, TermConfig
-from rlcli.config.source_classes import ClassSearch
 from rlcli.config.term_signatures import SECTIONS, SELECTORS, SignatureError, Vocabulary, first_paragraph, read_params
+from rlcli.config.unimported_classes import ClassSearch
 from rlcli.registry import TaskSource
 from rlcli.reporting.card_text import columns_text, modifier_text, noise_text, number, span, text_of, when_text
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.sim.tensor_state import require_in_range, require_matching_tensors
+from rlcli.sim.saved_tensors import require_in_range, require_matching_tensors
 
 
 def seed_generators(seed: int) -> None:

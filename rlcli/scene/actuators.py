@@ -15,8 +15,8 @@ from rlcli.random import stream
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem, match, match_values
 from rlcli.sim.column_views import as_index
+from rlcli.sim.saved_tensors import TensorState, require_in_range
 from rlcli.sim.selection import Selection
-from rlcli.sim.tensor_state import TensorState, require_in_range
 
 POSITION, VELOCITY, EFFORT = range(3)
 """Rows of `ActuatorModel.targets`."""

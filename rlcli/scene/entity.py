@@ -14,7 +14,7 @@ from torch import Tensor
 from rlcli.config.schema import EntityConfig
 from rlcli.errors import TaskError
 from rlcli.scene.entity_data import EntityData
-from rlcli.scene.joint_setup import model_actuator_kind
+from rlcli.scene.joint_and_actuator_setup import model_actuator_kind
 from rlcli.scene.names import match
 from rlcli.sim.acceleration_fields import sensor_columns
 from rlcli.sim.column_views import as_index, id_tensor

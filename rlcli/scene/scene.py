@@ -11,9 +11,9 @@ import numpy as np
 
 from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig, TerrainConfig
 from rlcli.errors import ConfigError, Problem, one_line
-from rlcli.scene.entity_model import entity_model, name_all, write_masses
+from rlcli.scene.entity_spec import entity_spec, name_all, write_masses
 from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_materials
-from rlcli.scene.joint_setup import SceneJoints
+from rlcli.scene.joint_and_actuator_setup import SceneJoints
 from rlcli.scene.names import SceneProblem
 from rlcli.scene.sensor_builder import SensorBuilder, SensorSpec
 from rlcli.scene.terrain import Ground, add_ground, make_ground, terrain_problems
@@ -76,7 +76,7 @@ class Scene:
 
     def _attach(self, name: str, entity: EntityConfig) -> None:
         try:
-            child = entity_model(name, entity, self.root, installed=self.installed)
+            child = entity_spec(name, entity, self.root, installed=self.installed)
         except SceneProblem as problem:
             self.problems.append(problem)
         else:

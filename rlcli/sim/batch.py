@@ -22,9 +22,9 @@ from rlcli.sim.acceleration_fields import ACCELERATION_FIELDS, force_sensors
 from rlcli.sim.batch_model import engine_call
 from rlcli.sim.batch_state import BatchState
 from rlcli.sim.mujoco_private import STATE_FIELDS, forward_of, without_profiler
+from rlcli.sim.saved_tensors import substate
 from rlcli.sim.selection import Field, Groups, IdSelection, Selection, ids_of
 from rlcli.sim.skippable_work import FIELDS_OF_SKIPPED_WORK
-from rlcli.sim.tensor_state import substate
 
 _MOTION_FIELDS = {"time", "qpos", "qvel", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"}
 """Fields of a state in which a physics step changes only positions, velocities, time and the warm start."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from rlcli.sim.batch_model import INTEGRATION_STATE, BatchModel
 from rlcli.sim.divergence_report import HISTORY_MEMORY, Call, StateHistory, StateLayout
 from rlcli.sim.mujoco_private import STATE_FIELDS, state_columns
-from rlcli.sim.tensor_state import substate
+from rlcli.sim.saved_tensors import substate
 
 
 class BatchState(BatchModel):

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from rlcli.config.schema import SimConfig
 from rlcli.errors import did_you_mean
-from rlcli.sim.tensor_state import require_matching_tensors, substate
+from rlcli.sim.saved_tensors import require_matching_tensors, substate
 from rlcli.sim.warp_fields import FORCE, INPUTS, KINEMATICS, STATE, VELOCITY, FieldStages
 from rlcli.sim.warp_model import WarpModel
 

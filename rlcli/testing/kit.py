@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
-from rlcli.testing import episode_checks, portability_checks, value_checks
+from rlcli.testing import episode_checks, portability_checks
 from rlcli.testing.findings import Finding, NotRunError, error_text
 from rlcli.testing.task_under_test import TaskUnderTest, open_task
 
@@ -22,17 +22,17 @@ OnCheck = Callable[[str, "list[Finding] | None"], None]
 OnNote = Callable[[str, str], None]
 
 CHECKS: dict[str, Check] = {
-    "names": value_checks.names,
-    "yaml-round-trip": value_checks.yaml_round_trip,
-    "finite": value_checks.finite,
-    "shapes": value_checks.shapes,
-    "dtypes": value_checks.dtypes,
-    "random-actions": value_checks.random_actions_stay_stable,
-    "extreme-actions": value_checks.extreme_actions_stay_stable,
+    "names": step_and_file_checks.names,
+    "yaml-round-trip": step_and_file_checks.yaml_round_trip,
+    "finite": step_and_file_checks.finite,
+    "shapes": step_and_file_checks.shapes,
+    "dtypes": step_and_file_checks.dtypes,
+    "random-actions": step_and_file_checks.random_actions_stay_stable,
+    "extreme-actions": step_and_file_checks.extreme_actions_stay_stable,
     "same-seed": episode_checks.same_seed,
     "start-states": episode_checks.start_states,
-    "constant-columns": value_checks.constant_columns,
-    "aliasing": value_checks.aliasing,
+    "constant-columns": step_and_file_checks.constant_columns,
+    "aliasing": step_and_file_checks.aliasing,
     "partial-reset": episode_checks.partial_reset,
     "final-observations": episode_checks.final_observations,
     "truncation": episode_checks.truncation,

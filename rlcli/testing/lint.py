@@ -19,7 +19,7 @@ import torch
 
 from rlcli.errors import ConfigError, MachineError, UsageError, require_known
 from rlcli.testing.findings import error_text
-from rlcli.testing.lint_rollouts import RolloutEvidence
+from rlcli.testing.fixed_policy_rollouts import RolloutEvidence
 from rlcli.testing.lint_rules import RULES, Remark
 from rlcli.testing.task_under_test import open_task
 

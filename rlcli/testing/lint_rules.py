@@ -18,7 +18,7 @@ from rlcli.config.schema import AgentConfig
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.testing.findings import error_text
-from rlcli.testing.lint_rollouts import FIXED_POLICIES, MAX_STEPS, RolloutEvidence, record_rollout
+from rlcli.testing.fixed_policy_rollouts import FIXED_POLICIES, MAX_STEPS, RolloutEvidence, record_rollout
 from rlcli.testing.task_under_test import observation_parts
 from rlcli.testing.timestep_checks import energy_drift
 

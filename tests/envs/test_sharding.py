@@ -11,7 +11,7 @@ from support.sharded_runs import both, differences, same, step_differences
 
 from rlcli.config.load import resolve
 from rlcli.envs.observers import StepObserver
-from rlcli.envs.shard import split
+from rlcli.envs.shard_range import split
 from rlcli.envs.sharding.choice import number_of_workers
 from rlcli.envs.sharding.env import ShardedEnv
 from rlcli.envs.sharding.state import join_states, split_state

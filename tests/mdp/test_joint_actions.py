@@ -10,7 +10,7 @@ import yaml
 from support.worlds import PENDULUM, PENDULUM_TASK, build, dump, write
 
 from rlcli.errors import ConfigError
-from rlcli.scene.kinematics import Jacobian
+from rlcli.scene.jacobian import Jacobian
 
 ARM = """
 <mujoco model="arm">

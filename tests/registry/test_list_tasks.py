@@ -22,7 +22,7 @@ def test_index_of_built_in_tasks_is_up_to_date():
     import rlcli_tasks
 
     file = Path(rlcli_tasks.__file__).with_name("index.json")
-    command = [sys.executable, "-m", "rlcli.envs.task_index", "--index", "rlcli"]
+    command = [sys.executable, "-m", "rlcli.envs.describe_plugins", "--index", "rlcli"]
     fresh = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert json.loads(file.read_text()) == json.loads(fresh), f"run: {' '.join(command[1:])} > {file}"
 

@@ -91,7 +91,7 @@ def _report(
 ) -> None:
     """Print the measurements and the recommendation, and write the preset."""
     from rlcli.runs.atomic_io import write_atomic
-    from rlcli.tuning.bench_recommendation import bench_preset, explanation
+    from rlcli.tuning.bench_preset import bench_preset, explanation
 
     findings = bench.findings
     _show(findings, (bench.horizon_key or "horizon").upper())

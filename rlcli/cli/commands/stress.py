@@ -16,7 +16,7 @@ from rlcli.errors import UsageError
 if TYPE_CHECKING:
     from rlcli.evaluation.session import PolicyInTask, PolicyRequest
     from rlcli.evaluation.stress import StressResult
-    from rlcli.evaluation.stress_params import Sweep
+    from rlcli.evaluation.stress_sweeps import Sweep
     from rlcli.reporting.heat_map import HeatMap
 
 _MAX_VARIANTS = 10_000
@@ -102,7 +102,7 @@ def _record(tested: PolicyInTask) -> dict[str, Any]:
 
 
 def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
-    from rlcli.evaluation.stress_params import grid, read_sweeps
+    from rlcli.evaluation.stress_sweeps import grid, read_sweeps
 
     if not texts:
         raise UsageError("no --sweep given", hint="as in --sweep body_mass=0.5:2 or --sweep action_delay=0:3")
@@ -132,7 +132,7 @@ def _show(result: StressResult, policy: str, against: str | None) -> list[HeatMa
     """Print the table, the heat maps and the worst variant; return the heat maps."""
     from rlcli.cli.ui.evaluation_tables import interval, show_stress
     from rlcli.evaluation.limits import mean_or_rate
-    from rlcli.evaluation.stress_params import describe_point
+    from rlcli.evaluation.stress_sweeps import describe_point
     from rlcli.reporting.heat_map import heat_maps
 
     show_stress(result, against)

@@ -12,7 +12,7 @@ from rlcli.evaluation.limits import mean_or_rate
 if TYPE_CHECKING:
     from rlcli.evaluation.comparison import Comparison
     from rlcli.evaluation.stress import StressResult, Summary
-    from rlcli.evaluation.stress_params import Point
+    from rlcli.evaluation.stress_sweeps import Point
 
 INTERVAL = "95 % INTERVAL"
 
@@ -54,7 +54,7 @@ def show_comparison(comparison: Comparison) -> None:
 
 def show_stress(result: StressResult, against: str | None) -> None:
     """Print a table with a row for each variant of the task."""
-    from rlcli.evaluation.stress_params import format_value
+    from rlcli.evaluation.stress_sweeps import format_value
 
     metric = result.metric
     columns = [*(sweep.name for sweep in result.sweeps), metric.upper(), INTERVAL]

@@ -16,12 +16,11 @@ from rlcli.config.load import Resolved
 from rlcli.envs.environment import Environment
 from rlcli.envs.make import make_env
 from rlcli.envs.observers import Observers
-from rlcli.envs.shard import Shard, split
+from rlcli.envs.shard_range import Shard, split
 from rlcli.envs.sharding import worker
 from rlcli.envs.sharding.arrays import map_tensors
 from rlcli.envs.sharding.engine import ShardedEngine, sums
-from rlcli.envs.sharding.own_code import has_untested_code
-from rlcli.envs.sharding.runner import (
+from rlcli.envs.sharding.shard_step import (
     SLOTS,
     Columns,
     Needs,
@@ -32,6 +31,7 @@ from rlcli.envs.sharding.runner import (
     read_episodes,
 )
 from rlcli.envs.sharding.state import join, join_states, split_state
+from rlcli.envs.sharding.untested_code import has_untested_code
 from rlcli.envs.sharding.worker import Job
 from rlcli.envs.sharding.workers import Worker, take_workers
 from rlcli.envs.step import Episodes, StepRecord, StepResult
@@ -40,7 +40,7 @@ from rlcli.errors import ConfigError, one_line
 from rlcli.machine import available_cores
 from rlcli.registry.task_imports import imported_files
 from rlcli.sim.divergence_report import MAX_DESCRIBED
-from rlcli.sim.tensor_state import mean_of, means
+from rlcli.sim.saved_tensors import mean_of, means
 
 
 class ShardedEnv(Environment):

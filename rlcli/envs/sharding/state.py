@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from rlcli.envs.shard import Shard
+from rlcli.envs.shard_range import Shard
 
 
 def environment_dim(shapes: Sequence[torch.Size]) -> int | None:

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from rlcli.config.load import Resolved
-    from rlcli.envs.shard import Shard
+    from rlcli.envs.shard_range import Shard
     from rlcli.envs.sharding.arrays import ArraySpec
-    from rlcli.envs.sharding.runner import Stage
+    from rlcli.envs.sharding.shard_step import Stage
     from rlcli.envs.vec_env import VecEnv
 
 BUILD, MAP, STEP, RESET, LOAD, CALL, CONTINUE = b"b", b"m", b"s", b"r", b"l", b"c", b"g"
@@ -64,7 +64,7 @@ def _serve(channel: Channel, arrays: int) -> None:
     import torch  # imported while the main process builds its own shard
 
     import rlcli.envs.managed
-    import rlcli.envs.sharding.runner  # noqa: F401
+    import rlcli.envs.sharding.shard_step  # noqa: F401
 
     torch.set_num_threads(1)
     worker = _Worker(channel, arrays)
@@ -106,7 +106,7 @@ class _Worker:
 
         from rlcli.envs.make import make_env
         from rlcli.envs.sharding.arrays import map_tensors
-        from rlcli.envs.sharding.runner import counter_specs
+        from rlcli.envs.sharding.shard_step import counter_specs
         from rlcli.registry.task_imports import import_again
 
         torch.set_rng_state(job.generator_state)
@@ -119,7 +119,7 @@ class _Worker:
 
     def _map(self, specs: Mapping[str, ArraySpec]) -> None:
         from rlcli.envs.sharding.arrays import map_tensors
-        from rlcli.envs.sharding.runner import ShardRunner
+        from rlcli.envs.sharding.shard_step import ShardRunner
 
         assert self._env is not None
         check = _GlobalGenerators().require_unused if self._has_own_code else lambda: None
@@ -127,7 +127,7 @@ class _Worker:
 
     def _stop(self, stage: Stage, content: Any) -> None:
         """Report a stage; serve calls until the main process continues the step."""
-        from rlcli.envs.sharding.runner import Stage
+        from rlcli.envs.sharding.shard_step import Stage
 
         self._channel.send(STOPPED + bytes([stage]), content)
         while stage != Stage.DONE:

@@ -11,7 +11,7 @@ import torch
 from rlcli.mdp.randomization_base import Draw, DrawKeys, FieldRandomization, RangeKeys, require_supported, unset_simple
 from rlcli.mdp.term import ActuatorTerm, JointTerm
 from rlcli.mdp.term_helpers import column_numbers, on_host
-from rlcli.scene.joint_setup import model_actuator_kind
+from rlcli.scene.joint_and_actuator_setup import model_actuator_kind
 from rlcli.scene.model_fields import FIELDS, ModelField
 from rlcli.scene.names import NameProblem
 from rlcli.sim.selection import Columns, Selection

@@ -11,8 +11,8 @@ from rlcli.mdp.parameters import Command, Entity, ManagedEnv, RaySensor
 from rlcli.mdp.term import EntityTerm, Term
 from rlcli.mdp.term_helpers import commanded_speed, constant
 from rlcli.sim.rotations import length, roll_pitch_yaw
+from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
-from rlcli.sim.tensor_state import TensorState
 from rlcli.task import Bodies, Sensors, reads_body_forces
 
 

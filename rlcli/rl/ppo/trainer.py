@@ -28,7 +28,7 @@ from rlcli.rl.ppo.setup import critic_groups, policy_spec
 from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.trainer import Report, TrainerState
 from rlcli.rl.trainer_base import BaseTrainer
-from rlcli.sim.tensor_state import require_matching_tensors
+from rlcli.sim.saved_tensors import require_matching_tensors
 
 
 class PpoTrainer(BaseTrainer):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rlcli.rl.policy import Normalizer
 from rlcli.rl.trainer import Rows
-from rlcli.sim.tensor_state import require_matching_tensors
+from rlcli.sim.saved_tensors import require_matching_tensors
 
 
 class TorchRolloutBuffer(RolloutBuffer):

@@ -23,8 +23,8 @@ from rlcli.rl.sb3.config import OffPolicyConfig, OnPolicyConfig, Sb3Config
 from rlcli.rl.sb3.setup import make_model, policy_spec
 from rlcli.rl.trainer import Report, TrainerState
 from rlcli.rl.trainer_base import BaseTrainer, finite_values
+from rlcli.sim.saved_tensors import require_matching_tensors
 from rlcli.sim.state_cache import is_finite
-from rlcli.sim.tensor_state import require_matching_tensors
 
 _METRICS = {
     "train/policy_gradient_loss": "Loss/surrogate",

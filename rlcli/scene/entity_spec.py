@@ -15,7 +15,7 @@ from rlcli.scene.names import SceneProblem
 from rlcli.scene.untrusted_mjcf import BadModel, model_roots, read_mjcf
 
 
-def entity_model(name: str, entity: EntityConfig, root: Path, *, installed: bool) -> mujoco.MjSpec:
+def entity_spec(name: str, entity: EntityConfig, root: Path, *, installed: bool) -> mujoco.MjSpec:
     """Return the model of an entity: its MJCF, or a body with one geom.
 
     Args:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.observers import Observers, StepObserver
-from rlcli.envs.shard import Shard
+from rlcli.envs.shard_range import Shard
 from rlcli.envs.sharding.arrays import ArraySpec
 from rlcli.envs.step import Episodes, StepRecord
 from rlcli.envs.vec_env import VecEnv

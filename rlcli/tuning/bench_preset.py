@@ -9,7 +9,7 @@ from typing import Any
 from rlcli.config.dump import to_yaml
 from rlcli.config.load import Resolved
 from rlcli.tuning.bench import Findings, Trained
-from rlcli.tuning.extract_preset import preset_of, put
+from rlcli.tuning.changed_settings import preset_of, put
 
 
 def bench_preset(

@@ -1,4 +1,4 @@
-"""`python -m rlcli.envs.task_index GROUP FILE NAME...`: build tasks and write their descriptions.
+"""`python -m rlcli.envs.describe_plugins GROUP FILE NAME...`: build tasks and write their descriptions.
 
 `--index DISTRIBUTION` prints the `index.json` that a distribution ships for `list-tasks`.
 """
@@ -73,7 +73,7 @@ _LOADERS = {registry.TASKS: describe, registry.TRAINERS: try_trainer, registry.F
 
 def main(arguments: list[str]) -> None:
     """Append one line of JSON to a file for each name, or print the index of a distribution."""
-    parser = argparse.ArgumentParser(prog="python -m rlcli.envs.task_index", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m rlcli.envs.describe_plugins", description=__doc__)
     parser.add_argument("--index", metavar="DISTRIBUTION", help="print the index.json of this distribution")
     parser.add_argument("group", nargs="?", choices=_LOADERS)
     parser.add_argument("file", nargs="?")
