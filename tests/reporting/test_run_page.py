@@ -156,7 +156,8 @@ def test_untrusted_text_is_escaped(cli, tmp_path):
     )
     run.config.write_text(
         run.config.read_text().replace(
-            "summary: Balance a pole on a cart (manager-based, Isaac Lab's numbers).", f"summary: {json.dumps(ATTACK)}"
+            "summary: Balance a pole on a cart (manager-based, Isaac Lab's parameters).",
+            f"summary: {json.dumps(ATTACK)}",
         )
     )
     folder = run.folder.rename(run.folder.with_name("a<b onclick=x>'\""))
