@@ -26,7 +26,7 @@ GOAL = slice(45, 53)
 class HandTask(DirectTask):
     """Turn the cube to one goal after another. Observations: docs/reference/zoo/hand-reorient.md lists the 69 columns.
 
-    The critic's states are these and what the ends of the fingers do and feel, 145 columns in all.
+    The critic observes 145 columns: these 69, then positions, velocities and loads of the fingertips.
     """
 
     num_observations = 69
