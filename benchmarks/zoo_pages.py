@@ -108,7 +108,16 @@ def results(zoo: Path, entry: Any) -> str:
         )
     versions = ", ".join(f"{name} {version}" for name, version in rows[0]["versions"].items())
     commands = list(dict.fromkeys(re.sub(r"--seed[ =]\d+", "--seed N", row["command"]) for row in rows))
-    said = "; ".join(f"`{command}`" for command in commands)
+    other_form = " (the other form)"
+    said = "; ".join(
+        f"`{command.removesuffix(other_form)}`"
+        + (
+            ", the other form of this task; the policy was evaluated in this form"
+            if command.endswith(other_form)
+            else ""
+        )
+        for command in commands
+    )
     return (
         f"{held}\n"
         + "\n".join(lines)
@@ -161,8 +170,8 @@ def index(zoo: Path, found: list[Any]) -> str:
         "# Built-in tasks",
         "",
         "After reading this page you can choose a task to start from. `rlcli play TASK` shows the policy that comes",
-        "with a task, and `rlcli train TASK` trains a new one. A task's page has its model, numbers, learning curves",
-        "and results.",
+        "with a task, and `rlcli train TASK` trains a new one. A task's page has its model, parameters, learning",
+        "curves and results.",
         "",
         "```{toctree}",
         ":hidden:",
@@ -171,12 +180,23 @@ def index(zoo: Path, found: list[Any]) -> str:
         "peers",
         "```",
         "",
-        "A success rate is the share of successful episodes; `error_vel_xy` [m/s] and `error_vel_yaw` [rad/s] are mean",
-        "errors of velocity commands; `speed` is in m/s. The page of a task defines its success. Several values in a",
-        "cell are those of several seeds. Each task has a required result, in brackets, and a time limit for the",
-        "training. Tier A: the policy solves the task. Tier B: the required result is lower, and one seed reached it.",
+        "Each task has a required result, in brackets, and a time limit for the training:",
+        "",
+        "- Tier A: three seeds reach the full goal within the time limit.",
+        "- Tier B: one seed reaches a lower goal within the time limit.",
+        "",
+        "Several values in a cell are those of several seeds. The values are:",
+        "",
+        "| value | meaning |",
+        "| --- | --- |",
+        "| success | share of successful episodes; the page of a task defines its success |",
+        "| error_vel_xy, error_vel_yaw | mean errors of the velocity command [m/s], [rad/s] |",
+        "| speed | mean speed towards the target [m/s] |",
+        "| successes | mean number of goals reached in a row in an episode |",
+        "",
         "*Manager-based* tasks are [lists of terms](../../tutorials/first-task.md), *direct* tasks are",
-        "[one Python class](../../tutorials/direct-task.md).",
+        '[one Python class](../../tutorials/direct-task.md). "Isaac Lab\'s parameters" means that the rewards, limits',
+        "and gains are those of Isaac Lab's task; the page of a task lists the differences.",
         "",
         "| task | what the policy does | observations, actions | machine, time (of the limit) | result (required) |",
         "| --- | --- | --- | --- | --- |",

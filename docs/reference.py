@@ -190,7 +190,12 @@ def _task_schema() -> Iterator[str]:
 def _agents() -> Iterator[str]:
     yield "# Agent settings\n"
     yield "After reading this page you can set every parameter of a trainer: in the task file under `agents.NAME`, or"
-    yield "on the command line as `agent.KEY=VALUE`, for example `rlcli train cartpole agent.learning_rate=1e-3`."
+    yield "on the command line as `agent.KEY=VALUE`. Nested keys have dots:\n"
+    yield "<!-- not run: examples of overrides; the tests of the command line train with such -->\n```sh"
+    yield "rlcli train cartpole agent.learning_rate=1e-3"
+    yield 'rlcli train cartpole "agent.policy.hidden=[128, 128]"\n```\n'
+    yield "A heading names a trainer and an algorithm: *sb3, ppo* has the settings of `trainer: sb3` with"
+    yield "`algorithm: ppo`. Headings such as *sb3, ppo: NetworkConfig* list the keys inside of a key of that type."
     yield "[The ppo trainer](ppo.md) explains the settings of `ppo`.\n"
     for title, schema in agent_schemas().items():
         yield from _models(title, schema, prefix=f"{title}: ")
@@ -198,13 +203,51 @@ def _agents() -> Iterator[str]:
 
 def _models(title: str, schema: dict[str, Any], prefix: str = "") -> Iterator[str]:
     """Yield the table of a model and those of the models inside it."""
-    yield from _model(f"## {title}", schema)
-    for name, model in sorted(schema.get("$defs", {}).items()):
-        if "properties" in model:
-            yield from _model(f"## {prefix}{name}", model)
+    inner = {name: model for name, model in sorted(schema.get("$defs", {}).items()) if "properties" in model}
+    links = {name: f"#{_slug(prefix + name)}" for name in inner}
+    yield from _model(f"## {title}", schema, links)
+    for name, model in inner.items():
+        yield from _model(f"## {prefix}{name}", _with_note(name, model, schema), links)
 
 
-def _model(heading: str, model: dict[str, Any]) -> Iterator[str]:
+def _with_note(name: str, model: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    """Return the model; its description says so if a key of this type has a default with other values."""
+    note = ""
+    for key, field in schema["properties"].items():
+        default = field.get("default")
+        if type_text(field).removesuffix(" or null") != name or not isinstance(default, dict):
+            continue
+        other = {k: v for k, v in default.items() if v != model["properties"].get(k, {}).get("default", v)}
+        if other:
+            note += (
+                f" The defaults in this table are those of keys that are missing in a mapping `{key}: {{...}}`. Without"
+                f" such a mapping, and with overrides such as `agent.{key}.{next(iter(other))}=...`, the defaults are"
+                f" `{yaml_text(default)}`."
+            )
+    return model | {"description": model.get("description", "") + note}
+
+
+def _slug(heading: str) -> str:
+    """Return the anchor of a heading."""
+    return re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-")
+
+
+def _linked(type_name: str, links: dict[str, str]) -> str:
+    """Return the text of a type as the cell of a table; models are links to their sections."""
+    return re.sub(
+        r"\w+", lambda word: f"[{word[0]}]({links[word[0]]})" if word[0] in links else word[0], _cell(type_name)
+    )
+
+
+def _schema_links() -> dict[str, str]:
+    """Return the models of the task schema with their sections, for pages in `terms/`."""
+    from rlcli.config.schema import TaskConfig
+
+    models = TaskConfig.model_json_schema()["$defs"]
+    return {name: f"../task-schema.md#{_slug(name)}" for name, model in models.items() if "properties" in model}
+
+
+def _model(heading: str, model: dict[str, Any], links: dict[str, str]) -> Iterator[str]:
     yield f"{heading}\n"
     if model.get("description"):
         yield _one_line(model["description"]) + "\n"
@@ -213,7 +256,8 @@ def _model(heading: str, model: dict[str, Any]) -> Iterator[str]:
     yield "| key | type | default | meaning |\n| --- | --- | --- | --- |"
     for key, field in model["properties"].items():
         default = "required" if key in model.get("required", ()) else f"`{_cell(yaml_text(field.get('default')))}`"
-        yield f"| `{key}` | {_cell(type_text(field))} | {default} | {_cell(_one_line(field.get('description', '')))} |"
+        meaning = _cell(_one_line(field.get("description", "")))
+        yield f"| `{key}` | {_linked(type_text(field), links)} | {default} | {meaning} |"
     yield ""
 
 
@@ -241,7 +285,8 @@ def _terms_index() -> Iterator[str]:
         yield f"| [{section}]({section}.md) | {counts[section]} | {contents} |"
     yield "\n## Keys of every term of a section\n"
     for section, model in MODELS.items():
-        yield from _model(f"### {section.capitalize()}", {"properties": model.model_json_schema()["properties"]})
+        keys = {"properties": model.model_json_schema()["properties"]}
+        yield from _model(f"### {section.capitalize()}", keys, _schema_links())
     yield "## All terms\n"
     for section in SECTIONS:
         names = sorted(entry.name for where, entry in _terms() if where == section)
@@ -251,9 +296,8 @@ def _terms_index() -> Iterator[str]:
 def _terms_page(section: str) -> Iterator[str]:
     yield f"# {section.capitalize()}\n"
     yield SECTIONS[section] + "\n"
-    for where, entry in _terms():
-        if where == section:
-            yield from _term(entry)
+    for entry in sorted((entry for where, entry in _terms() if where == section), key=lambda entry: entry.name):
+        yield from _term(entry)
 
 
 def _term(entry: TermEntry) -> Iterator[str]:

@@ -25,9 +25,15 @@ class FlightTask(DirectTask):
     class Params(StrictModel):
         """Settings of all flight tasks."""
 
-        target_period: int = Field(500, gt=0, description="Steps from one target to the next.")
-        start_offset: float = Field(0.3, ge=0, description="Start: offset from the default position +- [m].")
-        max_distance: float = Field(5.0, gt=0, description="Distance to the target beyond which it fails [m].")
+        target_period: int = Field(
+            500, gt=0, description="Number of environment steps between two changes of the target."
+        )
+        start_offset: float = Field(
+            0.3, ge=0, description="Largest absolute initial offset from the default position, along each axis [m]."
+        )
+        max_distance: float = Field(
+            5.0, gt=0, description="An episode fails if the robot is farther than this from the target [m]."
+        )
 
     params: Any
 

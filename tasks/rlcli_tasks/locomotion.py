@@ -59,11 +59,20 @@ class LocomotionTask(DirectTask):
     class Params(StrictModel):
         """Settings of all locomotion tasks."""
 
-        target: tuple[float, float] = Field((1000.0, 0.0), description="Target position, x and y [m].")
-        progress_weight: float = Field(1.0, description="Reward on the speed towards the target [s/m].")
-        up_weight: float = Field(0.1, description="Reward where the torso is upright to within acos(0.93).")
-        heading_weight: float = Field(0.5, description="Reward where the torso faces the target, to within acos(0.8).")
-        joint_vel_noise: float = Field(0.1, ge=0, description="Start: joint velocities +- [rad/s].")
+        target: tuple[float, float] = Field((1000.0, 0.0), description="Position of the target: x, y [m].")
+        progress_weight: float = Field(1.0, description="Weight of the reward on the speed towards the target [s/m].")
+        up_weight: float = Field(
+            0.1,
+            description="Reward per step in which the torso is tilted by less than acos(0.93) = 0.38 rad from upright.",
+        )
+        heading_weight: float = Field(
+            0.5,
+            description=(
+                "Reward per step in which the torso's heading is within acos(0.8) = 0.64 rad of the direction "
+                "to the target; with a larger angle a, this reward x cos(a) / 0.8."
+            ),
+        )
+        joint_vel_noise: float = Field(0.1, ge=0, description="Largest absolute initial joint velocity [rad/s].")
 
     joints: ClassVar[tuple[str, ...]]
     """Joint names in the order of observations and actions, which is the model's order."""

@@ -47,7 +47,7 @@ def cart_vel(env, *, entity: Entity = "robot", joints: Joints = ".*", factor: fl
 def cartpole(**changes):
     """Return the task `cartpole` as a Python configuration without agents."""
     parts = {
-        "summary": "Balance a pole on a cart (manager-based, Isaac Lab's numbers).",
+        "summary": "Balance a pole on a cart (manager-based, Isaac Lab's parameters).",
         "sim": SimConfig(dt=1 / 120, render_interval=2),
         "decimation": 2,
         "episode_length_s": 5.0,

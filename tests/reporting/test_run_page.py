@@ -135,7 +135,7 @@ def test_direct_task_page_has_parameters_and_docstrings(cli, tmp_path):
     write_run(tmp_path / "runs", "cartpole-direct", rows=learning())
     page = read(cli("report", "latest").out.strip())
     assert "Reward an upright pole and slow joints" in page.text
-    assert "Force at action 1 [N]." in page.text
+    assert "Force on the cart at action 1 [N]." in page.text
 
 
 def test_untrusted_text_is_escaped(cli, tmp_path):
@@ -156,7 +156,8 @@ def test_untrusted_text_is_escaped(cli, tmp_path):
     )
     run.config.write_text(
         run.config.read_text().replace(
-            "summary: Balance a pole on a cart (manager-based, Isaac Lab's numbers).", f"summary: {json.dumps(ATTACK)}"
+            "summary: Balance a pole on a cart (manager-based, Isaac Lab's parameters).",
+            f"summary: {json.dumps(ATTACK)}",
         )
     )
     folder = run.folder.rename(run.folder.with_name("a<b onclick=x>'\""))

@@ -122,7 +122,7 @@ def test_empty_tables_and_columns_are_left_out():
 def test_direct_task_card_has_parameters_and_docstrings():
     content = built("cartpole-direct", "params.max_effort=250", layout="direct.layout.json")
     assert rows(content, "Parameters")["max_effort"] == {
-        "Parameter": "max_effort", "Value": "250", "What": "Force at action 1 [N].", "Default": "400",
+        "Parameter": "max_effort", "Value": "250", "What": "Force on the cart at action 1 [N].", "Default": "400",
     }  # fmt: skip
     words = rows(content, "Docstrings of the task")
     assert words["Reward"]["What"] == "Reward an upright pole and slow joints; a failure costs 2."

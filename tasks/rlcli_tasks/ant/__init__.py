@@ -6,6 +6,6 @@ MANAGED = TaskSpec(package=__name__, summary="Run with a four-legged walker (man
 DIRECT = TaskSpec(
     package=__name__,
     config="direct.yaml",
-    summary="Run with a four-legged walker (direct, OmniIsaacGymEnvs' numbers).",
+    summary="Run with a four-legged walker (direct, OmniIsaacGymEnvs' parameters).",
     task="rlcli_tasks.ant.task:AntTask",
 )

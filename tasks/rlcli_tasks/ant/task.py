@@ -25,16 +25,28 @@ class AntTask(LocomotionTask):
     class Params(LocomotionTask.Params):
         """Settings of the task."""
 
-        effort: float = Field(7.5, gt=0, description="Torque at action 1 [N m].")
-        termination_height: float = Field(0.31, description="Torso height below which the episode fails [m].")
-        death_reward: float = Field(-2.0, description="Reward of the step that fails, in place of all others.")
-        alive_weight: float = Field(0.5, description="Reward per step.")
-        action_cost: float = Field(0.005, ge=0, description="Penalty on squared actions.")
-        energy_cost: float = Field(0.05, ge=0, description="Penalty on |action x joint velocity / (5 rad/s)|.")
-        limit_cost: float = Field(
-            0.1, ge=0, description="Penalty on each joint within 1% of its half range of a limit."
+        effort: float = Field(7.5, gt=0, description="Torque of each joint at action 1 [N m].")
+        termination_height: float = Field(0.31, description="An episode fails if the torso is lower than this [m].")
+        death_reward: float = Field(
+            -2.0, description="Reward of the step in which the episode fails, instead of all other terms."
         )
-        joint_pos_noise: float = Field(0.2, ge=0, description="Start: joint positions +-, inside the limits [rad].")
+        alive_weight: float = Field(0.5, description="Reward per step in which the episode does not fail.")
+        action_cost: float = Field(0.005, ge=0, description="Weight of the penalty on the sum of squared actions.")
+        energy_cost: float = Field(
+            0.05,
+            ge=0,
+            description="Weight of the penalty on |action x joint velocity / (5 rad/s)|, summed over the joints.",
+        )
+        limit_cost: float = Field(
+            0.1, ge=0, description="Penalty per joint that is nearer to a limit than 1 % of half of the joint's range."
+        )
+        joint_pos_noise: float = Field(
+            0.2,
+            ge=0,
+            description=(
+                "Largest absolute initial offset of a joint from its default position, within the joint limits [rad]."
+            ),
+        )
 
     params: Params
 

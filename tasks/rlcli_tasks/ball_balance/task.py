@@ -51,19 +51,25 @@ class BallBalanceTask(DirectTask):
     class Params(StrictModel):
         """Settings of the task."""
 
-        speed: float = Field(20.0, gt=0, description="Rate of a knee's target at action 1 [rad/s].")
+        speed: float = Field(20.0, gt=0, description="Speed of the target angle of a knee at action 1 [rad/s].")
         target_height: float = Field(0.7, description="Height of the point where the ball should rest [m].")
-        fall_height: float = Field(0.15, description="Height of the ball below which the episode fails [m].")
+        fall_height: float = Field(0.15, description="An episode fails if the ball is lower than this [m].")
         start_distance: tuple[float, float] = Field(
-            (0.001, 0.4), description="Start: distance of the ball from the middle, lowest and highest [m]."
+            (0.001, 0.4),
+            description="Range of the ball's initial horizontal distance from the middle: lowest, highest [m].",
         )
-        start_height: tuple[float, float] = Field((1.0, 2.0), description="Start: height of the ball likewise [m].")
+        start_height: tuple[float, float] = Field(
+            (1.0, 2.0), description="Range of the ball's initial height: lowest, highest [m]."
+        )
         start_speed: float = Field(
             2.0,
             ge=0,
-            description="Start: highest speed of the ball towards the middle, at the greatest distance [m/s].",
+            description=(
+                "Highest initial speed of the ball towards the middle, if the ball starts at the largest "
+                "distance; proportionally less at smaller distances [m/s]."
+            ),
         )
-        start_drop: float = Field(5.0, ge=0, description="Start: speed of the ball downwards [m/s].")
+        start_drop: float = Field(5.0, ge=0, description="Initial downward speed of the ball [m/s].")
 
     params: Params
 

@@ -38,14 +38,26 @@ class CartDoublePendulumTask(DirectTask):
         """Settings of the task."""
 
         cart_effort: float = Field(100.0, gt=0, description="Force on the cart at action 1 [N].")
-        pendulum_effort: float = Field(50.0, gt=0, description="Torque of the pole on the pendulum at action 1 [N m].")
-        max_cart_pos: float = Field(3.0, gt=0, description="Cart position at which the episode fails [m].")
-        pole_start: float = Field(0.7853982, ge=0, description="Start: angle of the pole +- [rad].")
-        pendulum_start: float = Field(0.7853982, ge=0, description="Start: angle between the links +- [rad].")
-        alive_weight: float = Field(2.0, description="Reward of a step that does not fail.")
-        failure_reward: float = Field(-4.0, description="Reward of a step that fails, in place of it.")
-        tilt_weight: float = Field(1.0, ge=0, description="Penalty on the squared tilt of either link [1/rad^2].")
-        speed_weight: float = Field(0.01, ge=0, description="Penalty on the speed of each joint [s/m or s/rad].")
+        pendulum_effort: float = Field(
+            50.0, gt=0, description="Torque between the pole and the pendulum at action 1 [N m]."
+        )
+        max_cart_pos: float = Field(
+            3.0, gt=0, description="An episode fails if the cart is farther than this from the middle of the rail [m]."
+        )
+        pole_start: float = Field(0.7853982, ge=0, description="Largest absolute initial angle of the pole [rad].")
+        pendulum_start: float = Field(
+            0.7853982, ge=0, description="Largest absolute initial angle between the pole and the pendulum [rad]."
+        )
+        alive_weight: float = Field(2.0, description="Reward per step in which the episode does not fail.")
+        failure_reward: float = Field(
+            -4.0, description="Reward of the step in which the episode fails, instead of alive_weight."
+        )
+        tilt_weight: float = Field(
+            1.0, ge=0, description="Weight of the penalty on the squared tilt of each link from the vertical [1/rad^2]."
+        )
+        speed_weight: float = Field(
+            0.01, ge=0, description="Weight of the penalty on the absolute velocity of each joint [s/m or s/rad]."
+        )
 
     params: Params
 

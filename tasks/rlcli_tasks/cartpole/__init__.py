@@ -2,7 +2,7 @@
 
 from rlcli.task import TaskSpec
 
-MANAGED = TaskSpec(package=__name__, summary="Balance a pole on a cart (manager-based, Isaac Lab's numbers).")
+MANAGED = TaskSpec(package=__name__, summary="Balance a pole on a cart (manager-based, Isaac Lab's parameters).")
 CAMERA = TaskSpec(
     package=__name__,
     config="camera.yaml",
@@ -11,6 +11,6 @@ CAMERA = TaskSpec(
 DIRECT = TaskSpec(
     package=__name__,
     config="direct.yaml",
-    summary="Balance a pole on a cart (direct, OmniIsaacGymEnvs' numbers).",
+    summary="Balance a pole on a cart (direct, OmniIsaacGymEnvs' parameters).",
     task="rlcli_tasks.cartpole.task:CartpoleTask",
 )

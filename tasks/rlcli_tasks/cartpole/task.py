@@ -26,10 +26,16 @@ class CartpoleTask(DirectTask):
     class Params(StrictModel):
         """Settings of the task."""
 
-        reset_dist: float = Field(3.0, gt=0, description="Cart position at which the episode fails [m].")
-        max_effort: float = Field(400.0, gt=0, description="Force at action 1 [N].")
-        cart_vel_weight: float = Field(0.01, ge=0, description="Penalty on |cart velocity| [s/m].")
-        pole_vel_weight: float = Field(0.005, ge=0, description="Penalty on |pole rate| [s/rad].")
+        reset_dist: float = Field(
+            3.0, gt=0, description="An episode fails if the cart is farther than this from the middle of the rail [m]."
+        )
+        max_effort: float = Field(400.0, gt=0, description="Force on the cart at action 1 [N].")
+        cart_vel_weight: float = Field(
+            0.01, ge=0, description="Weight of the penalty on the absolute cart velocity [s/m]."
+        )
+        pole_vel_weight: float = Field(
+            0.005, ge=0, description="Weight of the penalty on the absolute angular velocity of the pole [s/rad]."
+        )
 
     params: Params
 

@@ -33,18 +33,22 @@ class CrazyflieTask(FlightTask):
         thrust_to_weight: float = Field(
             1.9, gt=1, description="Thrust of all four motors at full speed, divided by the weight."
         )
-        motor_time: float = Field(
-            0.15, gt=0, description="Time in which a motor's speed settles [s]; 4 time constants."
-        )
+        motor_time: float = Field(0.15, gt=0, description="Settling time of a motor's speed: four time constants [s].")
         thrust_noise: float = Field(
             0.01, ge=0, description="Standard deviation of the thrust noise, divided by the commanded thrust."
         )
         target_low: tuple[float, float, float] = Field(
-            (0.0, 0.0, 2.0), description="Targets: lower corner of the box from which they are sampled [m]."
+            (0.0, 0.0, 2.0), description="Lower corner of the box from which targets are sampled: x, y, z [m]."
         )
-        target_high: tuple[float, float, float] = Field((0.0, 0.0, 2.0), description="Targets: upper corner [m].")
-        height_range: tuple[float, float] = Field((0.5, 5.0), description="Heights outside which it fails [m].")
-        effort_cost: float = Field(0.05, description="Penalty x exp(-sum of squared actions / 2): on low effort.")
+        target_high: tuple[float, float, float] = Field(
+            (0.0, 0.0, 2.0), description="Upper corner of the box from which targets are sampled: x, y, z [m]."
+        )
+        height_range: tuple[float, float] = Field(
+            (0.5, 5.0), description="An episode fails if the drone's height is outside this range: lowest, highest [m]."
+        )
+        effort_cost: float = Field(
+            0.05, description="Weight of the penalty exp(-sum of squared actions / 2), which is largest at action 0."
+        )
 
     params: Params
 

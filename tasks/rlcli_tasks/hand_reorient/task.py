@@ -26,7 +26,7 @@ GOAL = slice(45, 53)
 class HandTask(DirectTask):
     """Turn the cube to one goal after another. Observations: docs/reference/zoo/hand-reorient.md lists the 69 columns.
 
-    The critic's states are these and what the ends of the fingers do and feel, 145 columns in all.
+    The critic observes 145 columns: these 69, then positions, velocities and loads of the fingertips.
     """
 
     num_observations = 69
@@ -59,33 +59,52 @@ class HandTask(DirectTask):
         """Settings of the task."""
 
         goal_pos: tuple[float, float, float] = Field(
-            (-0.01, 0.0, 0.55), description="Position where the cube should stay [m]."
+            (-0.01, 0.0, 0.55), description="Position where the cube should stay: x, y, z [m]."
         )
         shown_pos: tuple[float, float, float] = Field(
-            (0.12, 0.2, 0.62), description="Position where the goal is displayed [m]."
+            (0.12, 0.2, 0.62), description="Position where viewers display the goal orientation: x, y, z [m]."
         )
         smoothing: float = Field(
             0.5,
             gt=0,
             le=1,
-            description="Weight of the new target in a step; the rest is the weight of the previous target.",
+            description="Weight of the new joint target in each step; the previous target has the rest of the weight.",
         )
-        success_tolerance: float = Field(0.4, gt=0, description="Angle at which a goal counts as reached [rad].")
+        success_tolerance: float = Field(
+            0.4, gt=0, description="A goal is reached if the angle between cube and goal is at most this [rad]."
+        )
         fall_distance: float = Field(
-            0.24, gt=0, description="Distance from that position at which the cube counts as lost [m]."
+            0.24, gt=0, description="An episode fails if the cube is this far or farther from goal_pos [m]."
         )
-        distance_weight: float = Field(-10.0, description="Reward on the distance of the cube from its position [1/m].")
-        rotation_weight: float = Field(1.0, description="Reward on 1 / (angle to the goal + rotation_eps) [rad].")
-        rotation_eps: float = Field(0.1, gt=0, description="See rotation_weight [rad].")
-        action_weight: float = Field(-0.0002, description="Reward on the sum of squared actions.")
-        goal_bonus: float = Field(250.0, description="Reward of a step that reaches a goal.")
-        fall_reward: float = Field(0.0, description="Reward of the step in which the cube is lost, besides the others.")
-        position_noise: float = Field(0.01, ge=0, description="Start: position of the cube +- [m].")
+        distance_weight: float = Field(
+            -10.0, description="Weight of the cube's distance from goal_pos in the reward; negative: a penalty [1/m]."
+        )
+        rotation_weight: float = Field(
+            1.0, description="Weight of 1 / (angle to the goal + rotation_eps) in the reward [rad]."
+        )
+        rotation_eps: float = Field(
+            0.1, gt=0, description="Angle that is added to the angle to the goal in the term of rotation_weight [rad]."
+        )
+        action_weight: float = Field(
+            -0.0002, description="Weight of the sum of squared actions in the reward; negative: a penalty."
+        )
+        goal_bonus: float = Field(250.0, description="Additional reward of a step in which a goal is reached.")
+        fall_reward: float = Field(
+            0.0, description="Additional reward of the step in which the episode fails; negative: a penalty."
+        )
+        position_noise: float = Field(
+            0.01,
+            ge=0,
+            description="Largest absolute initial offset of the cube from its default position, along each axis [m].",
+        )
         joint_noise: float = Field(
             0.2,
             ge=0,
             le=1,
-            description="Start: fraction of the way from the default to a position sampled in the range.",
+            description=(
+                "Initial joint positions are moved by this fraction of the way from the default to a position "
+                "sampled within the joint limits."
+            ),
         )
 
     params: Params

@@ -6,6 +6,6 @@ MANAGED = TaskSpec(package=__name__, summary="Run with a human figure (manager-b
 DIRECT = TaskSpec(
     package=__name__,
     config="direct.yaml",
-    summary="Run with a human figure (direct, OmniIsaacGymEnvs' numbers).",
+    summary="Run with a human figure (direct, OmniIsaacGymEnvs' parameters).",
     task="rlcli_tasks.humanoid.task:HumanoidTask",
 )

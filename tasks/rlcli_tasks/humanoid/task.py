@@ -32,21 +32,36 @@ class HumanoidTask(LocomotionTask):
     class Params(LocomotionTask.Params):
         """Settings of the task."""
 
-        power: float = Field(1.0, gt=0, description="Factor on the motors' torques.")
-        termination_height: float = Field(0.8, description="Torso height below which the episode fails [m].")
-        death_reward: float = Field(-1.0, description="Reward of the step that fails, in place of all others.")
-        alive_weight: float = Field(2.0, description="Reward per step.")
-        action_cost: float = Field(0.01, ge=0, description="Penalty on squared actions.")
+        power: float = Field(1.0, gt=0, description="Factor on the torques of all motors.")
+        termination_height: float = Field(0.8, description="An episode fails if the torso is lower than this [m].")
+        death_reward: float = Field(
+            -1.0, description="Reward of the step in which the episode fails, instead of all other terms."
+        )
+        alive_weight: float = Field(2.0, description="Reward per step in which the episode does not fail.")
+        action_cost: float = Field(0.01, ge=0, description="Weight of the penalty on the sum of squared actions.")
         energy_cost: float = Field(
-            0.05, ge=0, description="Penalty on |action x joint velocity / (10 rad/s)| x the motor's share of 135 N m."
+            0.05,
+            ge=0,
+            description=(
+                "Weight of the penalty on |action x joint velocity / (10 rad/s)| x (torque of the joint's motor "
+                "/ 135 N m), summed over the joints."
+            ),
         )
         limit_cost: float = Field(
             0.25,
             ge=0,
-            description="Penalty on a joint at its limit, from 0 at 98% of its half range, by the same share.",
+            description=(
+                "Penalty on a joint at its limit, times (torque of the joint's motor / 135 N m); it falls "
+                "linearly to 0 at 98 % of half of the joint's range."
+            ),
         )
         joint_pos_noise: float = Field(
-            0.2, ge=0, description="Start: joint positions +-, inside the limits; legs not inwards [rad]."
+            0.2,
+            ge=0,
+            description=(
+                "Largest absolute initial offset of a joint from its default position, within the joint limits; "
+                "the hip roll joints start outwards only [rad]."
+            ),
         )
 
     params: Params

@@ -8,6 +8,6 @@ from rlcli.task import TaskSpec
 DIRECT = TaskSpec(
     package=__name__,
     config="direct.yaml",
-    summary="Fly from point to point with the Mars helicopter (direct, OmniIsaacGymEnvs' numbers).",
+    summary="Fly from point to point with the Mars helicopter (direct, OmniIsaacGymEnvs' parameters).",
     task="rlcli_tasks.ingenuity.task:IngenuityTask",
 )

@@ -30,17 +30,30 @@ class IngenuityTask(FlightTask):
     class Params(FlightTask.Params):
         """Settings of the task."""
 
-        max_thrust: float = Field(20.0, gt=0, description="Largest thrust of a rotor, either way [N].")
-        lateral: float = Field(0.2, ge=0, description="Largest share of the thrust along each of x and y.")
-        target_low: tuple[float, float, float] = Field(
-            (-1.0, -1.0, 1.0), description="Targets: lower corner of the box from which they are sampled [m]."
+        max_thrust: float = Field(20.0, gt=0, description="Largest thrust of a rotor, upwards or downwards [N].")
+        lateral: float = Field(
+            0.2, ge=0, description="Largest sideways force of a rotor along each of x and y, divided by its thrust."
         )
-        target_high: tuple[float, float, float] = Field((1.0, 1.0, 2.0), description="Targets: upper corner [m].")
-        start_offset: float = Field(0.5, ge=0, description="Start: offset from the default position +- [m].")
-        max_distance: float = Field(20.0, gt=0, description="Distance to the target beyond which it fails [m].")
-        min_height: float = Field(0.5, description="Height below which it fails [m].")
+        target_low: tuple[float, float, float] = Field(
+            (-1.0, -1.0, 1.0), description="Lower corner of the box from which targets are sampled: x, y, z [m]."
+        )
+        target_high: tuple[float, float, float] = Field(
+            (1.0, 1.0, 2.0), description="Upper corner of the box from which targets are sampled: x, y, z [m]."
+        )
+        start_offset: float = Field(
+            0.5, ge=0, description="Largest absolute initial offset from the default position, along each axis [m]."
+        )
+        max_distance: float = Field(
+            20.0, gt=0, description="An episode fails if the robot is farther than this from the target [m]."
+        )
+        min_height: float = Field(0.5, description="An episode fails if the robot is lower than this [m].")
         steadiness: float = Field(
-            0.0, ge=0, description="Weight of nearness / (1 + 10 speed^2), a term that the original reward lacks [1]."
+            0.0,
+            ge=0,
+            description=(
+                "Weight of the reward term n / (1 + 10 v^2), with n = 1 / (1 + 2.5 d^2), speed v [m/s] and "
+                "distance to the target d [m]; the original reward lacks this term."
+            ),
         )
 
     params: Params

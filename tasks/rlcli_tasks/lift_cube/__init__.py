@@ -7,5 +7,5 @@ from rlcli.task import TaskSpec
 
 MANAGED = TaskSpec(
     package=__name__,
-    summary="Take a cube and hold it in the air (manager-based, Isaac Lab's numbers).",
+    summary="Take a cube and hold it in the air (manager-based, Isaac Lab's parameters).",
 )

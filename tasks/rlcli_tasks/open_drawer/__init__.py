@@ -7,6 +7,6 @@ from rlcli.task import TaskSpec
 
 DIRECT = TaskSpec(
     package=__name__,
-    summary="Pull a drawer open by its handle (direct, OmniIsaacGymEnvs' numbers).",
+    summary="Pull a drawer open by its handle (direct, OmniIsaacGymEnvs' parameters).",
     task="rlcli_tasks.open_drawer.task:DrawerTask",
 )

@@ -47,21 +47,59 @@ class DrawerTask(DirectTask):
     class Params(StrictModel):
         """Settings of the task."""
 
-        action_scale: float = Field(2.5, gt=0, description="Speed of a joint's target at action 1 [rad/s].")
+        action_scale: float = Field(2.5, gt=0, description="Speed of the target of an arm joint at action 1 [rad/s].")
         finger_speed: float = Field(
-            0.1, gt=0, description="Speed of the fingers' targets, as a fraction of it [m/rad]."
+            0.1, gt=0, description="Speed of a finger's target [m/s] at action 1, divided by action_scale [m/rad]."
         )
-        velocity_scale: float = Field(0.1, gt=0, description="Factor on observed joint velocities.")
-        start_noise: float = Field(0.125, ge=0, description="Start: joints +- about their default [rad, m].")
-        start_opening: float = Field(0.01, ge=0, description="Start: the drawer is up to this far open [m].")
-        distance_weight: float = Field(2.0, description="Reward on nearness to the handle, which is at most 2.")
-        rotation_weight: float = Field(0.5, description="Reward on the attitude of the gripper, at most 1.")
-        around_weight: float = Field(10.0, description="Reward on fingers above and below the handle and at it, 0.5.")
-        finger_weight: float = Field(100.0, description="Reward on how near to its height these are [1/m].")
-        close_weight: float = Field(10.0, description="Reward on fingers closed at the handle [1/m].")
-        open_weight: float = Field(7.5, description="Reward on the drawer's opening, half as much again if held [1/m].")
-        reach: float = Field(0.05, gt=0, description="Distance from which fingers count as around the handle [m].")
-        action_cost: float = Field(0.01, ge=0, description="Penalty on squared actions.")
+        velocity_scale: float = Field(
+            0.1, gt=0, description="Factor on the observed velocities of joints [s/rad] and fingers [s/m]."
+        )
+        start_noise: float = Field(
+            0.125,
+            ge=0,
+            description=(
+                "Largest absolute initial offset of a joint [rad] or finger [m] from its default position, "
+                "within the joint limits."
+            ),
+        )
+        start_opening: float = Field(0.01, ge=0, description="Largest initial opening of the drawer [m].")
+        distance_weight: float = Field(
+            2.0, description="Weight of the nearness of the grasp point to the handle, a value from 0 to 2."
+        )
+        rotation_weight: float = Field(
+            0.5, description="Weight of the alignment of the gripper with the handle, a value from -1 to 1."
+        )
+        around_weight: float = Field(
+            10.0,
+            description=(
+                "Weight of a grasp, a value of 0.5 if one finger is above and one below the handle within "
+                "`reach`, else 0."
+            ),
+        )
+        finger_weight: float = Field(
+            100.0,
+            description=(
+                "Weight of the nearness of the fingers' heights to the handle's height during a grasp: 0.08 m "
+                "minus the sum of both height differences [1/m]."
+            ),
+        )
+        close_weight: float = Field(
+            10.0,
+            description=(
+                "Weight of how far the fingers are closed, if the grasp point is within 3 cm of the handle [1/m]."
+            ),
+        )
+        open_weight: float = Field(
+            7.5, description="Weight of the drawer's opening; 1.5 times this weight during a grasp [1/m]."
+        )
+        reach: float = Field(
+            0.05,
+            gt=0,
+            description=(
+                "Largest distance of the grasp point from the handle at which the fingers can count as a grasp [m]."
+            ),
+        )
+        action_cost: float = Field(0.01, ge=0, description="Weight of the penalty on the sum of squared actions.")
 
     params: Params
 

@@ -8,6 +8,6 @@ from rlcli.task import TaskSpec
 DIRECT = TaskSpec(
     package=__name__,
     config="direct.yaml",
-    summary="Hover at a point with four tilting rotors (direct, OmniIsaacGymEnvs' numbers).",
+    summary="Hover at a point with four tilting rotors (direct, OmniIsaacGymEnvs' parameters).",
     task="rlcli_tasks.quadcopter.task:QuadcopterTask",
 )

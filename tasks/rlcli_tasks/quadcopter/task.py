@@ -39,16 +39,24 @@ class QuadcopterTask(DirectTask):
     class Params(StrictModel):
         """Settings of the task."""
 
-        tilt_speed: float = Field(25.132741, gt=0, description="Speed of a tilt's target at action 1, 8 pi [rad/s].")
-        thrust_speed: float = Field(100.0, gt=0, description="Change of a thrust at action 1 [N/s].")
-        max_thrust: float = Field(2.0, gt=0, description="Largest thrust of a rotor, either way [N].")
-        max_distance: float = Field(3.0, gt=0, description="Distance to the target beyond which it fails [m].")
-        min_height: float = Field(0.3, description="Height below which it fails [m].")
-        start_low: tuple[float, float, float] = Field(
-            (-1.5, -1.5, -0.2), description="Start: least offset from the default position [m]."
+        tilt_speed: float = Field(
+            25.132741, gt=0, description="Speed of the target of a rotor's tilt angle at action 1: 8 pi [rad/s]."
         )
-        start_high: tuple[float, float, float] = Field((1.5, 1.5, 1.5), description="Start: greatest offset [m].")
-        joint_pos_noise: float = Field(0.2, ge=0, description="Start: tilts +-, inside their limits [rad].")
+        thrust_speed: float = Field(100.0, gt=0, description="Rate of change of a rotor's thrust at action 1 [N/s].")
+        max_thrust: float = Field(2.0, gt=0, description="Largest thrust of a rotor, upwards or downwards [N].")
+        max_distance: float = Field(
+            3.0, gt=0, description="An episode fails if the robot is farther than this from the target [m]."
+        )
+        min_height: float = Field(0.3, description="An episode fails if the robot is lower than this [m].")
+        start_low: tuple[float, float, float] = Field(
+            (-1.5, -1.5, -0.2), description="Lower bounds of the initial offset from the default position: x, y, z [m]."
+        )
+        start_high: tuple[float, float, float] = Field(
+            (1.5, 1.5, 1.5), description="Upper bounds of the initial offset from the default position: x, y, z [m]."
+        )
+        joint_pos_noise: float = Field(
+            0.2, ge=0, description="Largest absolute initial tilt angle of a rotor, within the joint limits [rad]."
+        )
 
     params: Params
 

@@ -8,7 +8,7 @@ from rlcli.task import TaskSpec
 FLAT = TaskSpec(
     package=__name__,
     config="flat.yaml",
-    summary="Follow velocity commands on flat ground with a four-legged robot (manager-based, Isaac Lab's numbers).",
+    summary="Follow velocity commands on flat ground with a four-legged robot (manager-based, Isaac Lab's parameters).",
 )
 ROUGH = TaskSpec(
     package=__name__,

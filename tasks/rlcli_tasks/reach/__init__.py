@@ -5,10 +5,10 @@ from rlcli.task import TaskSpec
 JOINT = TaskSpec(
     package=__name__,
     config="joint.yaml",
-    summary="Bring an arm's hand to poses by joint positions (manager-based, Isaac Lab's numbers).",
+    summary="Bring an arm's hand to poses by joint positions (manager-based, Isaac Lab's parameters).",
 )
 IK = TaskSpec(
     package=__name__,
     config="ik.yaml",
-    summary="Bring an arm's hand to poses by inverse kinematics (manager-based, Isaac Lab's numbers).",
+    summary="Bring an arm's hand to poses by inverse kinematics (manager-based, Isaac Lab's parameters).",
 )
