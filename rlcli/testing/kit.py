@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
-from rlcli.testing import episode_checks, portability_checks, step_and_file_checks, timestep_checks
+from rlcli.testing import episode_checks, portability_checks, step_and_file_checks
 from rlcli.testing.findings import Finding, NotRunError, error_text
 from rlcli.testing.task_under_test import TaskUnderTest, open_task
 
