@@ -154,7 +154,7 @@ def test_fixture_fails_with_all_errors_without_traceback(managed, tmp_path):
     managed.write()
     code, output = run_pytest(tmp_path, THREE_LINES)
     assert code == 1
-    assert "task './pendulum' fails rlcli check:" in output
+    assert "task './pendulum' fails `rlcli check`:" in output
     assert "error: truncation:" in output
     assert "error: start-states: between episodes" in output
     assert "pytest_plugin.py" not in output
