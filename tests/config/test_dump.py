@@ -202,4 +202,4 @@ def test_json_schema_contains_own_terms_and_params(task):
     assert rewards["mine"]["properties"]["x"]["default"] == 2.0
     assert "odd" not in rewards
     params = json_schema(*extensions(find_task("cartpole-direct")))["properties"]["params"]
-    assert params["properties"]["reset_dist"]["description"].startswith("Cart position")
+    assert params["properties"]["reset_dist"]["description"].startswith("An episode fails if the cart")

@@ -130,9 +130,9 @@ def test_limits_apply_to_the_first_policy(cli, trained):
         (("nowhere",), 2, "--compare needs at least two policies, found: nowhere"),
         (("lqr", "zero"), 2, "--compare needs at least one run"),
         (("nowhere", "zero"), 5, "no run 'nowhere'"),
-        (("a", "b", "--checkpoint", "c"), 2, "as arguments"),
-        (("a", "b", "--policy", "zero"), 2, "as arguments"),
-        (("a", "b", "--record", "x.safetensors"), 2, "as arguments"),
+        (("a", "b", "--checkpoint", "c"), 2, "--compare cannot be combined with"),
+        (("a", "b", "--policy", "zero"), 2, "--compare cannot be combined with"),
+        (("a", "b", "--record", "x.safetensors"), 2, "--compare cannot be combined with"),
     ],
 )
 def test_compare_usage_errors(cli, words, code, message):

@@ -241,7 +241,7 @@ def test_mismatched_parameters_raise_value_error(env):
         observations.imu_orientation(env, **bound(env, {"entity": "robot", "sensors": "gyro"}, made))
     with pytest.raises(ValueError, match="no termination 'fel'; terminations: time_out, fell, low"):
         rewards.IsTerminatedTerm(env, terms=["fel"])
-    with pytest.raises(ValueError, match="no body 'leg'; choose from leg_fl, leg_fr"):
+    with pytest.raises(ValueError, match="no body 'leg'; its bodies: leg_fl, leg_fr"):
         rewards.GaitReward(env, std=1.0, max_err=1.0, velocity_threshold=1.0, **bound(
             env, {"entity": "robot", "sensor": "feet", "command": "velocity"}, made),
             synced_feet_pairs=(("leg", "leg_br"), ("leg_fr", "leg_bl")))  # fmt: skip

@@ -47,7 +47,7 @@ def test_list_tasks_imports_no_plugin_and_no_heavy_module(plugins, cli):
     lines = done.stdout.splitlines()
     assert lines[-1] == "0 [] []"
     assert sum("plug" in line for line in lines[:-1]) == 20
-    assert "--probe shows more" in done.stdout
+    assert "--probe` shows more" in done.stdout
 
 
 def cpu_time_of_children():

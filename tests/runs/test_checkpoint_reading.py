@@ -200,7 +200,7 @@ SHAPE = f"{HEADER}.shape"
         (edit_manifest(lambda m: m["logs"]["replay"]["shards"].reverse()), "'replay' lacks rows"),
         (log(first=5), "'replay' lacks rows"),
         (log(stop=17), "'replay' lacks rows"),
-        (shard(size=2**60), "free some memory: 'replay' needs"),
+        (shard(size=2**60), "'replay' needs"),
         (shard(sha256=DIGEST), "is corrupt: it does not match the manifest"),
         (lambda f: shutil.rmtree(f.parent / "logs"), "000000000006-000000000012.safetensors is missing"),
         (values(iteration=-1), STATE + "iteration: expected a whole number >= 0, found -1"),
@@ -288,7 +288,7 @@ def test_log_file_with_other_rows_than_its_name_is_refused(folder):
     data = safetensors.torch.save({"x": torch.zeros(6, 1), "y": torch.zeros(5)})
     file.write_bytes(data)
     shard(1, size=len(data), sha256=checkpoint_reader.sha256(data))(folder)
-    with pytest.raises(CheckpointError, match=f"{file.name} is corrupt: 'y' lacks rows"):
+    with pytest.raises(CheckpointError, match=f"{file.name} is corrupt: rows of 'y' are missing"):
         checkpoint_reader.open_checkpoint(folder).verify(whole=True)
 
 

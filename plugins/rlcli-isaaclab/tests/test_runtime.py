@@ -93,7 +93,7 @@ def test_scene_is_mapping_and_errors_list_names(env):
     assert env.scene.articulations["robot"] is env.scene["robot"]
     assert env.scene.rigid_objects == {}
     assert torch.equal(env.scene.env_origins, torch.zeros(4, 3))
-    with pytest.raises(KeyError, match="no 'terrain' in the scene; choose from robot"):
+    with pytest.raises(KeyError, match="no 'terrain' in the scene; entities and sensors: robot"):
         env.scene["terrain"]
     with pytest.raises(AttributeError, match=r"data has no 'joint_poss'; did you mean 'joint_pos"):
         env.scene["robot"].data.joint_poss  # noqa: B018
@@ -120,7 +120,7 @@ def test_managers_report_results_of_step(env):
     assert env.termination_manager.active_terms == ["time_out", "tilt", "low"]
     assert env.reward_manager.active_terms[:2] == ["alive", "fell"]
     assert env.max_episode_length_s == 0.6
-    with pytest.raises(NameProblem, match="no action 'arms'; choose from legs"):
+    with pytest.raises(NameProblem, match="no action 'arms'; actions: legs"):
         env.action_manager.get_term("arms")
     with pytest.raises(NameProblem, match="no termination 'tlit'; terminations: time_out"):
         env.termination_manager.get_term("tlit")
