@@ -16,7 +16,7 @@ from rlcli.envs.sharding.choice import number_of_workers
 from rlcli.envs.sharding.env import ShardedEnv
 from rlcli.envs.sharding.state import join_states, split_state
 from rlcli.envs.sharding.training_env import make_training_env
-from rlcli.errors import ConfigError, DivergedError, MachineError
+from rlcli.errors import ConfigError, DivergedError, MachineError, TaskError
 from rlcli.registry import find_task
 
 TASKS = [
@@ -293,3 +293,33 @@ def test_own_code_gets_several_workers_only_if_they_are_set(folder):
 def test_impossible_number_of_workers_is_a_configuration_error(folder, overrides, device, message):
     with pytest.raises(ConfigError, match=message):
         make_training_env(resolved(folder, *overrides), seed=1, device=device)
+
+
+def test_error_in_a_call_leaves_no_reply_unread(folder):
+    with both(resolved(folder), 2) as (alone, sharded):
+        for env in (alone, sharded):
+            env.reset(seed=1)
+            with pytest.raises(ValueError, match="'nothing' is not an MjData field"):
+                env.engine.field("nothing")
+        assert same(alone.engine.field("qpos"), sharded.engine.field("qpos"))
+
+
+def test_random_numbers_of_a_global_generator_are_refused_while_the_task_is_built(tmp_path):
+    (tmp_path / "task.yaml").write_text(TASK)
+    (tmp_path / "model.xml").write_text(MODEL)
+    (tmp_path / "terms.py").write_text(TERMS + "\nSIZE = torch.rand(1)\n")
+    with pytest.raises(TaskError, match="global random generator of torch"):
+        ShardedEnv(resolved(str(tmp_path)), workers=2)
+
+
+def test_state_of_all_environments_that_differs_is_refused(folder):
+    with both(resolved(folder), 2) as (_, sharded):
+        sharded.reset(seed=1)
+        sharded.state_dict()
+        sharded.call_one(8, _count_a_step)
+        with pytest.raises(TaskError, match=r"common_step.* differs between the worker processes"):
+            sharded.state_dict()
+
+
+def _count_a_step(env, row):
+    env._counters.common_step += 1

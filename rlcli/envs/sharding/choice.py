@@ -39,10 +39,8 @@ def number_of_workers(resolved: Resolved, device: str) -> int:
     if reason is None and scene.num_envs < 2 * scene.workers:
         reason = f"{scene.num_envs} environments are too few; each worker needs two"
     if reason is not None:
-        problem = resolved.problem(
-            ("scene", "workers"), f"{scene.workers} workers cannot step it: {reason}", "set it to 1"
-        )
-        raise ConfigError([problem])
+        message = f"{scene.workers} workers cannot step this task: {reason}"
+        raise ConfigError([resolved.problem(("scene", "workers"), message, "set scene.workers: 1")])
     return scene.workers
 
 

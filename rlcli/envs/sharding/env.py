@@ -177,10 +177,13 @@ class ShardedEnv(Environment):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of everything that the next steps depend on; the same as that of one process."""
-        state = join_states(self.call_all(_state))
-        # the only values of all environments: the means that curriculum terms log
-        logged = {f"workflow.curriculum.value.{name[11:]}": value for name, value in self._metric_values().items()}
-        return state | {name: mean_of(value) for name, value in logged.items() if name in state}
+        # the means that curriculum terms log are the only values of all environments
+        logged = {name.removeprefix("Curriculum/"): value for name, value in self._metric_values().items()}
+        averages = {f"workflow.curriculum.value.{name}": mean_of(value) for name, value in logged.items()}
+        states = self.call_all(_state)
+        return join_states(
+            [state | {name: averages[name] for name in averages.keys() & state.keys()} for state in states]
+        )
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Restore the state returned by `state_dict()`, of any number of processes."""
@@ -233,8 +236,11 @@ class ShardedEnv(Environment):
         """Return `function(env, *arguments)` of every shard, in order. The function is one of a module."""
         self._require_whole()
         self._workers.request(worker.CALL, (function, arguments))
-        own = function(self.local, *arguments)
-        return [own, *(value for (value,) in self._workers.replies())]
+        try:
+            own = function(self.local, *arguments)
+        finally:  # an unread reply would be taken for the next one
+            values = self._workers.replies()
+        return [own, *(value for (value,) in values)]
 
     def call_one(self, env: int, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return `function(env, row, *arguments)` of the shard that has an environment, with its row there."""

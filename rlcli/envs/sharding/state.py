@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.shard_range import Shard
+from rlcli.errors import TaskError
 
 
 def environment_dim(shapes: Sequence[torch.Size]) -> int | None:
@@ -26,8 +27,27 @@ def join(parts: Sequence[Tensor]) -> Tensor:
 
 
 def join_states(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-    """Join the states of all shards, in order."""
+    """Join the states of all shards, in order.
+
+    Raises:
+        TaskError: if a value that all environments share differs between the shards.
+    """
+    for name, value in states[0].items():
+        parts = [state.get(name) for state in states]
+        if any(part is None for part in parts) or (not _is_per_env(parts) and not _all_equal(value, parts)):
+            raise TaskError(
+                f"the state '{name}' of the task depends on all environments, and differs between the worker processes",
+                hint="set scene.workers: 1",
+            )
     return {name: join([state[name] for state in states]) for name in states[0]}
+
+
+def _is_per_env(parts: Sequence[Tensor | None]) -> bool:
+    return environment_dim([part.shape for part in parts if part is not None]) is not None
+
+
+def _all_equal(value: Tensor, parts: Sequence[Tensor | None]) -> bool:
+    return all(part is not None and torch.equal(value.nan_to_num(), part.nan_to_num()) for part in parts)
 
 
 def split_state(

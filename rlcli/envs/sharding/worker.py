@@ -8,7 +8,7 @@ import random
 import signal
 import socket
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,6 +83,7 @@ class _Worker:
     def __init__(self, channel: Channel, arrays: int) -> None:
         self._channel, self._arrays = channel, arrays
         self._env: VecEnv | None = None
+        self._check: Callable[[], None] = lambda: None
 
     def do(self, kind: bytes, content: Any) -> None:
         """Do what a message requests, and reply."""
@@ -112,18 +113,20 @@ class _Worker:
         torch.set_rng_state(job.generator_state)
         counters = map_tensors(self._arrays, counter_specs(job.shard.total))["counters"]
         shard = replace(job.shard, counters=counters[:, job.shard.rows])
-        self._number, self._has_own_code = job.number, job.has_own_code
+        self._number = job.number
+        if job.has_own_code:
+            self._check = _GlobalGenerators().require_unused
         import_again(job.files)
         resolved: Resolved = pickle.loads(job.resolved)
         self._env = make_env(resolved, seed=job.seed, shared_streams=job.shared_streams, shard=shard)
+        self._check()
 
     def _map(self, specs: Mapping[str, ArraySpec]) -> None:
         from rlcli.envs.sharding.arrays import map_tensors
         from rlcli.envs.sharding.shard_step import ShardRunner
 
         assert self._env is not None
-        check = _GlobalGenerators().require_unused if self._has_own_code else lambda: None
-        self._runner = ShardRunner(self._env, self._number, map_tensors(self._arrays, specs), self._stop, check)
+        self._runner = ShardRunner(self._env, self._number, map_tensors(self._arrays, specs), self._stop, self._check)
 
     def _stop(self, stage: Stage, content: Any) -> None:
         """Report a stage; serve calls until the main process continues the step."""
