@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from rlcli.envs.sharding.choice import ONE_WORKER
 from rlcli.errors import RlcliError
 from rlcli.training.signals import StopRequest
 
@@ -92,7 +93,7 @@ def start_command(run: Path, words: Sequence[str]) -> TrainingProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
-            env={**os.environ, STOP_WITH_PARENT: "1"},
+            env={**os.environ, STOP_WITH_PARENT: "1", ONE_WORKER: "1"},
             **group,
         )
     return TrainingProcess(run, process)

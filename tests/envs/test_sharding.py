@@ -277,6 +277,11 @@ def test_number_of_workers(task, overrides, cores, expected):
     assert found == expected
 
 
+def test_training_beside_others_gets_one_worker(monkeypatch):
+    monkeypatch.setenv("RLCLI_ONE_WORKER", "1")
+    assert number_of_workers(resolved("quadruped-flat", "sim.engine_threads=8"), "cpu") == 1
+
+
 def test_own_code_gets_several_workers_only_if_they_are_set(folder):
     many = ["scene.num_envs=4096", "sim.engine_threads=8"]
     assert number_of_workers(resolved(folder, *many), "cpu") == 1

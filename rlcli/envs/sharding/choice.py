@@ -15,6 +15,8 @@ ENVS_PER_WORKER = 256
 
 FREE_MEMORY_PER_WORKER = 1 << 30
 """Free memory for each process that `auto` starts [bytes]; a process takes about a quarter of it."""
+ONE_WORKER = "RLCLI_ONE_WORKER"
+"""Environment variable of trainings that run beside others: `auto` then uses one process."""
 FEWEST_CORES = 4
 """Fewest cores with which `auto` uses several processes: on fewer, physics already takes most of a step."""
 
@@ -34,6 +36,8 @@ def number_of_workers(resolved: Resolved, device: str) -> int:
         # a renderer for each process would need several times the memory
         has_camera = any(isinstance(sensor, CameraSensorConfig) for sensor in scene.sensors.values())
         if reason is not None or has_camera or cores < FEWEST_CORES or has_untested_code(resolved):
+            return 1
+        if ONE_WORKER in os.environ:
             return 1
         return max(1, min(cores, scene.num_envs // ENVS_PER_WORKER, available_memory() // FREE_MEMORY_PER_WORKER))
     if reason is None and scene.num_envs < 2 * scene.workers:
