@@ -19,8 +19,13 @@ class Shard:
     """Number of environments."""
     total: int
     """Number of environments of all shards."""
+    number: int = 0
+    """Index of the shard."""
+    number_of_shards: int = 1
     counters: Tensor | None = field(default=None, compare=False)
     """Lengths and indices of this shard's running episodes, written in place; None: new tensors. (2, count) int64"""
+    shared: dict[str, Tensor] = field(default_factory=dict, compare=False)
+    """Tensors that `ShardedEnv.share` has made, by name."""
 
     @property
     def rows(self) -> slice:
@@ -42,4 +47,4 @@ def split(total: int, shards: int) -> list[Shard]:
     sizes = [total // shards + (number >= shards - total % shards) for number in range(shards)]
     if shards > 1 and sizes[0] == sizes[-1]:
         sizes[0], sizes[-1] = sizes[0] - 1, sizes[-1] + 1
-    return [Shard(sum(sizes[:number]), size, sum(sizes)) for number, size in enumerate(sizes)]
+    return [Shard(sum(sizes[:number]), size, sum(sizes), number, shards) for number, size in enumerate(sizes)]

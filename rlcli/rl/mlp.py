@@ -7,6 +7,7 @@ fast, on Intel processors it is slower. numpy's expm1 is three times as fast as 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,26 @@ _AVX512 = torch.backends.cpu.get_cpu_capability() == "AVX512"
 _WORTH, _LARGE = 2**20, 64 * 64
 """Number of multiplications from which oneDNN's product is faster. A sum over samples must also have a result with
 so many elements."""
+
+
+_ROWS, _WIDE = 8192, 64
+"""Most samples of a part whose widest layer has `_WIDE` columns: with more, results leave the cache."""
+_pools: list[ThreadPoolExecutor] = []
+"""The threads of `use_threads`."""
+
+
+def use_threads(count: int) -> None:
+    """Set the number of threads that compute the outputs of `Mlp` for many samples; torch itself must use one."""
+    for pool in _pools:
+        pool.shutdown()
+    new = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,)) if count > 1 else None
+    _pools[:] = [new] if new else []
+
+
+def part_rows(layers: Iterable[nn.Module]) -> int:
+    """Return the number of samples whose intermediate results stay in the cache."""
+    widths = [layer.out_features for layer in layers if isinstance(layer, nn.Linear)]
+    return max(1, _ROWS * _WIDE // max(_WIDE, *widths))
 
 
 def _onednn() -> Callable[..., Tensor] | None:
@@ -105,7 +126,10 @@ def is_plain(layers: Iterable[nn.Module]) -> bool:
 class Mlp(nn.Sequential):
     """Multilayer perceptron that uses the fast operations of this module while autograd is off.
 
-    While autograd is on it uses torch's operations. The fast path calls no hooks of the layers.
+    While autograd is on it uses torch's operations. The fast path calls no hooks of the layers. It computes the hidden
+    layers in parts of the samples, which the threads of `use_threads` share. The parts do not depend on the number of
+    threads, and the last layer is computed for all samples at once, since the rounding of a product with one column
+    depends on the number of its rows.
     """
 
     def __init__(self, *layers: Any) -> None:
@@ -119,10 +143,35 @@ class Mlp(nn.Sequential):
             outputs: Tensor = super().forward(inputs)  # type: ignore[no-untyped-call]  # torch has no type here
             return outputs
         values = inputs.reshape(-1, inputs.shape[-1])
-        for layer in self:
-            if isinstance(layer, nn.Linear):
-                values = affine(values, layer.weight, layer.bias)
-            else:
-                linear, values = values, torch.empty_like(values)
-                FAST_ACTIVATIONS[type(layer)].forward(linear, values)
+        linears = [layer for layer in self if isinstance(layer, nn.Linear)]
+        activations = [FAST_ACTIVATIONS[type(layer)] for layer in self if not isinstance(layer, nn.Linear)]
+        if activations:
+            values = _hidden(values, linears[: len(activations)], activations)
+        if len(linears) > len(activations):
+            values = affine(values, linears[-1].weight, linears[-1].bias)
         return values.view(*inputs.shape[:-1], values.shape[-1])
+
+
+def _hidden(inputs: Tensor, linears: list[nn.Linear], activations: list[Activation]) -> Tensor:
+    """Return the outputs of layers that each have an activation. (n, d) -> (n, h)"""
+    outputs = torch.empty(len(inputs), linears[-1].out_features)
+    rows = max(512, part_rows(linears) // 512 * 512)  # with these parts the bits of a row do not depend on its part
+    starts = [rows * number for number in range(max(1, len(inputs) // rows))]
+    ends = [*starts[1:], len(inputs)]
+    inference = torch.is_inference_mode_enabled()  # a setting of each thread
+
+    def compute(start: int, end: int) -> None:
+        with torch.inference_mode(inference), torch.no_grad():
+            values = inputs[start:end]
+            for linear, activation in zip(linears, activations, strict=True):
+                values = affine(values, linear.weight, linear.bias)
+                out = outputs[start:end] if linear is linears[-1] else torch.empty_like(values)
+                activation.forward(values, out)
+                values = out
+
+    if _pools and len(starts) > 1:
+        list(_pools[0].map(compute, starts, ends))
+    else:
+        for start, end in zip(starts, ends, strict=True):
+            compute(start, end)
+    return outputs

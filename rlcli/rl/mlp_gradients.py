@@ -13,26 +13,104 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
 from torch import Tensor, nn
 
-from rlcli.rl.mlp import FAST_ACTIVATIONS, affine, input_gradient, weight_gradient
+from rlcli.rl.mlp import FAST_ACTIVATIONS, affine, input_gradient, part_rows, weight_gradient
 
-_ROWS, _WIDE = 8192, 64
-"""Most samples of a part whose widest layer has `_WIDE` columns: with more, results leave the cache."""
 _PARTS = 2
 """Parts of a large minibatch. With two networks they occupy the default number of threads, four. More parts mean
 shorter operations, and a thread waits for Python's lock between two operations."""
 OutputGradient = Callable[[slice, Tensor], tuple[Tensor, Tensor]]
 """Function of the rows of a part and of a network's outputs for them, (n, a). It returns the gradient of the loss with
-respect to the outputs, (n, a), and numbers that are summed over the parts, (m,)."""
+respect to the outputs, (n, a), and numbers that are summed over the parts: at most 3 + 2 a of the actor, one of the
+critic."""
+
+
+class PartMemory:
+    """Memory for the gradients of all parts of a minibatch, which several threads or processes fill.
+
+    Args:
+        actor: layers of the actor.
+        critic: layers of the critic.
+        rows: number of samples of the largest minibatch.
+        tensors: tensors of the shapes that `shapes` returns; None: new ones.
+    """
+
+    def __init__(
+        self,
+        actor: Iterable[nn.Module],
+        critic: Iterable[nn.Module],
+        rows: int,
+        tensors: Mapping[str, Tensor] | None = None,
+    ) -> None:
+        linears = [[layer for layer in layers if isinstance(layer, nn.Linear)] for layers in (actor, critic)]
+        self._max_rows = part_rows([*linears[0], *linears[1]])
+        # transposed, (inputs, outputs): products with few inputs are several times faster so
+        parameters = [parameter for layer in (*linears[0], *linears[1]) for parameter in (layer.weight, layer.bias)]
+        self._shapes = [parameter.t().shape for parameter in parameters]
+        self._ends = (0, 2 * len(linears[0]), len(parameters))
+        sizes = sum(shape.numel() for shape in self._shapes)
+        self._parts, self._columns = len(self.split(rows)), 3 + 2 * linears[0][-1].out_features
+        self.rows = min(rows, self._max_rows)
+        """Number of samples of the largest part."""
+        self.shapes = {"gradients": (self._parts, sizes), "numbers": (2, self._parts, self._columns)}
+        tensors = tensors or {name: torch.zeros(shape) for name, shape in self.shapes.items()}
+        self._gradients, self.numbers = tensors["gradients"], tensors["numbers"]
+        """`numbers`: the numbers of each network and part that are summed. (2, parts, columns)"""
+        self._views = [_views(row, self._shapes) for row in self._gradients]
+        self._sum = torch.zeros(sizes)
+        self._sum_views = _views(self._sum, self._shapes)
+
+    def split(self, rows: int) -> list[slice]:
+        """Return the rows of each part of a minibatch; the parts are as even as possible."""
+        parts = max(1, -(-rows // self._max_rows), min(_PARTS, 2 * rows // self._max_rows))
+        ends = [rows * number // parts for number in range(parts + 1)]
+        return [slice(start, end) for start, end in itertools.pairwise(ends)]
+
+    def tasks(self, rows: int) -> list[tuple[int, int, slice]]:
+        """Return what is to be computed for a minibatch: network (0: actor, 1: critic), part and its rows."""
+        return [(network, part, part_of) for network in range(2) for part, part_of in enumerate(self.split(rows))]
+
+    def gradients_of(self, network: int, part: int) -> list[Tensor]:
+        """Return where the gradients of a network's parameters for a part belong, transposed."""
+        return self._views[part][self._ends[network] : self._ends[network + 1]]
+
+    def sum_parts(self, rows: int, out: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Write the gradients of a minibatch; return the sums of both networks' numbers: (columns,) and ()."""
+        parts = len(self.split(rows))
+        torch.sum(self._gradients[:parts], dim=0, out=self._sum)
+        for gradient, transposed in zip(out, self._sum_views, strict=True):
+            gradient.copy_(transposed.t())
+        return self.numbers[0, :parts].sum(dim=0), self.numbers[1, :parts, 0].contiguous().sum()
+
+
+class PartGradients:
+    """Gradients of single parts of a minibatch, computed by one thread.
+
+    Args:
+        actor: layers of the actor.
+        critic: layers of the critic.
+        memory: memory for the results.
+    """
+
+    def __init__(self, actor: Iterable[nn.Module], critic: Iterable[nn.Module], memory: PartMemory) -> None:
+        self._memory, self._passes = memory, (_Passes(actor, memory.rows), _Passes(critic, memory.rows))
+
+    def compute(self, task: tuple[int, int, slice], inputs: Sequence[Tensor], losses: Sequence[OutputGradient]) -> None:
+        """Write the gradients of one of `PartMemory.tasks`. `inputs` and `losses` are those of actor and critic."""
+        network, part, rows = task
+        mlp = self._passes[network]
+        gradient, numbers = losses[network](rows, mlp.forward(inputs[network][rows]))
+        self._memory.numbers[network, part, : numbers.numel()] = numbers
+        mlp.backward(gradient, self._memory.gradients_of(network, part))
 
 
 class MlpGradients:
-    """Gradients of an actor and a critic on the same samples.
+    """Gradients of an actor and a critic on the same samples, computed by several threads.
 
     Args:
         actor: layers of the actor.
@@ -50,19 +128,9 @@ class MlpGradients:
         rows: int,
         threads: int,
     ) -> None:
-        linears = [layer for layer in (*actor, *critic) if isinstance(layer, nn.Linear)]
-        self._max_rows = max(1, _ROWS * _WIDE // max(_WIDE, *(layer.out_features for layer in linears)))
-        self._gradients = gradients
-        parts = len(self._split(rows))
-        # transposed, (inputs, outputs): products with few inputs are several times faster so
-        shapes = [parameter.t().shape for layer in linears for parameter in (layer.weight, layer.bias)]
-        self._part_gradients = torch.zeros(parts, sum(shape.numel() for shape in shapes))
-        self._part_views = [_views(row, shapes) for row in self._part_gradients]
-        self._sum = torch.zeros(self._part_gradients.shape[1])
-        self._sum_views = _views(self._sum, shapes)
-        threads = min(threads, 2 * parts)
-        rows = min(rows, self._max_rows)
-        self._scratch = [(_Passes(actor, rows), _Passes(critic, rows)) for _ in range(threads)]
+        self._gradients, self._memory = gradients, PartMemory(actor, critic, rows)
+        threads = min(threads, len(self._memory.tasks(rows)))
+        self._threads = [PartGradients(actor, critic, self._memory) for _ in range(threads)]
         self._pool = (
             ThreadPoolExecutor(threads - 1, initializer=torch.set_num_threads, initargs=(1,)) if threads > 1 else None
         )
@@ -70,39 +138,23 @@ class MlpGradients:
     def __call__(
         self, obs: Tensor, critic_obs: Tensor, actor_loss: OutputGradient, critic_loss: OutputGradient
     ) -> tuple[Tensor, Tensor]:
-        """Write the gradients of a minibatch; return the summed metrics of both losses. Inputs (n, d), (n, c)"""
-        cuts = self._split(len(obs))
-        numbers = [[torch.empty(0)] * len(cuts) for _ in range(2)]
-        tasks = deque(itertools.product(range(2), enumerate(cuts)))
+        """Write the gradients of a minibatch; return the summed numbers of both losses. Inputs (n, d), (n, c)"""
+        tasks = deque(self._memory.tasks(len(obs)))
 
-        def work(mlps: Sequence[_Passes]) -> None:
+        def work(thread: PartGradients) -> None:
             while True:
                 try:
-                    network, (part, rows) = tasks.popleft()
+                    task = tasks.popleft()
                 except IndexError:
                     return
-                mlp, inputs = mlps[network], (obs, critic_obs)[network]
-                output_gradient = (actor_loss, critic_loss)[network]
-                gradient, numbers[network][part] = output_gradient(rows, mlp.forward(inputs[rows]))
-                first = mlps[0].parameters if network else 0
-                mlp.backward(gradient, self._part_views[part][first : first + mlp.parameters])
+                thread.compute(task, (obs, critic_obs), (actor_loss, critic_loss))
 
         with torch.no_grad():
-            others = [self._pool.submit(work, mlps) for mlps in self._scratch[1:]] if self._pool else []
-            work(self._scratch[0])
+            others = [self._pool.submit(work, thread) for thread in self._threads[1:]] if self._pool else []
+            work(self._threads[0])
             for other in others:
                 other.result()
-            torch.sum(self._part_gradients[: len(cuts)], dim=0, out=self._sum)
-            for gradient, transposed in zip(self._gradients, self._sum_views, strict=True):
-                gradient.copy_(transposed.t())
-            actor_numbers, critic_numbers = (torch.stack(values).sum(dim=0) for values in numbers)
-            return actor_numbers, critic_numbers
-
-    def _split(self, rows: int) -> list[slice]:
-        """Return the rows of each part of a minibatch; the parts are as even as possible."""
-        parts = max(1, -(-rows // self._max_rows), min(_PARTS, 2 * rows // self._max_rows))
-        ends = [rows * number // parts for number in range(parts + 1)]
-        return [slice(start, end) for start, end in itertools.pairwise(ends)]
+            return self._memory.sum_parts(len(obs), self._gradients)
 
 
 class _Passes:
@@ -117,8 +169,6 @@ class _Passes:
         )
         self._inputs: list[Tensor] = []
         self._outputs: list[Tensor] = []
-        self.parameters = 2 * len(self._weights)
-        """Number of parameters."""
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Return the outputs in memory that the next call overwrites. (n, d) -> (n, outputs)"""

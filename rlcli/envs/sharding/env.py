@@ -18,7 +18,7 @@ from rlcli.envs.make import make_env
 from rlcli.envs.observers import Observers
 from rlcli.envs.shard_range import Shard, split
 from rlcli.envs.sharding import worker
-from rlcli.envs.sharding.arrays import map_tensors
+from rlcli.envs.sharding.arrays import ArraySpec, map_tensors
 from rlcli.envs.sharding.engine import ShardedEngine, sums
 from rlcli.envs.sharding.shard_step import (
     SLOTS,
@@ -78,15 +78,17 @@ class ShardedEnv(Environment):
             first = replace(self._shards[0], counters=counters[:, self._shards[0].rows])
             self._local = make_env(parts[0], seed=seed, shared_streams=shared_streams, shard=first)
             self._workers.replies()
-            specs = array_specs(self.local, total, workers)
-            self._workers.request(worker.MAP, specs)
-            self._arrays = map_tensors(self._workers.arrays, specs)
+            self._specs = array_specs(self.local, total, workers)
+            self._workers.request(worker.MAP, self._specs)
+            self._arrays = map_tensors(self._workers.arrays, self._specs)
             self._workers.replies()
         except BaseException:
             self._workers.close()
             raise
         self._runner = ShardRunner(self.local, 0, self._arrays, self._reach)
-        self._command = self._arrays["command"].numpy()
+        self._command, self._counts, self._seconds = (
+            self._arrays[name].numpy() for name in ("command", "counts", "seconds")
+        )
         self._columns: list[Columns | None] = [None] * workers
         self._slot = 0
         self._episodes: Episodes | None = None
@@ -143,13 +145,13 @@ class ShardedEnv(Environment):
             self._runner.step()
         slot = self._slot
         final_obs = None
-        if bool(arrays["counts"][:, 1].any()):
+        if self._counts[:, 1].any():
             final_obs = {group: arrays[f"final.{group}"] for group in self.layout.observations}
         reward, terminated, truncated = (arrays[name][slot] for name in ("reward", "terminated", "truncated"))
         if not self.observers.on_step:
             self._read_episodes()
         obs = self._obs()
-        self.seconds["physics"] = float(arrays["seconds"][:, 0].mean())
+        self.seconds["physics"] = float(self._seconds[:, 0].mean())
         self.seconds["step"] += time.perf_counter() - start
         return StepResult(obs, reward, terminated, truncated, final_obs, self._episodes)
 
@@ -231,6 +233,16 @@ class ShardedEnv(Environment):
         self.local.close()
 
     # --- calls of functions in the processes of the shards ---
+
+    def share(self, specs: Mapping[str, ArraySpec]) -> dict[str, Tensor]:
+        """Return new tensors, zeros, that all processes share; in each process they are in `VecEnv.shard.shared`."""
+        self._require_whole()
+        self._specs = {**self._specs, **specs}
+        self._workers.request(worker.SHARE, (self._specs, list(specs)))
+        tensors = map_tensors(self._workers.arrays, self._specs)
+        self._workers.replies()
+        self.local.shard.shared.update({name: tensors[name] for name in specs})
+        return self.local.shard.shared
 
     def call_all(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
         """Return `function(env, *arguments)` of every shard, in order. The function is one of a module."""

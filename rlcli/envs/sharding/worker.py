@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rlcli.envs.sharding.shard_step import Stage
     from rlcli.envs.vec_env import VecEnv
 
-BUILD, MAP, STEP, RESET, LOAD, CALL, CONTINUE = b"b", b"m", b"s", b"r", b"l", b"c", b"g"
+BUILD, MAP, SHARE, STEP, RESET, LOAD, CALL, CONTINUE = b"b", b"m", b"h", b"s", b"r", b"l", b"c", b"g"
 """Messages of the main process."""
 READY, STOPPED, VALUE, ERROR = b"y", b"t", b"v", b"e"
 """Messages of a worker: the shard is built; it stopped at a stage; the value of a call; an error."""
@@ -98,6 +98,9 @@ class _Worker:
         elif kind == BUILD:
             self._build(content)
             self._channel.send(READY)
+        elif kind == SHARE:
+            self._share(*content)
+            self._channel.send(READY)
         else:
             self._map(content)
             self._channel.send(READY)
@@ -127,6 +130,13 @@ class _Worker:
 
         assert self._env is not None
         self._runner = ShardRunner(self._env, self._number, map_tensors(self._arrays, specs), self._stop, self._check)
+
+    def _share(self, specs: Mapping[str, ArraySpec], names: list[str]) -> None:
+        from rlcli.envs.sharding.arrays import map_tensors
+
+        assert self._env is not None
+        tensors = map_tensors(self._arrays, specs)
+        self._env.shard.shared.update({name: tensors[name] for name in names})
 
     def _stop(self, stage: Stage, content: Any) -> None:
         """Report a stage; serve calls until the main process continues the step."""

@@ -16,7 +16,8 @@ Where a minimum or a maximum has two equal arguments, each gets half of the grad
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -33,6 +34,23 @@ _HALF = torch.tensor(0.5)
 
 MinibatchGradient = Callable[[PpoConfig, Samples, Tensor, Tensor, Tensor, Tensor], LossResult]
 """Function that computes the loss of a minibatch and writes its gradient; for its arguments see `minibatch_loss`."""
+
+
+class LayerGradients(Protocol):
+    """Computation of the gradients of the layers of both networks."""
+
+    def __call__(self, obs: Tensor, critic_obs: Tensor, objective: Objective) -> tuple[Tensor, Tensor]:
+        """Write the gradients; return the sums that `Objective`'s functions return. Inputs (n, d), (n, c)"""
+
+
+def threaded_gradients(networks: ActorCritic, rows: int, threads: int) -> Callable[[Sequence[Tensor]], LayerGradients]:
+    """Return the computation of `LayerGradients` by threads of this process."""
+
+    def make(gradients: Sequence[Tensor]) -> LayerGradients:
+        mlps = MlpGradients(networks.actor, networks.critic, gradients, rows, threads)
+        return lambda obs, critic_obs, o: mlps(obs, critic_obs, o.mean_gradient, o.value_gradient)
+
+    return make
 
 
 class AutogradGradient:
@@ -70,8 +88,7 @@ class ClosedFormGradient:
         networks: actor and critic for which `has_closed_form` is true.
         out: vector for the gradient and, after it, the KL divergence.
         slices: parameter name -> slice of its gradient in `out`.
-        rows: number of samples of the largest minibatch.
-        threads: number of threads that share the work.
+        compute: what computes the gradients of the layers: threads or processes.
     """
 
     def __init__(
@@ -79,15 +96,14 @@ class ClosedFormGradient:
         networks: ActorCritic,
         out: Tensor,
         slices: Mapping[str, slice],
-        rows: int,
-        threads: int,
+        compute: Callable[[Sequence[Tensor]], LayerGradients],
     ) -> None:
         self._networks, self._out = networks, out
         parameters = dict(networks.named_parameters())
         gradients = {name: out[part].view_as(parameters[name]) for name, part in slices.items()}
         (name,) = (name for name in gradients if name.endswith("_std"))
         self._std_gradient = gradients.pop(name)
-        self._mlps = MlpGradients(networks.actor, networks.critic, list(gradients.values()), rows, threads)
+        self._compute = compute(list(gradients.values()))
 
     def __call__(
         self, config: PpoConfig, batch: Samples, obs: Tensor, critic_obs: Tensor, advantage: Tensor, old_std: Tensor
@@ -96,8 +112,8 @@ class ClosedFormGradient:
         networks = self._networks
         with torch.no_grad():
             std, policy_entropy = networks.std, entropy(networks.std)
-            objective = _Objective(config, batch, advantage, std)
-            sums = self._mlps(obs, critic_obs, objective.mean_gradient, objective.value_gradient)
+            objective = Objective(config, batch, advantage, std, torch.empty_like(batch.mean))
+            sums = self._compute(obs, critic_obs, objective)
             actor_means, value_loss = (values / len(advantage) for values in sums)
             losses, log_std_gradient, distance = actor_means.split_with_sizes([3, len(std), len(std)])
             surrogate, clip_fraction, bounds = losses
@@ -111,14 +127,20 @@ class ClosedFormGradient:
         return LossResult(loss, metrics, objective.mean, std)
 
 
-class _Objective:
-    """Loss of a minibatch as a function of the networks' outputs, with the gradient with respect to the outputs."""
+class Objective:
+    """Loss of a minibatch as a function of the networks' outputs, with the gradient with respect to the outputs.
 
-    def __init__(self, config: PpoConfig, batch: Samples, advantage: Tensor, std: Tensor) -> None:
-        self._config, self._batch, self._advantage, self._std = config, batch, advantage, std
+    Args:
+        config: configuration of the agent.
+        batch: the minibatch.
+        advantage: advantages, standardized if the agent does so. (n,)
+        std: standard deviation of the policy. (a,)
+        mean: memory for the outputs of the actor. (n, a)
+    """
+
+    def __init__(self, config: PpoConfig, batch: Samples, advantage: Tensor, std: Tensor, mean: Tensor) -> None:
+        self._config, self.batch, self.advantage, self.std, self.mean = config, batch, advantage, std, mean
         self._mean_scale = 1.0 / (std * len(advantage))
-        self.mean = torch.empty_like(batch.mean)
-        """Outputs of the actor. (n, a)"""
 
     def mean_gradient(self, rows: slice, mean: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gradient of the actor's outputs, as `rlcli.rl.mlp_gradients.OutputGradient`.
@@ -126,30 +148,30 @@ class _Objective:
         The summed numbers are surrogate, number of clipped ratios, bounds loss, (3,); gradients of the log std, (a,);
         and squared distances between old and new mean, (a,).
         """
-        config, batch = self._config, self._batch
+        config, batch = self._config, self.batch
         self.mean[rows] = mean
         distance = (batch.mean[rows] - mean).square_().sum(dim=0)
-        noise = (batch.action[rows] - mean).div_(self._std)
+        noise = (batch.action[rows] - mean).div_(self.std)
         surrogate, clipped, log_prob_gradient, log_std_gradient = self._surrogate(rows, noise)
         gradient = noise.mul_(log_prob_gradient[:, None]).mul_(self._mean_scale)  # dlog pi/dmean = z / std
         bounds = torch.zeros(())
         if config.bounds_coef:
             excess = (mean.abs() - config.bounds_margin).clamp_(min=0.0)
             bounds = excess.square().sum()
-            gradient += excess.mul_(mean.sign()).mul_(2.0 * config.bounds_coef / len(self._advantage))
+            gradient += excess.mul_(mean.sign()).mul_(2.0 * config.bounds_coef / len(self.advantage))
         return gradient, torch.cat((torch.stack((surrogate, clipped, bounds)), log_std_gradient, distance))
 
     def value_gradient(self, rows: slice, value: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gradient of the critic's outputs, as `OutputGradient`; the summed number is the squared error."""
-        config, value, old_value = self._config, value.squeeze(-1), self._batch.value[rows]
-        error = value - self._batch.target[rows]
+        config, value, old_value = self._config, value.squeeze(-1), self.batch.value[rows]
+        error = value - self.batch.target[rows]
         if config.clip_value is None:
             gradient, square = error, error.square()
         else:
             limit = config.clip_value_range or config.clip_range
             change = value - old_value
             within = change.clamp(-limit, limit)
-            clipped = old_value + within - self._batch.target[rows]
+            clipped = old_value + within - self.batch.target[rows]
             # within the range `clipped` equals `error` except for rounding and has its gradient; outside it is constant
             gradient, square = torch.where(change == within, clipped, 0.0), clipped.square()
             if config.clip_value == "larger":
@@ -157,12 +179,12 @@ class _Objective:
                 gradient = torch.lerp(gradient, error, _share_of_minimum(square, plain))
                 square = torch.max(plain, square)
         # `gradient` is half the derivative of `square`
-        return gradient.mul_(2.0 * config.value_coef / len(self._advantage))[:, None], square.sum()
+        return gradient.mul_(2.0 * config.value_coef / len(self.advantage))[:, None], square.sum()
 
     def _surrogate(self, rows: slice, noise: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the surrogate loss (equation 7), the number of clipped ratios, and dL/dlog pi and dL/dlog std."""
-        limit, advantage, square = self._config.clip_range, self._advantage[rows], noise.square()
-        ratio = (log_prob(noise, self._std) - self._batch.log_prob[rows]).exp_()
+        limit, advantage, square = self._config.clip_range, self.advantage[rows], noise.square()
+        ratio = (log_prob(noise, self.std) - self.batch.log_prob[rows]).exp_()
         within = ratio.clamp(1.0 - limit, 1.0 + limit)
         plain, bounded, clipped = advantage * ratio, advantage * within, ratio != within
         # dr/dlog pi = r, so dL_clip/dlog pi = r A = `plain` where the minimum is not the clipped product

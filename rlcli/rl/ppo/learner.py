@@ -7,6 +7,7 @@ CUDA graph and replay it. `metrics` reads one small tensor.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -14,7 +15,14 @@ from torch import Tensor
 from rlcli.rl.nan_check import require_finite, require_finite_learner
 from rlcli.rl.ppo.collector import Collector
 from rlcli.rl.ppo.compile import compile_update, tf32_matmul
-from rlcli.rl.ppo.gradient import AutogradGradient, ClosedFormGradient, MinibatchGradient, has_closed_form
+from rlcli.rl.ppo.gradient import (
+    AutogradGradient,
+    ClosedFormGradient,
+    LayerGradients,
+    MinibatchGradient,
+    has_closed_form,
+    threaded_gradients,
+)
 from rlcli.rl.ppo.loss import KL, METRICS, LossResult, UpdateFunctions, standardize
 from rlcli.rl.ppo.networks import adam, flatten, unroll
 from rlcli.rl.ppo.rollout_buffer import Samples
@@ -61,13 +69,22 @@ class Learner:
         if mode:
             self.functions = compile_update(self.functions, self._call_all, tuned=mode == "tuned")
         if not mode and has_closed_form(self._networks):
-            rows = max(len(minibatch.target) for minibatch in collector.rollout.minibatches)
-            self.minibatch_gradient = ClosedFormGradient(
-                self._networks, self.gradient_and_kl, slices, rows, torch_threads
-            )
+            compute = self._gradient_computation(torch_threads)
+            self.minibatch_gradient = ClosedFormGradient(self._networks, self.gradient_and_kl, slices, compute)
             self.torch_threads = 1
         else:
             self.minibatch_gradient = AutogradGradient(self._networks, self.gradient_and_kl, self.functions.loss)
+
+    def _gradient_computation(self, threads: int) -> Callable[[Sequence[Tensor]], LayerGradients]:
+        """Return what computes the gradients of the layers: the processes of the environment, or threads."""
+        env, rollout = self.collector.env, self.collector.rollout
+        if env.workers > 1:
+            from rlcli.envs.sharding.env import ShardedEnv
+            from rlcli.rl.ppo.gradient_processes import distributed_gradients
+
+            assert isinstance(env, ShardedEnv)
+            return distributed_gradients(env, self._networks, self.weights, self.config, rollout)
+        return threaded_gradients(self._networks, max(rollout.sizes), threads)
 
     def update(self) -> None:
         """Estimate the advantages, then optimise actor and critic."""

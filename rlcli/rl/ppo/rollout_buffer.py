@@ -61,11 +61,10 @@ class RolloutBuffer:
     ) -> None:
         obs, critic_obs, action = sizes
         self._packed = torch.zeros(steps, envs, obs + critic_obs + 2 * action + 5, device=device)
-        self._ordered = torch.zeros(self._packed.shape[0] * envs, self._packed.shape[2], device=device)
+        self.columns, self.sizes = sizes, minibatches
         self.samples = Samples.views(self._packed, *sizes)
         """(num_steps, num_envs, ...)"""
-        self.minibatches = [Samples.views(part, *sizes) for part in self._ordered.split_with_sizes(minibatches)]
-        """(n, ...) each"""
+        self.move(torch.zeros(self._packed.shape[0] * envs, self._packed.shape[2], device=device))
         self.old_std = torch.ones(len(minibatches), action, device=device)
         """Standard deviation of the old policy, for each minibatch; its mean is `Samples.mean`. (minibatches, a)"""
         self.reward = torch.zeros(steps, envs, device=device)
@@ -81,6 +80,12 @@ class RolloutBuffer:
         parts = self._indices[0].split_with_sizes([size // steps for size in minibatches]) if whole_envs else ()
         self.environments = [part.clone() for part in parts]
         """Environments of each minibatch; empty without `whole_envs`. (n,) each"""
+
+    def move(self, memory: Tensor) -> None:
+        """Use other memory for the samples in the order of the minibatches. (num_steps * num_envs, ...)"""
+        self.ordered = memory
+        self.minibatches = [Samples.views(part, *self.columns) for part in memory.split_with_sizes(self.sizes)]
+        """(n, ...) each"""
 
     def is_finite(self) -> bool:
         """Return whether all samples are finite."""
@@ -112,4 +117,4 @@ class RolloutBuffer:
 
     def fill_minibatches(self, order: Tensor) -> None:
         """Copy the samples into the minibatches; sample (t, env) has index t * num_envs + env."""
-        torch.index_select(self._packed.view(self._ordered.shape), 0, order, out=self._ordered)
+        torch.index_select(self._packed.view(self.ordered.shape), 0, order, out=self.ordered)

@@ -18,6 +18,7 @@ from rlcli.random import derive
 from rlcli.rl import distributed
 from rlcli.rl.budget import remaining_budget
 from rlcli.rl.cuda_graph import capture_on_gpu
+from rlcli.rl.mlp import use_threads
 from rlcli.rl.nan_check import require_finite
 from rlcli.rl.optimizers import below
 from rlcli.rl.ppo.collector import Collector
@@ -52,6 +53,7 @@ class PpoTrainer(BaseTrainer):
         self.spec = policy_spec(env, config)
 
         torch.set_num_threads(torch_threads)
+        use_threads(max(torch_threads, env.workers) if device == "cpu" else 1)
         seed_generators(derive(seed, "trainer"))
         self.networks = ActorCritic(env, config, groups).to(self.device)
         # all ranks start with equal weights and explore with different noise

@@ -18,7 +18,7 @@ from rlcli.rl.mlp import Mlp, is_plain
 from rlcli.rl.mlp_gradients import MlpGradients
 from rlcli.rl.policy import ACTIVATIONS
 from rlcli.rl.ppo.config import PpoConfig
-from rlcli.rl.ppo.gradient import AutogradGradient, ClosedFormGradient, _Objective
+from rlcli.rl.ppo.gradient import AutogradGradient, ClosedFormGradient, Objective
 from rlcli.rl.ppo.loss import minibatch_loss
 from rlcli.rl.ppo.rollout_buffer import Samples
 from rlcli.rl.ppo.trainer import PpoTrainer
@@ -182,7 +182,7 @@ def test_output_gradients_match_autograd_at_clipping_edges(clip_value, clip_valu
     result = minibatch_loss(networks, config, batch, zeros, zeros, advantage, torch.ones(1))
     expected = torch.autograd.grad(result.loss, (mean, value, std))
     with torch.no_grad():
-        objective = _Objective(config, batch, advantage, std.detach())
+        objective = Objective(config, batch, advantage, std.detach(), torch.empty_like(batch.mean))
         of_mean, numbers = objective.mean_gradient(slice(0, count), mean.detach())
         of_value, _ = objective.value_gradient(slice(0, count), value.detach())
     of_std = numbers[3:4] / count
@@ -215,7 +215,8 @@ def compute_gradients(actor, critic, rows, threads):
     def of_value(_, value):
         return value / rows, torch.tensor([float(len(value))])
 
-    sums = torch.cat(MlpGradients(actor, critic, gradients, rows, threads)(obs, critic_obs, of_mean, of_value))
+    of_actor, of_critic = MlpGradients(actor, critic, gradients, rows, threads)(obs, critic_obs, of_mean, of_value)
+    sums = torch.cat((of_actor[:2], of_critic[None]))
     twins = actor.double(), critic.double()
     loss = twins[0](obs.double()).sin().sum() + 0.5 * twins[1](critic_obs.double()).square().sum()
     expected = torch.autograd.grad(loss / rows, [*twins[0].parameters(), *twins[1].parameters()])
