@@ -264,8 +264,9 @@ def test_workers_import_no_file_of_the_current_folder(folder, tmp_path):
     ("task", "overrides", "cores", "expected"),
     [
         ("cartpole", ["scene.num_envs=1024"], 1, 1),
-        ("cartpole", ["scene.num_envs=1024"], 16, 4),
-        ("cartpole", ["scene.num_envs=1024"], 2, 1),
+        ("cartpole", ["scene.num_envs=1024"], 16, 1),
+        ("cartpole", ["scene.num_envs=2048"], 16, 4),
+        ("cartpole", ["scene.num_envs=4096"], 2, 1),
         ("quadruped-flat", [], 8, 8),
         ("quadruped-flat", ["scene.workers=3"], 16, 3),
         ("cartpole-camera", ["scene.num_envs=4096"], 16, 1),

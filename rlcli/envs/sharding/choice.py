@@ -10,8 +10,10 @@ from rlcli.envs.sharding.untested_code import has_untested_code
 from rlcli.errors import ConfigError
 from rlcli.machine import available_cores, available_memory
 
-ENVS_PER_WORKER = 256
-"""Smallest number of environments for which a further process pays: below it, its fixed cost per step outweighs it."""
+ENVS_PER_WORKER = 512
+"""Number of environments for which a further process pays: below it, the fixed cost of its step outweighs it."""
+FEWEST_WORKERS = 4
+"""Fewest processes that `auto` uses: two or three are not faster than one whose engine uses all cores."""
 
 FREE_MEMORY_PER_WORKER = 1 << 30
 """Free memory for each process that `auto` starts [bytes]; a process takes about a quarter of it."""
@@ -39,7 +41,8 @@ def number_of_workers(resolved: Resolved, device: str) -> int:
             return 1
         if ONE_WORKER in os.environ:
             return 1
-        return max(1, min(cores, scene.num_envs // ENVS_PER_WORKER, available_memory() // FREE_MEMORY_PER_WORKER))
+        count = min(cores, scene.num_envs // ENVS_PER_WORKER, available_memory() // FREE_MEMORY_PER_WORKER)
+        return count if count >= FEWEST_WORKERS else 1
     if reason is None and scene.num_envs < 2 * scene.workers:
         reason = f"{scene.num_envs} environments are too few; each worker needs two"
     if reason is not None:
