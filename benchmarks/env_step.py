@@ -30,10 +30,27 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.registry import find_task
 
 NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
-TASKS = (
-    "ant ant-direct ball-balance biped-velocity cart-double-pendulum cartpole cartpole-direct crazyflie hand-reorient humanoid"
-    " humanoid-direct ingenuity lift-cube open-drawer quadcopter quadruped-flat quadruped-rough reach reach-ik"
-).split()
+TASKS = [
+    "ant",
+    "ant-direct",
+    "ball-balance",
+    "biped-velocity",
+    "cart-double-pendulum",
+    "cartpole",
+    "cartpole-direct",
+    "crazyflie",
+    "hand-reorient",
+    "humanoid",
+    "humanoid-direct",
+    "ingenuity",
+    "lift-cube",
+    "open-drawer",
+    "quadcopter",
+    "quadruped-flat",
+    "quadruped-rough",
+    "reach",
+    "reach-ik",
+]
 """All built-in tasks but cartpole-camera, which renders pictures."""
 
 

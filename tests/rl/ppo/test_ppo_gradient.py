@@ -332,3 +332,19 @@ def test_training_does_not_depend_on_threads(make_trainer):
         trainer.iterate()
         ends.append(trainer.learner.weights.detach().clone())
     assert torch.equal(*ends)
+
+
+@pytest.mark.parametrize("rows", [100, 1500, 5003])
+def test_outputs_of_many_samples_do_not_depend_on_threads(rows):
+    torch.manual_seed(2)
+    network = mlp.Mlp(nn.Linear(9, 512), nn.ELU(), nn.Linear(512, 64), nn.ELU(), nn.Linear(64, 3))
+    inputs, found = torch.randn(rows, 9), []
+    try:
+        for threads in (1, 3):
+            mlp.use_threads(threads)
+            with torch.no_grad():
+                found.append(network(inputs))
+    finally:
+        mlp.use_threads(1)
+    assert torch.equal(*found)
+    torch.testing.assert_close(found[0], network(inputs).detach(), rtol=1e-5, atol=1e-5)
