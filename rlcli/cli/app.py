@@ -217,7 +217,10 @@ def _hint_for_option(name: str, arguments: list[str]) -> str | None:
 
 
 def _matching_settings(option: str) -> list[str]:
-    """Return the settings that an option without its dashes may mean: a full key, or the last part of one to three."""
+    """Return the settings that the user may mean by an unknown option: its name is a key, or the last part of a key.
+
+    The list is empty if more than three keys end with the name.
+    """
     name = option.replace("-", "_")
     if "." in name.strip("."):
         return [name]

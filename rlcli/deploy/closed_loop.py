@@ -391,7 +391,10 @@ class _PlainMujocoRunner:
         for name in ("nq", "nv", "nu", "na", "nbody", "nsensordata"):
             written, wanted = getattr(model, name), getattr(own, name)
             if written != wanted:
-                raise CheckpointError(f"export again: {name} is {written} in the file and {wanted} in the run")
+                raise CheckpointError(
+                    f"the exported model does not fit the run: {name} is {written} in the file and {wanted} in the run;"
+                    " export the policy again"
+                )
 
 
 def _metadata_error(error: Exception) -> CheckpointError:

@@ -327,7 +327,10 @@ def _check_state(values: dict[str, Any], step: int, file: Path) -> None:
     check_json(_State, values, file)
     if values.get("env_steps", step) != step:
         found = values["env_steps"]
-        raise CheckpointError(f"{file} is corrupt: it has step {found}, the manifest step {step}; use RUN@step:N")
+        raise CheckpointError(
+            f"{file} is corrupt: its step is {found}, but manifest.json has step {step};"
+            " choose another checkpoint with RUN@step:N"
+        )
     for key, entry in values.items():
         if key.partition(".")[0] == "statistics":
             check_json(_Statistics, entry, file, key)

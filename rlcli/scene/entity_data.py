@@ -118,7 +118,10 @@ class EntityData:
         return self._default_vel.of(self.default_joint_vel, joints)
 
     def read_default_joints(self, selection: Selection, joints: Columns = ALL) -> tuple[Tensor, Tensor]:
-        """Return default positions and velocities of some joints, with the limits of `read_view`. (rows, k) each"""
+        """Return the default positions and velocities of some joints for the selected environments. (rows, k) each
+
+        Do not write to the tensors: they may be views.
+        """
         position, velocity = self.default_joint_pos, self.default_joint_vel
         if not isinstance(joints, slice):
             return selection.read_view(position, joints), selection.read_view(velocity, joints)

@@ -55,7 +55,7 @@ class SceneJoints:
                         self._add_actuator(need.entity, names[position], need.kind)
 
     def add_motors(self) -> None:
-        """Add a motor to every hinge and slide without an actuator: a direct task may set any effort."""
+        """Add a motor to every hinge and slide joint that has no actuator, so that a direct task can apply efforts."""
         driven = {actuator.target for actuator in self._spec.actuators}
         for entity in self._entities:
             for joint in self._joint_names(entity):

@@ -69,7 +69,7 @@ class BatchState(BatchModel):
             self._default[self.state_layout.columns(name)] = values.numpy()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the state rows, of the warning counters and of the expanded model fields."""
+        """Return copies of the state rows, the warning counters and the model fields with a value for each world."""
         return {
             "state": self._state.clone(),
             "warning": torch.from_numpy(np.array(self._batch.warning)),

@@ -56,7 +56,7 @@ class EngineView(Protocol):
         """
 
     def expanded_fields(self) -> list[str]:
-        """Return the names of the model fields that have been expanded."""
+        """Return the names of the model fields that have a value for each world."""
 
 
 class ReplayableView(EngineView, Protocol):
@@ -116,10 +116,10 @@ class Engine(EngineView, Protocol):
         """
 
     def expanded(self, name: str) -> Tensor | None:
-        """Return a model field that has been expanded; None if all worlds share the model's value."""
+        """Return a model field that has a value for each world; None if all worlds share the model's value."""
 
     def set_constants(self, selection: Selection | None = None) -> None:
-        """Recompute the constants that MuJoCo derives from model fields, after a write to expanded fields.
+        """Recompute the constants that MuJoCo derives from model fields, after a write to fields with own values.
 
         Args:
             selection: the worlds; None: all. An `asynchronous` engine always recomputes all worlds.

@@ -75,11 +75,11 @@ class WarpModel:
         return self._expanded[name]
 
     def expanded(self, name: str) -> Tensor | None:
-        """Return a model field that has been expanded; None if all worlds share the model's value."""
+        """Return a model field that has a value for each world; None if all worlds share the model's value."""
         return self._expanded.get(name)
 
     def expanded_fields(self) -> list[str]:
-        """Return the names of the model fields that have been expanded."""
+        """Return the names of the model fields that have a value for each world."""
         return list(self._expanded)
 
     def set_constants(self, selection: Selection | None = None) -> None:

@@ -79,7 +79,7 @@ class WarpState(WarpModel):
         return self._fields[name]
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the state, of bound inputs and of the expanded model fields."""
+        """Return copies of the state, of bound inputs and of the model fields with a value for each world."""
         inputs = [name for name in INPUTS if name in self._fields]
         return {
             **{name: self.field(name).clone() for name in (*STATE, *inputs)},

@@ -1,4 +1,4 @@
-"""Job of a training: an open run, its configuration and its start. The module imports nothing heavy."""
+"""`Job`: everything that a training needs to know before it starts. The module imports neither torch nor MuJoCo."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Job:
     init_from: Path | None = None
     """Folder of the checkpoint whose weights the policy starts with."""
     stages: list[int] = field(default_factory=list)
-    """Iterations after which a checkpoint is saved; training ends at the last. They replace the agent's budget and its
-    rule for the checkpoints to keep."""
+    """Iterations after which a checkpoint is saved; training ends after the last one. If this list is not empty, the
+    agent's `max_iterations`, `max_steps`, `save_interval` and `keep_*` have no effect."""
     config: str | None = None
     """New content of a resumed run's `config.yaml`, if its budget changes."""
     video_every: int = 0

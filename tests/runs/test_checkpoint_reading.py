@@ -207,7 +207,7 @@ SHAPE = f"{HEADER}.shape"
         (values(updates=1.5), STATE + "updates: expected a whole number, found 1.5"),
         (values(processes="x" * 100), f"processes: expected a whole number, found '{'x' * 56}..."),
         (values(rnd_updates=None), "rnd_updates: expected a whole number, found null"),
-        (values(env_steps=299), "it has step 299, the manifest step 300"),
+        (values(env_steps=299), "its step is 299, but manifest.json has step 300"),
         (values(learning_rate=-1e-9), "learning_rate: expected a number >= 0, found -1e-09"),
         (values(learning_rate=1e6), "learning_rate: expected a number < 1e+06, found 1000000.0"),
         (values(learning_rate=True), "learning_rate: expected a number, found true"),

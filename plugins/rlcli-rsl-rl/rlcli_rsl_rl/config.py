@@ -137,8 +137,8 @@ class SymmetryConfig(StrictModel):
 
     data_augmentation_func: str
     """`module:function` of the task's package or a plugin's, or `file.py:function` beside the task, called as
-    `f(env=, obs=, actions=)`: the samples and, after them, their mirror images; `obs` or `actions` may be None.
-    `env.unwrapped` is rlcli's."""
+    `f(env=, obs=, actions=)`. It returns the observations and the actions with their mirror images appended. `obs` or
+    `actions` may be None. `env.unwrapped` is rlcli's environment."""
     use_data_augmentation: bool = False
     """Also train on mirrored samples."""
     use_mirror_loss: bool = False

@@ -90,7 +90,7 @@ class ShardedEngine:
         return torch.cat(self._shards.call_all(_field, name))
 
     def expanded_fields(self) -> list[str]:
-        """Return the names of the model fields that have been expanded."""
+        """Return the names of the model fields that have a value for each world."""
         return self._local.expanded_fields()
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
