@@ -39,7 +39,7 @@ def default_root_state(entity: Entity) -> Tensor:
     if entity.root_qpos is not None:
         pose = model.qpos0[entity.root_qpos : entity.root_qpos + 7]
     elif not entity.root_body:  # the entity has no body, only geoms of the world
-        pose = np.concatenate([entity.config.pos, entity.config.quat])
+        pose = np.concatenate([entity.config.pos or np.zeros(3), entity.config.quat or [1.0, 0.0, 0.0, 0.0]])
     else:
         body = entity.root_body
         pose = np.concatenate([model.body_pos[body], model.body_quat[body]])

@@ -30,7 +30,7 @@ TASK = {
         "num_envs": 3,
         "entities": {
             "low": {"model": "low.xml"},
-            "high": {"model": "high.xml", "pos": [0.0, 0.0, 0.2]},
+            "high": {"model": "high.xml", "pos": [0.0, 0.0, 0.3]},
             "robot": {"model": "cart.xml"},
         },
     },
@@ -94,8 +94,8 @@ def test_contact_force_includes_friction(tmp_path, engine):
 
 def test_contact_slots_have_order_of_configuration(tmp_path):
     task = edited(dump(TASK), scene={"entities": {
-        "left": {"model": "low.xml", "pos": [-0.12, 0.0, 0.0]},
-        "right": {"model": "low.xml", "pos": [0.12, 0.0, 0.0]},
+        "left": {"model": "low.xml", "pos": [-0.12, 0.0, 0.1]},
+        "right": {"model": "low.xml", "pos": [0.12, 0.0, 0.1]},
         "plank": {"model": "plank.xml", "pos": [0.0, 0.0, 0.225]},
         "robot": {"model": "cart.xml"},
     }, "sensors": {
@@ -130,7 +130,7 @@ def test_contact_forces_of_several_partners_are_summed(tmp_path):
 @MANY_STEPS
 def test_air_and_contact_times_count_steps(tmp_path, engine):
     """Drop a box from 0.2 m: it falls for sqrt(2 h / g) = 0.202 s, in steps of 0.02 s."""
-    entities = {"low": {"pos": [0.0, 0.0, 0.2]}, "high": {"pos": [9.0, 0.0, 0.0]}}
+    entities = {"low": {"pos": [0.0, 0.0, 0.3]}, "high": {"pos": [9.0, 0.0, 0.1]}}
     env = boxes(tmp_path, {"box": contact(entity="low", bodies="box", history=3)}, f"sim.engine={engine}",
                 *(f"scene.entities.{n}.pos={e['pos']}" for n, e in entities.items()))  # fmt: skip
     sensor = env.sensors["box"]

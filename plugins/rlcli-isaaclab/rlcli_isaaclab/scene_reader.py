@@ -200,9 +200,10 @@ class SceneReader:
         init = item.node("init_state")
         position = [as_float(v) for v in init.get("pos", (0.0, 0.0, 0.0))]
         rotation = [as_float(v) for v in init.get("rot", (1.0, 0.0, 0.0, 0.0))]
-        if any(position):
+        root_position, root_rotation = self._models.get(name, {}).get("root") or (None, None)
+        if position != root_position:
             entity["pos"] = position
-        if rotation != [1.0, 0.0, 0.0, 0.0]:
+        if rotation != root_rotation:
             entity["quat"] = rotation
         self._read_joint_state(name, entity, init)
         self._read_root_velocity(entity, init)
@@ -269,6 +270,7 @@ class SceneReader:
         self._models[name] = {
             "joint": names,
             "body": [compiled.body(b).name for b in range(1, compiled.nbody)],  # body 0 is the world
+            "root": (compiled.body_pos[1].tolist(), compiled.body_quat[1].tolist()) if compiled.nbody > 1 else None,
             "damping": dict(zip(names, compiled.dof_damping[dofs].tolist(), strict=True)),
             "armature": dict(zip(names, compiled.dof_armature[dofs].tolist(), strict=True)),
             "friction_loss": dict(zip(names, compiled.dof_frictionloss[dofs].tolist(), strict=True)),

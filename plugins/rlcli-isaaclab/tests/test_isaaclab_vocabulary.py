@@ -186,7 +186,7 @@ def articulation(name, **more):
 @configclass
 class SceneCfg(InteractiveSceneCfg):
     ground = TerrainImporterCfg(prim_path="/World/ground", terrain_type="plane")
-    robot = articulation("walker", actuators={
+    robot = articulation("walker", init_state=ArticulationCfg.InitialStateCfg(pos=(0.0, 0.0, 0.35)), actuators={
         "front": ImplicitActuatorCfg(joint_names_expr=["hip_f."], stiffness=20.0, damping=0.5, effort_limit_sim=8.0),
         "back": DCMotorCfg(joint_names_expr=["hip_b."], stiffness=20.0, damping=0.5, effort_limit=8.0,
                            saturation_effort=9.0, velocity_limit=30.0)})  # fmt: skip

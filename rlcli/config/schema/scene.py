@@ -173,10 +173,13 @@ class EntityConfig(StrictModel):
     """Coefficient of sliding friction of a shape."""
     color: Color = (0.55, 0.6, 0.65)
     """Red, green, blue of a shape in [0, 1]."""
-    pos: Vec3 = (0.0, 0.0, 0.0)
-    """Position of the MJCF's origin, or of the centre of the shape, in the environment's frame [m]."""
-    quat: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """Orientation (w, x, y, z) in the environment's frame; it is normalised."""
+    pos: Vec3 | None = None
+    """Start position of the root in the environment's frame [m]; null: that in the MJCF, and 0 for a shape. The root is
+    the first body of the MJCF, or the shape. It starts there if it can move, and is fixed there otherwise; the rest of
+    the MJCF moves with it. Events that reset the root use this pose. Keyframes of the MJCF are not read."""
+    quat: Quaternion | None = None
+    """Start orientation of the root (w, x, y, z) in the environment's frame, which is normalised; null: that in the
+    MJCF."""
     joints: dict[str, JointConfig] = {}
     """Joint name or regex -> changes of the joint. If several match a joint, the later one wins key by key."""
     actuators: dict[str, ActuatorConfig] = {}
