@@ -85,7 +85,8 @@ def _orientation(element: Any) -> FloatArray:
     if element.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:
         compiler = element.compiler
         quat = np.array(mujoco.MjSpec.resolve_orientation(compiler.degree, compiler.eulerseq, element.alt))
-    return quat / np.linalg.norm(quat)
+    unit: FloatArray = quat / np.linalg.norm(quat)
+    return unit
 
 
 def _product(pos: FloatArray, quat: FloatArray, pos2: FloatArray, quat2: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -164,7 +164,7 @@ def test_spinning_body_acceleration_is_gravity_plus_centripetal(tmp_path, engine
     np.testing.assert_allclose(acceleration[:, 0, 2], -9.81, rtol=1e-4)
     inward = np.array([0.0, 4.0, 16.0])
     np.testing.assert_allclose(acceleration[:, 1, 0], -out * inward, atol=2e-3)
-    expected = 9.81**2 + ((0.3 - out) * inward) ** 2
+    expected = np.hypot(9.81, (0.3 - out) * inward)
     np.testing.assert_allclose(result.reward.numpy(), expected * env.step_dt, rtol=1e-3)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from rlcli.errors import TaskError
 from rlcli_isaaclab import assets
-from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators
+from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
 from rlcli_isaaclab.sensor_reader import read_sensor
 from rlcli_isaaclab.settings import Key, Node, as_float, kind_of
 from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
@@ -138,9 +138,20 @@ class SceneReader:
         except NameProblem:
             return ".*", None  # the environment reports wrong joint names of an actuator when it is built
         settings = self._joint_settings.get(entity, [])
-        moved = [pattern for pattern, values in settings if values.get("stiffness") or values.get("damping")]
-        native = [n for n in chosen if n not in explicit and any(re.fullmatch(p, n) for p in moved)]
+        moved = {n: settings_of(n, settings) for n in chosen if n not in explicit}
+        native = [n for n, values in moved.items() if values.get("stiffness") or values.get("damping")]
         return [model["actuators"].get(n, n) for n in native], [n for n in chosen if n in explicit]
+
+    def damped_joints(self, entity: str, driven: Mapping[str, str]) -> list[str]:
+        """Return the joints whose implicit actuator becomes a damping of the joint, as its stiffness is zero.
+
+        Args:
+            entity: name of the entity.
+            driven: joint -> what an action commands: effort, velocity or position.
+        """
+        found = {n: settings_of(n, self._joint_settings.get(entity, [])) for n in self.names(entity, "joint") or []}
+        passive = [n for n, values in found.items() if values.get("damping") and not values.get("stiffness")]
+        return [n for n in passive if driven.get(n) != "velocity"]
 
     def sensor_of_bodies(self, name: str, bodies: Any, preserve: bool, key: Key) -> str:
         """Return the name of a sensor for some bodies of a contact sensor; adds one unless these are all its bodies."""
@@ -196,7 +207,7 @@ class SceneReader:
         spawn.skip("func", "visible", "copy_from_source", "activate_contact_sensors", "semantic_tags")
         spawn.skip("visual_material_path", "variants")
         self._read_model(name, model)
-        entity: dict[str, Any] = {"model": model}
+        entity: dict[str, Any] = {"model": model, "velocity_point": "com"}
         init = item.node("init_state")
         position = [as_float(v) for v in init.get("pos", (0.0, 0.0, 0.0))]
         rotation = [as_float(v) for v in init.get("rot", (1.0, 0.0, 0.0, 0.0))]
@@ -226,7 +237,7 @@ class SceneReader:
         if rigid.get("kinematic_enabled"):
             config["mocap"] = True
         elif kind_of(item.data.get("class_type")) == "RigidObject" or rigid:
-            config["free"] = True
+            config |= {"free": True, "velocity_point": "com"}
         for key in ("mass", "density"):
             if mass.get(key):
                 config[key] = as_float(mass.get(key))

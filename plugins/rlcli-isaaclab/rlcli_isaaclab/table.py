@@ -111,6 +111,15 @@ TERMS: dict[str, dict[str, Entry]] = {
 }
 """Section -> Isaac Lab's name -> counterpart. `randomization.py` translates the parameters of randomization events."""
 
+EFFORT_TERMS = {
+    "joint_effort",
+    "joint_torques_l2",
+    "joint_torques_penalty",
+    "applied_torque_limits",
+    "joint_effort_out_of_limit",
+}
+"""Terms that read the efforts of actuators."""
+
 ACTIONS: dict[str, str] = {
     "JointEffortAction": "joint_effort",
     "JointPositionAction": "joint_position",

@@ -15,7 +15,7 @@ from rlcli_isaaclab.observation_reader import read_processing
 from rlcli_isaaclab.randomization import EVENTS, translate_event
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, equals_default, kind_of, to_plain
-from rlcli_isaaclab.table import ACTIONS, COMMANDS, TERMS, Entry, finite_times
+from rlcli_isaaclab.table import ACTIONS, COMMANDS, EFFORT_TERMS, TERMS, Entry, finite_times
 
 _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
 """Prefixes of the modules whose functions are in `table.py`."""
@@ -222,6 +222,10 @@ class TermReader:
             config |= self._read_params(signature, entry, params)
             if entry.note:
                 self.report.entries[(*node.key, "func")] = ("approximated", entry.note)
+            entity = config.get("entity", "robot")
+            if name in EFFORT_TERMS and self.scene.damped_joints(entity, self.driven_joints.get(entity, {})):
+                why = "without the damping of implicit actuators with zero stiffness, which becomes that of the joint"
+                self.report.entries[(*node.key, "func")] = ("approximated", why)
         else:
             config = self._read_user_term(section, function, name, node, params)
         return config

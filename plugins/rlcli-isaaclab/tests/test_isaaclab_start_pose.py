@@ -5,6 +5,10 @@ import math
 import mujoco
 import pytest
 import torch
+
+from rlcli.config.load import resolve
+from rlcli.config.python_task import source_of
+from rlcli.envs.make import make_env
 from rlcli_isaaclab import (
     ArticulationCfg,
     AssetBaseCfg,
@@ -20,10 +24,6 @@ from rlcli_isaaclab import (
     mdp,
     sim_utils,
 )
-
-from rlcli.config.load import resolve
-from rlcli.config.python_task import source_of
-from rlcli.envs.make import make_env
 
 torch.set_num_threads(1)
 

@@ -174,8 +174,8 @@ def yaw_aligned(env: ManagedEnv, *, entity: Entity = "robot", std: float = 0.5) 
 
 @reads_body_forces
 def body_lin_acc_l2(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
-    """Sum of the squared accelerations of the bodies' origins in the last substep [m^2/s^4]. (num_envs,)"""
-    return entity.data.body_lin_acc_w[:, bodies].square().sum(dim=-1).sum(dim=1)
+    """Sum of the magnitudes of the accelerations of bodies in the last substep, not squared [m/s^2]. (num_envs,)"""
+    return length(entity.data.body_lin_acc_w[:, bodies]).sum(dim=1)
 
 
 def body_angular_velocity_penalty(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies) -> Tensor:
