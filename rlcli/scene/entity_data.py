@@ -74,6 +74,7 @@ class EntityData:
         """Default root pose and velocity: position, quat (w, x, y, z), linear, angular. (num_envs, 13)"""
         self.joint_vel_limits = joint_speed_limits(entity).to(device)
         """Speed limit of each joint, `velocity_limit`; infinite for a joint without one. (k,) [m/s or rad/s]"""
+        self.has_speed_limits = bool(self.joint_vel_limits.isfinite().any())
         self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32, device=device).expand(num_envs, -1)
         self._down = _direction(self._gravity)
         self._body_columns: dict[int, tuple[Columns, Columns, Columns]] = {}

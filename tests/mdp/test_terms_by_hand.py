@@ -239,7 +239,7 @@ def test_mismatched_parameters_raise_value_error(env):
             env, {"entity": "robot", "sites": "leg.*", "object": "object"}, made))  # fmt: skip
     with pytest.raises(ValueError, match=r"one framequat sensor \(4 columns\) in sensors; selected: 3 columns"):
         observations.imu_orientation(env, **bound(env, {"entity": "robot", "sensors": "gyro"}, made))
-    with pytest.raises(ValueError, match="no termination 'fel'; terminations: time_out, fell, low"):
+    with pytest.raises(ValueError, match="no termination matches 'fel'"):
         rewards.IsTerminatedTerm(env, terms=["fel"])
     with pytest.raises(ValueError, match="no body 'leg'; its bodies: leg_fl, leg_fr"):
         rewards.GaitReward(env, std=1.0, max_err=1.0, velocity_threshold=1.0, **bound(

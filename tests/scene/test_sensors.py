@@ -192,6 +192,20 @@ def test_force_threshold_defines_contact(tmp_path):
     assert env.sensors["heavy"].force[0, 0, 2] > 9.0
 
 
+@ENGINES
+def test_body_without_colliding_geom_reads_zero(tmp_path, engine):
+    sensors = {"all": contact(entity="low", bodies=".*"), "some": contact(entity="low", bodies=["tag", "box"])}
+    env = boxes(tmp_path, sensors, f"sim.engine={engine}")
+    rest(env, 5)
+    for name, (solid, empty) in {"all": (0, 1), "some": (1, 0)}.items():
+        sensor = env.sensors[name]
+        assert (sensor.names[solid], sensor.names[empty]) == ("box", "tag")
+        assert sensor.force[:, solid, 2].min() > 5.0
+        assert not sensor.force[:, empty].any()
+        assert sensor.found.tolist() == [[index == solid for index in range(2)]] * 3
+        assert sensor.air_time[:, empty].tolist() == pytest.approx([0.1] * 3)
+
+
 # --- rays ---
 
 TOWER = """
@@ -439,9 +453,9 @@ def test_invalid_sensor_raises_config_error_with_key(tmp_path, sensor, message, 
 
 def test_contact_sensor_on_body_without_contacts_is_refused(tmp_path):
     with pytest.raises(
-        ConfigError, match=r"scene.sensors.x.bodies: body 'tag' has no geom .*; bodies with such a geom: box$"
+        ConfigError, match=r"scene.sensors.x.bodies: no geom of tag can touch anything; bodies with such a geom: box$"
     ):
-        boxes(tmp_path, {"x": contact(entity="low", bodies=["box", "tag"])})
+        boxes(tmp_path, {"x": contact(entity="low", bodies=["tag"])})
 
 
 def test_ground_sensor_without_ground_is_refused(tmp_path):

@@ -25,6 +25,7 @@ class SceneReader:
         self.prims: dict[str, str] = {}
         """Entity -> the last part of its prim path."""
         self.sensors: dict[str, dict[str, Any]] = {}
+        self.has_terrain = False
         self._models: dict[str, Any] = {}
         self._joint_settings: dict[str, JointSettings] = {}
 
@@ -71,6 +72,7 @@ class SceneReader:
         config["entities"] = self.entities
         if self.sensors:
             config["sensors"] = self.sensors
+        self.has_terrain = "terrain" in config
         return config
 
     def add_joint_settings(self, driven: Mapping[str, Mapping[str, str]]) -> None:

@@ -260,8 +260,8 @@ def source(tmp_path_factory):
 def rows(section):
     """Return Isaac Lab's name -> name of the built-in term, from the page."""
     text = PAGE.read_text().split(f"`{section}:`\n")[1].split("\n## ")[0]
-    found = re.findall(r"^\| `([^`]+)` \| (same|`[a-z0-9_]+`) \|", text, re.MULTILINE)
-    return {name: name if here == "same" else here.strip("`") for name, here in found}
+    found = re.findall(r"^\| `([^`]+)` \| (same|similar|`[a-z0-9_]+`) \|", text, re.MULTILINE)
+    return {name: name if here in ("same", "similar") else here.strip("`") for name, here in found}
 
 
 @pytest.mark.parametrize(
