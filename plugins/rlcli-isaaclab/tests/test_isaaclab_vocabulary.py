@@ -133,7 +133,7 @@ TERMINATIONS = {
     "object_reached_goal": {"command_name": "hand", "threshold": 0.001, **THING},
     "object_away_from_goal": {"command_name": "hand", "threshold": 99.0, **THING},
     "object_away_from_robot": {"threshold": 99.0, "asset_cfg": Pick("robot"), "object_cfg": Pick("object")},
-    "out_of_bound": {"asset_cfg": Pick("robot"), "in_bound_range": {"x": (-90.0, 90.0), "z": (-9.0, 9.0)}},
+    "out_of_bound": {"asset_cfg": Pick("robot"), "in_bound_range": dict.fromkeys("xyz", (-90.0, 90.0))},
     "abnormal_robot_state": {},
 }  # fmt: skip
 SPREAD = {"operation": "scale", "distribution": "uniform"}
