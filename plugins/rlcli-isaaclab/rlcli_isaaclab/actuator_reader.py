@@ -137,8 +137,8 @@ def merge_joint_settings(
         by_joint[joint] = {key: values[key] for key in sorted(values, key=_rank)}
     joints: dict[str, Any] = {}
     for pattern in dict.fromkeys([*(pattern for pattern, _, _ in settings), *map(re.escape, by_joint)]):
-        matched = [joint for joint in by_joint if re.fullmatch(pattern, joint)]
-        if matched and all(by_joint[joint] == by_joint[matched[0]] for joint in matched):
+        matched = [joint for joint in model["joint"] if re.fullmatch(pattern, joint)]
+        if matched and all(j in by_joint and by_joint[j] == by_joint[matched[0]] for j in matched):
             if by_joint[matched[0]]:
                 joints[matched[0] if len(matched) == 1 else pattern] = by_joint[matched[0]]
             for joint in matched:

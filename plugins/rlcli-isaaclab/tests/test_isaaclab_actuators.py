@@ -123,6 +123,15 @@ def test_regexes_count_only_within_their_group(tmp_path):
     assert limited == {"robot/hip_fl", "robot/hip_fr"}
 
 
+def test_equal_regexes_in_two_groups_are_kept_apart(tmp_path):
+    left = implicit([".*l"], stiffness={".*": 20.0}, armature={".*": 0.05})
+    right = implicit([".*r"], stiffness={".*": 5.0})
+    model = robot(task(tmp_path, left=left, right=right))[0].engine.model
+    gains = {model.actuator(a).name[-1]: model.actuator_gainprm[a, 0] for a in range(4)}
+    assert gains == {"l": 20.0, "r": 5.0}
+    assert model.dof_armature[6:].tolist() == [0.05, 0.01, 0.05, 0.01]
+
+
 def test_viscous_friction_is_damping_of_the_joint(tmp_path):
     damped = implicit([".*"], viscous_friction={"hip_f.": 0.3, "hip_b.": 0.0})
     model = robot(task(tmp_path, legs=damped))[0].engine.model
