@@ -137,7 +137,13 @@ def _root_quat(entity: Entity) -> Formula:
 
 
 def _root_lin_vel_w(entity: Entity) -> Formula:
-    return _root(entity, "qvel", 0, 3, 7)
+    velocity = _root(entity, "qvel", 0, 3, 7)
+    if entity.config.velocity_point == "origin" or not entity.is_floating:
+        return velocity
+    if entity.engine.expanded("body_ipos") is not None:  # the centre of mass differs between environments
+        raise NoFormula
+    com = numbers(torch.tensor(entity.engine.model.body_ipos[entity.root_body]))
+    return op("add", velocity, op("rotate", _root_quat(entity), op("cross", _root_ang_vel_b(entity), com)))
 
 
 def _root_ang_vel_b(entity: Entity) -> Formula:
@@ -180,6 +186,8 @@ def _joint_angle_sum(env: VecEnv, entity: Entity, joints: Columns) -> Formula:
 
 
 def _joint_pos_limit_normalized(env: VecEnv, entity: Entity, joints: Columns) -> Formula:
+    if entity.engine.expanded("jnt_range") is not None:  # the limits differ between environments
+        raise NoFormula
     low, high = entity.data.soft_joint_pos_limits[joints].unbind(dim=1)
     limited = high - low < torch.inf
     low, high = torch.where(limited, low, 0.0), torch.where(limited, high, 1.0)
@@ -242,11 +250,12 @@ def _body_projected_gravity_b(env: VecEnv, entity: Entity, bodies: Columns) -> F
 
 def _body_state_b(env: VecEnv, entity: Entity, bodies: Columns) -> Formula:
     root, parts = _root_quat(entity), []
+    point = "xpos" if entity.config.velocity_point == "origin" else "xipos"
     for b in _selected(entity.body_ids, bodies):
         parts += [
             op("unrotate", root, op("sub", _row_of("xpos", b, 3), _root_pos(entity))),
             op("product", op("inverse", root), _row_of("xquat", b, 4)),
-            op("unrotate", root, _velocity_at(entity, b, _row_of("xpos", b, 3))),
+            op("unrotate", root, _velocity_at(entity, b, _row_of(point, b, 3))),
             op("unrotate", root, _row_of("cvel", b, 6, 0, 3)),
         ]
     return op("cat", *parts)

@@ -94,9 +94,9 @@ class ArticulationView:
         return _rows(data.root_pos_w, indices, clone), _rows(data.root_quat_w, indices, clone)
 
     def get_velocities(self, indices: Tensor | None = None, clone: bool = True) -> Tensor:
-        """Return root velocities, world frame: linear [m/s], then angular [rad/s]. (n, 6)"""
+        """Return velocities of the root's origin, world frame: linear [m/s], then angular [rad/s]. (n, 6)"""
         data = self._entity.data
-        return _rows(torch.cat([data.root_lin_vel_w, data.root_ang_vel_w], dim=1), indices, clone)
+        return _rows(torch.cat([data.root_origin_lin_vel_w, data.root_ang_vel_w], dim=1), indices, clone)
 
     def set_joint_positions(self, positions: Tensor, indices: Tensor | None = None) -> None:
         """Set joint positions, and the targets of position actuators to them. (n, num_dof) [m or rad]"""
@@ -136,7 +136,7 @@ class ArticulationView:
         self._set("qpos", torch.cat([positions, orientations], dim=1), indices, slice(root, root + 7))
 
     def set_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
-        """Set root velocities of a floating robot, world frame. (n, 6) [m/s, rad/s]"""
+        """Set velocities of the root's origin of a floating robot, world frame. (n, 6) [m/s, rad/s]"""
         qpos, dof = self._entity.floating()
         rows = slice(None) if indices is None else indices.long()
         quat = self._qpos[rows][:, qpos + 3 : qpos + 7].float()

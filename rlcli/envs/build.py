@@ -126,7 +126,11 @@ def _default_state(engine: Engine, entities: dict[str, Entity]) -> dict[str, Ten
             _, dof = entity.floating()
             root = entity.data.default_root_state[:1].double().cpu()
             local = rotate_inverse(root[:, 3:7], root[:, 10:])  # MuJoCo: in the body frame for a free joint
-            qvel[dof : dof + 6] = torch.cat([root[:, 7:10], local], dim=1)[0]
+            linear = root[:, 7:10]
+            if entity.config.velocity_point == "com":
+                state = entity.data.default_root_state[:1]
+                linear = linear - entity.com_velocity(state[:, 3:7], local.to(state)).double().cpu()
+            qvel[dof : dof + 6] = torch.cat([linear, local], dim=1)[0]
     return {"qpos": qpos, "qvel": qvel}
 
 

@@ -32,7 +32,7 @@ def reset_joints_by_offset(
 ) -> None:
     """Reset joints to their default state plus uniform offsets [m or rad, m/s or rad/s].
 
-    Positions are clipped to the soft limits.
+    Positions are clipped to the soft limits, velocities to the speed limits.
     """
     default_pos, default_vel = entity.data.read_default_joints(selection, joints)
     offset = selection.uniform(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
@@ -50,7 +50,7 @@ def reset_joints_by_scale(
 ) -> None:
     """Reset joints to their default state times uniform factors.
 
-    Positions are clipped to the soft limits.
+    Positions are clipped to the soft limits, velocities to the speed limits.
     """
     default_pos, default_vel = entity.data.read_default_joints(selection, joints)
     factor = selection.uniform(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
@@ -68,7 +68,8 @@ def reset_joints_by_gaussian(
 ) -> None:
     """Reset joints to their default state plus gaussian offsets [m or rad, m/s or rad/s].
 
-    position, velocity: [mean, std]. Positions are clipped to the soft limits.
+    position, velocity: [mean, std]. Positions are clipped to the soft limits, velocities to the speed
+    limits.
     """
     default_pos, default_vel = entity.data.read_default_joints(selection, joints)
     offset = selection.normal(*_bounds(env, position, velocity), (2, default_pos.shape[1]))
@@ -290,6 +291,9 @@ def _wrench_columns(entity: Entity, bodies: Bodies) -> Tensor:
 def _write_joints(entity: Entity, selection: Selection, joints: Joints, position: Tensor, velocity: Tensor) -> None:
     low, high = (_rows(selection, limit) for limit in entity.data.joint_limits_of(joints, soft=True))
     entity.write_joint_positions(selection, position.clamp_(low, high), joints)
+    if entity.data.has_speed_limits:
+        fastest = entity.data.joint_vel_limits[joints]
+        velocity = velocity.clamp(-fastest, fastest)
     entity.write_joint_velocities(selection, velocity, joints)
 
 

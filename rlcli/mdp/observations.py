@@ -50,7 +50,7 @@ def joint_angle_sum(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints
 
 def joint_pos_limit_normalized(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Joint positions, -1 at the lower and 1 at the upper soft limit; 0 for a joint without limits. (num_envs, k)"""
-    low, high = entity.data.soft_joint_pos_limits[joints].unbind(dim=1)
+    low, high = entity.data.joint_limits_of(joints, soft=True)
     scaled = (2.0 * entity.data.joint_pos_of(joints) - low - high) / (high - low)
     return torch.where(high - low < torch.inf, scaled, 0.0)
 

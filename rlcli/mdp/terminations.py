@@ -108,14 +108,12 @@ def object_reached_goal(
     return length(goal_in_world(entity, command) - object.data.root_pos_w) < threshold
 
 
-def object_away_from_goal(
-    env: ManagedEnv, *, entity: Entity = "robot", object: Entity = "object", command: Command, threshold: float
-) -> Tensor:
-    """End the episode where an object is over `threshold` [m] from the goal of a pose command. (num_envs,)
+def object_away_from_goal(env: ManagedEnv, *, object: Entity = "object", command: Command, threshold: float) -> Tensor:
+    """End the episode where an object is over `threshold` [m] from the goal. (num_envs,)
 
-    The command is one of `entity`.
+    The goal is in columns 0 to 2 of the command, from the environment's origin.
     """
-    return length(goal_in_world(entity, command) - object.data.root_pos_w) > threshold
+    return length(command.command[:, :3] + env.origins - object.data.root_pos_w) > threshold
 
 
 def object_away_from_robot(

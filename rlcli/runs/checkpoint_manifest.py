@@ -25,8 +25,8 @@ OPS = {
 }  # fmt: skip
 """Operation of formulas -> number of its operands; None: any number."""
 FIELDS = {
-    "qpos", "qvel", "xpos", "xquat", "site_xpos", "cvel", "subtree_com", "sensordata", "qfrc_actuator", "mocap_pos",
-    "mocap_quat",
+    "qpos", "qvel", "xpos", "xipos", "xquat", "site_xpos", "cvel", "subtree_com", "sensordata", "qfrc_actuator",
+    "mocap_pos", "mocap_quat",
 }  # fmt: skip
 """Fields of MjData that formulas may read."""
 _NO_LAYOUT = "the checkpoint does not describe the policy's columns, which this rlcli needs: train again"

@@ -13,7 +13,8 @@ from torch import Tensor
 from rlcli.config.schema import ActuatorConfig
 from rlcli.random import stream
 from rlcli.scene.entity import Entity
-from rlcli.scene.names import NameProblem, match, match_values
+from rlcli.scene.initial_state import values_by_joint
+from rlcli.scene.names import NameProblem, match
 from rlcli.sim.column_views import as_index
 from rlcli.sim.saved_tensors import TensorState, require_in_range
 from rlcli.sim.selection import Selection
@@ -50,14 +51,15 @@ class ActuatorModel(TensorState):
         self._dof_columns = as_index(entity.dof_columns[self.joints].tolist(), device)
         self._controls = as_index(controls, device)
         k = len(self.joints)
-        self.stiffness = _by_joint(config.stiffness, names, device).expand(n, -1).clone()
+        self.stiffness = values_by_joint(config.stiffness, names).to(device).expand(n, -1).clone()
         """(num_envs, k) [N/m or N m/rad]"""
-        self.damping = _by_joint(config.damping, names, device).expand(n, -1).clone()
+        self.damping = values_by_joint(config.damping, names).to(device).expand(n, -1).clone()
         """(num_envs, k) [N s/m or N m s/rad]"""
         limit = torch.inf if config.effort_limit is None else config.effort_limit
-        self.effort_limit = _by_joint(limit, names, device).expand(n, -1).clone()
+        self.effort_limit = values_by_joint(limit, names).to(device).expand(n, -1).clone()
         """(num_envs, k) [N or N m]"""
-        self._saturation_effort, self._velocity_limit = config.saturation_effort, config.velocity_limit
+        self._saturation_effort, speed = config.saturation_effort, config.velocity_limit
+        self._velocity_limit = values_by_joint(speed, names).to(device) if isinstance(speed, Mapping) else speed
         self.targets = torch.zeros(n, 3, k, device=device)
         """Position, velocity and effort targets of each joint. (num_envs, 3, k)"""
         self.computed_effort = torch.zeros(n, k, device=device)
@@ -180,17 +182,3 @@ class JointCommand:
                 self._ctrl[:, self._controls] = own.to(self._ctrl.dtype)
         for targets, from_columns, to_joints in self._model_targets:
             targets[:, to_joints] = command[:, from_columns]
-
-
-def _by_joint(value: float | Mapping[str, float], names: Sequence[str], device: torch.device) -> Tensor:
-    """Return the value of each joint; the keys of a mapping are names or regular expressions. (k,)
-
-    Raises:
-        NameProblem: if a mapping has no value for a joint, or a key that matches no joint.
-    """
-    if isinstance(value, float | int):
-        return torch.full((len(names),), float(value), device=device)
-    values = match_values(value, names, "joint")
-    if None in values:
-        raise NameProblem(f"no value for joint '{names[values.index(None)]}'; add one, or a pattern that matches it")
-    return torch.tensor(values, dtype=torch.float32, device=device)

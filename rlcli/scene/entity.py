@@ -19,7 +19,7 @@ from rlcli.scene.names import match
 from rlcli.sim.acceleration_fields import sensor_columns
 from rlcli.sim.column_views import as_index, id_tensor
 from rlcli.sim.engine import Engine
-from rlcli.sim.rotations import rotate, rotate_inverse
+from rlcli.sim.rotations import cross, rotate, rotate_inverse
 from rlcli.sim.selection import ALL, Columns, Field, Selection
 from rlcli.sim.state_cache import SimData
 
@@ -63,6 +63,7 @@ class Entity:
         self.root_qpos, self.root_dof = self._root(model)
         self.mocap = int(model.body_mocapid[self.root_body])
         """Index of the root among MuJoCo's mocap bodies; -1 if the root is not a mocap body."""
+        self._com = torch.tensor(model.body_ipos[self.root_body], dtype=torch.float32, device=engine.device)[None]
         self._qpos, self._qvel = engine.field("qpos"), engine.field("qvel")
         self._targets: dict[tuple[int, ...], tuple[Columns, Field, Columns]] = {}
         self.data = EntityData(self, sim)
@@ -127,12 +128,14 @@ class Entity:
 
         Args:
             selection: the environments.
-            linear_w: linear velocity. (rows, 3) [m/s]
+            linear_w: linear velocity of its `velocity_point`. (rows, 3) [m/s]
             angular_w: angular velocity. (rows, 3) [rad/s]
         """
         root, dof = self.floating()
         quat = selection.read(self._qpos, slice(root + 3, root + 7)).float()
         local = rotate_inverse(quat, angular_w)  # a free joint's angular velocity is in the body's frame
+        if self.config.velocity_point == "com":
+            linear_w = linear_w - self.com_velocity(quat, local, selection)
         selection.write(self._qvel, torch.cat([linear_w, local], dim=1), slice(dof, dof + 6))
 
     def read_root_velocity(self, selection: Selection) -> tuple[Tensor, Tensor]:
@@ -143,7 +146,24 @@ class Entity:
         qpos, dof = self.floating()
         velocity = selection.read(self._qvel, slice(dof, dof + 6)).float()
         quat = selection.read(self._qpos, slice(qpos + 3, qpos + 7)).float()
-        return velocity[:, :3], rotate(quat, velocity[:, 3:])
+        linear, local = velocity[:, :3], velocity[:, 3:]
+        if self.config.velocity_point == "com":
+            linear = linear + self.com_velocity(quat, local, selection)
+        return linear, rotate(quat, local)
+
+    def com_velocity(self, quat: Tensor, angular_b: Tensor, selection: Selection | None = None) -> Tensor:
+        """Return the velocity of the root's centre of mass relative to the root's origin, world frame. (rows, 3) [m/s]
+
+        Args:
+            quat: orientation of the root. (rows, 4)
+            angular_b: angular velocity of the root, body frame. (rows, 3) [rad/s]
+            selection: the environments of the rows; None: all.
+        """
+        com, own = self._com, self.engine.expanded("body_ipos")
+        if own is not None:  # it is randomised
+            com = own.view(len(own), -1, 3)[:, self.root_body].float()
+            com = com if selection is None else selection.read_view(com)
+        return rotate(quat, cross(angular_b, com.expand_as(angular_b)))
 
     def floating(self) -> tuple[int, int]:
         """Return the first column of the root's free joint in qpos and in qvel.

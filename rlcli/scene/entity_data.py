@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from rlcli.scene.initial_state import default_joint_state, default_root_state
-from rlcli.scene.joint_and_actuator_setup import joint_settings
+from rlcli.scene.initial_state import default_joint_state, default_root_state, joint_speed_limits
 from rlcli.scene.joint_efforts import JointEfforts
 from rlcli.sim.acceleration_fields import computes_body_forces
 from rlcli.sim.column_views import MAX_CACHED_VIEWS, CachedViews, as_index, evenly_spaced, id_tensor
@@ -31,6 +29,7 @@ class EntityData:
     def __init__(self, entity: Entity, sim: SimData) -> None:
         self._entity = entity
         self._sim = sim
+        self._at_com = entity.config.velocity_point == "com"
         self._cache: dict[str, tuple[int, Tensor]] = {}
         self._pos, self._vel = CachedViews(), CachedViews()
         self._default_pos, self._default_vel = CachedViews(), CachedViews()
@@ -73,9 +72,9 @@ class EntityData:
         """Default joint velocities. (num_envs, k) [m/s or rad/s]"""
         self.default_root_state = default_root_state(entity).to(device).expand(num_envs, -1).clone()
         """Default root pose and velocity: position, quat (w, x, y, z), linear, angular. (num_envs, 13)"""
-        speeds = [joint_settings(entity.config, name).velocity_limit or math.inf for name in entity.joint_names]
-        self.joint_vel_limits = torch.tensor(speeds, device=device)
+        self.joint_vel_limits = joint_speed_limits(entity).to(device)
         """Speed limit of each joint, `velocity_limit`; infinite for a joint without one. (k,) [m/s or rad/s]"""
+        self.has_speed_limits = bool(self.joint_vel_limits.isfinite().any())
         self._gravity = torch.tensor(model.opt.gravity, dtype=torch.float32, device=device).expand(num_envs, -1)
         self._down = _direction(self._gravity)
         self._body_columns: dict[int, tuple[Columns, Columns, Columns]] = {}
@@ -176,7 +175,12 @@ class EntityData:
 
     @property
     def root_lin_vel_w(self) -> Tensor:
-        """Root linear velocity, world frame. (num_envs, 3) [m/s]"""
+        """Linear velocity of the root's `velocity_point`, world frame. (num_envs, 3) [m/s]"""
+        return self.root_com_lin_vel_w if self._at_com else self.root_origin_lin_vel_w
+
+    @property
+    def root_origin_lin_vel_w(self) -> Tensor:
+        """Velocity of the origin of the root's frame, world frame. (num_envs, 3) [m/s]"""
         return self.default_root_state[:, 7:10] if self._free_root is None else self._free_root[2]
 
     @property
@@ -186,7 +190,7 @@ class EntityData:
 
     @property
     def root_lin_vel_b(self) -> Tensor:
-        """Root linear velocity, body frame. (num_envs, 3) [m/s]"""
+        """`root_lin_vel_w` in the body frame. (num_envs, 3) [m/s]"""
         return self._once("root_lin_vel_b", lambda: rotate_inverse(self.root_quat_w, self.root_lin_vel_w))
 
     @property
@@ -196,8 +200,11 @@ class EntityData:
 
     @property
     def root_com_lin_vel_w(self) -> Tensor:
-        """Velocity of the root body's centre of mass, world frame. (num_envs, 3) [m/s]"""
-        return self.body_com_lin_vel_w[:, 0]
+        """Velocity of the root's centre of mass, world frame. (num_envs, 3) [m/s]"""
+        return self._once(
+            "root_com_lin_vel_w",
+            lambda: self.root_origin_lin_vel_w + self._entity.com_velocity(self.root_quat_w, self.root_ang_vel_b),
+        )
 
     @property
     def forward_w(self) -> Tensor:
@@ -287,13 +294,17 @@ class EntityData:
 
     @property
     def body_lin_vel_w(self) -> Tensor:
-        """Velocities of the bodies' frame origins, world frame. (num_envs, bodies, 3) [m/s]"""
+        """Velocities of each body's `velocity_point`, world frame. (num_envs, bodies, 3) [m/s]"""
         return self._once("body_lin_vel_w", lambda: self.body_lin_vel_of(ALL))
 
-    def body_lin_vel_of(self, bodies: Columns) -> Tensor:
-        """Return `body_lin_vel_w[:, bodies]`, computed for these bodies only. (num_envs, k, 3) [m/s]"""
+    def body_lin_vel_of(self, bodies: Columns, point: str | None = None) -> Tensor:
+        """Return `body_lin_vel_w[:, bodies]`, computed for these bodies only. (num_envs, k, 3) [m/s]
+
+        point: `origin` or `com`; None: the entity's `velocity_point`.
+        """
         columns, roots = self._columns_of(bodies)
-        return self._velocity_at(self._sim.derived_columns("xpos", columns), columns, roots)
+        at_com = self._at_com if point is None else point == "com"
+        return self._velocity_at(self._sim.derived_columns("xipos" if at_com else "xpos", columns), columns, roots)
 
     def body_states_of(self, bodies: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return `body_pos_w`, `body_quat_w`, `body_lin_vel_w` and `body_ang_vel_w` of some bodies.
@@ -303,18 +314,13 @@ class EntityData:
         columns, roots = self._columns_of(bodies)
         derived = self._sim.derived_columns
         position, velocity = derived("xpos", columns), derived("cvel", columns)
-        linear = velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(position, roots))
+        point = derived("xipos", columns) if self._at_com else position
+        linear = velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(point, roots))
         return position, derived("xquat", columns), linear, velocity[..., :3]
 
     @property
-    def body_com_lin_vel_w(self) -> Tensor:
-        """Velocities of the bodies' centres of mass, world frame. (num_envs, bodies, 3) [m/s]"""
-        columns = self._columns_of(ALL)
-        return self._once("body_com_lin_vel_w", lambda: self._velocity_at(self.body_com_pos_w, *columns))
-
-    @property
     def body_lin_vel_b(self) -> Tensor:
-        """Velocities of the bodies' frame origins, each in its body's frame. (num_envs, bodies, 3) [m/s]"""
+        """`body_lin_vel_w`, each in its body's frame. (num_envs, bodies, 3) [m/s]"""
         return self._once("body_lin_vel_b", lambda: rotate_inverse(self.body_quat_w, self.body_lin_vel_w))
 
     @property
@@ -329,18 +335,19 @@ class EntityData:
 
     @property
     def body_lin_acc_w(self) -> Tensor:
-        """Accelerations of the bodies' frame origins over the last substep, world frame. (num_envs, bodies, 3) [m/s^2]
+        """Accelerations of each body's `velocity_point` over the last substep, world frame.
 
-        The acceleration is 0 at rest and equals gravity in free fall.
+        (num_envs, bodies, 3) [m/s^2]. The acceleration is 0 at rest and equals gravity in free fall.
         """
 
         def compute() -> Tensor:
             acceleration = self._body_force("cacc")[:, self._body_index]
             angular, linear = acceleration[..., :3], acceleration[..., 3:]
-            at_origin = linear + cross(angular, self._from_tree_com(self.body_pos_w, self._columns_of(ALL)[1]))
+            point = self.body_com_pos_w if self._at_com else self.body_pos_w
+            at_point = linear + cross(angular, self._from_tree_com(point, self._columns_of(ALL)[1]))
             turning = cross(self.body_ang_vel_w, self.body_lin_vel_w)
             # MuJoCo's cacc contains -gravity, as an accelerometer measures it
-            return at_origin + turning + self.gravity_w[:, None]
+            return at_point + turning + self.gravity_w[:, None]
 
         return self._once("body_lin_acc_w", compute)
 

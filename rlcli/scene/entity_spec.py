@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from rlcli.config.schema import EntityConfig
 from rlcli.errors import MissingModelError, TaskError, one_line
 from rlcli.registry import model_file
 from rlcli.scene.names import SceneProblem
 from rlcli.scene.untrusted_mjcf import BadModel, model_roots, read_mjcf
+
+FloatArray = NDArray[np.float64]
 
 
 def entity_spec(name: str, entity: EntityConfig, root: Path, *, installed: bool) -> mujoco.MjSpec:
@@ -47,6 +51,20 @@ def name_all(child: mujoco.MjSpec) -> None:
                 used.add(new_name)
 
 
+def frame_of_start_pose(child: mujoco.MjSpec, entity: EntityConfig) -> tuple[FloatArray, FloatArray]:
+    """Return position and quaternion of the frame to attach a model to, so that its root has the start pose."""
+    pos, quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    element: Any = child.worldbody.first_body()
+    while element is not None:  # the root, then the <frame> elements around it
+        pos, quat = _product(element.pos, _orientation(element), pos, quat)
+        element = element.frame
+    start_pos = pos if entity.pos is None else np.array(entity.pos)
+    start_quat = quat if entity.quat is None else np.array(entity.quat) / np.linalg.norm(entity.quat)
+    inverse_pos, inverse_quat = np.empty(3), np.empty(4)
+    mujoco.mju_negPose(inverse_pos, inverse_quat, pos, quat)
+    return _product(start_pos, start_quat, inverse_pos, inverse_quat)
+
+
 def write_masses(child: mujoco.MjSpec) -> None:
     """Set the mass and inertia of every body explicitly: attaching would lose the MJCF's `settotalmass`."""
     with warnings.catch_warnings(action="ignore"):  # MuJoCo has deprecated the attribute, but models still use it
@@ -59,6 +77,23 @@ def write_masses(child: mujoco.MjSpec) -> None:
         body.ipos, body.iquat = compiled.ipos, compiled.iquat
     child.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     child.compiler.settotalmass = -1.0
+
+
+def _orientation(element: Any) -> FloatArray:
+    """Return the orientation of a body or frame of a specification, which may be given as Euler angles."""
+    quat = np.array(element.quat)
+    if element.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:
+        compiler = element.compiler
+        quat = np.array(mujoco.MjSpec.resolve_orientation(compiler.degree, compiler.eulerseq, element.alt))
+    unit: FloatArray = quat / np.linalg.norm(quat)
+    return unit
+
+
+def _product(pos: FloatArray, quat: FloatArray, pos2: FloatArray, quat2: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the product of two poses."""
+    product = np.empty(3), np.empty(4)
+    mujoco.mju_mulPose(*product, pos, quat, pos2, quat2)
+    return product
 
 
 def _load_mjcf(entity: EntityConfig, path: tuple[str, ...], root: Path, installed: bool) -> mujoco.MjSpec:

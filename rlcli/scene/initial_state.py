@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.scene.names import NameProblem, match
+from rlcli.scene.joint_and_actuator_setup import joint_settings
+from rlcli.scene.names import NameProblem, match, match_values
 
 if TYPE_CHECKING:
     from rlcli.scene.entity import Entity
@@ -29,6 +32,34 @@ def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
     return position, velocity
 
 
+def joint_speed_limits(entity: Entity) -> Tensor:
+    """Return the speed limit of each joint: its `velocity_limit`, or else the no-load speed of its dc_motor. (k,)"""
+    names, config = entity.joint_names, entity.config
+    limits = torch.full((len(names),), torch.inf)
+    for motor in config.actuators.values():
+        if motor.velocity_limit is not None:
+            with contextlib.suppress(NameProblem):  # making the actuator model reports it
+                joints = match(motor.joints, names, "joint")
+                limits[joints] = values_by_joint(motor.velocity_limit, [names[j] for j in joints])
+    for joint, name in enumerate(names):
+        limits[joint] = joint_settings(config, name).velocity_limit or limits[joint]
+    return limits
+
+
+def values_by_joint(value: float | Mapping[str, float], names: Sequence[str]) -> Tensor:
+    """Return the value of each joint; the keys of a mapping are names or regular expressions. (k,)
+
+    Raises:
+        NameProblem: if a mapping has no value for a joint, or a key that matches no joint.
+    """
+    if isinstance(value, float | int):
+        return torch.full((len(names),), float(value))
+    values = match_values(value, names, "joint")
+    if None in values:
+        raise NameProblem(f"no value for joint '{names[values.index(None)]}'; add one, or a pattern that matches it")
+    return torch.tensor(values, dtype=torch.float32)
+
+
 def default_root_state(entity: Entity) -> Tensor:
     """Return the default root pose and velocity, from the MJCF and the entity's configuration. (13,)
 
@@ -39,7 +70,7 @@ def default_root_state(entity: Entity) -> Tensor:
     if entity.root_qpos is not None:
         pose = model.qpos0[entity.root_qpos : entity.root_qpos + 7]
     elif not entity.root_body:  # the entity has no body, only geoms of the world
-        pose = np.concatenate([entity.config.pos, entity.config.quat])
+        pose = np.concatenate([entity.config.pos or np.zeros(3), entity.config.quat or [1.0, 0.0, 0.0, 0.0]])
     else:
         body = entity.root_body
         pose = np.concatenate([model.body_pos[body], model.body_quat[body]])

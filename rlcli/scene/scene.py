@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import TypeVar
 
 import mujoco
-import numpy as np
 
 from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig, TerrainConfig
 from rlcli.errors import ConfigError, Problem, one_line
-from rlcli.scene.entity_spec import entity_spec, name_all, write_masses
+from rlcli.scene.entity_spec import entity_spec, frame_of_start_pose, name_all, write_masses
 from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_materials
 from rlcli.scene.joint_and_actuator_setup import SceneJoints
 from rlcli.scene.names import SceneProblem
@@ -96,8 +95,8 @@ class Scene:
         for key in list(child.keys):
             child.delete(key)  # a keyframe of one entity has the wrong size in a scene of several entities
         self.spec.memory = max(self.spec.memory, child.memory)
-        quat = np.asarray(entity.quat) / np.linalg.norm(entity.quat)
-        frame = self.spec.worldbody.add_frame(pos=entity.pos, quat=quat)
+        pos, quat = frame_of_start_pose(child, entity)
+        frame = self.spec.worldbody.add_frame(pos=pos, quat=quat)
         with warnings.catch_warnings(action="ignore"):
             self.spec.attach(child, prefix=f"{name}/", frame=frame)
         self.joints.override(name, entity, degrees=bool(child.compiler.degree))

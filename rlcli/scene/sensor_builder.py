@@ -78,12 +78,12 @@ class SensorBuilder:
         """Add an MJCF sensor for each pair of a body and a partner, which measures net force and contact count."""
         prefix = f"{config.entity}/"
         bodies = self._bodies(config.entity, config.bodies, path, "bodies")
-        solid = [body for body in self._bodies(config.entity, ".*", path, "bodies") if self._can_touch(body)]
-        for body in bodies:
-            if body not in solid:
-                allowed = listing([b.removeprefix(prefix) for b in solid]) if solid else "none"
-                message = f"body '{body.removeprefix(prefix)}' has no geom that can touch anything"
-                raise SceneProblem((*path, "bodies"), message, f"bodies with such a geom: {allowed}")
+        if not any(map(self._can_touch, bodies)):
+            solid = [body for body in self._bodies(config.entity, ".*", path, "bodies") if self._can_touch(body)]
+            allowed = listing([b.removeprefix(prefix) for b in solid]) if solid else "none"
+            found = listing([body.removeprefix(prefix) for body in bodies])
+            message = f"no geom of {found} can touch anything"
+            raise SceneProblem((*path, "bodies"), message, f"bodies with such a geom: {allowed}")
         sensors: list[list[str]] = []
         for slot, body in enumerate(bodies):
             sensors.append([])

@@ -23,7 +23,7 @@ WALKER = """
 <mujoco>
   <worldbody>
     <body name="trunk" pos="0 0 1">
-      <freejoint/><geom size="0.2 0.1 0.05" type="box"/><site name="imu" quat="0.9 0.1 0.3 0.2"/>
+      <freejoint/><geom size="0.2 0.1 0.05" pos="0.05 0.02 0" type="box"/><site name="imu" quat="0.9 0.1 0.3 0.2"/>
       <body name="leg" pos="0.2 0 0">
         <joint name="hip" axis="0 1 0" range="-0.6 1.2" limited="true"/>
         <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03"/><site name="foot" pos="0 0 -0.3" euler="0 30 20"/>
@@ -52,6 +52,7 @@ scene:
   entities:
     robot:
       model: walker.xml
+      velocity_point: com
       init: {joint_pos: {knee: 0.4}, joint_vel: {hip: 0.5}}
       joints: {knee: {kp: 20.0, kv: 1.0}, hip: {kp: 30.0, kv: 1.0}}
     object: {model: ball.xml}
@@ -122,6 +123,7 @@ PREPARED = {
     "filtered": "{func: joint_vel, modifiers: [{kind: digital_filter, b: [0.2, 0.3, 0.1], a: [-0.5, 0.1]}]}",
     "fed_forward": "{func: joint_vel, modifiers: [{kind: digital_filter, b: [0.7, 0.3]}]}",
     "integrated": "{func: joint_vel, modifiers: [{kind: integrator}]}",
+    "of_the_origin": "{func: base_lin_vel, entity: object}",
 }
 
 

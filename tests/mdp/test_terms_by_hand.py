@@ -164,7 +164,7 @@ def test_spinning_body_acceleration_is_gravity_plus_centripetal(tmp_path, engine
     np.testing.assert_allclose(acceleration[:, 0, 2], -9.81, rtol=1e-4)
     inward = np.array([0.0, 4.0, 16.0])
     np.testing.assert_allclose(acceleration[:, 1, 0], -out * inward, atol=2e-3)
-    expected = 9.81**2 + ((0.3 - out) * inward) ** 2
+    expected = np.hypot(9.81, (0.3 - out) * inward)
     np.testing.assert_allclose(result.reward.numpy(), expected * env.step_dt, rtol=1e-3)
 
 
@@ -239,7 +239,7 @@ def test_mismatched_parameters_raise_value_error(env):
             env, {"entity": "robot", "sites": "leg.*", "object": "object"}, made))  # fmt: skip
     with pytest.raises(ValueError, match=r"one framequat sensor \(4 columns\) in sensors; selected: 3 columns"):
         observations.imu_orientation(env, **bound(env, {"entity": "robot", "sensors": "gyro"}, made))
-    with pytest.raises(ValueError, match="no termination 'fel'; terminations: time_out, fell, low"):
+    with pytest.raises(ValueError, match="no termination matches 'fel'"):
         rewards.IsTerminatedTerm(env, terms=["fel"])
     with pytest.raises(ValueError, match="no body 'leg'; its bodies: leg_fl, leg_fr"):
         rewards.GaitReward(env, std=1.0, max_err=1.0, velocity_threshold=1.0, **bound(

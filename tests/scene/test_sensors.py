@@ -30,7 +30,7 @@ TASK = {
         "num_envs": 3,
         "entities": {
             "low": {"model": "low.xml"},
-            "high": {"model": "high.xml", "pos": [0.0, 0.0, 0.2]},
+            "high": {"model": "high.xml", "pos": [0.0, 0.0, 0.3]},
             "robot": {"model": "cart.xml"},
         },
     },
@@ -94,8 +94,8 @@ def test_contact_force_includes_friction(tmp_path, engine):
 
 def test_contact_slots_have_order_of_configuration(tmp_path):
     task = edited(dump(TASK), scene={"entities": {
-        "left": {"model": "low.xml", "pos": [-0.12, 0.0, 0.0]},
-        "right": {"model": "low.xml", "pos": [0.12, 0.0, 0.0]},
+        "left": {"model": "low.xml", "pos": [-0.12, 0.0, 0.1]},
+        "right": {"model": "low.xml", "pos": [0.12, 0.0, 0.1]},
         "plank": {"model": "plank.xml", "pos": [0.0, 0.0, 0.225]},
         "robot": {"model": "cart.xml"},
     }, "sensors": {
@@ -130,7 +130,7 @@ def test_contact_forces_of_several_partners_are_summed(tmp_path):
 @MANY_STEPS
 def test_air_and_contact_times_count_steps(tmp_path, engine):
     """Drop a box from 0.2 m: it falls for sqrt(2 h / g) = 0.202 s, in steps of 0.02 s."""
-    entities = {"low": {"pos": [0.0, 0.0, 0.2]}, "high": {"pos": [9.0, 0.0, 0.0]}}
+    entities = {"low": {"pos": [0.0, 0.0, 0.3]}, "high": {"pos": [9.0, 0.0, 0.1]}}
     env = boxes(tmp_path, {"box": contact(entity="low", bodies="box", history=3)}, f"sim.engine={engine}",
                 *(f"scene.entities.{n}.pos={e['pos']}" for n, e in entities.items()))  # fmt: skip
     sensor = env.sensors["box"]
@@ -190,6 +190,20 @@ def test_force_threshold_defines_contact(tmp_path):
     assert env.sensors["light"].found.all()
     assert not env.sensors["heavy"].found.any()
     assert env.sensors["heavy"].force[0, 0, 2] > 9.0
+
+
+@ENGINES
+def test_body_without_colliding_geom_reads_zero(tmp_path, engine):
+    sensors = {"all": contact(entity="low", bodies=".*"), "some": contact(entity="low", bodies=["tag", "box"])}
+    env = boxes(tmp_path, sensors, f"sim.engine={engine}")
+    rest(env, 5)
+    for name, (solid, empty) in {"all": (0, 1), "some": (1, 0)}.items():
+        sensor = env.sensors[name]
+        assert (sensor.names[solid], sensor.names[empty]) == ("box", "tag")
+        assert sensor.force[:, solid, 2].min() > 5.0
+        assert not sensor.force[:, empty].any()
+        assert sensor.found.tolist() == [[index == solid for index in range(2)]] * 3
+        assert sensor.air_time[:, empty].tolist() == pytest.approx([0.1] * 3)
 
 
 # --- rays ---
@@ -439,9 +453,9 @@ def test_invalid_sensor_raises_config_error_with_key(tmp_path, sensor, message, 
 
 def test_contact_sensor_on_body_without_contacts_is_refused(tmp_path):
     with pytest.raises(
-        ConfigError, match=r"scene.sensors.x.bodies: body 'tag' has no geom .*; bodies with such a geom: box$"
+        ConfigError, match=r"scene.sensors.x.bodies: no geom of tag can touch anything; bodies with such a geom: box$"
     ):
-        boxes(tmp_path, {"x": contact(entity="low", bodies=["box", "tag"])})
+        boxes(tmp_path, {"x": contact(entity="low", bodies=["tag"])})
 
 
 def test_ground_sensor_without_ground_is_refused(tmp_path):

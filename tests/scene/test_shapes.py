@@ -153,7 +153,7 @@ def test_options_come_from_first_mjcf_after_shape(tmp_path):
 def test_model_attached_twice_gives_equal_trajectories(tmp_path):
     """Compare two distant critters with equal actions to a critter that is alone."""
     events = {"root": None, "joints": None, "push": None, "shove": None}
-    pair = {name: {"model": "critter.xml", "pos": [0.0, y, 0.0], "joints": {".*": {"kp": 20.0, "kv": 0.5}}}
+    pair = {name: {"model": "critter.xml", "pos": [0.0, y, 0.35], "joints": {".*": {"kp": 20.0, "kv": 0.5}}}
             for name, y in (("robot", 0.0), ("other", 8.0))}  # fmt: skip
     legs = {"func": "joint_position", "joints": ["hip_br", "hip_fl", "hip_bl", "hip_fr"], "scale": 0.5}
     task = edited(CRITTER_TASK, scene={"entities": pair}, events=events, rewards={"power": None},

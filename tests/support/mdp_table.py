@@ -314,8 +314,7 @@ TERMINATIONS = [
     (t.abnormal_robot_state, ALL, lambda s: (abs(s.v) > 2 * FASTEST).any()),
     (t.object_reached_goal, {**ARM, **THING, "command": "pose", "threshold": 0.5}, lambda s:
      norm(s.goal - s.thing) < 0.5),
-    (t.object_away_from_goal, {**ARM, **THING, "command": "pose", "threshold": 0.5}, lambda s:
-     norm(s.goal - s.thing) > 0.5),
+    (t.object_away_from_goal, {**GOAL, "threshold": 1.5}, lambda s: norm(s.goal + s.origin - s.thing) > 1.5),
     (t.object_away_from_robot, {**ROBOT, **THING, "threshold": 3.0}, lambda s: norm(s.pos - s.thing) > 3.0),
 ]  # fmt: skip
 

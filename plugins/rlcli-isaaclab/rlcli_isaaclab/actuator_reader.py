@@ -8,8 +8,8 @@ from typing import Any
 
 from rlcli_isaaclab.settings import Node, Report, as_float, kind_of, to_plain
 
-JointSettings = list[tuple[str, dict[str, Any]]]
-"""(regex of joints, settings); later entries override earlier ones."""
+JointSettings = list[tuple[str, dict[str, Any], list[str]]]
+"""(regex of joints, settings, regexes of all joints of the group); later entries override earlier ones."""
 
 
 def read_actuators(
@@ -27,21 +27,20 @@ def read_actuators(
         kind = kind_of(item.get("class_type"))
         patterns = item.require("joint_names_expr") or [".*"]
         patterns = [patterns] if isinstance(patterns, str) else list(patterns)
-        effort_limit = item.get("effort_limit_sim")
-        effort_limit = item.get("effort_limit") if effort_limit is None else effort_limit
-        item.skip("effort_limit")
-        for key in ("velocity_limit", "velocity_limit_sim"):
-            if kind != "DCMotor" or key != "velocity_limit":
-                item.note("ignored", key, "MuJoCo's joints have no speed limit")
-        for key in ("dynamic_friction", "viscous_friction"):
-            item.note("ignored", key, "MuJoCo has no such setting; set friction and damping instead")
-        passive = {"armature": item.get("armature"), "friction_loss": item.get("friction")}
+        passive = {
+            "armature": item.get("armature"),
+            "friction_loss": item.get("friction"),
+            "viscous_friction": item.get("viscous_friction"),
+        }
+        if item.get("dynamic_friction") != item.get("friction"):
+            item.note("ignored", "dynamic_friction", "MuJoCo has one dry friction: that of `friction`")
         gains = {"stiffness": item.get("stiffness"), "damping": item.get("damping")}
         if kind == "ImplicitActuator":
-            settings = {**gains, **passive, "effort_limit": effort_limit}
+            settings = {**gains, **passive, **_read_implicit_limits(item)}
         elif kind in ("IdealPDActuator", "DCMotor", "DelayedPDActuator"):
             models[group] = _read_explicit_actuator(item, kind, order_joints(patterns, item), gains)
-            settings = passive
+            speed = None if kind == "DCMotor" else _speed_limit(item)  # terms read that of a DC motor by themselves
+            settings = {**passive, "velocity_limit": speed}
         else:
             item.report.problem(
                 item.key,
@@ -50,26 +49,68 @@ def read_actuators(
             continue
         for setting, value in settings.items():
             if isinstance(value, Mapping):
-                joints += [(str(pattern), {setting: as_float(number)}) for pattern, number in value.items()]
+                joints += [(str(pattern), {setting: as_float(number)}, patterns) for pattern, number in value.items()]
             elif value is not None:
-                joints += [(pattern, {setting: as_float(value)}) for pattern in patterns]
+                joints += [(pattern, {setting: as_float(value)}, patterns) for pattern in patterns]
     return joints, models
+
+
+_NO_SPEED_LIMIT = "terms read it; MuJoCo's joints have no speed limit"
+
+
+def _read_implicit_limits(item: Node) -> dict[str, Any]:
+    """Return the limits of an implicit actuator. As in Isaac Lab, a `velocity_limit` alone has no effect."""
+    for key in ("effort_limit", "velocity_limit"):
+        old, new = item.get(key), item.get(f"{key}_sim")
+        if old is not None and new is not None and old != new:
+            message = f"{key} and {key}_sim of an implicit actuator differ: {old} and {new}"
+            item.report.problem(item.key, message, f"set {key}_sim only")
+    if item.get("velocity_limit_sim") is None:
+        item.note("ignored", "velocity_limit", "as in Isaac Lab, an implicit actuator has only velocity_limit_sim")
+    item.note("approximated", "velocity_limit_sim", _NO_SPEED_LIMIT)
+    effort = item.get("effort_limit_sim")
+    return {
+        "effort_limit": item.get("effort_limit") if effort is None else effort,
+        "velocity_limit": item.get("velocity_limit_sim"),
+    }
+
+
+def _speed_limit(item: Node) -> Any:
+    """Return the speed limit of an explicit actuator."""
+    item.note("approximated", "velocity_limit_sim", _NO_SPEED_LIMIT)
+    limit, of_solver = item.get("velocity_limit"), item.get("velocity_limit_sim")
+    return of_solver if limit is None else limit
 
 
 def _read_explicit_actuator(item: Node, kind: str, joints: Any, gains: Mapping[str, Any]) -> dict[str, Any]:
     """Return an actuator model; rlcli computes its effort before each physics step."""
     config = {"joints": joints, "kind": "dc_motor" if kind == "DCMotor" else "pd"}
     config |= {key: value for key, value in gains.items() if value is not None}
-    effort_limit = item.get("effort_limit")
+    effort_limit, of_solver = item.get("effort_limit"), item.get("effort_limit_sim")
+    for key, value in {**gains, "effort_limit": effort_limit}.items():
+        if value is None:
+            value = "no limit" if key == "effort_limit" else "0"
+            item.report.entries[(*item.key, key)] = ("approximated", f"{value}: that of the USD is not known")
     if effort_limit is not None:
         config["effort_limit"] = effort_limit
+    if of_solver is not None and of_solver != effort_limit:
+        item.note("ignored", "effort_limit_sim", "an explicit actuator has one limit, effort_limit")
     if kind == "DCMotor":
         config["saturation_effort"] = item.require("saturation_effort")
-        config["velocity_limit"] = item.require("velocity_limit")
+        config["velocity_limit"] = _speed_limit(item) or item.require("velocity_limit")
     if kind == "DelayedPDActuator":
         config["delay"] = [item.get("min_delay", 0), item.get("max_delay", 0)]
     plain: dict[str, Any] = to_plain(config)
     return plain
+
+
+def settings_of(joint: str, settings: JointSettings) -> dict[str, Any]:
+    """Return the settings of one joint. A regex counts only for the joints of its group."""
+    found: dict[str, Any] = {}
+    for pattern, values, group in settings:
+        if re.fullmatch(pattern, joint) and any(re.fullmatch(other, joint) for other in group):
+            found |= values
+    return found
 
 
 def merge_joint_settings(
@@ -84,34 +125,56 @@ def merge_joint_settings(
         name: name of the entity.
         report: receives what is approximated.
     """
-    by_pattern: dict[str, dict[str, Any]] = {}
-    for pattern, values in settings:
-        by_pattern.setdefault(pattern, {}).update(values)
+    by_joint: dict[str, dict[str, Any]] = {}
+    for joint in model["joint"]:
+        values = settings_of(joint, settings)
+        has_actuator = joint in driven or joint in model["driven"]
+        key = ("scene", name, "actuators", joint)
+        values = _joint_config(values, driven.get(joint, ""), has_actuator, key, report)
+        for item in ("damping", "armature", "friction_loss"):
+            if item in values and model[item][joint] == values[item]:
+                del values[item]
+        by_joint[joint] = {key: values[key] for key in sorted(values, key=_rank)}
     joints: dict[str, Any] = {}
-    for pattern, values in by_pattern.items():
+    for pattern in dict.fromkeys([*(pattern for pattern, _, _ in settings), *map(re.escape, by_joint)]):
         matched = [joint for joint in model["joint"] if re.fullmatch(pattern, joint)]
-        stiffness = values.pop("stiffness", 0.0)
-        kinds = {driven.get(joint, "") for joint in matched}
-        if stiffness and kinds == {"effort"}:
-            values = {"stiffness": stiffness, **values}
-            why = "a spring around the MJCF's rest position, in addition to the effort"
-            report.entries[("scene", name, "actuators", pattern, "stiffness")] = ("approximated", why)
-        elif stiffness:
-            values = {"actuator": "position", "kp": stiffness, "kv": values.pop("damping", 0.0), **values}
-        elif kinds == {"velocity"} and values.get("damping"):
-            values = {"actuator": "velocity", "kv": values.pop("damping"), **values}
-        if matched:
-            for key in ("damping", "armature", "friction_loss"):
-                if key in values and all(model[key][joint] == values[key] for joint in matched):
-                    del values[key]
-            if not stiffness and not any(joint in driven or joint in model["driven"] for joint in matched):
-                values.pop("effort_limit", None)  # no action and no actuator of the MJCF drives these joints
-        if values:
-            joints[pattern] = {key: values[key] for key in sorted(values, key=_rank)}
+        if matched and all(j in by_joint and by_joint[j] == by_joint[matched[0]] for j in matched):
+            if by_joint[matched[0]]:
+                joints[matched[0] if len(matched) == 1 else pattern] = by_joint[matched[0]]
+            for joint in matched:
+                del by_joint[joint]
     return joints
 
 
-_LAST_KEYS = ("damping", "armature", "friction_loss", "effort_limit")
+def _joint_config(
+    values: dict[str, Any], command: str, has_actuator: bool, key: tuple[str, ...], report: Report
+) -> dict[str, Any]:
+    """Return rlcli's settings of a joint.
+
+    Args:
+        values: settings of its implicit actuator, or the passive ones of an explicit actuator.
+        command: what an action commands: effort, velocity, position or, without an action, nothing.
+        has_actuator: whether an action or an actuator of the MJCF drives the joint.
+        key: key of the joint in the report.
+        report: receives what is approximated.
+    """
+    stiffness, viscous = values.pop("stiffness", 0.0), values.pop("viscous_friction", 0.0)
+    if stiffness and command == "effort":
+        values = {"stiffness": stiffness, **values}
+        why = "a spring around the MJCF's rest position, in addition to the effort"
+        report.entries[(*key, "stiffness")] = ("approximated", why)
+    elif stiffness:
+        values = {"actuator": "position", "kp": stiffness, "kv": values.pop("damping", 0.0), **values}
+    elif command == "velocity" and values.get("damping"):
+        values = {"actuator": "velocity", "kv": values.pop("damping"), **values}
+    if viscous:
+        values["damping"] = values.get("damping", 0.0) + viscous
+    if not stiffness and not has_actuator:
+        values.pop("effort_limit", None)
+    return values
+
+
+_LAST_KEYS = ("damping", "armature", "friction_loss", "effort_limit", "velocity_limit")
 """Keys that follow the actuator's own keys in the file."""
 
 

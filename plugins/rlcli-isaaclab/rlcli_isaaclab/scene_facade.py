@@ -13,22 +13,26 @@ from rlcli.errors import did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem, match
 from rlcli.sim.rotations import rotate, rotate_inverse
+from rlcli.sim.selection import ALL
 
 _DATA_NAMES = {
     "applied_torque": "applied_effort",
     "computed_torque": "computed_effort",
     "root_link_pos_w": "root_pos_w",
     "root_link_quat_w": "root_quat_w",
-    "root_link_lin_vel_w": "root_lin_vel_w",
+    "root_link_lin_vel_w": "root_origin_lin_vel_w",
     "root_link_ang_vel_w": "root_ang_vel_w",
-    "root_link_lin_vel_b": "root_lin_vel_b",
     "root_link_ang_vel_b": "root_ang_vel_b",
+    "root_com_ang_vel_w": "root_ang_vel_w",
+    "root_com_ang_vel_b": "root_ang_vel_b",
+    "root_lin_vel_w": "root_com_lin_vel_w",
     "body_link_pos_w": "body_pos_w",
     "body_link_quat_w": "body_quat_w",
-    "body_link_lin_vel_w": "body_lin_vel_w",
     "body_link_ang_vel_w": "body_ang_vel_w",
+    "body_com_ang_vel_w": "body_ang_vel_w",
 }
-"""Isaac Lab's name -> rlcli's name, where they differ."""
+"""Isaac Lab's name -> rlcli's name, where they differ. Isaac Lab's velocities without `link` are those of the centre of
+mass, whatever the entity's `velocity_point` is."""
 
 
 class Data:
@@ -67,22 +71,88 @@ class Data:
         return torch.cat([self._data.root_pos_w, self._data.root_quat_w], dim=1)
 
     @property
+    def soft_joint_vel_limits(self) -> Tensor:
+        """Speed limits of the actuators. (num_envs, joints) [m/s or rad/s]"""
+        return self._data.joint_vel_limits.expand(self._env.num_envs, -1)
+
+    joint_vel_limits = soft_joint_vel_limits
+
+    @property
+    def root_lin_vel_b(self) -> Tensor:
+        """Velocity of the root's centre of mass, root frame. (num_envs, 3) [m/s]"""
+        return rotate_inverse(self._data.root_quat_w, self._data.root_com_lin_vel_w)
+
+    root_com_lin_vel_b = root_lin_vel_b
+
+    @property
+    def root_link_lin_vel_b(self) -> Tensor:
+        """Velocity of the root's origin, root frame. (num_envs, 3) [m/s]"""
+        return rotate_inverse(self._data.root_quat_w, self._data.root_origin_lin_vel_w)
+
+    @property
     def root_vel_w(self) -> Tensor:
-        """Root linear [m/s] and angular [rad/s] velocity, world frame. (num_envs, 6)"""
-        return torch.cat([self._data.root_lin_vel_w, self._data.root_ang_vel_w], dim=1)
+        """Velocity of the root's centre of mass [m/s] and angular velocity [rad/s], world frame. (num_envs, 6)"""
+        return torch.cat([self._data.root_com_lin_vel_w, self._data.root_ang_vel_w], dim=1)
+
+    root_com_vel_w = root_vel_w
+
+    @property
+    def root_link_vel_w(self) -> Tensor:
+        """Velocity of the root's origin [m/s] and angular velocity [rad/s], world frame. (num_envs, 6)"""
+        return torch.cat([self._data.root_origin_lin_vel_w, self._data.root_ang_vel_w], dim=1)
 
     @property
     def root_state_w(self) -> Tensor:
-        """Root pose and velocity, world frame. (num_envs, 13)"""
+        """Root pose, and velocity of its centre of mass, world frame. (num_envs, 13)"""
         return torch.cat([self.root_pose_w, self.root_vel_w], dim=1)
 
-    root_link_pose_w, root_link_vel_w, root_link_state_w = root_pose_w, root_vel_w, root_state_w
+    @property
+    def root_link_state_w(self) -> Tensor:
+        """Root pose, and velocity of its origin, world frame. (num_envs, 13)"""
+        return torch.cat([self.root_pose_w, self.root_link_vel_w], dim=1)
+
+    root_link_pose_w = root_pose_w
+
+    @property
+    def body_lin_vel_w(self) -> Tensor:
+        """Velocities of the bodies' centres of mass, world frame. (num_envs, bodies, 3) [m/s]"""
+        return self._data.body_lin_vel_of(ALL, "com")
+
+    body_com_lin_vel_w = body_lin_vel_w
+
+    @property
+    def body_link_lin_vel_w(self) -> Tensor:
+        """Velocities of the bodies' origins, world frame. (num_envs, bodies, 3) [m/s]"""
+        return self._data.body_lin_vel_of(ALL, "origin")
+
+    @property
+    def body_pose_w(self) -> Tensor:
+        """Positions [m] and quaternions (w, x, y, z) of all bodies, world frame. (num_envs, bodies, 7)"""
+        return torch.cat([self._data.body_pos_w, self._data.body_quat_w], dim=-1)
+
+    body_link_pose_w = body_pose_w
+
+    @property
+    def body_vel_w(self) -> Tensor:
+        """Linear velocities of the centres of mass and angular velocities, world frame. (num_envs, bodies, 6)"""
+        return torch.cat([self.body_lin_vel_w, self._data.body_ang_vel_w], dim=-1)
+
+    body_com_vel_w = body_vel_w
+
+    @property
+    def body_link_vel_w(self) -> Tensor:
+        """Linear velocities of the origins and angular velocities, world frame. (num_envs, bodies, 6)"""
+        return torch.cat([self.body_link_lin_vel_w, self._data.body_ang_vel_w], dim=-1)
 
     @property
     def body_state_w(self) -> Tensor:
-        """Poses and velocities of all bodies, world frame. (num_envs, bodies, 13)"""
-        d: Any = self._data
-        return torch.cat([d.body_pos_w, d.body_quat_w, d.body_lin_vel_w, d.body_ang_vel_w], dim=-1)
+        """Poses of all bodies, and velocities of their centres of mass, world frame. (num_envs, bodies, 13)"""
+        return torch.cat([self.body_pose_w, self.body_vel_w], dim=-1)
+
+    @property
+    def body_link_state_w(self) -> Tensor:
+        """Poses of all bodies, and velocities of their origins, world frame. (num_envs, bodies, 13)"""
+        return torch.cat([self.body_pose_w, self.body_link_vel_w], dim=-1)
 
     @property
     def GRAVITY_VEC_W(self) -> Tensor:  # noqa: N802
@@ -152,7 +222,23 @@ class Asset:
         self._write("qpos", columns, root_pose, None, env_ids)
 
     def write_root_velocity_to_sim(self, root_velocity: Tensor, env_ids: Any = None) -> None:
-        """Set the root's linear [m/s] and angular [rad/s] velocity, world frame. Set the pose first. (rows, 6)"""
+        """Set velocities of the root's centre of mass [m/s] and angular velocities [rad/s], world frame. (rows, 6)
+
+        Set the pose first.
+        """
+        root, _ = self._entity.floating()
+        rows = slice(None) if env_ids is None else env_ids
+        quat = self._env.engine.field("qpos")[:, root + 3 : root + 7].float()
+        angular = torch.zeros_like(quat[:, :3])
+        angular[rows] = rotate_inverse(quat[rows], root_velocity[:, 3:])
+        linear = root_velocity[:, :3] - self._entity.com_velocity(quat, angular)[rows]
+        self.write_root_link_velocity_to_sim(torch.cat([linear, root_velocity[:, 3:]], dim=1), env_ids)
+
+    def write_root_link_velocity_to_sim(self, root_velocity: Tensor, env_ids: Any = None) -> None:
+        """Set velocities of the root's origin [m/s] and angular velocities [rad/s], world frame. (rows, 6)
+
+        Set the pose first.
+        """
         root, dof = self._entity.floating()
         rows = slice(None) if env_ids is None else env_ids
         quat = self._env.engine.field("qpos")[rows, root + 3 : root + 7].float()
@@ -162,12 +248,16 @@ class Asset:
         self._write("qvel", columns, torch.cat([root_velocity[:, :3], local], dim=1), None, env_ids)
 
     def write_root_state_to_sim(self, root_state: Tensor, env_ids: Any = None) -> None:
-        """Set the root's pose and velocity, world frame. (rows, 13)"""
+        """Set the root's pose, and the velocity of its centre of mass, world frame. (rows, 13)"""
         self.write_root_pose_to_sim(root_state[:, :7], env_ids)
         self.write_root_velocity_to_sim(root_state[:, 7:], env_ids)
 
+    def write_root_link_state_to_sim(self, root_state: Tensor, env_ids: Any = None) -> None:
+        """Set the root's pose, and the velocity of its origin, world frame. (rows, 13)"""
+        self.write_root_pose_to_sim(root_state[:, :7], env_ids)
+        self.write_root_link_velocity_to_sim(root_state[:, 7:], env_ids)
+
     write_root_link_pose_to_sim, write_root_com_velocity_to_sim = write_root_pose_to_sim, write_root_velocity_to_sim
-    write_root_link_state_to_sim, write_root_link_velocity_to_sim = write_root_state_to_sim, write_root_velocity_to_sim
 
     def _write(self, field: str, columns: Tensor, values: Tensor, joint_ids: Any, env_ids: Any) -> None:
         target = self._env.engine.field(field)

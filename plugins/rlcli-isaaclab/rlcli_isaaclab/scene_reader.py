@@ -9,7 +9,7 @@ from typing import Any
 
 from rlcli.errors import TaskError
 from rlcli_isaaclab import assets
-from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators
+from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
 from rlcli_isaaclab.sensor_reader import read_sensor
 from rlcli_isaaclab.settings import Key, Node, as_float, kind_of
 from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
@@ -25,6 +25,7 @@ class SceneReader:
         self.prims: dict[str, str] = {}
         """Entity -> the last part of its prim path."""
         self.sensors: dict[str, dict[str, Any]] = {}
+        self.has_terrain = False
         self._models: dict[str, Any] = {}
         self._joint_settings: dict[str, JointSettings] = {}
 
@@ -71,6 +72,7 @@ class SceneReader:
         config["entities"] = self.entities
         if self.sensors:
             config["sensors"] = self.sensors
+        self.has_terrain = "terrain" in config
         return config
 
     def add_joint_settings(self, driven: Mapping[str, Mapping[str, str]]) -> None:
@@ -138,9 +140,20 @@ class SceneReader:
         except NameProblem:
             return ".*", None  # the environment reports wrong joint names of an actuator when it is built
         settings = self._joint_settings.get(entity, [])
-        moved = [pattern for pattern, values in settings if values.get("stiffness") or values.get("damping")]
-        native = [n for n in chosen if n not in explicit and any(re.fullmatch(p, n) for p in moved)]
+        moved = {n: settings_of(n, settings) for n in chosen if n not in explicit}
+        native = [n for n, values in moved.items() if values.get("stiffness") or values.get("damping")]
         return [model["actuators"].get(n, n) for n in native], [n for n in chosen if n in explicit]
+
+    def damped_joints(self, entity: str, driven: Mapping[str, str]) -> list[str]:
+        """Return the joints whose implicit actuator becomes a damping of the joint, as its stiffness is zero.
+
+        Args:
+            entity: name of the entity.
+            driven: joint -> what an action commands: effort, velocity or position.
+        """
+        found = {n: settings_of(n, self._joint_settings.get(entity, [])) for n in self.names(entity, "joint") or []}
+        passive = [n for n, values in found.items() if values.get("damping") and not values.get("stiffness")]
+        return [n for n in passive if driven.get(n) != "velocity"]
 
     def sensor_of_bodies(self, name: str, bodies: Any, preserve: bool, key: Key) -> str:
         """Return the name of a sensor for some bodies of a contact sensor; adds one unless these are all its bodies."""
@@ -196,13 +209,14 @@ class SceneReader:
         spawn.skip("func", "visible", "copy_from_source", "activate_contact_sensors", "semantic_tags")
         spawn.skip("visual_material_path", "variants")
         self._read_model(name, model)
-        entity: dict[str, Any] = {"model": model}
+        entity: dict[str, Any] = {"model": model, "velocity_point": "com"}
         init = item.node("init_state")
         position = [as_float(v) for v in init.get("pos", (0.0, 0.0, 0.0))]
         rotation = [as_float(v) for v in init.get("rot", (1.0, 0.0, 0.0, 0.0))]
-        if any(position):
+        root_position, root_rotation = self._models.get(name, {}).get("root") or (None, None)
+        if position != root_position:
             entity["pos"] = position
-        if rotation != [1.0, 0.0, 0.0, 0.0]:
+        if rotation != root_rotation:
             entity["quat"] = rotation
         self._read_joint_state(name, entity, init)
         self._read_root_velocity(entity, init)
@@ -225,7 +239,7 @@ class SceneReader:
         if rigid.get("kinematic_enabled"):
             config["mocap"] = True
         elif kind_of(item.data.get("class_type")) == "RigidObject" or rigid:
-            config["free"] = True
+            config |= {"free": True, "velocity_point": "com"}
         for key in ("mass", "density"):
             if mass.get(key):
                 config[key] = as_float(mass.get(key))
@@ -269,6 +283,7 @@ class SceneReader:
         self._models[name] = {
             "joint": names,
             "body": [compiled.body(b).name for b in range(1, compiled.nbody)],  # body 0 is the world
+            "root": (compiled.body_pos[1].tolist(), compiled.body_quat[1].tolist()) if compiled.nbody > 1 else None,
             "damping": dict(zip(names, compiled.dof_damping[dofs].tolist(), strict=True)),
             "armature": dict(zip(names, compiled.dof_armature[dofs].tolist(), strict=True)),
             "friction_loss": dict(zip(names, compiled.dof_frictionloss[dofs].tolist(), strict=True)),

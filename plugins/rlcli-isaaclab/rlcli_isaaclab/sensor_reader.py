@@ -40,11 +40,13 @@ def read_sensor(kind: str, item: Node, prims: Mapping[str, str]) -> dict[str, An
 
 
 def _read_contact_sensor(item: Node, entity: str, body: str | None) -> dict[str, Any]:
-    item.skip("track_air_time", "track_contact_points", "track_friction_forces")
+    item.skip("track_contact_points", "track_friction_forces")
+    item.note("approximated", "track_air_time", "times are multiples of the environment step, not of the physics step")
     config: dict[str, Any] = {"kind": "contact", "entity": entity, "bodies": body or ".*"}
     history = item.get("history_length", 0)
     if history > 1:
         config["history"] = history
+        item.note("approximated", "history_length", "counts environment steps, not physics steps")
     config["force_threshold"] = as_float(item.get("force_threshold", 1.0))
     if item.data.get("filter_prim_paths_expr"):
         item.note("ignored", "filter_prim_paths_expr", "write `against` of the contact sensor")

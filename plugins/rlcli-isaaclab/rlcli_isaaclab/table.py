@@ -19,7 +19,7 @@ class Entry:
     note: str | None = None
     """How the counterpart differs."""
     fixed: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters that Isaac Lab's term has as constants in its code."""
+    """Parameters that Isaac Lab's term has as constants in its code; `entity`: its default asset."""
 
 
 def _pose(value: Mapping[str, Any]) -> dict[str, Any]:
@@ -39,6 +39,11 @@ def _xyz(value: Mapping[str, Any]) -> dict[str, Any]:
     return {axis: value[axis] for axis in ("x", "y", "z") if axis in value}
 
 
+def _bounds(value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the range of each axis; as in Isaac Lab, an axis that is not given has the range 0 to 0."""
+    return {axis: value.get(axis, (0.0, 0.0)) for axis in ("x", "y", "z")}
+
+
 def _names(value: Any) -> dict[str, Any]:
     return {"terms": [value] if isinstance(value, str) else list(value)}
 
@@ -52,8 +57,14 @@ _JOINTS: dict[str, str | Translate] = {"position_range": "position", "velocity_r
 _ROOT: dict[str, str | Translate] = {"pose_range": _pose, "velocity_range": _velocity}
 _TARGET: dict[str, str | Translate] = {"target_pos": "target"}
 
+_ACCELERATION = "MuJoCo's acceleration, not the change of velocity in the last physics step divided by its time"
+_PRESENT = "MuJoCo's own actuators: from the present state, not from that before the last physics step"
+
 TERMS: dict[str, dict[str, Entry]] = {
     "observations": {
+        "height_scan": Entry(note="a ray without a hit has its full length, not infinity"),
+        "body_incoming_wrench": Entry(note="about the body's origin, in its frame; PhysX: in the frame of the joint"),
+        "imu_lin_acc": Entry(note=_ACCELERATION),
         "base_heading_proj": Entry(params=_TARGET),
         "base_angle_to_target": Entry(params=_TARGET),
         "fingertips_pos": Entry("ee_pos"),
@@ -69,13 +80,23 @@ TERMS: dict[str, dict[str, Entry]] = {
     "rewards": {
         "is_terminated_term": Entry(params={"term_keys": _names}),
         "move_to_target_bonus": Entry(params=_TARGET),
-        "progress_reward": Entry(params=_TARGET),
+        "progress_reward": Entry(params=_TARGET, note="the first step of an episode has no difference in height"),
+        "body_lin_acc_l2": Entry(note=_ACCELERATION),
+        "joint_acc_l2": Entry(note=_ACCELERATION),
+        "joint_acceleration_penalty": Entry(note=_ACCELERATION),
+        "applied_torque_limits": Entry(note=_PRESENT),
+        "open_drawer_bonus": Entry(note="not doubled during a grasp"),
+        "multi_stage_open_drawer": Entry(note="later stages need no grasp"),
+        "orientation_command_error_tanh": Entry(
+            note="the angle of a body of the robot, not of an object, and without the condition on contacts"
+        ),
         "GaitReward": Entry("gait_reward"),
-        "action_l2_clamped": Entry("action_l2"),
-        "action_rate_l2_clamped": Entry("action_rate_l2"),
+        "action_l2_clamped": Entry("action_l2", note="not clamped to 1000"),
+        "action_rate_l2_clamped": Entry("action_rate_l2", note="not clamped to 1000"),
     },
     "terminations": {
-        "out_of_bound": Entry(params={"in_bound_range": _xyz}),
+        "joint_effort_out_of_limit": Entry(note=_PRESENT),
+        "out_of_bound": Entry(params={"in_bound_range": _bounds}, fixed={"entity": "object"}),
         "terrain_out_of_bounds": Entry(
             "out_of_bound", {"distance_buffer": lambda value: {}}, "without bounds: set x and y of out_of_bound"
         ),
@@ -88,7 +109,10 @@ TERMS: dict[str, dict[str, Entry]] = {
         "reset_root_state_uniform": Entry(params=_ROOT),
         "reset_root_state_with_random_orientation": Entry(params=_ROOT | {"pose_range": _xyz}),
         "push_by_setting_velocity": Entry(params={"velocity_range": _velocity}),
-        "apply_external_force_torque": Entry(params={"force_range": "force", "torque_range": "torque"}),
+        "apply_external_force_torque": Entry(
+            params={"force_range": "force", "torque_range": "torque"},
+            note="force and torque keep their direction in the world, not in the body's frame",
+        ),
         "reset_scene_to_default": Entry(params={"reset_joint_targets": lambda value: {}}),
         "randomize_rigid_body_scale": Entry("randomize_geom_size"),
         "randomize_rigid_body_material": Entry("randomize_geom_friction"),
@@ -110,6 +134,25 @@ TERMS: dict[str, dict[str, Entry]] = {
     },
 }
 """Section -> Isaac Lab's name -> counterpart. `randomization.py` translates the parameters of randomization events."""
+
+HEIGHT_TERMS = {
+    "base_pos_z",
+    "root_height_below_minimum",
+    "base_height_l2",
+    "object_is_lifted",
+    "object_goal_distance",
+    "foot_clearance_reward",
+}
+"""Terms that measure heights above the environment's origin; Isaac Lab measures them above z = 0."""
+
+EFFORT_TERMS = {
+    "joint_effort",
+    "joint_torques_l2",
+    "joint_torques_penalty",
+    "applied_torque_limits",
+    "joint_effort_out_of_limit",
+}
+"""Terms that read the efforts of actuators."""
 
 ACTIONS: dict[str, str] = {
     "JointEffortAction": "joint_effort",

@@ -15,7 +15,7 @@ from rlcli_isaaclab.observation_reader import read_processing
 from rlcli_isaaclab.randomization import EVENTS, translate_event
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, equals_default, kind_of, to_plain
-from rlcli_isaaclab.table import ACTIONS, COMMANDS, TERMS, Entry, finite_times
+from rlcli_isaaclab.table import ACTIONS, COMMANDS, EFFORT_TERMS, HEIGHT_TERMS, TERMS, Entry, finite_times
 
 _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
 """Prefixes of the modules whose functions are in `table.py`."""
@@ -222,6 +222,13 @@ class TermReader:
             config |= self._read_params(signature, entry, params)
             if entry.note:
                 self.report.entries[(*node.key, "func")] = ("approximated", entry.note)
+            if name in HEIGHT_TERMS and self.scene.has_terrain:
+                why = "heights above the environment's origin, not above z = 0"
+                self.report.entries[(*node.key, "func")] = ("approximated", why)
+            entity = config.get("entity", "robot")
+            if name in EFFORT_TERMS and self.scene.damped_joints(entity, self.driven_joints.get(entity, {})):
+                why = "without the damping of implicit actuators with zero stiffness, which becomes that of the joint"
+                self.report.entries[(*node.key, "func")] = ("approximated", why)
         else:
             config = self._read_user_term(section, function, name, node, params)
         return config
@@ -266,7 +273,7 @@ class TermReader:
 
     def _read_params(self, signature: Signature, entry: Entry, params: Node) -> dict[str, Any]:
         """Return the parameters of a built-in term under rlcli's names."""
-        config: dict[str, Any] = dict(entry.fixed)
+        config = {key: value for key, value in entry.fixed.items() if key != "entity" or "asset_cfg" not in params}
         by_alias: dict[str, Any] = {}
         for parameter in signature.parameters:
             by_alias.setdefault(parameter.alias or "", parameter)

@@ -40,6 +40,7 @@ def test_cartpole_run_equals_builtin_cartpole_config(imported):
     assert code == 0
     ours = to_data(resolve(folder_task(folder)))
     theirs = to_data(resolve(find_task("cartpole"), flags={"scene.num_envs": 4096}))
+    theirs["scene"]["entities"]["robot"]["velocity_point"] = "com"  # Isaac Lab's velocities
     for key in ("decimation", "episode_length_s", "sim", "scene", "actions", "observations", "rewards", "terminations"):
         assert ours[key] == theirs[key], key
     assert list(ours["events"].values()) == list(theirs["events"].values())

@@ -9,7 +9,7 @@ import rlcli
 from rlcli.config.term_signatures import SECTIONS, builtin_terms
 
 PAGE = Path(rlcli.__path__[0]).parent / "docs" / "reference" / "isaac-lab-terms.md"
-ROW = re.compile(r"^\| `([^`]+)` \| (same|not possible|not offered|`[a-z0-9_]+`) \| (.*) \|$")
+ROW = re.compile(r"^\| `([^`]+)` \| (same|similar|not possible|not offered|`[a-z0-9_]+`) \| (.*) \|$")
 
 
 def tables():
@@ -48,4 +48,5 @@ def test_listed_counterparts_exist(section):
             assert remark, f"{name}: why?"
             assert name not in terms
         else:
-            assert (name if here == "same" else here.strip("`")) in terms, name
+            assert (name if here in ("same", "similar") else here.strip("`")) in terms, name
+            assert here != "similar" or remark, f"{name}: how does it differ?"

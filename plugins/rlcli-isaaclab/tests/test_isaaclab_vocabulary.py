@@ -133,7 +133,7 @@ TERMINATIONS = {
     "object_reached_goal": {"command_name": "hand", "threshold": 0.001, **THING},
     "object_away_from_goal": {"command_name": "hand", "threshold": 99.0, **THING},
     "object_away_from_robot": {"threshold": 99.0, "asset_cfg": Pick("robot"), "object_cfg": Pick("object")},
-    "out_of_bound": {"asset_cfg": Pick("robot"), "in_bound_range": {"x": (-90.0, 90.0), "z": (-9.0, 9.0)}},
+    "out_of_bound": {"asset_cfg": Pick("robot"), "in_bound_range": dict.fromkeys("xyz", (-90.0, 90.0))},
     "abnormal_robot_state": {},
 }  # fmt: skip
 SPREAD = {"operation": "scale", "distribution": "uniform"}
@@ -186,7 +186,7 @@ def articulation(name, **more):
 @configclass
 class SceneCfg(InteractiveSceneCfg):
     ground = TerrainImporterCfg(prim_path="/World/ground", terrain_type="plane")
-    robot = articulation("walker", actuators={
+    robot = articulation("walker", init_state=ArticulationCfg.InitialStateCfg(pos=(0.0, 0.0, 0.35)), actuators={
         "front": ImplicitActuatorCfg(joint_names_expr=["hip_f."], stiffness=20.0, damping=0.5, effort_limit_sim=8.0),
         "back": DCMotorCfg(joint_names_expr=["hip_b."], stiffness=20.0, damping=0.5, effort_limit=8.0,
                            saturation_effort=9.0, velocity_limit=30.0)})  # fmt: skip
@@ -260,8 +260,8 @@ def source(tmp_path_factory):
 def rows(section):
     """Return Isaac Lab's name -> name of the built-in term, from the page."""
     text = PAGE.read_text().split(f"`{section}:`\n")[1].split("\n## ")[0]
-    found = re.findall(r"^\| `([^`]+)` \| (same|`[a-z0-9_]+`) \|", text, re.MULTILINE)
-    return {name: name if here == "same" else here.strip("`") for name, here in found}
+    found = re.findall(r"^\| `([^`]+)` \| (same|similar|`[a-z0-9_]+`) \|", text, re.MULTILINE)
+    return {name: name if here in ("same", "similar") else here.strip("`") for name, here in found}
 
 
 @pytest.mark.parametrize(

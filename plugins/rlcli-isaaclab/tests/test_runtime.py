@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.worlds import build, critter
+from support.worlds import CRITTER, CRITTER_TASK, build, critter, edited, write
 
 from rlcli.scene.names import NameProblem
 from rlcli_isaaclab.runtime import facade_of
@@ -48,6 +48,37 @@ def test_written_root_state_is_read_back_in_selected_rows(robot):
     assert torch.equal(robot.data.root_state_w[[0, 2]], before[[0, 2]])
     assert torch.allclose(robot.data.root_pose_w[rows], written[:, :7], atol=1e-6)
     assert torch.allclose(robot.data.root_vel_w[rows], written[:, 7:], atol=1e-6)
+
+
+def test_velocities_without_link_are_those_of_the_centre_of_mass(tmp_path):
+    inertia = '<inertial pos="0.05 0.02 -0.03" mass="3" diaginertia="0.02 0.05 0.06"/>'
+    xml = CRITTER.replace('<freejoint name="root"/>', f'<freejoint name="root"/>{inertia}')
+    env = facade_of(build(write(tmp_path / "off", edited(CRITTER_TASK), critter_xml=xml), 4))
+    env.reset(seed=3)
+    robot, rows = env.scene["robot"], torch.tensor([3, 1])
+    written = torch.cat([random_pose(2), torch.randn(2, 6, generator=torch.Generator().manual_seed(2))], dim=1)
+    arm = lab.quat_apply(written[:, 3:7], torch.tensor([[0.05, 0.02, -0.03]] * 2))
+    turning = torch.linalg.cross(written[:, 10:], arm)
+    for write_state, of_com, of_origin in (
+        (robot.write_root_state_to_sim, 0.0, -turning),
+        (robot.write_root_link_state_to_sim, turning, 0.0),
+    ):
+        write_state(written, env_ids=rows)
+        env.managed.engine.forward(env.managed._select_all())
+        env.managed.sim.refresh()
+        data = robot.data
+        com, origin = written[:, 7:10] + of_com, written[:, 7:10] + of_origin
+        for found, expected in (
+            (data.root_lin_vel_w, com), (data.root_com_lin_vel_w, com), (data.root_vel_w[:, :3], com),
+            (data.root_state_w[:, 7:10], com), (data.body_lin_vel_w[:, 0], com), (data.body_state_w[:, 0, 7:10], com),
+            (lab.quat_apply(data.root_quat_w, data.root_lin_vel_b), com), (data.body_vel_w[:, 0, :3], com),
+            (data.root_link_lin_vel_w, origin), (data.root_link_vel_w[:, :3], origin),
+            (data.root_link_state_w[:, 7:10], origin), (data.body_link_lin_vel_w[:, 0], origin),
+            (data.body_link_state_w[:, 0, 7:10], origin), (data.body_link_vel_w[:, 0, :3], origin),
+            (lab.quat_apply(data.root_quat_w, data.root_link_lin_vel_b), origin),
+        ):  # fmt: skip
+            torch.testing.assert_close(found[rows], expected, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(data.root_link_ang_vel_w[rows], written[:, 10:], atol=1e-5, rtol=1e-5)
 
 
 def test_written_joint_is_read_back_and_others_keep(robot):

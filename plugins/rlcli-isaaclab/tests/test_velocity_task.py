@@ -25,7 +25,7 @@ from rlcli_isaaclab import (
 CRITTER_CFG = ArticulationCfg(
     spawn=sim_utils.UsdFileCfg(usd_path="critter.xml"),
     init_state=ArticulationCfg.InitialStateCfg(
-        pos=(0.0, 0.0, 0.05), joint_pos={"hip_f[lr]": 0.2, "hip_b.*": -0.2}, joint_vel={".*": 0.0}
+        pos=(0.0, 0.0, 0.4), joint_pos={"hip_f[lr]": 0.2, "hip_b.*": -0.2}, joint_vel={".*": 0.0}
     ),
     soft_joint_pos_limit_factor=0.9,
     actuators={

@@ -33,8 +33,8 @@ class Prim:
         self.child: mujoco.MjSpec | None = None
         self.label = ""
         self.shape = False
-        self.pos: tuple[float, ...] = (0.0, 0.0, 0.0)
-        self.quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+        self.pos: tuple[float, ...] | None = None
+        self.quat: tuple[float, ...] | None = None
         self.settings: dict[str, Any] = {}
         self.names: dict[str, Mapping[str, str]] = {}
 
@@ -93,7 +93,7 @@ class Stage:
     def define(self, path: str, pos: Any, quat: Any) -> Prim:
         """Add a prim."""
         prim = self.prims[path] = Prim(self, path)
-        prim.pos, prim.quat = _to_floats(pos, (0.0, 0.0, 0.0)), _to_floats(quat, (1.0, 0.0, 0.0, 0.0))
+        prim.pos, prim.quat = (None if value is None else _to_floats(value, ()) for value in (pos, quat))
         return prim
 
     def load(self, prim: Prim, kinds: list[str]) -> None:

@@ -150,9 +150,9 @@ def test_setters_write_selected_rows_and_joints(env):
         arms.set_joint_positions(torch.zeros(3, 3))
 
 
-def test_world_poses_include_grid_and_robot_position(env):
+def test_world_poses_are_grid_and_start_position_of_root(env):
     position, _ = env.task._arms.get_world_poses()
-    assert torch.allclose(position - env.task._env_pos, torch.tensor([0.0, 0.0, 1.5]))
+    assert torch.allclose(position - env.task._env_pos, torch.tensor([0.0, 0.0, 0.5]))
     assert env.task._env_pos[:, :2].unique(dim=0).shape[0] == 4
     assert torch.allclose(env.task._balls.get_world_poses()[0], env.task._env_pos + torch.tensor([0.0, 0.0, 2.0]))
 

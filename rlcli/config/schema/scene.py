@@ -77,7 +77,7 @@ class JointConfig(StrictModel):
     effort_limit: Positive | None = None
     """Largest force or torque of the joint's actuator [N or N m]."""
     velocity_limit: Positive | None = None
-    """Speed limit that terms read [m/s or rad/s]; the physics does not enforce it."""
+    """Speed limit that terms read [m/s or rad/s]; the physics does not enforce it. null: that of its dc_motor."""
     actuator: Literal["motor", "position", "velocity"] | None = None
     """Actuator to add if the MJCF has none of this kind. Action terms add the actuators that they need by
     themselves."""
@@ -106,8 +106,9 @@ class ActuatorConfig(StrictModel):
     """Largest force or torque [N or N m]; null: no limit."""
     saturation_effort: Positive | None = None
     """Stall force or torque of a dc_motor [N or N m]."""
-    velocity_limit: Positive | None = None
-    """No-load speed of a dc_motor [m/s or rad/s]."""
+    velocity_limit: Positive | dict[str, Positive] | None = None
+    """No-load speed of a dc_motor [m/s or rad/s], like `stiffness` one for all joints or one for each. Terms read it as
+    the speed limit of joints whose own `velocity_limit` is null."""
     delay: StepRange = (0, 0)
     """[low, high] physics steps until a command takes effect, both included. One number is drawn for each environment
     at the start of an episode."""
@@ -130,7 +131,7 @@ class InitialStateConfig(StrictModel):
     joint_vel: dict[str, Number] = {}
     """Joint name or regex -> default velocity [m/s or rad/s]."""
     lin_vel: Vec3 = (0.0, 0.0, 0.0)
-    """Linear velocity of a free root body, world frame [m/s]."""
+    """Linear velocity of a free root body, world frame [m/s]; of its `velocity_point`."""
     ang_vel: Vec3 = (0.0, 0.0, 0.0)
     """Angular velocity of a free root body, world frame [rad/s]."""
 
@@ -173,10 +174,16 @@ class EntityConfig(StrictModel):
     """Coefficient of sliding friction of a shape."""
     color: Color = (0.55, 0.6, 0.65)
     """Red, green, blue of a shape in [0, 1]."""
-    pos: Vec3 = (0.0, 0.0, 0.0)
-    """Position of the MJCF's origin, or of the centre of the shape, in the environment's frame [m]."""
-    quat: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """Orientation (w, x, y, z) in the environment's frame; it is normalised."""
+    pos: Vec3 | None = None
+    """Start position of the root in the environment's frame [m]; null: that in the MJCF, and 0 for a shape. The root is
+    the first body of the MJCF, or the shape. It starts there if it can move, and is fixed there otherwise; the rest of
+    the MJCF moves with it. Events that reset the root use this pose. Keyframes of the MJCF are not read."""
+    quat: Quaternion | None = None
+    """Start orientation of the root (w, x, y, z) in the environment's frame, which is normalised; null: that in the
+    MJCF."""
+    velocity_point: Literal["origin", "com"] = "origin"
+    """Point of a body whose linear velocity and acceleration are read by terms, given in `init` and set by events: the
+    origin of the body's frame, or its centre of mass (com), as in Isaac Lab."""
     joints: dict[str, JointConfig] = {}
     """Joint name or regex -> changes of the joint. If several match a joint, the later one wins key by key."""
     actuators: dict[str, ActuatorConfig] = {}

@@ -26,7 +26,8 @@ class ContactSensorConfig(StrictModel):
     entity: str = "robot"
     """Name of an entity."""
     bodies: Names
-    """Names or regexes of its bodies. Each body has one column, in this order."""
+    """Names or regexes of its bodies. Each body has one column, in this order. A body without a geom that can touch
+    anything reads 0; at least one must have such a geom."""
     against: Literal["ground"] | TouchedConfig | None = None
     """The other side of the contacts: ground (the plane or the terrain) or bodies of an entity; null: everything."""
     history: Count = 1

@@ -10,6 +10,7 @@ from torch import Tensor
 from rlcli.mdp.parameters import Command, Entity, ManagedEnv, RaySensor
 from rlcli.mdp.term import EntityTerm, Term
 from rlcli.mdp.term_helpers import commanded_speed, constant
+from rlcli.scene.names import match
 from rlcli.sim.rotations import length, roll_pitch_yaw
 from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
@@ -104,21 +105,22 @@ class ProgressReward(EntityTerm, TensorState):
 
 @dataclass(kw_only=True, eq=False)
 class IsTerminatedTerm(Term):
-    """Number of the terminations `terms` that ended the episode in this step; 0 on a time-out. (num_envs,)"""
+    """Number of the terminations `terms` that ended the episode in this step; 0 on a time-out. (num_envs,)
 
-    terms: list[str]
+    terms: names or regexes of terminations.
+    """
+
+    terms: str | list[str] = ".*"
 
     def __post_init__(self) -> None:
         known = [name for name, config in self.env.config.terminations.items() if config is not None]
-        for name in self.terms:
-            if name not in known:
-                raise ValueError(f"no termination '{name}'; terminations: {', '.join(known) or 'none'}")
+        self._names = [known[position] for position in match(self.terms, known, "termination")]
 
     def __call__(self) -> Tensor:
         """Return the number of terminations. (num_envs,)"""
         manager = self.env.termination_manager
         fired = torch.zeros_like(manager.terminated, dtype=torch.float32)
-        for name in self.terms:
+        for name in self._names:
             fired = fired + manager.fired[name]
         return fired * ~manager.time_outs
 
@@ -174,8 +176,8 @@ def yaw_aligned(env: ManagedEnv, *, entity: Entity = "robot", std: float = 0.5) 
 
 @reads_body_forces
 def body_lin_acc_l2(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
-    """Sum of the squared accelerations of the bodies' origins in the last substep [m^2/s^4]. (num_envs,)"""
-    return entity.data.body_lin_acc_w[:, bodies].square().sum(dim=-1).sum(dim=1)
+    """Sum of the magnitudes of the accelerations of bodies in the last substep, not squared [m/s^2]. (num_envs,)"""
+    return length(entity.data.body_lin_acc_w[:, bodies]).sum(dim=1)
 
 
 def body_angular_velocity_penalty(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies) -> Tensor:

@@ -53,7 +53,7 @@ def joint_pos_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joint
 class JointPosLimitsPenaltyRatio(JointTerm):
     """Sum of (|x| - threshold) / (1 - threshold) x gear_ratio over joints with |x| > threshold. (num_envs,)
 
-    x: joint position, scaled to -1 at the lower and 1 at the upper limit; joints without limits do not count.
+    x: joint position, scaled to -1 at the lower and 1 at the upper soft limit; joints without limits do not count.
     gear_ratio: one for all joints, or one for each in the order of `joints`.
     """
 
@@ -65,8 +65,9 @@ class JointPosLimitsPenaltyRatio(JointTerm):
 
     def __call__(self) -> Tensor:
         """Return the sum. (num_envs,)"""
-        low, high = (limit[:, self.joints] for limit in self.entity.data.joint_limits())
-        scaled = ((2.0 * self.entity.data.joint_pos_of(self.joints) - low - high) / (high - low)).abs()
+        data, soft = self.entity.data, self.entity.config.soft_joint_pos_limit_factor < 1.0
+        low, high = (limit[:, self.joints] for limit in data.joint_limits(soft))  # at 1.0 soft limits are the limits
+        scaled = ((2.0 * data.joint_pos_of(self.joints) - low - high) / (high - low)).abs()
         violation = (scaled - self.threshold) / (1.0 - self.threshold)
         # a joint without limits has no scale (nan), and is never beyond it
         return torch.where(scaled > self.threshold, violation * self._ratio, 0.0).sum(dim=1)
