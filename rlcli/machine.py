@@ -11,6 +11,7 @@ import platform
 import re
 import shutil
 import stat
+import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -66,6 +67,11 @@ def _control_groups(controller: str, groups: Path, own: Path) -> Iterator[Path]:
         for root in (groups / controllers, groups / controller) if controllers else (groups,):
             folder = root / path.strip("/")
             yield from (each for each in (folder, *folder.parents) if each.is_relative_to(root))
+
+
+def python_command(*arguments: str) -> list[str]:
+    """Return the command that runs this Python with arguments, without imports from the current folder."""
+    return [sys.executable, "-P", *arguments]
 
 
 def read_plain(file: Path, most: int) -> bytes:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,7 @@ import mujoco
 import numpy as np
 
 from rlcli.errors import one_line
-from rlcli.machine import read_plain
+from rlcli.machine import python_command, read_plain
 from rlcli.registry import chosen_model, model_file
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
@@ -281,7 +280,7 @@ def _compile_in_subprocess(file: Path) -> None:
     Raises:
         BadModel: if compiling fails.
     """
-    command = [sys.executable, "-P", "-c", _SUBPROCESS_CODE, str(file), str(_MAX_MEMORY), str(TIME_S)]
+    command = python_command("-c", _SUBPROCESS_CODE, str(file), str(_MAX_MEMORY), str(TIME_S))
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=2 * TIME_S)
     except subprocess.TimeoutExpired:
