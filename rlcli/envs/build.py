@@ -66,7 +66,8 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
         binder.raise_problems()
     scene.spec.visual.global_.offwidth = task.viewer.width
     scene.spec.visual.global_.offheight = task.viewer.height
-    engine = open_engine(scene.compile(), task.scene.num_envs, task.sim, device=str(device))
+    model = scene.compile(on_cpu=device.type == "cpu")
+    engine = open_engine(model, task.scene.num_envs, task.sim, device=str(device))
     data = SimData(engine)
     entities = _make_entities(scene, binder, engine, data)
     actuators = _make_actuators(entities, binder)

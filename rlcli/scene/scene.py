@@ -16,6 +16,7 @@ from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_mate
 from rlcli.scene.joint_and_actuator_setup import SceneJoints
 from rlcli.scene.names import SceneProblem
 from rlcli.scene.sensor_builder import SensorBuilder, SensorSpec
+from rlcli.scene.sparse_newton import avoid_sparse_newton
 from rlcli.scene.terrain import Ground, add_ground, make_ground, terrain_problems
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
@@ -60,8 +61,8 @@ class Scene:
         self.views.append(view)
         return view
 
-    def compile(self) -> mujoco.MjModel:
-        """Compile the scene to an MjModel.
+    def compile(self, *, on_cpu: bool = True) -> mujoco.MjModel:
+        """Compile the scene to an MjModel, for the CPU engine or for MuJoCo Warp.
 
         Raises:
             ConfigError: if MuJoCo refuses the model.
@@ -69,10 +70,13 @@ class Scene:
         try:
             # MuJoCo warns about options of the MJCF that `sim` overrides
             with warnings.catch_warnings(action="ignore"):
-                return self.spec.compile()
+                model = self.spec.compile()
         except ValueError as error:
             message = f"MuJoCo cannot compile the model: {one_line(error)}"
             raise ConfigError([Problem("scene", "", message)]) from None
+        if on_cpu:
+            avoid_sparse_newton(self.spec, model)
+        return model
 
     def _attach(self, name: str, entity: EntityConfig) -> None:
         try:
