@@ -15,7 +15,9 @@ from rlcli.scene.names import SceneProblem
 from rlcli.scene.untrusted_mjcf import BadModel, model_roots, read_mjcf
 
 
-def entity_spec(name: str, entity: EntityConfig, root: Path, *, installed: bool) -> mujoco.MjSpec:
+def entity_spec(
+    name: str, entity: EntityConfig, root: Path, *, installed: bool, compiled: bool = False
+) -> mujoco.MjSpec:
     """Return the model of an entity: its MJCF, or a body with one geom.
 
     Args:
@@ -23,6 +25,7 @@ def entity_spec(name: str, entity: EntityConfig, root: Path, *, installed: bool)
         entity: configuration of the entity.
         root: the task's folder.
         installed: whether the task is installed: the files of an installed task are trusted.
+        compiled: whether to compile a copy of the model, too.
 
     Raises:
         SceneProblem: if the MJCF cannot be read.
@@ -30,7 +33,7 @@ def entity_spec(name: str, entity: EntityConfig, root: Path, *, installed: bool)
     """
     if entity.model is None:
         return _shape_model(entity)
-    return _load_mjcf(entity, ("scene", "entities", name, "model"), root, installed)
+    return _load_mjcf(entity, ("scene", "entities", name, "model"), root, installed, compiled)
 
 
 def name_all(child: mujoco.MjSpec) -> None:
@@ -61,7 +64,9 @@ def write_masses(child: mujoco.MjSpec) -> None:
     child.compiler.settotalmass = -1.0
 
 
-def _load_mjcf(entity: EntityConfig, path: tuple[str, ...], root: Path, installed: bool) -> mujoco.MjSpec:
+def _load_mjcf(
+    entity: EntityConfig, path: tuple[str, ...], root: Path, installed: bool, compiled: bool
+) -> mujoco.MjSpec:
     """Read the MJCF of an entity."""
     assert entity.model is not None
     try:
@@ -78,7 +83,7 @@ def _load_mjcf(entity: EntityConfig, path: tuple[str, ...], root: Path, installe
         raise SceneProblem(path, f"no file '{entity.model}' in {root}", hint)
     try:
         installed = installed or ":" in entity.model
-        return read_mjcf(file, model_roots(root, entity.model), installed=installed)
+        return read_mjcf(file, model_roots(root, entity.model), installed=installed, compiled=compiled)
     except BadModel as error:
         raise SceneProblem(path, f"'{entity.model}' is not a valid MJCF: {one_line(error)}") from None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,6 +19,7 @@ from rlcli.scene.names import SceneProblem
 from rlcli.scene.sensor_builder import SensorBuilder, SensorSpec
 from rlcli.scene.sparse_newton import avoid_sparse_newton
 from rlcli.scene.terrain import Ground, add_ground, make_ground, terrain_problems
+from rlcli.scene.untrusted_mjcf import MUJOCO_ERRORS
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 _OPTIONS = (
@@ -71,12 +73,20 @@ class Scene:
             # MuJoCo warns about options of the MJCF that `sim` overrides
             with warnings.catch_warnings(action="ignore"):
                 model = self.spec.compile()
-        except ValueError as error:
+        except MUJOCO_ERRORS as error:
             message = f"MuJoCo cannot compile the model: {one_line(error)}"
             raise ConfigError([Problem("scene", "", message)]) from None
         if on_cpu:
             avoid_sparse_newton(self.spec, model)
         return model
+
+    def broken_models(self) -> Iterator[SceneProblem]:
+        """Compile the model of each entity by itself and yield the problems, which name the file."""
+        for name, entity in self.config.entities.items():
+            try:
+                entity_spec(name, entity, self.root, installed=self.installed, compiled=True)
+            except SceneProblem as problem:
+                yield problem
 
     def _attach(self, name: str, entity: EntityConfig) -> None:
         try:

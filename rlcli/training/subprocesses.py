@@ -77,7 +77,7 @@ class TrainingProcess:
         if not isinstance(printed, dict):
             error = RlcliError(f"the process ended with exit code {self.exit_code}; see {self.run / LOG}")
         else:
-            error = RlcliError(str(printed.get("message")))
+            error = RlcliError(str(printed.get("message")).split("\n"))
             error.kind = str(printed.get("kind"))
         error.exit_code = self.exit_code
         return error
