@@ -12,6 +12,7 @@ import numpy as np
 
 from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig, TerrainConfig
 from rlcli.errors import ConfigError, Problem, one_line
+from rlcli.machine import memory_error
 from rlcli.scene.entity_spec import entity_spec, name_all, write_masses
 from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_materials
 from rlcli.scene.joint_and_actuator_setup import SceneJoints
@@ -74,6 +75,8 @@ class Scene:
             with warnings.catch_warnings(action="ignore"):
                 model = self.spec.compile()
         except MUJOCO_ERRORS as error:
+            if too_little := memory_error(error):
+                raise too_little from None
             message = f"MuJoCo cannot compile the model: {one_line(error)}"
             raise ConfigError([Problem("scene", "", message)]) from None
         if on_cpu:

