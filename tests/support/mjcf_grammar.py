@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 
 import mujoco
 
+from rlcli.errors import Problem, one_line
 from rlcli.scene.untrusted_mjcf import BadModel, read_mjcf
 
 RICH = """
@@ -176,7 +177,7 @@ def attempt(folder):
         model = read_mjcf(folder / "model.xml", [folder], compiled=True).compile()
         mujoco.MjData(model)
     except BadModel as error:
-        return str(error)
+        return str(Problem("task.yaml", "scene.entities.robot.model", one_line(error)))
     return "taken"
 
 
@@ -217,7 +218,7 @@ def complaint(message, folder):
     """Return what is wrong with a message."""
     if "\n" in message:
         return "several lines"
-    if str(folder) not in message and ".xml" not in message:
+    if ".xml" not in message:
         return "no place"
     if len(message.replace(str(folder), "")) > 600 or "n" * 201 in message:
         return "long"
