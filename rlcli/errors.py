@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from rlcli.safe_text import message_line
+
 
 class RlcliError(Exception):
-    """An error that the user can fix. `message` says what is wrong and where; `hint` says what to do."""
+    """An error that the user can fix.
+
+    Args:
+        message: what is wrong and where: one line, or a list of lines.
+        hint: what to do.
+    """
 
     exit_code = 1
     kind = "error"
 
-    def __init__(self, message: str, *, hint: str | None = None) -> None:
-        super().__init__(message)
-        self.message = message
-        self.hint = hint
+    def __init__(self, message: str | Sequence[str], *, hint: str | None = None) -> None:
+        self.message = "\n".join(map(message_line, [message] if isinstance(message, str) else message))
+        self.hint = hint and message_line(hint)
+        super().__init__(self.message)
 
 
 class UsageError(RlcliError):
@@ -38,6 +46,12 @@ class Problem:
     message: str
     hint: str | None = None
 
+    def __post_init__(self) -> None:
+        """Make each part one line of limited length."""
+        for name in self.__slots__:
+            value = getattr(self, name)
+            object.__setattr__(self, name, value and message_line(value))
+
     def __str__(self) -> str:
         """Return one line: where, key, what is wrong, what to do."""
         text = f"{self.where}: {self.path}: {self.message}" if self.path else f"{self.where}: {self.message}"
@@ -52,7 +66,7 @@ class ConfigError(RlcliError):
 
     def __init__(self, problems: Iterable[Problem]) -> None:
         self.problems = sorted(dict.fromkeys(problems), key=_position)
-        super().__init__("\n".join(str(problem) for problem in self.problems))
+        super().__init__([str(problem) for problem in self.problems])
 
 
 class ShapeError(ConfigError):
@@ -124,7 +138,8 @@ class Stopped(RlcliError):
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str | None:
     """Return `did you mean 'x'?` for the most similar candidates (at most three), or None if none is similar."""
-    close = difflib.get_close_matches(name, dict.fromkeys(candidates), n=3, cutoff=0.6)
+    known = dict.fromkeys(itertools.islice(candidates, 1000))
+    close = difflib.get_close_matches(name[:200], known, n=3, cutoff=0.6)
     return f"did you mean {' or '.join(repr(match) for match in close)}?" if close else None
 
 

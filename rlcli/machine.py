@@ -11,11 +11,12 @@ import platform
 import re
 import shutil
 import stat
+import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
-from rlcli.errors import DependencyError, DeviceError, UsageError
+from rlcli.errors import DependencyError, DeviceError, MachineError, UsageError, one_line
 
 _GROUPS, _OWN_GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _NO_LIMIT = 1 << 60
@@ -68,6 +69,11 @@ def _control_groups(controller: str, groups: Path, own: Path) -> Iterator[Path]:
             yield from (each for each in (folder, *folder.parents) if each.is_relative_to(root))
 
 
+def python_command(*arguments: str) -> list[str]:
+    """Return the command that runs this Python with arguments, without imports from the current folder."""
+    return [sys.executable, "-P", *arguments]
+
+
 def read_plain(file: Path, most: int) -> bytes:
     """Return the content of a regular file. A pipe or a device at this path is refused without blocking.
 
@@ -98,6 +104,38 @@ def available_memory(report: Path = Path("/proc/meminfo")) -> int:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     except (AttributeError, OSError, ValueError):
         return 8 * 2**30
+
+
+def memory_error(error: BaseException) -> MachineError | None:
+    """Return the error to show for an exception that means too little memory; None for any other exception."""
+    if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
+        return None
+    hint = "close other programs, raise the limit of the process (`ulimit -v`), or lower scene.num_envs"
+    return MachineError(f"too little memory: {one_line(error, 200)}", hint=hint)
+
+
+def require_address_space() -> None:
+    """Check that a limit such as `ulimit -v` leaves room for torch, which would end the process without a message.
+
+    Raises:
+        MachineError: if it does not.
+    """
+    with contextlib.suppress(ImportError):
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if 0 < limit < _LEAST_ADDRESS_SPACE:
+            message = f"the process is limited to {limit >> 20} MiB of memory; {_LEAST_ADDRESS_SPACE >> 20} are needed"
+            raise MachineError(message, hint="raise the limit, for example with `ulimit -v unlimited`")
+
+
+_LEAST_ADDRESS_SPACE = 800 << 20
+_NO_MEMORY = re.compile(
+    r"(not|n't) allocate memory|not enough memory|bad_alloc|failed to map segment|n't start new thread|unable to mmap"
+    r"|out of memory",
+    re.IGNORECASE,
+)
+"""Messages of MuJoCo, torch, the dynamic linker and Python, which raise different classes."""
 
 
 def resident_memory(report: Path = Path("/proc/self/statm")) -> int | None:

@@ -19,7 +19,7 @@ from rlcli.cli.ui.help_text import HelpGroup
 from rlcli.cli.ui.options import CHOOSE, add_command
 from rlcli.config.settings_file import read_settings
 from rlcli.errors import ConfigError, MachineError, RlcliError, Stopped, UsageError
-from rlcli.machine import delay_garbage_collection
+from rlcli.machine import delay_garbage_collection, memory_error, require_address_space
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.settings import settings_file, use_settings
 from rlcli.trainers import TrainerSpec
@@ -41,8 +41,12 @@ GROUPS = {"import": "import_"}
 COMMANDS = tuple(name for names in PANELS.values() for name in names if name not in GROUPS)
 """Other commands: each has a module of `rlcli.cli.commands` of its name with a function `command`."""
 
-_INTERRUPTED = 130
 _HELP_FLAGS = frozenset(("-h", "--help", "--version", "--install-completion", "--show-completion"))
+_LIGHT = frozenset(
+    (*_HELP_FLAGS, "list-tasks", "terms", "show", "new", "validate", "lint", "sweep", "runs", "diff", "doctor")
+)
+"""First words of command lines that need not import torch."""
+_INTERRUPTED = 130
 _COMPLETION_VARIABLE = "_RLCLI_COMPLETE"
 """Environment variable that a shell sets to complete a command line."""
 _SETTINGS = {
@@ -129,6 +133,8 @@ def _command_name(arguments: list[str]) -> str | None:
 
 def _run(arguments: list[str]) -> int:
     try:
+        if not _LIGHT.intersection([*arguments[:1], *_HELP_FLAGS.intersection(arguments)]) or "--deep" in arguments:
+            require_address_space()
         with use_settings(_user_settings(arguments)):
             result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
         if result == _INTERRUPTED:  # typer turns Ctrl-C into this exit code
@@ -161,6 +167,9 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
     if isinstance(error, OSError):
         file = f"{error.filename}: " if error.filename else ""
         return MachineError(f"{file}{error.strerror or error}")
+
+    if too_little := memory_error(error):  # before imports, which need memory
+        return too_little
 
     from rlcli.cli.ui.error_origin import error_of_task
     from rlcli.sim.gl import opengl_import_error

@@ -13,6 +13,7 @@ from rlcli.config import strict_yaml
 from rlcli.config.strict_yaml import Document, Path, YamlError
 from rlcli.errors import ConfigError, Problem
 from rlcli.machine import read_plain
+from rlcli.safe_text import shorten
 
 _KEY = re.compile(r'"([^"]+)"|([^.="\s]+)')
 _OVERRIDE = re.compile(rf"\s*((?:{_KEY.pattern})(?:\.(?:{_KEY.pattern}))*)\s*=(.*)", re.DOTALL)
@@ -49,7 +50,7 @@ class Layers:
                 self._merge(value, origin, path, source)
                 continue
             if key in target:
-                self._forget(path)
+                self._forget(path, target[key])
             target[key] = copy.deepcopy(value)
             for below in _paths(value):
                 self.origins[path + below] = origin(source + below)
@@ -67,10 +68,13 @@ class Layers:
         last: str | int = path[-1]
         if isinstance(target, list):
             last = _index(target, last, taken)
+            old = target[last]
         elif not isinstance(target, dict):
             raise LookupError(f"'{taken[-1]}' is a value, not a mapping")
+        else:
+            old = target.get(last)
         taken = (*taken, last)
-        self._forget(taken)
+        self._forget(taken, old)
         target[last] = value
         for below in _paths(value):
             self.origins[taken + below] = origin
@@ -106,7 +110,6 @@ class Layers:
         path = (*taken, step)
         if target.get(str(step)) is None:
             target[str(step)] = {}
-            self._forget(path)
             self.origins[path] = origin
         return target[str(step)], path
 
@@ -120,9 +123,10 @@ class Layers:
             target = target[str(step)]
         return target
 
-    def _forget(self, path: Path) -> None:
-        for known in [p for p in self.origins if p[: len(path)] == path]:
-            del self.origins[known]
+    def _forget(self, path: Path, value: object) -> None:
+        """Remove the origins of the value at a path."""
+        for below in _paths(value):
+            self.origins.pop(path + below, None)
 
 
 def read(file: FilePath, name: str | None = None, *, pipe: bool = False) -> Document:
@@ -183,15 +187,23 @@ def parse_override(text: str) -> tuple[Path, Any]:
     Raises:
         ConfigError: if the text is not of the form key.path=value, or the value is not YAML.
     """
-    where = f"override '{text}'"
+    where = override_place(text)
     match = _OVERRIDE.fullmatch(text)
     if match is None:
         raise ConfigError([Problem(where, "", "is not an override; write KEY.PATH=VALUE, as in scene.num_envs=64")])
     path = parse_address(match[1])
+    if len(path) > strict_yaml.MAX_DEPTH:
+        message = f"the key has {len(path)} parts; {strict_yaml.MAX_DEPTH} are allowed"
+        raise ConfigError([Problem(where, "", message)])
     try:
         return path, strict_yaml.load_value(match[match.lastindex or 0])
     except YamlError as error:
         raise ConfigError([Problem(where, ".".join(path), error.message)]) from None
+
+
+def override_place(text: str) -> str:
+    """Return the location of an override, for a message."""
+    return f"override '{shorten(text, 150)}'"
 
 
 def parse_address(text: str) -> tuple[str, ...]:

@@ -18,8 +18,8 @@ from rlcli.config import messages
 from rlcli.config.layers import Layers, document_origins, read
 from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.strict_yaml import Document, Path
-from rlcli.config.term_signatures import Vocabulary
-from rlcli.config.validation import PATCHES, TaskCheck, agent_names, term_entries
+from rlcli.config.term_signatures import Vocabulary, term_entries
+from rlcli.config.validation import MAX_AGENTS, MAX_PROBLEMS, PATCHES, TaskCheck, agent_names
 from rlcli.errors import ConfigError, DependencyError, Problem
 from rlcli.formats import Note
 from rlcli.registry import TaskSource
@@ -142,14 +142,20 @@ def check_all(source: TaskSource, *, config_file: FilePath | None = None, overri
     """
     check = TaskCheck(source)
     check.read_task(check.document())
+    names = agent_names(check.layers)
+    if len(names) > MAX_AGENTS:
+        message = f"{len(names)} agents; {MAX_AGENTS} are allowed"
+        raise ConfigError([Problem(check.layers.place(("agents",)), "agents", message)])
     problems: list[Problem] = []
     unchecked: list[str] = []
-    for name in tuple(agent_names(check.layers)) or (None,):
+    for name in names or (None,):
         for play in (False, True):
             try:
                 resolve(source, agent=name, play=play, config_file=config_file, overrides=overrides)
             except ConfigError as error:
                 problems += error.problems
+                if len(problems) > 2 * MAX_PROBLEMS:
+                    raise ConfigError(problems[:MAX_PROBLEMS]) from None
             except DependencyError:
                 unchecked += [name] if name and name not in unchecked else []
     if problems:

@@ -44,8 +44,8 @@ def problems(
     place: Callable[[Path], str],
     prefix: Path = (),
     locations: KeyLocations | None = None,
-) -> list[Problem]:
-    """Return the errors of a validation as problems.
+) -> Iterator[Problem]:
+    """Yield the errors of a validation as problems.
 
     Args:
         error: the error that pydantic raised.
@@ -61,13 +61,12 @@ def problems(
         if item["type"] == "missing" and isinstance(path[-1], int):
             path = path[:-1]  # a tuple that is too short: report the list, not the missing item
         grouped.setdefault(path, []).append(item)
-    found = []
+    outer = {path[:length] for path in grouped for length in range(len(path))}
     for path, items in grouped.items():
-        if any(len(other) > len(path) and other[: len(path)] == path for other in grouped):
+        if path in outer:
             continue  # one alternative of a union; the error of another alternative is more precise
         message, hint, at = _message(path, items, model, data, locations or {})
-        found.append(Problem(place(prefix + at), dotted(prefix + at), message, hint))
-    return found
+        yield Problem(place(prefix + at), dotted(prefix + at), message, hint)
 
 
 def dotted(path: Path) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,6 +29,7 @@ _INT = re.compile(r"[-+]?(0|[1-9][0-9]{0,18})\Z")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]{1,4})?\Z")
 _OCTAL = re.compile(r"[-+]?0[0-9]+\Z")
 _NOT_FINITE = re.compile(r"[-+]?\.(inf|nan)\Z", re.IGNORECASE)
+_SURROGATE = re.compile("[\ud800-\udfff]")
 _WORDS = {"yes", "no", "on", "off"}
 _CONSTANTS = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
@@ -125,6 +127,18 @@ def _parse_cached(text: str) -> tuple[Any, dict[Path, Mark]]:
         raise YamlError(found, place=_after(text[: error.position])) from None
 
 
+def _events(text: str) -> Iterator[events.Event]:
+    """Yield PyYAML's events."""
+    loader = yaml.SafeLoader(text)
+    try:
+        while loader.check_event():
+            yield loader.get_event()
+    except (ValueError, OverflowError):  # an escape such as "\\U00110000"
+        raise YamlError("an escape is not a Unicode character; correct it", loader.get_mark()) from None
+    finally:
+        loader.dispose()
+
+
 class _Reader:
     """Builder of data and positions from PyYAML's events."""
 
@@ -135,7 +149,7 @@ class _Reader:
 
     def read(self, text: str) -> tuple[Any, dict[Path, Mark]]:
         documents = 0
-        for count, event in enumerate(yaml.parse(text, Loader=yaml.SafeLoader)):
+        for count, event in enumerate(_events(text)):
             if count > MAX_ITEMS:
                 raise YamlError(f"the file has more than {MAX_ITEMS} items; make it smaller", event.start_mark)
             self._refuse(event)
@@ -207,6 +221,8 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
     text = event.value
     if len(text) > MAX_SCALAR:
         raise YamlError(f"the value is longer than {MAX_SCALAR} characters; shorten it", event.start_mark)
+    if _SURROGATE.search(text):
+        raise YamlError("half of a surrogate pair (\\ud800 to \\udfff) is not a character; remove it", event.start_mark)
     if not event.implicit[0]:  # quoted or block: always text
         return text
     if key and text == "<<":

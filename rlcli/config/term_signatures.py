@@ -21,6 +21,7 @@ from typing import Any, Literal, Union
 from pydantic import ConfigDict, Field, create_model
 
 from rlcli.config import schema
+from rlcli.config.strict_yaml import Path as KeyPath
 from rlcli.config.unimported_classes import ClassSearch, SourceClass, constructor, last_name, parse
 
 SECTIONS: dict[str, type[schema.TermConfig]] = {
@@ -365,3 +366,24 @@ def _field_default(node: ast.expr | None) -> Any:
 
 def _takes_env(arguments: ast.arguments, position: int) -> bool:
     return len(arguments.args) > position and arguments.args[position].arg == "env"
+
+
+def term_entries(data: dict[str, Any]) -> list[tuple[str, KeyPath, dict[str, Any]]]:
+    """Return every term of a raw configuration as (section, path, entry)."""
+    found: list[tuple[str, KeyPath, dict[str, Any]]] = []
+    for section in SECTIONS:
+        content = data.get(section)
+        if not isinstance(content, dict):
+            continue
+        if section == "success":
+            found.append((section, (section,), content))
+        elif section == "observations":
+            for group, terms in content.items():
+                found += [
+                    (section, (section, group, n), t)
+                    for n, t in (terms.items() if isinstance(terms, dict) else ())
+                    if isinstance(t, dict)
+                ]
+        else:
+            found += [(section, (section, n), t) for n, t in content.items() if isinstance(t, dict)]
+    return found

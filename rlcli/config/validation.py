@@ -12,10 +12,18 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, python_task
 from rlcli.config.foreign_keys import move_foreign_keys
-from rlcli.config.layers import Layers, Origin, document_origins, parse_override, read
+from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
-from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, Vocabulary, params_model, read_params
+from rlcli.config.term_signatures import (
+    SECTIONS,
+    Signature,
+    SignatureError,
+    Vocabulary,
+    params_model,
+    read_params,
+    term_entries,
+)
 from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing
 from rlcli.formats import Note
 from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, formats, load_entry
@@ -27,6 +35,7 @@ PATCHES = ("agents", "play")
 
 Changes to these values from a --config file or an override are made first; then the patches are applied.
 """
+MAX_AGENTS, MAX_PROBLEMS = 64, 50
 _DEVICES = ("cpu", "cuda")
 
 
@@ -75,9 +84,20 @@ class TaskCheck:
             return Document(task.data)
         return read(self.source.config, self.source.label)  # the record of a run, which is YAML
 
+    def add(self, *problems: Problem) -> None:
+        """Add problems.
+
+        Raises:
+            ConfigError: if there are more than `MAX_PROBLEMS`.
+        """
+        self.problems += problems
+        if len(self.problems) > MAX_PROBLEMS:
+            text = f"more than {MAX_PROBLEMS} mistakes; the first ones are listed"
+            raise ConfigError([Problem(self.source.label, "", text), *self.problems[:MAX_PROBLEMS]])
+
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
         """Add a problem at a path."""
-        self.problems.append(Problem(self.layers.place(path), messages.dotted(path), message, hint))
+        self.add(Problem(self.layers.place(path), messages.dotted(path), message, hint))
 
     def _is_mapping(self, value: object, path: Path) -> bool:
         """Return whether the value at a path is a mapping; add a problem if it is not."""
@@ -121,9 +141,9 @@ class TaskCheck:
         found: list[Change] = []
         for text in overrides:
             try:
-                found.append((*parse_override(text), Origin("override", f"override '{text}'")))
+                found.append((*parse_override(text), Origin("override", override_place(text))))
             except ConfigError as error:
-                self.problems += error.problems
+                self.add(*error.problems)
         for key, value in flags.items():
             path = tuple(key.split("."))
             found.append((path, value, Origin("flag", f"--{path[-1].replace('_', '-')}")))
@@ -148,7 +168,7 @@ class TaskCheck:
         if wanted is not None:
             if wanted in names:
                 return wanted
-            self.problems.append(Problem("--agent", "", f"no agent '{wanted}'", hint(wanted)))
+            self.add(Problem("--agent", "", f"no agent '{wanted}'", hint(wanted)))
             return None
         self.apply([change for change in changes if change[0][:2] == ("agents", "default")], None)
         at: Path = ("agents", "default")
@@ -173,7 +193,7 @@ class TaskCheck:
             self._no_agent(origin(()).where)
         elif not isinstance(patch, dict):
             where = origin(()).where
-            self.problems.append(Problem(where, "agent", f"expected a mapping, found {messages.format_value(patch)}"))
+            self.add(Problem(where, "agent", f"expected a mapping, found {messages.format_value(patch)}"))
         else:
             self.layers.merge(patch, origin, ("agents", name))
 
@@ -181,10 +201,10 @@ class TaskCheck:
         """Add the problem that a change of `agent` has no agent to apply to."""
         names = agent_names(self.layers)
         if not names:
-            self.problems.append(Problem(where, "agent", "this task has no agents; add agents: to its YAML"))
+            self.add(Problem(where, "agent", "this task has no agents; add agents: to its YAML"))
         elif not self.problems:  # otherwise the choice of the agent was wrong and is reported already
             hint = f"name one: --agent {' or '.join(names)}"
-            self.problems.append(Problem(where, "agent", "the task has several agents and no default", hint))
+            self.add(Problem(where, "agent", "the task has several agents and no default", hint))
 
     def patch(self, layer: str, at: Path) -> None:
         """Merge the patch at path `at` over the task."""
@@ -210,12 +230,12 @@ class TaskCheck:
                 similar = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))
                 if similar:
                     key = messages.dotted(path)
-                    self.problems.append(Problem(origin.where, key, "there is nothing to remove", similar))
+                    self.add(Problem(origin.where, key, "there is nothing to remove", similar))
                     continue
             try:
                 self.layers.set(path, value, origin)
             except LookupError as error:
-                self.problems.append(Problem(origin.where, messages.dotted(path), str(error.args[0])))
+                self.add(Problem(origin.where, messages.dotted(path), str(error.args[0])))
 
     # --- validation ---
 
@@ -289,7 +309,8 @@ class TaskCheck:
             content = move_foreign_keys(data) if model is TaskConfig else data
             return model.model_validate_json(json.dumps(content), context=context)
         except ValidationError as error:
-            self.problems += messages.problems(error, model, data, self.layers.place, at, self.locations)
+            for problem in messages.problems(error, model, data, self.layers.place, at, self.locations):
+                self.add(problem)
             return None
 
     def read_terms(self) -> None:
@@ -298,7 +319,7 @@ class TaskCheck:
             self.vocabulary = Vocabulary.of(self.source.term_files)
             self.vocabulary.own.update(self.functions)
         except SyntaxError as error:
-            self.problems.append(_not_python(error))
+            self.add(_not_python(error))
 
     def _term(self, section: str, path: Path, entry: dict[str, Any]) -> TermConfig | None:
         """Return a term with its parameters, checked against the signature of its function; None if it is not valid."""
@@ -316,7 +337,7 @@ class TaskCheck:
                 try:
                     model = params_model(signature, section)
                 except SignatureError as error:
-                    self.problems.append(Problem(f"{signature.file}:{signature.line}:1", name, str(error)))
+                    self.add(Problem(f"{signature.file}:{signature.line}:1", name, str(error)))
         checked = self._validate(model, entry, path)
         return base.model_construct(**dict(checked)) if checked is not None else None
 
@@ -353,9 +374,9 @@ class TaskCheck:
         try:
             return read_params(self.source.task_file, self.source.task.rpartition(":")[2])
         except SyntaxError as error:
-            self.problems.append(_not_python(error))
+            self.add(_not_python(error))
         except SignatureError as error:
-            self.problems.append(Problem(str(self.source.task_file), "Params", str(error)))
+            self.add(Problem(str(self.source.task_file), "Params", str(error)))
         return None
 
     def _require_managed(self, data: Mapping[str, Any]) -> None:
@@ -379,23 +400,6 @@ class TaskCheck:
                 self.problem(
                     (section,), f"a direct task has no {section} terms; its class implements them: delete this section"
                 )
-
-
-def term_entries(data: Mapping[str, Any]) -> list[tuple[str, Path, dict[str, Any]]]:
-    """Return every term of a raw configuration as (section, path, entry)."""
-    found: list[tuple[str, Path, dict[str, Any]]] = []
-    for section in SECTIONS:
-        content = data.get(section)
-        if not isinstance(content, dict):
-            continue
-        if section == "success":
-            found.append((section, (section,), content))
-        elif section == "observations":
-            for group, terms in content.items():
-                found += [(section, (section, group, n), t) for n, t in _mapping(terms).items() if isinstance(t, dict)]
-        else:
-            found += [(section, (section, n), t) for n, t in content.items() if isinstance(t, dict)]
-    return found
 
 
 def _without(data: Any, paths: Iterable[Path]) -> Any:

@@ -15,7 +15,7 @@ from typing import Any
 from rlcli.doctor.check import Check
 from rlcli.doctor.installation import TRIPLE, version
 from rlcli.errors import MachineError
-from rlcli.machine import available_cores, has_gpu_driver
+from rlcli.machine import available_cores, has_gpu_driver, python_command
 from rlcli.registry.imports import release_numbers
 from rlcli.registry.probe import signal_name
 from rlcli.sim.gl import candidates
@@ -147,7 +147,7 @@ _KNOWN = ("enable", "enabled", "on", "true", "1", "glx", "wgl", "cgl")
 
 def run_isolated(check_name: str, timeout_s: float) -> Answer:
     """Run a check in a separate process (`isolated_process.py`) and return its result, or None and the reason."""
-    command = [sys.executable, "-m", "rlcli.doctor.isolated_process", check_name]
+    command = python_command("-m", "rlcli.doctor.isolated_process", check_name)
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     try:
         done = subprocess.run(

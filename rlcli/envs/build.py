@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rlcli.config.load import Resolved
 from rlcli.config.schema import InitialStateConfig
+from rlcli.errors import ConfigError
 from rlcli.managers.term import Binder
 from rlcli.scene.actuators import ActuatorModel
 from rlcli.scene.entity import Entity
@@ -66,7 +67,14 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
         binder.raise_problems()
     scene.spec.visual.global_.offwidth = task.viewer.width
     scene.spec.visual.global_.offheight = task.viewer.height
-    engine = open_engine(scene.compile(), task.scene.num_envs, task.sim, device=str(device))
+    try:
+        model = scene.compile(on_cpu=device.type == "cpu")
+    except ConfigError:
+        for problem in scene.broken_models():
+            binder.add_problem(problem.path, str(problem), problem.hint)
+        binder.raise_problems()
+        raise
+    engine = open_engine(model, task.scene.num_envs, task.sim, device=str(device))
     data = SimData(engine)
     entities = _make_entities(scene, binder, engine, data)
     actuators = _make_actuators(entities, binder)

@@ -11,7 +11,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -22,7 +21,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rlcli.machine import available_cores
+from rlcli.machine import available_cores, python_command
 from rlcli.registry import OWN, TASKS, Entry, package_folder
 
 TIMEOUT_S = 30.0
@@ -157,7 +156,7 @@ def _probe_names(
         file, log = Path(folder) / "rows", Path(folder) / "stderr"
         with log.open("wb") as stderr:
             process = subprocess.Popen(
-                [sys.executable, "-m", _BUILDER, group, str(file), *names],
+                python_command("-m", _BUILDER, group, str(file), *names),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,

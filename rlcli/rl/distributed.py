@@ -15,6 +15,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import MachineError
+from rlcli.machine import python_command
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -151,7 +152,6 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
         Exit code 0, or the exit code of a process that failed by itself and not because of another process.
     """
     import logging
-    import sys
 
     from torch.distributed import run
     from torch.distributed.elastic.multiprocessing.api import SignalException
@@ -161,7 +161,7 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # each process prints its own error already
     options = ["--standalone", f"--nproc-per-node={processes}"]
     try:
-        run.run(run.parse_args([*options, "--no-python", sys.executable, "-m", "rlcli", *arguments]))  # type: ignore[no-untyped-call]  # torch has no type here
+        run.run(run.parse_args([*options, "--no-python", *python_command("-m", "rlcli", *arguments)]))  # type: ignore[no-untyped-call]  # torch has no type here
     except ChildFailedError as error:
         return _exit_code([failure.exitcode for failure in error.failures.values()])
     except SignalException as error:

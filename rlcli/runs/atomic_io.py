@@ -99,7 +99,7 @@ def disk_errors(path: Path, *, remove: bool = False) -> Iterator[None]:
 _HINTS = {
     28: "free some space, then continue with --resume",
     13: "choose another folder with --runs-dir",
-    30: "choose another folder with --runs-dir",
+    30: "the disk is read-only: make it writable, copy the run, or choose another folder with --runs-dir",
     122: "the disk quota is used up: free some space",
 }
 """errno -> hint: ENOSPC, EACCES, EROFS, EDQUOT."""

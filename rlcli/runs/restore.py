@@ -98,8 +98,8 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
         return
     table = _table([("field", "in the checkpoint", "now"), *differing])
     names = "manifest.json" if "bundle" in checkpoint.manifest else "run.json"
-    message = f"{checkpoint.folder} does not fit the installed task:\n{table}"
-    raise CheckpointError(message, hint=f"install the task's version that {names} names, or train again")
+    lines = [f"{checkpoint.folder} does not fit the installed task:", *table]
+    raise CheckpointError(lines, hint=f"install the task's version that {names} names, or train again")
 
 
 def require_trainer(checkpoint: Checkpoint, trainer: str) -> None:
@@ -128,16 +128,17 @@ def require_same_policy(checkpoint: Checkpoint, policy: Policy, trainer: str) ->
     if rows:
         table = _table([("policy", "in the checkpoint", "the agent's"), *rows])
         owner = checkpoint.manifest.get("trainer") or "?"
-        raise CheckpointError(
+        title = (
             f"{checkpoint.folder}: the weights do not fit the agent; the checkpoint is from trainer '{owner}', and the"
-            f" agent uses '{trainer}':\n{table}",
-            hint="give the agent the network of the checkpoint, or start without --init-from",
+            f" agent uses '{trainer}':"
         )
+        hint = "give the agent the network of the checkpoint, or start without --init-from"
+        raise CheckpointError([title, *table], hint=hint)
 
 
-def _table(rows: Sequence[tuple[str, str, str]]) -> str:
+def _table(rows: Sequence[tuple[str, str, str]]) -> list[str]:
     widths = [max(len(row[column]) for row in rows) for column in range(2)]
-    return "\n".join(f"  {a.ljust(widths[0])}  {b.ljust(widths[1])}  {c}" for a, b, c in rows)
+    return [f"  {a.ljust(widths[0])}  {b.ljust(widths[1])}  {c}" for a, b, c in rows]
 
 
 def _differing_rows(record: Mapping[str, Any], current: Mapping[str, Any]) -> list[tuple[str, str, str]]:

@@ -19,7 +19,7 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from rlcli.config import strict_yaml
 from rlcli.errors import CheckpointError, MachineError, UsageError
-from rlcli.runs.atomic_io import disk_errors, to_json, write_atomic
+from rlcli.runs.atomic_io import disk_error, disk_errors, to_json, write_atomic
 from rlcli.runs.safe_io import FileModel, Word, check_json, read_file, read_json, refuse_links, require_inside
 
 CONFIG = "config.yaml"
@@ -90,6 +90,8 @@ class Run:
             self._lock.acquire()
         except Timeout:
             raise MachineError(f"another process writes to {self.folder}; wait for its end") from None
+        except OSError as error:
+            raise disk_error(self.folder / LOCK, error) from None
 
     def unlock(self) -> None:
         """Release the lock."""

@@ -61,7 +61,7 @@ def check_json(kind: type[Model], value: object, file: Path, *keys: str, hint: s
     try:
         return kind.model_validate_json(json.dumps(value))  # strict models accept a list for a tuple only in JSON
     except ValidationError as error:
-        problem = messages.problems(error, kind, value, messages.dotted)[0]
+        problem = next(messages.problems(error, kind, value, messages.dotted))
         at = ".".join(filter(None, (*keys, problem.path)))[:200]
         raise CheckpointError(f"{file} is corrupt: {at + ': ' if at else ''}{problem.message}", hint=hint) from None
 

@@ -19,7 +19,9 @@ from rlcli.scene.untrusted_mjcf import BadModel, model_roots, read_mjcf
 FloatArray = NDArray[np.float64]
 
 
-def entity_spec(name: str, entity: EntityConfig, root: Path, *, installed: bool) -> mujoco.MjSpec:
+def entity_spec(
+    name: str, entity: EntityConfig, root: Path, *, installed: bool, compiled: bool = False
+) -> mujoco.MjSpec:
     """Return the model of an entity: its MJCF, or a body with one geom.
 
     Args:
@@ -27,6 +29,7 @@ def entity_spec(name: str, entity: EntityConfig, root: Path, *, installed: bool)
         entity: configuration of the entity.
         root: the task's folder.
         installed: whether the task is installed: the files of an installed task are trusted.
+        compiled: whether to compile a copy of the model, too.
 
     Raises:
         SceneProblem: if the MJCF cannot be read.
@@ -34,7 +37,7 @@ def entity_spec(name: str, entity: EntityConfig, root: Path, *, installed: bool)
     """
     if entity.model is None:
         return _shape_model(entity)
-    return _load_mjcf(entity, ("scene", "entities", name, "model"), root, installed)
+    return _load_mjcf(entity, ("scene", "entities", name, "model"), root, installed, compiled)
 
 
 def name_all(child: mujoco.MjSpec) -> None:
@@ -96,7 +99,9 @@ def _product(pos: FloatArray, quat: FloatArray, pos2: FloatArray, quat2: FloatAr
     return product
 
 
-def _load_mjcf(entity: EntityConfig, path: tuple[str, ...], root: Path, installed: bool) -> mujoco.MjSpec:
+def _load_mjcf(
+    entity: EntityConfig, path: tuple[str, ...], root: Path, installed: bool, compiled: bool
+) -> mujoco.MjSpec:
     """Read the MJCF of an entity."""
     assert entity.model is not None
     try:
@@ -113,7 +118,7 @@ def _load_mjcf(entity: EntityConfig, path: tuple[str, ...], root: Path, installe
         raise SceneProblem(path, f"no file '{entity.model}' in {root}", hint)
     try:
         installed = installed or ":" in entity.model
-        return read_mjcf(file, model_roots(root, entity.model), installed=installed)
+        return read_mjcf(file, model_roots(root, entity.model), installed=installed, compiled=compiled)
     except BadModel as error:
         raise SceneProblem(path, f"'{entity.model}' is not a valid MJCF: {one_line(error)}") from None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TypeVar
 
@@ -10,12 +11,15 @@ import mujoco
 
 from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig, TerrainConfig
 from rlcli.errors import ConfigError, Problem, one_line
+from rlcli.machine import memory_error
 from rlcli.scene.entity_spec import entity_spec, frame_of_start_pose, name_all, write_masses
 from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_materials
 from rlcli.scene.joint_and_actuator_setup import SceneJoints
 from rlcli.scene.names import SceneProblem
 from rlcli.scene.sensor_builder import SensorBuilder, SensorSpec
+from rlcli.scene.sparse_newton import avoid_sparse_newton
 from rlcli.scene.terrain import Ground, add_ground, make_ground, terrain_problems
+from rlcli.scene.untrusted_mjcf import MUJOCO_ERRORS
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 _OPTIONS = (
@@ -59,8 +63,8 @@ class Scene:
         self.views.append(view)
         return view
 
-    def compile(self) -> mujoco.MjModel:
-        """Compile the scene to an MjModel.
+    def compile(self, *, on_cpu: bool = True) -> mujoco.MjModel:
+        """Compile the scene to an MjModel, for the CPU engine or for MuJoCo Warp.
 
         Raises:
             ConfigError: if MuJoCo refuses the model.
@@ -68,10 +72,23 @@ class Scene:
         try:
             # MuJoCo warns about options of the MJCF that `sim` overrides
             with warnings.catch_warnings(action="ignore"):
-                return self.spec.compile()
-        except ValueError as error:
+                model = self.spec.compile()
+        except MUJOCO_ERRORS as error:
+            if too_little := memory_error(error):
+                raise too_little from None
             message = f"MuJoCo cannot compile the model: {one_line(error)}"
             raise ConfigError([Problem("scene", "", message)]) from None
+        if on_cpu:
+            avoid_sparse_newton(self.spec, model)
+        return model
+
+    def broken_models(self) -> Iterator[SceneProblem]:
+        """Compile the model of each entity by itself and yield the problems, which name the file."""
+        for name, entity in self.config.entities.items():
+            try:
+                entity_spec(name, entity, self.root, installed=self.installed, compiled=True)
+            except SceneProblem as problem:
+                yield problem
 
     def _attach(self, name: str, entity: EntityConfig) -> None:
         try:

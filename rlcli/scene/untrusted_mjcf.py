@@ -9,8 +9,8 @@ robots are below the first threshold and are compiled at once: parsing takes mil
 from __future__ import annotations
 
 import math
+import re
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,33 +21,49 @@ import mujoco
 import numpy as np
 
 from rlcli.errors import one_line
-from rlcli.machine import read_plain
+from rlcli.machine import memory_error, python_command, read_plain
 from rlcli.registry import chosen_model, model_file
+from rlcli.safe_text import float_or_nan, shorten
+from rlcli.scene.mjcf_cost import ENDLESS, element_cost, number_of
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 _MAX_TEXT = 16 * 1024 * 1024
 _MAX_ASSET = 256 * 1024 * 1024
 _MAX_FILES = 1000
 _MAX_DEPTH = 200
-_MAX_MEMORY = 4 * 1024**3
+_MAX_LEVELS = 50
+"""Files that are included in each other."""
+_MAX_MEMORY = 2 * 1024**3
 SUBPROCESS_COST, _MAX_COST = 5_000, 1_000_000
-"""Elements after replication; `_element_cost` counts an expensive element as several."""
-TIME_S = 30
+"""Elements after replication; `element_cost` counts an expensive element as several."""
+TIME_S = 10
 _MAX_ITERATIONS = 100_000
 _TEXT = (".xml", ".mjcf", ".urdf")
+_NOT_FINITE = re.compile(r"[-+]?(nan|inf)|[eE]\+?\d{3}", re.IGNORECASE)
+_NAMES = {
+    *("name", "class", "childclass", "prefix", "model", "frame", "target", "instance", "plugin", "key", "material"),
+    *("mesh", "hfield", "texture", "camera", "actuator", "tendon", "tendon1", "tendon2", "flex", "node", "objname"),
+    *("refname", "body", "body1", "body2", "subtree1", "subtree2", "joint", "joint1", "joint2", "jointinparent"),
+    *("geom", "geom1", "geom2", "site", "site1", "site2", "sidesite", "cranksite", "slidersite", "refsite"),
+}
+"""Attributes with names, which may be those of numbers."""
+_FREE_SENSORS = ("clock", "e_potential", "e_kinetic", "user", "plugin")
+MUJOCO_ERRORS = (ValueError, RuntimeError, MemoryError, mujoco.FatalError, mujoco.UnexpectedError)
+"""Exceptions that MuJoCo raises for a model that it cannot read or compile."""
 
 
 class BadModel(ValueError):
     """Error for a model that is refused; the message has the file and the reason."""
 
 
-def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False) -> mujoco.MjSpec:
+def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False, compiled: bool = False) -> mujoco.MjSpec:
     """Check a model and read it.
 
     Args:
         file: MJCF of the model.
         roots: folders that must contain the model and all files that it loads.
         installed: whether the model belongs to an installed package, whose size is trusted.
+        compiled: whether to compile a copy, too.
 
     Raises:
         BadModel: if the model is refused, or MuJoCo cannot read it.
@@ -55,19 +71,23 @@ def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False) -> 
     scan = _MjcfScan(file, [root.resolve() for root in roots])
     if not any(file.resolve().is_relative_to(root) for root in scan.roots):
         raise BadModel(f"{file}: lies outside of {scan.roots[0]}; move it inside")
-    scan.read(file)
-    if not installed and scan.cost > _MAX_COST:
+    cost = scan.read(file)
+    if not installed and cost > _MAX_COST:
         raise BadModel(
-            f"{file}: too large: as expensive as {scan.cost:,.0f} elements, {_MAX_COST:,} are allowed;"
+            f"{file}: too large: as expensive as {cost:,.0f} elements, {_MAX_COST:,} are allowed;"
             f" make its most expensive part smaller: {scan.costliest}"
         )
-    if not installed and scan.cost > SUBPROCESS_COST:
+    if not installed and cost > SUBPROCESS_COST:
         _compile_in_subprocess(file)
     try:
         quiet_mujoco()
         spec = mujoco.MjSpec.from_file(str(file))
-    except ValueError as error:
-        raise BadModel(one_line(error)) from None
+        if compiled or spec.compiler.settotalmass > 0:  # `write_masses` compiles it
+            spec.compile()
+    except MUJOCO_ERRORS as error:
+        if too_little := memory_error(error):
+            raise too_little from None
+        raise BadModel(f"{scan.file_of(str(error))}: {one_line(error)}") from None
     _check_options(spec, file)
     return spec
 
@@ -97,44 +117,125 @@ def package_roots(root: Path) -> list[Path]:
 
 
 @dataclass(slots=True)
+class _Text:
+    """One MJCF file: its cost without other files, and how often each other file is copied into it."""
+
+    cost: float = 0.0
+    elements: float = 0.0
+    """Number of elements after replication."""
+    stored: float = 0.0
+    """Numbers that `size` stores with each element of the model."""
+    replicas: float = 0.0
+    """Sum of the counts of the elements `replicate`."""
+    free_sensors: int = 0
+    """Sensors of no object, which MuJoCo doubles with every replica."""
+    includes: list[tuple[float, Path]] = field(default_factory=list)
+    models: list[tuple[int, str, Path]] = field(default_factory=list)
+    """Line and name of each model that elements `attach` may copy, and its file."""
+    attached: dict[str, float] = field(default_factory=dict)
+    """Name of a model -> how often it is attached."""
+
+
+@dataclass(slots=True)
 class _MjcfScan:
     """Parser that checks a model and all files that it includes or loads."""
 
     main: Path
     roots: list[Path]
-    cost: float = 0.0
     costliest: str = ""
     _max_cost: float = 0.0
-    _texts: list[Path] = field(default_factory=list)
+    _texts: dict[Path, _Text] = field(default_factory=dict)
+    _costs: dict[Path, float] = field(default_factory=dict)
+    """Cost of each model of which the files are known."""
     _asset_folders: set[str] = field(default_factory=lambda: {""})
     _assets: list[tuple[Path, int, str, str]] = field(default_factory=list)
     """File, line, element and file name of each asset to load."""
 
-    def read(self, file: Path) -> None:
-        """Parse the model and the files that it includes; then check the assets that it loads.
+    def read(self, file: Path) -> float:
+        """Parse the model and the files that it refers to, and check the assets that it loads; return its cost.
 
         Raises:
             BadModel: if anything is refused.
         """
-        self._read_text(file)
+        self._read_text(file, 0)
         if len(self._assets) > _MAX_FILES:
             raise BadModel(f"{self.main}: loads more than {_MAX_FILES} files; use fewer meshes and textures")
+        loaded = 0.0
         for source, line, element, name in self._assets:
             for found in self._allowed_files(source, line, element, name):
-                self._check_asset(found, source, line)
+                loaded += self._asset_cost(found, source, line)
+        return self._model_cost(file.resolve(), ()) + loaded
 
-    def _read_text(self, file: Path) -> None:
+    def file_of(self, error: str) -> str:
+        """Return the files that an error of MuJoCo may be about: those with the line and the words that it names.
+
+        MuJoCo gives elements of included files the line 0.
+        """
+        place = re.search(r"line (?:number=)?(\d+)", error, re.IGNORECASE)
+        number = int(place[1]) if place else 0
+        words = [word for word in re.findall(r"'([^']+)'", error) if number == 0 or f"Element '{word}'" in error]
+        files = [file for file in self._texts if number or file != self.main.resolve()]
+        found = [str(file) for file in files if _has_words(file, number, words)]
+        return " or ".join(found[:3]) or str(self.main)
+
+    def _model_cost(self, file: Path, parents: tuple[Path, ...]) -> float:
+        """Return the cost of a model, with the models that it attaches.
+
+        Raises:
+            BadModel: if the model attaches itself, on which MuJoCo would crash.
+        """
+        if file in self._costs:
+            return self._costs[file]
+        parts = self._included(file, 1.0, ())
+        models: dict[str, float] = {}
+        for source, _, text in parts:
+            for line, name, other in text.models:
+                chain = (*parents, file, other)
+                if other in chain[:-1]:
+                    cycle = " -> ".join(each.name for each in chain[chain.index(other) :])
+                    raise BadModel(f"{source}:{line}: model: {cycle}: a model must not attach itself; remove one")
+                models[name] = models.get(name, 0.0) + self._model_cost(other, (*parents, file))
+        cost = sum(copies * text.cost for _, copies, text in parts) + sum(models.values())
+        stored = sum(text.stored for _, _, text in parts)
+        cost += stored * sum(copies * text.elements for _, copies, text in parts) / 1_000
+        replicas = min(sum(text.replicas for _, _, text in parts), 50.0)
+        sensors = sum(text.free_sensors for _, _, text in parts) * 2.0**replicas
+        self._note_cost(sensors, f"sensors without an object in {file}, which every replica of `replicate` doubles")
+        cost += sensors
+        for _, copies, text in parts:
+            for name, count in text.attached.items():
+                attached = copies * count * models.get(name, max(models.values(), default=0.0))
+                self._note_cost(attached, f"attach of model '{name}' in {file}")
+                cost += attached
+        self._costs[file] = min(cost, ENDLESS)
+        return self._costs[file]
+
+    def _included(self, file: Path, copies: float, parents: tuple[Path, ...]) -> list[tuple[Path, float, _Text]]:
+        """Return the text of a file and those that it includes, each with the number of its copies."""
+        if file in parents:
+            raise BadModel(f"{file}: includes itself; remove the include")
+        text = self._texts[file]
+        found = [(file, copies, text)]
+        for count, other in text.includes:
+            found += self._included(other, min(copies * count, ENDLESS), (*parents, file))
+            if len(found) > _MAX_FILES:
+                raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files; use fewer")
+        return found
+
+    def _read_text(self, file: Path, level: int) -> None:
+        """Parse a file and the files that it includes or attaches."""
         if file.suffix.lower() not in _TEXT:
             allowed = ", ".join(_TEXT)
             raise BadModel(f"{file}: not MJCF; give a text file ({allowed}): compiled models (.mjb) are not opened")
-        if len(self._texts) >= _MAX_FILES:
-            raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files; use fewer")
-        self._texts.append(file)
+        if len(self._texts) >= _MAX_FILES or level > _MAX_LEVELS:
+            limits = f"{_MAX_FILES} files, or more than {_MAX_LEVELS} in each other"
+            raise BadModel(f"{self.main}: includes more than {limits}; use fewer")
+        text = self._texts[file.resolve()] = _Text()
         try:
             data = read_plain(file, _MAX_TEXT)
         except OSError as error:
             raise BadModel(f"{file}: {error.strerror or error}") from None
-        includes: list[tuple[int, str, str]] = []
+        files: list[tuple[int, str, str, str, float]] = []
         copies: list[float] = [1.0]
         """How often each open element is replicated."""
         parser = expat.ParserCreate("utf-8")
@@ -143,9 +244,22 @@ class _MjcfScan:
             line = parser.CurrentLineNumber
             if len(copies) > _MAX_DEPTH:
                 raise BadModel(f"{file}:{line}: nested deeper than {_MAX_DEPTH} elements; use fewer levels")
-            self._add_cost(copies[-1] * _element_cost(name, attributes), f"{name} at {file}:{line}")
             _check_numbers(file, line, name, attributes)
-            copies.append(copies[-1] * (max(1.0, _number(attributes.get("count"))) if name == "replicate" else 1.0))
+            cost = min(copies[-1] * element_cost(name, attributes), ENDLESS)
+            self._note_cost(cost, f"{name} at {file}:{line}")
+            text.cost += cost
+            text.elements += copies[-1]
+            if name == "size":
+                text.stored += sum(
+                    number_of(attributes.get(key)) for key in attributes if key.startswith(("nuser_", "nkey"))
+                )
+            if name == "attach":
+                model = attributes.get("model", "")
+                text.attached[model] = text.attached.get(model, 0.0) + copies[-1]
+            count = max(1.0, number_of(attributes.get("count"))) if name == "replicate" else 1.0
+            copies.append(min(copies[-1] * count, ENDLESS))
+            text.replicas += count if name == "replicate" else 0.0
+            text.free_sensors += name in _FREE_SENSORS and "objname" not in attributes
             for key in ("meshdir", "texturedir", "assetdir"):
                 if key in attributes:
                     self._asset_folders.add(attributes[key])
@@ -155,7 +269,7 @@ class _MjcfScan:
                 if value.lower().endswith((".mjb", ".mjz", ".zip")):
                     raise BadModel(f"{file}:{line}: {name}: '{value}' is a compiled model; give its MJCF text")
                 if name in ("include", "model") or "xml" in attributes.get("content_type", ""):
-                    includes.append((line, name, value))
+                    files.append((line, name, value, attributes.get("name", ""), copies[-1]))
                 elif key != "filename" or name in ("mesh", "texture"):
                     self._assets.append((file, line, name, value))
 
@@ -172,13 +286,16 @@ class _MjcfScan:
             raise BadModel(f"{file}:{error.lineno}:{error.offset + 1}: not well-formed XML: {why}") from None
         except ValueError as error:
             raise BadModel(str(error) if isinstance(error, BadModel) else f"{file}: not XML: {error}") from None
-        for line, element, name in includes:
-            for found in self._allowed_files(file, line, element, name):
+        for line, element, value, name, count in files:
+            for found in self._allowed_files(file, line, element, value):
+                if element == "include":
+                    text.includes.append((count, found))
+                else:
+                    text.models.append((line, name, found))
                 if found not in self._texts:
-                    self._read_text(found)
+                    self._read_text(found, level + 1)
 
-    def _add_cost(self, cost: float, source: str) -> None:
-        self.cost += cost
+    def _note_cost(self, cost: float, source: str) -> None:
         if cost > self._max_cost:
             self._max_cost, self.costliest = cost, source
 
@@ -203,7 +320,7 @@ class _MjcfScan:
                 seen.add(path)
                 yield path
 
-    def _check_asset(self, path: Path, file: Path, line: int) -> None:
+    def _asset_cost(self, path: Path, file: Path, line: int) -> float:
         if not path.is_file():
             raise BadModel(f"{file}:{line}: '{path}' is not a regular file; name a mesh or image file")
         size = path.stat().st_size
@@ -214,46 +331,30 @@ class _MjcfScan:
             head = opened.read(24)
         if head[:8] == b"\x89PNG\r\n\x1a\n":  # a small file may decompress to a huge image: width x height
             cost = max(cost, int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big") / 10_000)
-        self._add_cost(cost, f"'{path}'")
+        self._note_cost(cost, f"'{path}'")
+        return cost
+
+
+def _has_words(file: Path, number: int, words: Sequence[str]) -> bool:
+    """Return whether a line of a file (0: any) has these words."""
+    text = read_plain(file, _MAX_TEXT).decode("utf-8", "replace")
+    lines = text.splitlines()
+    part = text if number == 0 else lines[number - 1] if number <= len(lines) else ""
+    return bool(part) and all(word in part for word in words)
 
 
 def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str]) -> None:
-    """Refuse sizes that are too large, and options that are not finite."""
+    """Refuse sizes that are too large, and numbers that are not finite; a range may be infinite."""
     for key, value in attributes.items():
         limit = _MAX_MEMORY if key == "memory" else 1_000_000
-        if name == "size" and _number(value) > limit:
+        if name == "size" and number_of(value) > limit:
             raise BadModel(f'{file}:{line}: size {key}="{value[:40]}" is too large; {limit:,} is allowed')
-        is_option = name in ("compiler", "option")
-        if is_option and any(word.lower().lstrip("+-")[:3] in ("nan", "inf") for word in value.split()):
-            raise BadModel(f'{file}:{line}: {name} {key}="{value[:40]}" is not finite; give a number')
-
-
-def _element_cost(name: str, attributes: dict[str, str]) -> float:
-    """Return the cost of an element, in ordinary elements."""
-    counts = [max(1.0, _number(word)) for word in attributes.get("count", "").split()]
-    if name in ("flexcomp", "composite"):
-        return 1.0 + 10.0 * math.prod(counts)
-    if name == "hfield":
-        return 1.0 + _number(attributes.get("nrow")) * _number(attributes.get("ncol")) / 1_000
-    if name == "texture":
-        width = _number(attributes.get("width"))
-        return 1.0 + width * max(width, _number(attributes.get("height"))) / 10_000
-    if name == "mesh":  # a built-in shape
-        return 1.0 + math.prod(max(1.0, _number(word)) for word in attributes.get("params", "").split()) / 10
-    if name == "size":
-        return 1.0 + sum(_number(attributes.get(key)) for key in attributes if key != "memory") / 100
-    return 1.0 + sum(len(value) for value in attributes.values()) / 10_000
-
-
-def _number(text: str | None) -> float:
-    """Return a number, which may end in MuJoCo's K, M, G, T, P or E; 0 for text that MuJoCo will refuse."""
-    text = (text or "").strip()
-    factor = {"k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40, "p": 2**50, "e": 2**60}.get(text[-1:].lower(), 1)
-    try:
-        value = float(text[:-1] if factor != 1 else text)
-    except ValueError:
-        return 0.0
-    return value * factor if math.isfinite(value) else math.inf
+        if key in _NAMES or key.startswith("file") or name in ("text", "config") or not _NOT_FINITE.search(value):
+            continue
+        for word in value.split():
+            number = float_or_nan(word)
+            if (math.isnan(number) and _NOT_FINITE.match(word)) or (math.isinf(number) and "range" not in key):
+                raise BadModel(f'{file}:{line}: {name} {key}="{shorten(value, 40)}" is not finite; give a number')
 
 
 def _check_options(spec: mujoco.MjSpec, file: Path) -> None:
@@ -281,7 +382,7 @@ def _compile_in_subprocess(file: Path) -> None:
     Raises:
         BadModel: if compiling fails.
     """
-    command = [sys.executable, "-P", "-c", _SUBPROCESS_CODE, str(file), str(_MAX_MEMORY), str(TIME_S)]
+    command = python_command("-c", _SUBPROCESS_CODE, str(file), str(_MAX_MEMORY), str(TIME_S))
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=2 * TIME_S)
     except subprocess.TimeoutExpired:
@@ -310,7 +411,7 @@ except (ImportError, ValueError, OSError):
     pass  # no limits on this system; the timeout of the parent process remains
 try:
     mujoco.MjSpec.from_file(file).compile()
-except (ValueError, MemoryError, RuntimeError) as error:
-    print(error or type(error).__name__)
+except Exception as error:
+    print(str(error) or type(error).__name__)
     sys.exit(1)
 """

@@ -152,9 +152,9 @@ def create_imported_run(
     differing = [(key, str(imported.spec[key]), str(size)) for key, size in sizes.items() if imported.spec[key] != size]
     if differing:
         rows = [("field", "in the file", f"of {resolved.source.name}"), *differing]
-        table = "\n".join(f"  {a:<18}{b:<14}{c}" for a, b, c in rows)
+        table = [f"  {a:<18}{b:<14}{c}" for a, b, c in rows]
         raise CheckpointError(
-            f"the policy in {record['imported']['file']} does not fit {resolved.source.name}:\n{table}",
+            [f"the policy in {record['imported']['file']} does not fit {resolved.source.name}:", *table],
             hint="give the task the same observation and action columns in the same order; see `rlcli show TASK`",
         )
     entries = {

@@ -8,7 +8,6 @@ import logging
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -18,6 +17,7 @@ from typing import Any
 
 from rlcli.envs.sharding.choice import ONE_WORKER
 from rlcli.errors import RlcliError
+from rlcli.machine import python_command
 from rlcli.training.signals import StopRequest
 
 _log = logging.getLogger(__name__)
@@ -77,7 +77,7 @@ class TrainingProcess:
         if not isinstance(printed, dict):
             error = RlcliError(f"the process ended with exit code {self.exit_code}; see {self.run / LOG}")
         else:
-            error = RlcliError(str(printed.get("message")))
+            error = RlcliError(str(printed.get("message")).split("\n"))
             error.kind = str(printed.get("kind"))
         error.exit_code = self.exit_code
         return error
@@ -89,7 +89,7 @@ def start_command(run: Path, words: Sequence[str]) -> TrainingProcess:
     group = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP} if os.name == "nt" else {"start_new_session": True}  # type: ignore[attr-defined]
     with (run / LOG).open("ab") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "rlcli", *words, "--json"],
+            python_command("-m", "rlcli", *words, "--json"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,

@@ -155,6 +155,8 @@ def _serve_with_checks(server: Any, port: int) -> Any:
             for name, value in request.headers.raw_items():
                 headers.setdefault(name.lower(), []).append(value)
             reason = refusal_reason(port, request.path, headers)
+            if getattr(request, "method", "GET") != "GET":
+                reason = "only GET is answered"
             if reason is not None:
                 body = f"refused: {reason}\n".encode()
                 refusal = server.Headers({"Content-Type": "text/plain", "Content-Length": str(len(body))})

@@ -3,10 +3,12 @@
 import copy
 import json
 import random
+import time
 from typing import Annotated, Any, get_args
 
 import pytest
 from pydantic import BaseModel, TypeAdapter, ValidationError
+from support import yaml_grammar
 from support.fault_sizes import amount, chosen
 
 from rlcli.cli.app import main
@@ -219,6 +221,35 @@ def test_random_bytes_give_a_mapping_or_a_syntax_error(seed):
         assert type(document.data) is dict
         read += 1
     assert 0 < read < BATCH
+
+
+def test_thousands_of_mistakes_are_listed_in_part_and_in_little_time(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "task").mkdir()
+    (tmp_path / "task" / "task.yaml").write_text(GOOD + "".join(f"key_{n}: 1\n" for n in range(2000)))
+    begin = time.process_time()
+    assert main(["validate", "./task"]) == 3
+    assert time.process_time() - begin < 5
+    printed = capsys.readouterr().err
+    assert "more than 50 mistakes" in printed
+    assert len(printed) < 30_000
+
+
+@pytest.mark.parametrize("first", range(amount(1, 20, 400)))
+def test_task_files_and_overrides_of_the_grammar_end_with_a_message(first, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    count = amount(15, 50)
+    assert yaml_grammar.run_all(first * count, count, tmp_path) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(amount(2, 20, 200)))
+def test_task_file_of_the_grammar_is_refused_by_the_command(seed, child, tmp_path):
+    text, words = yaml_grammar.case(seed, yaml_grammar.documents())
+    (tmp_path / "task").mkdir()
+    (tmp_path / "task" / "task.yaml").write_text(text, encoding="utf-8", errors="surrogatepass")
+    ended = child(tmp_path, "validate", "./task", *(word for word in words if "\ud800" not in word)).ended()
+    assert not yaml_grammar.complaint(ended.code, ended.err, 0.0)
 
 
 @pytest.mark.parametrize("seed", range(amount(1, 5, 50)))

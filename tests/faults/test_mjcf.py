@@ -7,7 +7,7 @@ import sys
 import time
 
 import pytest
-from support import mjcf_mutants
+from support import mjcf_grammar, mjcf_mutants
 from support.fault_sizes import amount, chosen
 
 from rlcli.cli.app import main
@@ -36,6 +36,17 @@ def model(inner="", body="", asset=""):
     return f"<mujoco>{inner}<asset>{asset}</asset><worldbody>{BLOCK}{body}</worldbody></mujoco>"
 
 
+ATTACH = '<body><attach model="m" body="block" prefix="m-"/></body>'
+PARTS = {
+    "leads_out": '<mujoco><include file="../../outside.xml"/></mujoco>',
+    "attaches_back": model(asset='<model name="m" file="../model.xml"/>', body=ATTACH),
+    "many": model(body='<replicate count="1000"><geom size="1"/></replicate>'),
+    "geoms": "<mujoco>" + '<geom size="1"/>' * 100 + "</mujoco>",
+    "wrong": '<mujoco>\n<worldbody>\n<geom size="1" sise="2"/></worldbody></mujoco>',
+    "no_mass": "<mujoco><worldbody>\n\n\n<body><joint/></body></worldbody></mujoco>",
+}
+
+
 def png(width, height):
     return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", width, height) + b"\x08\x02\0\0\0" + b"\0" * 40
 
@@ -56,7 +67,7 @@ NAMED = {
     "an include by a linked folder": (model('<include file="up/outside.xml"/>'), "lies outside"),
     "an include of an include outside": (model('<include file="parts/leads_out.xml"/>'), "lies outside"),
     "an include in references": (model('<include file="&#46;&#46;/outside.xml"/>'), "lies outside"),
-    "an include of itself": (model('<include file="model.xml"/>'), "MJCF"),
+    "an include of itself": (model('<include file="model.xml"/>'), "includes itself"),
     "an include of text": (model('<include file="notes.txt"/>'), "not MJCF"),
     "a pipe": (model('<include file="pipe.xml"/>'), "not a regular file"),
     "a folder as model": (model('<include file="folder.xml"/>'), "folder.xml"),
@@ -80,7 +91,10 @@ NAMED = {
     "a flex outside": (model(body='<flexcomp name="f" type="mesh" file="../outside.obj"/>'), "lies outside"),
     "a model outside": (model(asset='<model name="m" file="../outside.xml"/>'), "lies outside"),
     "a compiled model as asset": (model(asset='<model name="m" file="bin.mjb"/>'), "compiled model"),
-    "a resource of another kind": (model(asset='<mesh name="m" file="http://example.invalid/m.obj"/>'), "not the name"),
+    "a resource of another kind": (
+        model(asset='<mesh name="m" file="http://example.invalid/m.obj"/>'),
+        "is not a file name",
+    ),
     "a picture of four terapixels": (
         model(asset='<texture name="t" type="2d" file="huge.png"/>'),
         "too large: as expensive as",
@@ -131,6 +145,55 @@ NAMED = {
     "two documents": (model() + "<include file='../outside.xml'/>", "not well-formed"),
     "a null byte": (model() + "\0", "not well-formed"),
     "an unknown element": (model("<evil/>"), "evil"),
+    "a model that attaches itself": (
+        model(asset='<model name="m" file="model.xml"/>', body=ATTACH),
+        "must not attach itself",
+    ),
+    "two models that attach each other": (
+        model(asset='<model name="m" file="parts/attaches_back.xml"/>', body=ATTACH),
+        "model.xml -> attaches_back.xml -> model.xml",
+    ),
+    "a model in copies of copies": (
+        model(
+            asset='<model name="m" file="parts/many.xml"/>',
+            body='<replicate count="2000">' + ATTACH + "</replicate>",
+        ),
+        "too large: as expensive as",
+    ),
+    "an include in copies": (
+        model(body='<replicate count="20000"><body><include file="parts/geoms.xml"/></body></replicate>'),
+        "too large: as expensive as",
+    ),
+    "a sensor that every copy doubles": (
+        model(body='<replicate count="40"><geom size="1"/></replicate>').replace(
+            "</mujoco>", "<sensor><clock/></sensor></mujoco>"
+        ),
+        "sensors without an object",
+    ),
+    "a sensor of 900 million numbers": (
+        model().replace("</mujoco>", '<sensor><user dim="900000000"/></sensor></mujoco>'),
+        "too large: as expensive as",
+    ),
+    "a sensor of 100 million contacts": (
+        model().replace("</mujoco>", '<sensor><contact subtree1="block" num="100000000"/></sensor></mujoco>'),
+        "too large: as expensive as",
+    ),
+    "user data of every element": (
+        model('<size nuser_geom="1000000"/>', body='<replicate count="4000"><geom size="1"/></replicate>'),
+        "too large: as expensive as",
+    ),
+    "a mesh of 20,000 rows": (
+        model(asset='<mesh name="m" builtin="supersphere" params="20000 1 1"/>'),
+        "too large: as",
+    ),
+    "a mass that is no number": (model(body='<geom size="1" mass="nan"/>'), 'geom mass="nan" is not finite'),
+    "a place that is no number": (model(body='<geom size="1" pos="0 nan 0"/>'), 'geom pos="0 nan 0" is not finite'),
+    "a damping without end": (model(body='<body><joint damping="inf"/></body>'), 'joint damping="inf" is not finite'),
+    "a mistake in an included file": (model('<include file="parts/wrong.xml"/>'), "parts/wrong.xml: "),
+    "a mistake that the compiler finds in an included file": (
+        model('<include file="parts/no_mass.xml"/>'),
+        "parts/no_mass.xml: ",
+    ),
     "twenty megabytes of spaces": (model(" " * (20 << 20)), "larger than"),
 }
 
@@ -145,7 +208,8 @@ def task(tmp_path):
     (folder / "bin.mjb").write_bytes(b"\0" * 100)
     (folder / "huge.png").write_bytes(png(2_000_000, 2_000_000))
     (folder / "folder.xml").mkdir()
-    (folder / "parts" / "leads_out.xml").write_text('<mujoco><include file="../../outside.xml"/></mujoco>')
+    for name, text in PARTS.items():
+        (folder / "parts" / f"{name}.xml").write_text(text)
     (tmp_path / "outside.xml").write_text("<mujoco/>")
     for name in ("obj", "png", "skn"):
         (tmp_path / f"outside.{name}").write_text("v 0 0 0")
@@ -238,9 +302,18 @@ def test_mutated_models_are_accepted_or_refused_without_a_crash(first, tmp_path)
     assert done.stdout.count("taken") == count
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="children are forked")
+@pytest.mark.parametrize("first", range(0, amount(1, 20, 200)))
+def test_models_of_the_grammar_are_accepted_or_refused_with_a_place(first, tmp_path):
+    count = amount(20, 100)
+    line = [sys.executable, mjcf_grammar.__file__, str(first * count), str(count), str(tmp_path)]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+
+
 def test_large_model_leaves_no_log_in_its_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    geoms, odd = '<geom size="1"/>' * 6000, '<custom><numeric name="odd" data="NaN"/></custom>'  # which MuJoCo warns of
+    geoms, odd = '<geom size="1"/>' * 6000, '<custom><text name="odd" data="NaN"/></custom>'  # which MuJoCo warns of
     (tmp_path / "model.xml").write_text(f"<mujoco>{odd}<worldbody>{geoms}</worldbody></mujoco>")
     read_mjcf(tmp_path / "model.xml", [tmp_path])
     assert [file.name for file in tmp_path.iterdir()] == ["model.xml"]

@@ -72,7 +72,10 @@ def test_write_atomic_reports_an_error_of_the_temporary_path(tmp_path):
     [
         (errno.ENOSPC, "free some space, then continue with --resume"),
         (errno.EACCES, "choose another folder with --runs-dir"),
-        (errno.EROFS, "choose another folder with --runs-dir"),
+        (
+            errno.EROFS,
+            "the disk is read-only: make it writable, copy the run, or choose another folder with --runs-dir",
+        ),
         (errno.EDQUOT, "the disk quota is used up: free some space"),
         (errno.EIO, None),
     ],

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.cli.ui.terminal import supports_styles
 from rlcli.errors import ConfigError, RlcliError
-from rlcli.safe_text import UNSAFE
+from rlcli.safe_text import UNSAFE, message_line
 
 if TYPE_CHECKING:
     from rlcli.reporting.heat_map import HeatMap
@@ -80,7 +80,7 @@ class Console:
     def warn(self, text: str) -> None:
         """Print a non-fatal warning."""
         if not self.muted:
-            _write(sys.stderr, f"warning: {_escaped(text)}")
+            _write(sys.stderr, f"warning: {message_line(text)}")
 
     def error(self, error: RlcliError) -> None:
         """Print the error that ended the command."""
@@ -91,10 +91,10 @@ class Console:
             content = {"kind": error.kind, "exit_code": error.exit_code, "message": error.message, "hint": error.hint}
             with contextlib.suppress(OSError):  # stdout itself may be broken
                 self._write_json(error={**content, "problems": problems})
-        lines = error.message.splitlines() or [""]
-        _write(sys.stderr, "\n".join(f"error: {_escaped(line)}" for line in lines))
+        lines = error.message.split("\n")
+        _write(sys.stderr, "\n".join(f"error: {line}" for line in lines))
         if error.hint:
-            _write(sys.stderr, f"hint: {_escaped(error.hint)}")
+            _write(sys.stderr, f"hint: {error.hint}")
 
     def _write_json(self, **content: Any) -> None:
         text = json.dumps({"schema": SCHEMA_VERSION, **content}, indent=2, default=str)
@@ -168,11 +168,6 @@ def discard(stream: Any) -> None:
     """Redirect a broken stream to the null device, so that nothing fails when Python flushes it at exit."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def _escaped(text: str) -> str:
-    """Escape the characters of a text that are not printable, except newlines and tabs."""
-    return "".join(c if c.isprintable() or c in "\n\t" else repr(c)[1:-1] for c in text)
 
 
 def _write(stream: Any, text: str) -> None:

@@ -18,6 +18,7 @@ from rlcli.envs.sharding import worker
 from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
 from rlcli.envs.sharding.worker import Job
 from rlcli.errors import MachineError
+from rlcli.machine import python_command
 
 _CODE = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[3]);"
@@ -39,8 +40,7 @@ class Worker:
     def __init__(self, number: int, arrays: int) -> None:
         self.number = number
         ours, theirs = socket.socketpair()
-        # -P: no file of the current folder is imported
-        command = [sys.executable, "-P", "-c", _CODE, str(theirs.fileno()), str(arrays), _search_path()]
+        command = python_command("-c", _CODE, str(theirs.fileno()), str(arrays), _search_path())
         with theirs:
             self._process = subprocess.Popen(
                 command,

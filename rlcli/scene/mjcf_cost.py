@@ -1,0 +1,52 @@
+"""Cost of an MJCF element: how many ordinary elements take as much time and memory to compile."""
+
+from __future__ import annotations
+
+import math
+
+from rlcli.safe_text import float_or_nan
+
+ENDLESS = 1e18
+"""Largest number of copies and of cost that is counted: products of a few of them stay finite."""
+
+
+def element_cost(name: str, attributes: dict[str, str]) -> float:
+    """Return the cost of an element, in ordinary elements."""
+
+    def numbers(key: str) -> list[float]:
+        return [max(1.0, number_of(word)) for word in attributes.get(key, "").split()]
+
+    def product(*keys: str) -> float:
+        return math.prod(number for key in keys for number in numbers(key))
+
+    if name == "flexcomp":
+        return 1.0 + 10.0 * product("count", "cellcount")
+    if name == "hfield":
+        return 1.0 + product("nrow", "ncol") / 1_000
+    if name == "texture":
+        width = number_of(attributes.get("width"))
+        return 1.0 + width * max(width, number_of(attributes.get("height"))) / 10_000
+    if name == "mesh":  # a built-in shape; the first number of some is the resolution in both directions
+        params = numbers("params")
+        return 1.0 + math.prod(params) * max(params, default=1.0) / 10 + len(attributes.get("vertex", "")) / 10_000
+    if name == "size":
+        return 1.0 + sum(number_of(attributes.get(key)) for key in attributes if key != "memory") / 100
+    if name == "lengthrange":  # the compiler simulates so many steps for every muscle
+        return (
+            1.0
+            + number_of(attributes.get("inttotal", "10"))
+            / max(number_of(attributes.get("timestep", "0.01")), 1e-9)
+            / 10
+        )
+    if name == "config" and attributes.get("key") in ("size", "nchannel"):  # of the plugin touch_grid
+        return 1.0 + math.prod(max(1.0, number_of(word)) for word in attributes.get("value", "").split()) / 10
+    stored = product("num", "dim", "nsample", "actdim", "resolution", *(["size"] if name == "numeric" else []))
+    return 1.0 + stored / 100 + sum(len(value) for value in attributes.values()) / 10_000
+
+
+def number_of(text: str | None) -> float:
+    """Return a number, which may end in MuJoCo's K, M, G, T, P or E; 0 for text that MuJoCo will refuse."""
+    text = (text or "").strip()
+    factor = {"k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40, "p": 2**50, "e": 2**60}.get(text[-1:].lower(), 1)
+    value = float_or_nan(text[:-1] if factor != 1 else text)
+    return 0.0 if math.isnan(value) else min(value * factor, ENDLESS)
