@@ -136,7 +136,7 @@ def compare(
     comparison = Comparison(sweep.folder, sweep.settings["task"], threshold, best.number, seeds)
     with _request_of_sweep(sweep, request) as base:
         resolved, _ = base.resolve()
-        if resolved.task.success is None and until is None:
+        if not resolved.task.success and until is None:
             raise UsageError("the task defines no success, so --until is needed", hint="add --until return=X")
         require_success(resolved, [threshold.key], "--until return=X")
         if resolved.agent is not None and not resolved.agent.eval_interval:

@@ -64,18 +64,20 @@ class Columns:
     terms: tuple[str, ...]
     causes: tuple[str, ...]
     metrics: tuple[str, ...]
-    success: bool
+    conditions: tuple[str, ...]
+    condition_values: tuple[str, ...]
 
     @staticmethod
     def of(episodes: Episodes) -> Columns:
         """Return the names of some episodes' columns."""
-        terms, causes, metrics = (tuple(part) for part in (episodes.reward_terms, episodes.causes, episodes.metrics))
-        return Columns(terms, causes, metrics, episodes.success is not None)
+        named = (episodes.reward_terms, episodes.causes, episodes.metrics)
+        return Columns(*(tuple(part) for part in (*named, episodes.conditions, episodes.condition_values)))
 
     @property
     def count(self) -> int:
         """Number of columns."""
-        return _FIXED_COLUMNS + len(self.terms) + len(self.causes) + len(self.metrics) + self.success
+        named = (self.terms, self.causes, self.metrics, self.conditions, self.condition_values)
+        return _FIXED_COLUMNS + sum(len(part) for part in named) + bool(self.conditions)
 
 
 def counter_specs(total: int) -> dict[str, ArraySpec]:
@@ -210,6 +212,7 @@ class ShardRunner:
                 )
             self._columns = self._new_columns = columns
         named = [*episodes.reward_terms.values(), *episodes.causes.values(), *episodes.metrics.values()]
+        named += [*episodes.conditions.values(), *episodes.condition_values.values()]
         fixed = [episodes.ids, episodes.returns, episodes.lengths, episodes.truncated]
         values = [*fixed, *named, *([] if episodes.success is None else [episodes.success])]
         for row, value in zip(self._episodes[:, :count], values, strict=False):
@@ -273,8 +276,11 @@ def read_episodes(
     terms = {name: next(table).float() for name in widest.terms}
     causes = {name: next(table).bool() for name in widest.causes}
     metrics = {name: next(table).float() for name in widest.metrics}
-    success = next(table).bool() if widest.success else None
-    return Episodes(ids.long(), returns.float(), lengths.long(), terms, causes, truncated.bool(), success, metrics)
+    conditions = {name: next(table).bool() for name in widest.conditions}
+    values = {name: next(table).float() for name in widest.condition_values}
+    success = next(table).bool() if widest.conditions else None
+    fixed = (ids.long(), returns.float(), lengths.long(), terms, causes, truncated.bool())
+    return Episodes(*fixed, success, conditions, values, metrics)
 
 
 def _with_causes(part: Tensor, names: Columns, widest: Columns) -> Tensor:
