@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.config.schema import SuccessConfig
+from rlcli.config.schema import SuccessConfig, bound_text
 from rlcli.envs.shard_range import Shard
 from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.sim.engine import Engine
@@ -44,6 +44,12 @@ class SuccessCondition:
         if self._low is None:
             return value if self._high is None else value <= self._high
         return value >= self._low if self._high is None else (value >= self._low) & (value <= self._high)
+
+    def describe(self, env_id: int, step_dt: float) -> str:
+        """Return name, newest value, bound and how long the condition has held."""
+        bound = f" {float(self.value[env_id]):.3g}, {bound_text(self.term.config.model_dump())}" if self.bounded else ""
+        held = float(self.steps[env_id]) * step_dt
+        return f"{self.name}{bound}: " + (f"holds since {held:.1f} s" if held else "fails")
 
     def count(self) -> None:
         """Count a step."""

@@ -278,6 +278,10 @@ class VecEnv(Workflow):
         """The environment of this process, with terms and managers: this object, if no other process steps a part."""
         return self
 
+    def success_conditions(self, env_id: int) -> list[str]:
+        """Return each condition of success in one environment, as in `speed 0.21, at most 0.3: holds since 0.4 s`."""
+        return [condition.describe(env_id, self.step_dt) for condition in self._counters.conditions]
+
     def compute_success(self) -> Tensor | None:
         """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""
         held = [torch.as_tensor(condition.holds()) for condition in self._counters.conditions]

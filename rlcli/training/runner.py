@@ -23,6 +23,7 @@ from rlcli.runs.checkpoint_reader import steps
 from rlcli.runs.provenance import built_record, differences, environment_record
 from rlcli.runs.restore import resolve_run
 from rlcli.training.checkpoint_writer import CheckpointWriter, Keep, manifest_entries
+from rlcli.training.health import Health
 from rlcli.training.job import Job, TrainingResult
 from rlcli.training.loggers import open_loggers, read_metrics
 from rlcli.training.loop import TrainLoop
@@ -113,6 +114,7 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
             save_interval=agent.save_interval,
             periodic_eval=_periodic_eval(job, writer, stop),
             videos=_training_videos(job, stop),
+            health=_health(job, budgets[-1].iterations(trainer)),
             show=view.show,
             count_divergences=lambda: env.divergences,
             stop=stop,
@@ -127,6 +129,10 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
             close(*_end_state(error))
         raise
     close("finished")
+    for note in [] if loop.health is None else loop.health.notes(loop.metrics):
+        _log.info("%s", note)
+    for finding in run.findings() if job.writes else ():
+        _log.warning("at the end: %s", finding)
 
 
 def _open_writer(job: Job, env: Environment) -> CheckpointWriter:
@@ -200,6 +206,17 @@ def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest) -> Per
     if run.record.get("best") != writer.best:
         run.update(best=writer.best)
     return evaluator
+
+
+def _health(job: Job, iterations: int) -> Health | None:
+    """Return the health checks with the metrics of earlier iterations; only the rank that writes the run checks."""
+    if not job.writes:
+        return None
+    agent, _ = job.resolved.require_agent()
+    health = Health(job.resolved.task, agent, iterations)
+    for row in read_metrics(job.run.metrics) if job.resume_from is not None else ():
+        health.add(row["iteration"], {name: value for name, value in row.items() if "/" in name})
+    return health
 
 
 def _training_videos(job: Job, stop: StopRequest) -> TrainingVideos | None:
