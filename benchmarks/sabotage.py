@@ -11,7 +11,6 @@ import argparse
 import concurrent.futures
 import json
 import random
-import signal
 import subprocess
 import sys
 import tempfile
@@ -124,7 +123,7 @@ def train(name: str, task: str, trainer: str, seed: int, until: float) -> dict[s
                     total = json.loads(run.read_text()).get("iterations", 10**9)
                     rows = len((run.parent / "metrics.jsonl").read_text().splitlines())
             if process.poll() is None:
-                process.send_signal(signal.SIGINT)
+                process.terminate()
             error = process.communicate()[1]
         if run is None:
             return {"error": error[-500:], "named": {}, "success": None}

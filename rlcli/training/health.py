@@ -286,7 +286,7 @@ def observations(health: Health) -> Found:
             yield f"the observation '{metric.rpartition('/')[2]}' is the same in all environments", "its scale and func"
     for metric in [*health.names("Health/clipped/"), *health.names("Health/normalized")]:
         share = health.median(metric) or 0.0
-        if share > 0.5 and health.struggles(0.1):
+        if share > 0.9 and health.struggles(0.1):
             name = metric.partition("Health/clipped/")[2] or "normalised observations"
             yield f"{share:.0%} of the values of '{name}' are at the clip", "a wider clip, or a smaller scale"
 
@@ -306,7 +306,7 @@ def blocked_success(health: Health) -> Found:
             continue
         others = [health.median(n) or 0.0 for n in health.names("Success/") if n != f"Success/{name}"]
         alone = bool(others) and min(others) > 0.5 and held < 0.1 * min(others) and health.progress == 1.0
-        learned = health.change(RETURN) > 2.0 and not _approaches(health.values(RETURN))
+        learned = health.change(RETURN) > 1.0 and not _approaches(health.values(RETURN))
         never = max(health.values(f"Success/{name}")) == 0.0 and (learned or health.progress == 1.0)
         if (never and not _approaches(_gaps(values, condition.model_dump()))) or alone:
             value = f", its value is {statistics.fmean(values[-3:]):.3g}, and the bound is" if values else ""

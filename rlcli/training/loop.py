@@ -60,6 +60,8 @@ class TrainLoop:
     stop: StopRequest = field(default_factory=StopRequest)
     metrics: dict[str, float] = field(init=False, default_factory=dict)
     """Metrics of the newest iteration."""
+    reached: bool = field(init=False, default=False)
+    """Whether an evaluation has reached the bar that ends the training."""
     _ranks: distributed.ProcessGroup = field(init=False, default_factory=distributed.current)
     _boundary: tuple[int, int] = field(init=False, default=(0, 0))
     """Iteration and environment steps at the beginning of the current iteration."""
@@ -98,7 +100,7 @@ class TrainLoop:
             writer.wait()
         begin, first_step = time.monotonic(), trainer.env_steps
         # a signal on any rank stops all ranks at the same boundary
-        while not (stopped := any(self._ranks.sum(self.stop.signal is not None))) and not budget.spent(trainer):
+        while not (stopped := any(self._ranks.sum(self.stop.signal is not None))) and not self._is_over(budget):
             report, evaluation, is_best, must_save = self._iterate()
             self.metrics = metrics = {**_with_rates(report, trainer.steps_per_iteration), **evaluation}
             for logger in self.loggers:
@@ -116,8 +118,11 @@ class TrainLoop:
                 self.videos.record(trainer.policy, trainer.env_steps)
         self._save()
         writer.wait()
-        if stopped and not budget.spent(trainer):
+        if stopped and not self._is_over(budget):
             raise self._stopped(f"stopped at iteration {trainer.iteration}, checkpoint written")
+
+    def _is_over(self, budget: Budget) -> bool:
+        return self.reached or budget.spent(self.trainer)
 
     def _check_health(self, metrics: dict[str, float]) -> None:
         """Run the health checks; log new findings, and write the present ones into run.json."""
@@ -156,7 +161,9 @@ class TrainLoop:
             unsaved_s = time.monotonic() - self._saved_at
             is_overdue = self.save_interval is None and self._ranks.is_rank_zero and unsaved_s > SAVE_EVERY_S
             new_divergences = self.count_divergences() - diverged_before
-            diverged, *must_save = self._ranks.sum(new_divergences, is_overdue, is_best)
+            reached = evaluator is not None and evaluator.reached
+            diverged, reached_on, *must_save = self._ranks.sum(new_divergences, reached, is_overdue, is_best)
+            self.reached = bool(reached_on)
             _require_stable(diverged, trainer)
         return report, evaluation, is_best, any(must_save)
 

@@ -20,8 +20,8 @@ from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.loggers import read_metrics
 from rlcli.training.signals import StopRequest
 from rlcli.training.subprocesses import POLL_S, start_training
+from rlcli.training.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
 from rlcli.tuning.sweep import Sweep
-from rlcli.tuning.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
 
 _log = logging.getLogger(__name__)
 
