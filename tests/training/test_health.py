@@ -92,7 +92,7 @@ def test_every_check_is_on_the_page():
 def test_training_without_rewards_records_and_prints_the_finding(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     weights = [f"rewards.{name}.weight=0" for name in ("alive", "terminating", "pole_pos", "cart_vel", "pole_vel")]
-    words = ["--num-envs", "8", "--logger", "none", "--max-iterations", "12", "episode_length_s=0.2", "agent.n_steps=16"]
+    words = ["--num-envs", "8", "--logger", "none", "--max-iterations", "12", "episode_length_s=0.2"]
     assert main(["train", "cartpole", *weights, *words, "--agent", "sb3-ppo"]) == 0
     (file,) = Path("runs").glob("cartpole/*/run.json")
     assert "no-reward" in [finding["check"] for finding in json.loads(file.read_text())["health"]]
