@@ -48,7 +48,7 @@ def overrides(name: str, task: str, trainer: str) -> list[str]:
         "clipped observations": clip,
         "action scale 1e-3": ["actions.joint_effort.scale=0.1"] if managed else ["params.max_effort=0.4"],
         "termination in step one": [
-            f"terminations.first={{func: joint_vel_out_of_manual_limit, {SPEED}, bounds: [9.0, 9.1]}}"
+            f"terminations.first={{func: joint_vel_out_of_manual_limit, {SPEED}, max_velocity: 1e-6}}"
         ]
         if managed
         else [],

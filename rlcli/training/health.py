@@ -272,7 +272,7 @@ def value_function(health: Health) -> Found:
             f"the value loss has grown from {start:.3g} to {loss:.3g}",
             "a smaller agent.learning_rate or reward_scale",
         )
-    elif explained < 0.02 and loss > 0.0:
+    elif explained < 0.02 and loss > 0.0 and not _approaches(health.values(RETURN)) and health.change(RETURN) < 1.0:
         yield (
             f"the critic explains {explained:.2f} of the variance of returns",
             ("observations that show the state, normalize_observations, or another gamma"),
