@@ -73,8 +73,9 @@ class Health:
     def add(self, iteration: int, metrics: Mapping[str, Any]) -> None:
         """Add the metrics of an iteration, and run the checks if they are due."""
         self.iteration = iteration
+        ended = any(name.startswith("Episode_") for name in metrics)  # without an episode, Train/* repeat old values
         for name, value in metrics.items():
-            if name.startswith(_GROUPS):
+            if name.startswith(_GROUPS) and (ended or not name.startswith("Train/")):
                 self._series.setdefault(name, []).append(float(value))
         if not self.due(iteration):
             return
@@ -162,7 +163,7 @@ def probe(trainer: Trainer) -> dict[str, float]:
 def no_reward(health: Health) -> Found:
     """Check that returns differ."""
     values = health.values(RETURN)
-    if len(values) >= _MIN_ITERATIONS and max(values) - min(values) <= 1e-6 * abs(values[0]):
+    if len(values) >= (_MIN_ITERATIONS if any(values) else 3) and max(values) - min(values) <= 1e-6 * abs(values[0]):
         what = "every reward is 0" if values[0] == 0.0 else "the reward depends on nothing that the policy changes"
         yield f"the return is {values[0]:g} in all {len(values)} iterations: {what}", "rlcli lint TASK, and the weights"
 
