@@ -123,8 +123,7 @@ def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -
         if section == "observations":
             settings = model_schema(ObservationGroupConfig)["properties"]
             term = {"type": "object", "properties": settings, "additionalProperties": term}
-        if section != "success":
-            term = {"type": "object", "additionalProperties": term}
+        term = {"type": "object", "additionalProperties": term}
         schema["properties"][section] = {**term, "description": schema["properties"][section]["description"]}
     if params is not None:
         schema["properties"]["params"] = model_schema(params)

@@ -375,9 +375,7 @@ def term_entries(data: dict[str, Any]) -> list[tuple[str, KeyPath, dict[str, Any
         content = data.get(section)
         if not isinstance(content, dict):
             continue
-        if section == "success":
-            found.append((section, (section,), content))
-        elif section == "observations":
+        if section == "observations":
             for group, terms in content.items():
                 found += [
                     (section, (section, group, n), t)

@@ -289,6 +289,9 @@ class TaskCheck:
         data = {key: value for key, value in self.layers.data.items() if key not in PATCHES}
         unknown = {key: value for key, value in data.items() if key not in TaskConfig.model_fields}
         self.format = formats.format_of_key(unknown) or self.format
+        for section in [name for name in SECTIONS if isinstance(_mapping(data.get(name)).get("func"), str)]:
+            func = data.pop(section)["func"]
+            self.problem((section,), "a term needs a name", f"write {section}: {{NAME: {{func: {func}, ...}}}}")
         entries = term_entries(data)
         # each term is validated with the model of its own function, then removed from the data for `TaskConfig`
         terms = {path: self._term(section, path, entry) for section, path, entry in entries}
@@ -416,9 +419,7 @@ def _filled(task: TaskConfig, terms: Mapping[Path, TermConfig | None], params: d
     """Return the task with its validated terms and parameters. Terms that are null in the data are removed."""
     update: dict[str, Any] = {} if params is None else {"params": params}
     for section in SECTIONS:
-        if section == "success":
-            update[section] = terms.get((section,))
-        elif section == "observations":
+        if section == "observations":
             update[section] = {
                 name: group.model_copy(update=_kept_terms(terms, (section, name), group.terms), deep=False)
                 for name, group in task.observations.items()

@@ -1,18 +1,60 @@
-"""Counters of the environment loop: steps, episodes, and steps in which the success condition holds."""
+"""Counters of the environment loop: steps, episodes, and steps in which the conditions of success hold."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from rlcli.config.schema import SuccessConfig, bound_text
 from rlcli.envs.shard_range import Shard
 from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.sim.engine import Engine
 from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Field, Selection, in_place
+
+
+class SuccessCondition:
+    """A condition of success, with its value in the newest step and the number of steps since it began to hold."""
+
+    def __init__(self, term: BoundTerm, lengths: Tensor, as_field: Callable[[Tensor], Field], step_dt: float) -> None:
+        config, first = term.config, first_value(term)
+        assert isinstance(config, SuccessConfig)
+        check_shape(term, first, tuple(lengths.shape))
+        self.name, self.term, self._as_field = term.name, term, as_field
+        self._low, self._high = config.at_least, config.at_most
+        self.bounded = (self._low, self._high) != (None, None)
+        if self.bounded == (first.dtype == torch.bool):
+            what = "a truth value; remove at_most and at_least"
+            what = what if self.bounded else "a number; add at_most or at_least"
+            raise term.error(f"'{config.func}' returns {what}")
+        self.hold_steps = math.ceil(config.hold_s / step_dt - 1e-6)
+        self.steps = torch.zeros_like(lengths, dtype=torch.float32)
+        """Number of consecutive steps in which the condition holds. (num_envs,)"""
+        self.field = as_field(self.steps)
+        self.value: Field = self.field
+
+    def holds(self) -> Field:
+        """Return where the condition holds in the current state, and keep the value. (num_envs,) bool"""
+        self.value = value = self._as_field(self.term.call())
+        if self._low is None:
+            return value if self._high is None else value <= self._high
+        return value >= self._low if self._high is None else (value >= self._low) & (value <= self._high)
+
+    def describe(self, env_id: int, step_dt: float) -> str:
+        """Return name, newest value, bound and how long the condition has held."""
+        bound = f" {float(self.value[env_id]):.3g}, {bound_text(self.term.config.model_dump())}" if self.bounded else ""
+        held = float(self.steps[env_id]) * step_dt
+        return f"{self.name}{bound}: " + (f"holds since {held:.1f} s" if held else "fails")
+
+    def count(self) -> None:
+        """Count a step."""
+        self.field += 1.0
+        self.field *= self.holds()
 
 
 class EpisodeCounters(TensorState):
@@ -28,24 +70,19 @@ class EpisodeCounters(TensorState):
         self.lengths: Tensor = memory[0].zero_()
         # -1: the first reset of a new environment begins episode 0, like a reset with a seed
         self.indices: Tensor = memory[1].fill_(-1)
-        self.success_steps = torch.zeros(num_envs, device=device)
-        """Number of consecutive steps in which the success condition holds. (num_envs,)"""
         self.common_step = torch.zeros((), dtype=torch.int64, device=device)
-        self.success: Callable[[], Tensor] | None = None
-        self._hold_steps = 0
+        self.conditions: list[SuccessCondition] = []
 
     def attach(self, engine: Engine) -> None:
         """Make the fields, once the engine exists."""
         self._as_field = engine.as_field
         self.id_field, self.length_field = engine.as_field(self.ids), engine.as_field(self.lengths)
-        self.index_field, self._success_field = engine.as_field(self.indices), engine.as_field(self.success_steps)
+        self.index_field = engine.as_field(self.indices)
         self._common_step = in_place(self.common_step)
 
-    def set_success(self, term: BoundTerm, hold_s: float, step_dt: float) -> None:
-        """Set the success condition; it must hold for the last `hold_s` seconds of an episode."""
-        check_shape(term, first_value(term), tuple(self.ids.shape))
-        self.success = term.call
-        self._hold_steps = math.ceil(hold_s / step_dt - 1e-6)
+    def set_success(self, terms: list[BoundTerm], step_dt: float) -> None:
+        """Set the conditions of success."""
+        self.conditions = [SuccessCondition(term, self.lengths, self._as_field, step_dt) for term in terms]
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the counters that are saved in a checkpoint."""
@@ -53,7 +90,7 @@ class EpisodeCounters(TensorState):
             "episode_length": self.lengths,
             "episode_index": self.indices,
             "common_step": self.common_step,
-            "success_hold": self.success_steps,
+            **{f"success_hold.{condition.name}": condition.steps for condition in self.conditions},
         }
 
     def advance(self) -> None:
@@ -62,16 +99,18 @@ class EpisodeCounters(TensorState):
         self._common_step += 1
 
     def count_success(self) -> None:
-        """Count a step where the success condition holds, and restart the count where it does not."""
-        if self.success is not None:
-            self._success_field += 1.0
-            self._success_field *= self._as_field(self.success())
+        """Count a step where a condition of success holds, and restart its count where it does not."""
+        for condition in self.conditions:
+            condition.count()
 
-    def succeeded(self, ended: Selection, timed_out: Tensor) -> Tensor | None:
-        """Return which of the ended episodes succeed; None without a condition. timed_out (n,) -> (n,) bool"""
-        if self.success is None:
-            return None
-        return timed_out & (ended.read_view(self._success_field) >= self._hold_steps)
+    def succeeded(self, ended: Selection, timed_out: Tensor) -> dict[str, Any]:
+        """Return `success`, `conditions` and `condition_values` of the ended episodes. timed_out (n,)"""
+        if not self.conditions:
+            return {"success": None}
+        held = {each.name: ended.read_view(each.field) >= each.hold_steps for each in self.conditions}
+        values = {each.name: ended.read(each.value) for each in self.conditions if each.bounded}
+        success = functools.reduce(torch.logical_and, held.values(), timed_out)
+        return {"success": success, "conditions": held, "condition_values": values}
 
     def end(self, terminated: Tensor, truncated: Tensor) -> tuple[Field, Field]:
         """Count the episodes that end. Return where an episode ends, and where it ends by time-out alone."""
@@ -83,5 +122,5 @@ class EpisodeCounters(TensorState):
     def reset(self, selection: Selection) -> None:
         """Set the counters of new episodes to zero."""
         selection.write(self.length_field, 0)
-        if self.success is not None:
-            selection.write(self._success_field, 0.0)
+        for condition in self.conditions:
+            selection.write(condition.field, 0.0)

@@ -90,7 +90,7 @@ class Environment(ABC):
 
     @abstractmethod
     def compute_success(self) -> Tensor | None:
-        """Return where the success condition holds in the current state; None without one. (num_envs,) bool"""
+        """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""
 
     @abstractmethod
     def check(self) -> None:

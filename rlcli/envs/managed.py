@@ -261,7 +261,7 @@ class ManagedEnv(VecEnv):
     def _result_terms(self) -> Iterator[Any]:
         """Yield the functions and classes of observations, rewards, terminations and success, before they are bound."""
         task = self.config
-        sections = {"rewards": task.rewards, "terminations": task.terminations, "success": {"success": task.success}}
+        sections = {"rewards": task.rewards, "terminations": task.terminations, "success": task.success}
         groups = [("observations", group.terms) for group in task.observations.values()]
         for section, configs in [*sections.items(), *groups]:
             for config in configs.values():  # type: ignore[attr-defined]

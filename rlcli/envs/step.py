@@ -26,7 +26,11 @@ class Episodes:
     truncated: Tensor
     """Whether the episode ended by time-out alone. (n,) bool"""
     success: Tensor | None
-    """Whether the episode met the task's success condition; None for a task without one. (n,) bool"""
+    """Whether the episode met the task's conditions of success; None for a task without one. (n,) bool"""
+    conditions: dict[str, Tensor] = field(default_factory=dict)
+    """Condition of success -> whether it held during the last `hold_s` seconds. (n,) bool each"""
+    condition_values: dict[str, Tensor] = field(default_factory=dict)
+    """Condition of success with a bound -> its value in the last step. (n,) each"""
     metrics: dict[str, Tensor] = field(default_factory=dict)
     """`command/metric` -> its mean over the episode. (n,) each"""
     mask: Tensor | None = None

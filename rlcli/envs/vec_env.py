@@ -6,6 +6,7 @@ Autoreset is same-step: the observation returned with a finished episode is the 
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Mapping
 
@@ -107,14 +108,13 @@ class VecEnv(Workflow):
         self.env_origins = grid(distinct, self.config.scene.env_spacing).to(self.device)[streams]
         self._counters.attach(self.engine)
         self._bind_terms()
-        success = self._binder.success()
+        success = self._binder.bind_all("success")
         self._binder.raise_problems()
         self._build_workflow()
         self.layout = self._make_layout()
         self._action_shape = (self.num_envs, self.layout.action_size)
         self._action_columns = self.layout.action_columns()
-        if success is not None and self.config.success is not None:
-            self._counters.set_success(success, self.config.success.hold_s, self.step_dt)
+        self._counters.set_success(success, self.step_dt)
 
     def reset(self, seed: int | None = None, *, episode: int = 0) -> dict[str, Tensor]:
         """Start a new episode everywhere, and return observations by group; see `Environment.reset`."""
@@ -137,7 +137,7 @@ class VecEnv(Workflow):
         1. Observers run `before_step`; the action is checked.
         2. The action becomes controls; physics runs; diverged environments return to their last finite state.
         3. Observers run `after_physics`; counters and sensors advance.
-        4. Terminations, rewards and the success condition are computed.
+        4. Terminations, rewards and the conditions of success are computed.
         5. Final observations and `Episodes` of the episodes that end are computed.
         6. Observers run `on_step`.
         7. Environments whose episode ended, and those of `restart`, are reset.
@@ -219,9 +219,9 @@ class VecEnv(Workflow):
             terms,
             causes,
             truncated_rows,
-            self._counters.succeeded(ended, truncated_rows),
-            self._episode_metrics(ended),
-            finished if isinstance(finished, Tensor) else None,
+            metrics=self._episode_metrics(ended),
+            mask=finished if isinstance(finished, Tensor) else None,
+            **self._counters.succeeded(ended, truncated_rows),
         )
         return ended, final_obs, episodes
 
@@ -278,10 +278,14 @@ class VecEnv(Workflow):
         """The environment of this process, with terms and managers: this object, if no other process steps a part."""
         return self
 
+    def success_conditions(self, env_id: int) -> list[str]:
+        """Return each condition of success in one environment, as in `speed 0.21, at most 0.3: holds since 0.4 s`."""
+        return [condition.describe(env_id, self.step_dt) for condition in self._counters.conditions]
+
     def compute_success(self) -> Tensor | None:
-        """Return where the success condition holds in the current state; None without one. (num_envs,) bool"""
-        success = self._counters.success
-        return None if success is None else success()
+        """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""
+        held = [torch.as_tensor(condition.holds()) for condition in self._counters.conditions]
+        return functools.reduce(torch.logical_and, held) if held else None
 
     def check(self) -> None:
         """Raise the `DivergedError` of the steps since the last call; a CPU raises it in the step."""

@@ -25,10 +25,16 @@ T = TypeVar("T")
 class Evaluation:
     """Finished episodes. Each list has one entry for each episode, in the order in which they ended."""
 
+    conditions: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """Condition of success -> its bounds, as `at_least` and `at_most`."""
     envs: list[int] = field(default_factory=list)
     returns: list[float] = field(default_factory=list)
     lengths: list[int] = field(default_factory=list)
     successes: list[bool] = field(default_factory=list)
+    held: dict[str, list[bool]] = field(default_factory=dict)
+    """Condition of success -> whether it held at the end of each episode."""
+    condition_values: dict[str, list[float]] = field(default_factory=dict)
+    """Condition of success with a bound -> its value in the last step of each episode."""
     truncated: list[bool] = field(default_factory=list)
     reward_terms: dict[str, list[float]] = field(default_factory=dict)
     causes: dict[str, list[bool]] = field(default_factory=dict)
@@ -53,6 +59,14 @@ class Evaluation:
         }
         if self.successes:
             result["success"] = proportion(sum(self.successes), len(self.successes))
+            result["conditions"] = {name: self._condition(name, bounds) for name, bounds in self.conditions.items()}
+        return result
+
+    def _condition(self, name: str, bounds: dict[str, Any]) -> dict[str, Any]:
+        """Return the share of episodes in which a condition of success held, its mean value and its bounds."""
+        result = {"held": proportion(sum(self.held[name]), len(self.held[name])), **bounds}
+        if name in self.condition_values:
+            result["value"] = _mean_of_finite(self.condition_values[name])
         return result
 
     def part(self, first: int, stop: int) -> Evaluation:
@@ -74,6 +88,9 @@ class Evaluation:
             returns=take(self.returns),
             lengths=take(self.lengths),
             successes=take(self.successes),
+            conditions=self.conditions,
+            held={name: take(flags) for name, flags in self.held.items()},
+            condition_values={name: take(values) for name, values in self.condition_values.items()},
             truncated=take(self.truncated),
             reward_terms={name: take(values) for name, values in self.reward_terms.items()},
             causes=causes,
@@ -107,7 +124,9 @@ def evaluate(
     quota = torch.full((size,), episodes // size)
     quota[: episodes % size] += 1
     quota = quota.repeat(groups)
-    result = Evaluation()
+    keys = {"at_least", "at_most"}
+    success = {name: config for name, config in env.config.success.items() if config is not None}
+    result = Evaluation({name: each.model_dump(include=keys, exclude_none=True) for name, each in success.items()})
     before = env.causes
     obs = env.reset(seed=env.seed)["policy"]
     with torch.no_grad(), env.observers.added(_EpisodeMeans(env)) as means:
@@ -170,6 +189,10 @@ def _add_episodes(result: Evaluation, ended: Episodes, quota: Tensor, means: _Ep
         result.truncated.append(bool(ended.truncated[row]))
         if ended.success is not None:
             result.successes.append(bool(ended.success[row]))
+        for name, flags in ended.conditions.items():
+            result.held.setdefault(name, []).append(bool(flags[row]))
+        for name, numbers in ended.condition_values.items():
+            result.condition_values.setdefault(name, []).append(float(numbers[row]))
         for name, sums in ended.reward_terms.items():
             result.reward_terms.setdefault(name, []).append(float(sums[row]))
         for name, column in values.items():

@@ -107,7 +107,7 @@ def require_success(resolved: Resolved, keys: Iterable[str], instead: str = "--f
     Raises:
         UsageError: if it does not.
     """
-    if any(key.partition(".")[0] == "success" for key in keys) and resolved.task.success is None:
+    if any(key.partition(".")[0] == "success" for key in keys) and not resolved.task.success:
         raise UsageError("the task defines no success", hint=f"add `success:` to its YAML, or write {instead}")
 
 

@@ -71,7 +71,7 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
     Raises:
         UsageError: if the task has no regulator, with the reason.
     """
-    if resolved.task.success is None:
+    if not resolved.task.success:
         raise _no_regulator(resolved, "the task defines no success, so its target state is unknown")
     with contextlib.closing(make_env(_without_randomness(resolved.with_num_envs(1)))) as env:
         model = env.engine.model

@@ -147,11 +147,6 @@ class Binder:
         bound = [self.bind(section, (*path, name), config) for name, config in configs.items() if config is not None]
         return [term for term in bound if term is not None]
 
-    def success(self) -> BoundTerm | None:
-        """Return the task's success condition, bound."""
-        config = self.resolved.task.success
-        return self.bind("success", ("success",), config) if config is not None else None
-
     def load(self, signature: Signature) -> Any:
         """Import a term and return its function or class.
 

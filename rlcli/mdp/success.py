@@ -1,136 +1,107 @@
-"""Success conditions: they hold in the states in which an episode should end. (num_envs,) bool each."""
+"""Values that conditions of success compare with `at_most` or `at_least`. (num_envs,) each."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
 from rlcli.mdp.parameters import Command, Entity, ManagedEnv, VecEnv
-from rlcli.mdp.term_helpers import all_columns, angle_to_goal, constant, cosine, distance_to_goal, goal_in_world, single
+from rlcli.mdp.term_helpers import angle_to_goal, constant, distance_to_goal, goal_in_world, single
 from rlcli.sim.rotations import length, wrap_to_pi
 from rlcli.task import Bodies, Joints, Sites
 
 
-def joints_near(
-    env: VecEnv, *, entity: Entity = "robot", joints: Joints = ".*", target: float = 0.0, tolerance: float
-) -> Tensor:
-    """Succeed where every joint is within `tolerance` of `target` [m or rad]. (num_envs,)
+def joint_error(env: VecEnv, *, entity: Entity = "robot", joints: Joints = ".*", target: float = 0.0) -> Tensor:
+    """Return the largest distance of a joint from `target` [m or rad]. (num_envs,)
 
     The difference is wrapped to [-pi, pi].
     """
     data = entity.data
-    angle = wrap_to_pi(data.joint_pos_of(joints) - target) if target else data.joint_angle_of(joints)
-    return all_columns(angle.abs() < tolerance)
+    error = wrap_to_pi(data.joint_pos_of(joints) - target) if target else data.joint_angle_of(joints)
+    return error.abs()[:, 0] if error.shape[1] == 1 else error.abs().amax(dim=1)
 
 
-def root_moves(
-    env: VecEnv,
-    *,
-    entity: Entity = "robot",
-    direction: tuple[float, float, float] = (1.0, 0.0, 0.0),
-    speed: float,
-    limit_angle: float | None = None,
+def root_velocity(
+    env: VecEnv, *, entity: Entity = "robot", direction: tuple[float, float, float] = (1.0, 0.0, 0.0)
 ) -> Tensor:
-    """Succeed where the root's velocity along `direction` is above `speed` [m/s]. (num_envs,)
+    """Return the root's velocity along `direction` [m/s]. (num_envs,)
 
-    direction: unit vector, world frame. limit_angle: if given, the root's up axis must also be within this angle of the
-    world's [rad].
+    direction: unit vector, world frame.
     """
     x, y, z = entity.data.root_lin_vel_w.unbind(dim=1)
-    moves = direction[0] * x + direction[1] * y + direction[2] * z > speed
-    if limit_angle is None:
-        return moves
-    return moves & (-entity.data.projected_gravity_b[:, 2] > cosine(limit_angle))
+    return direction[0] * x + direction[1] * y + direction[2] * z
 
 
-def root_upright(
-    env: VecEnv, *, entity: Entity = "robot", limit_angle: float, minimum_height: float | None = None
-) -> Tensor:
-    """Succeed where the root's up axis is within `limit_angle` [rad] of the world's. (num_envs,)
-
-    minimum_height: if given, the root must also be higher than that above its environment's origin [m].
-    """
-    upright = -entity.data.projected_gravity_b[:, 2] > cosine(limit_angle)
-    if minimum_height is None:
-        return upright
-    return upright & (entity.data.root_pos_w[:, 2] - env.origins[:, 2] > minimum_height)
+def root_speed(env: VecEnv, *, entity: Entity = "robot") -> Tensor:
+    """Return the magnitude of the root's velocity [m/s]. (num_envs,)"""
+    return length(entity.data.root_lin_vel_w)
 
 
-def root_near(env: VecEnv, *, entity: Entity = "robot", target: tuple[float, float, float], tolerance: float) -> Tensor:
-    """Succeed where the root is within `tolerance` [m] of `target`. (num_envs,)
+def root_tilt(env: VecEnv, *, entity: Entity = "robot") -> Tensor:
+    """Return the angle between the root's up axis and the world's [rad]. (num_envs,)"""
+    return (-entity.data.projected_gravity_b[:, 2]).clamp(-1.0, 1.0).acos()
+
+
+def root_height(env: VecEnv, *, entity: Entity = "robot") -> Tensor:
+    """Return the height of the root above its environment's origin [m]. (num_envs,)"""
+    return entity.data.root_pos_w[:, 2] - env.origins[:, 2]
+
+
+def root_distance(env: VecEnv, *, entity: Entity = "robot", target: tuple[float, float, float]) -> Tensor:
+    """Return the distance of the root from `target` [m]. (num_envs,)
 
     target: a point from the environment's origin [m].
     """
-    return length(entity.data.root_pos_w - env.origins - constant(target, env.device)) < tolerance
+    return length(entity.data.root_pos_w - env.origins - constant(target, env.device))
 
 
-def root_hovers(
-    env: VecEnv, *, entity: Entity = "robot", goal: Entity = "target", tolerance: float, speed: float
-) -> Tensor:
-    """Succeed where the root is within `tolerance` [m] of the root of `goal`. (num_envs,)
+def root_distance_to(env: VecEnv, *, entity: Entity = "robot", goal: Entity = "target") -> Tensor:
+    """Return the distance of the root from the root of `goal` [m]. (num_envs,)"""
+    return length(entity.data.root_pos_w - goal.data.root_pos_w)
 
-    The root must also be slower than `speed` [m/s].
+
+def velocity_error(env: VecEnv, *, entity: Entity = "robot", command: Command) -> Tensor:
+    """Return the error of the root's horizontal velocity under a velocity command [m/s], root frame. (num_envs,)"""
+    return length(command.command[:, :2] - entity.data.root_lin_vel_b[:, :2])
+
+
+def yaw_rate_error(env: VecEnv, *, entity: Entity = "robot", command: Command) -> Tensor:
+    """Return the error of the root's yaw rate under a velocity command [rad/s], root frame. (num_envs,)"""
+    return (command.command[:, 2] - entity.data.root_ang_vel_b[:, 2]).abs()
+
+
+def mean_velocity_error(env: ManagedEnv, *, command: Command) -> Tensor:
+    """Return the mean error of a velocity command's horizontal velocity over the episode so far [m/s]. (num_envs,)
+
+    The mean includes the start of the episode and changes of the command.
     """
-    near = length(entity.data.root_pos_w - goal.data.root_pos_w) < tolerance
-    return near & (length(entity.data.root_lin_vel_w) < speed)
+    return env.command_manager.running_mean(command, "error_vel_xy")
 
 
-def velocity_tracked(
-    env: VecEnv,
-    *,
-    entity: Entity = "robot",
-    command: Command,
-    linear_tolerance: float,
-    angular_tolerance: float,
-) -> Tensor:
-    """Succeed where the root follows a velocity command. (num_envs,)
+def mean_yaw_rate_error(env: ManagedEnv, *, command: Command) -> Tensor:
+    """Return the mean error of a velocity command's yaw rate over the episode so far [rad/s]. (num_envs,)
 
-    linear_tolerance: largest error of the horizontal velocity [m/s]. angular_tolerance: of the yaw rate [rad/s]. Both
-    in the root's frame.
+    The mean includes the start of the episode and changes of the command.
     """
-    data, commanded = entity.data, command.command
-    linear = length(commanded[:, :2] - data.root_lin_vel_b[:, :2]) < linear_tolerance
-    return linear & ((commanded[:, 2] - data.root_ang_vel_b[:, 2]).abs() < angular_tolerance)
+    return env.command_manager.running_mean(command, "error_vel_yaw")
 
 
-def velocity_tracked_on_average(
-    env: ManagedEnv, *, command: Command, linear_tolerance: float, angular_tolerance: float
+def body_goal_distance(env: VecEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command) -> Tensor:
+    """Return the distance of a body from the goal of a pose command of `entity` [m]. (num_envs,)"""
+    return distance_to_goal(entity, bodies, command)
+
+
+def body_goal_angle(env: VecEnv, *, entity: Entity = "robot", bodies: Bodies, command: Command) -> Tensor:
+    """Return the angle of a body from the goal orientation of a pose command of `entity` [rad]. (num_envs,)"""
+    return angle_to_goal(entity, bodies, command)
+
+
+def site_goal_distance(env: VecEnv, *, entity: Entity = "robot", sites: Sites, command: Command) -> Tensor:
+    """Return the distance of a site from the goal of a pose command of `entity` [m]. (num_envs,)"""
+    return length(single(entity.data.site_pos_w[:, sites], "site") - goal_in_world(entity, command))
+
+
+def object_goal_distance(
+    env: VecEnv, *, entity: Entity = "robot", object: Entity = "object", command: Command
 ) -> Tensor:
-    """Succeed where the mean errors of a velocity command are within their tolerances. (num_envs,)
-
-    The means are over the episode so far, with its start and its changes of command. linear_tolerance [m/s],
-    angular_tolerance [rad/s].
-    """
-    running_mean = env.command_manager.running_mean
-    linear = running_mean(command, "error_vel_xy") < linear_tolerance
-    return linear & (running_mean(command, "error_vel_yaw") < angular_tolerance)
-
-
-def body_at_goal(
-    env: VecEnv,
-    *,
-    entity: Entity = "robot",
-    bodies: Bodies,
-    command: Command,
-    tolerance: float,
-    angle_tolerance: float | None = None,
-) -> Tensor:
-    """Succeed where a body is within `tolerance` [m] of the goal of a pose command of `entity`. (num_envs,)
-
-    angle_tolerance: if given, the body's orientation must also be within this angle of the goal's [rad].
-    """
-    near = distance_to_goal(entity, bodies, command) < tolerance
-    if angle_tolerance is None:
-        return near
-    return near & (angle_to_goal(entity, bodies, command) < angle_tolerance)
-
-
-def site_at_goal(env: VecEnv, *, entity: Entity = "robot", sites: Sites, command: Command, tolerance: float) -> Tensor:
-    """Succeed where a site is within `tolerance` [m] of the goal of a pose command of `entity`. (num_envs,)"""
-    return length(single(entity.data.site_pos_w[:, sites], "site") - goal_in_world(entity, command)) < tolerance
-
-
-def object_at_goal(
-    env: VecEnv, *, entity: Entity = "robot", object: Entity = "object", command: Command, tolerance: float
-) -> Tensor:
-    """Succeed where an object is within `tolerance` [m] of the goal of a pose command of `entity`. (num_envs,)"""
-    return length(object.data.root_pos_w - goal_in_world(entity, command)) < tolerance
+    """Return the distance of an object from the goal of a pose command of `entity` [m]. (num_envs,)"""
+    return length(object.data.root_pos_w - goal_in_world(entity, command))

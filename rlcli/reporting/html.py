@@ -12,6 +12,7 @@ import jinja2
 from markupsafe import Markup, escape
 
 from rlcli import __version__
+from rlcli.config.schema import bound_text
 from rlcli.reporting.run_page import Page
 from rlcli.safe_text import UNSAFE, shorten
 
@@ -45,6 +46,7 @@ def templates() -> jinja2.Environment:
         lstrip_blocks=True,
     )
     environment.filters["coded"] = _coded
+    environment.globals["bound_text"] = bound_text
     return environment
 
 

@@ -63,6 +63,8 @@ class Page:
     facts: list[tuple[str, str]]
     card: Card | None = None
     charts: list[Chart] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
+    """Findings of the training's health checks."""
     evaluation: dict[str, Any] | None = None
     checkpoint: str | None = None
     video: bytes | None = None
@@ -96,6 +98,7 @@ def gather_page(run: Run, checkpoint: Path | None) -> Page:
     with _part(page, "charts", "There are no learning curves", CheckpointError):
         (curve,), _ = gather([run])
         _add_charts(curve, page)
+    page.findings = run.findings()
     page.facts = list(_facts(run, curve))
     if page.checkpoint is not None and page.checkpoint.isdecimal():
         page.facts.insert(0, ("Checkpoint", f"step {int(page.checkpoint):,}"))

@@ -19,7 +19,7 @@ from typing import Any
 from rlcli.config.layers import leaves
 from rlcli.config.load import Resolved
 from rlcli.config.messages import dotted
-from rlcli.config.schema import ObservationConfig, ObservationGroupConfig, TaskConfig, TermConfig
+from rlcli.config.schema import ObservationConfig, ObservationGroupConfig, TaskConfig, TermConfig, bound_text
 from rlcli.config.term_signatures import SECTIONS, SELECTORS, SignatureError, Vocabulary, first_paragraph, read_params
 from rlcli.config.unimported_classes import ClassSearch
 from rlcli.registry import TaskSource
@@ -231,8 +231,6 @@ def _term_tables(task: TaskConfig, vocabulary: Vocabulary) -> Iterable[Table]:
     ) -> Table:
         """Return a table; `cells` makes the cells between name and parameters of (config, meaning, unit)."""
         terms = getattr(task, section)
-        if section == "success":
-            terms = {terms.func: terms} if terms else {}
         rows = [
             (name, *cells(config, *_meaning(section, config, vocabulary)), _parameters(section, config, vocabulary))
             for name, config in terms.items()
@@ -249,9 +247,8 @@ def _term_tables(task: TaskConfig, vocabulary: Vocabulary) -> Iterable[Table]:
     titles = ("Term", "What it does", "When", "Parameters")
     ends = {True: "truncates", False: "terminates"}
     yield table("terminations", note, titles, lambda term, meaning, unit: (ends[term.time_out], meaning))
-    hold = number(task.success.hold_s) if task.success else ""
-    note = f"An episode succeeds if it ends by time-out and the condition held during its last {hold} s."
-    yield table("success", note, ("Condition", "When", "Parameters"), lambda term, meaning, unit: (meaning,))
+    note = "An episode succeeds if it ends by time-out and each condition held during its last seconds."
+    yield table("success", note, ("Condition", "Value", "Must be", "For [s]", "Parameters"), _condition_cells)
     titles = ("Term", "What", "Unit", "Resampled", "Ranges")
     yield table(
         "commands", "", titles, lambda term, meaning, unit: (meaning, unit, f"every {span(term.resampling_time_s)} s")
@@ -259,6 +256,11 @@ def _term_tables(task: TaskConfig, vocabulary: Vocabulary) -> Iterable[Table]:
     titles = ("Term", "When", "What", "Ranges and parameters")
     yield table("events", "", titles, lambda term, meaning, unit: (when_text(term), meaning))
     yield table("curriculum", "", ("Term", "What", "Parameters"), lambda term, meaning, unit: (meaning,))
+
+
+def _condition_cells(term: Any, meaning: str, unit: str) -> tuple[str, ...]:
+    value = meaning.removeprefix("Return ")
+    return value[:1].upper() + value[1:], bound_text(term.model_dump()) or "true", number(term.hold_s)
 
 
 def _sensors(task: TaskConfig) -> Table:

@@ -11,6 +11,15 @@ from torch import Tensor
 from rlcli.envs.step import Episodes
 from rlcli.rl.distributed import ProcessGroup
 
+_METRICS = {
+    "term": "Episode_Reward",
+    "cause": "Episode_Termination",
+    "metric": "Metrics",
+    "held": "Success",
+    "value": "Success_Value",
+}
+"""Kind of a sum -> group of its metric."""
+
 
 class EpisodeStatistics:
     """Statistics of the finished episodes of an iteration.
@@ -21,7 +30,9 @@ class EpisodeStatistics:
     - `Episode_Reward/<term>`: mean sum of the term over an episode, divided by the full episode length [s] (Isaac
       Lab's definition);
     - `Episode_Termination/<term>`: share of the episodes that the term ended;
-    - `Metrics/<command>/<metric>`: mean of the means of the episodes.
+    - `Metrics/<command>/<metric>`: mean of the means of the episodes;
+    - `Success/<condition>`: share of the episodes at whose end the condition of success held;
+    - `Success_Value/<condition>`: mean of the condition's value in the last step.
 
     Sums stay on the device of the episodes, so that adding to them forces no host sync.
     """
@@ -41,7 +52,9 @@ class EpisodeStatistics:
             return
         values = {"return": episodes.returns, **{f"term.{k}": v for k, v in episodes.reward_terms.items()}}
         values |= {f"metric.{k}": v for k, v in episodes.metrics.items()}
+        values |= {f"value.{k}": v for k, v in episodes.condition_values.items()}
         flags = {f"cause.{k}": v for k, v in episodes.causes.items()}
+        flags |= {f"held.{k}": v for k, v in episodes.conditions.items()}
         if episodes.success is not None:
             flags["success"] = episodes.success
         flags["count"] = torch.ones_like(episodes.truncated) if episodes.mask is None else episodes.mask
@@ -99,7 +112,9 @@ class EpisodeStatistics:
         if not count:
             return {}
         scale = 1.0 / (count * self._episode_length_s)
-        rewards = {f"Episode_Reward/{n.removeprefix('term.')}": v * scale for n, v in sums.items() if n[:5] == "term."}
-        causes = {f"Episode_Termination/{n.removeprefix('cause.')}": v for n, v in sums.items() if n[:6] == "cause."}
-        metrics = {f"Metrics/{n.removeprefix('metric.')}": v for n, v in sums.items() if n[:7] == "metric."}
-        return {**rewards, **{name: total / count for name, total in {**causes, **metrics}.items()}}
+        metrics = {}
+        for name, total in sums.items():
+            kind, _, term = name.partition(".")
+            if kind in _METRICS:
+                metrics[f"{_METRICS[kind]}/{term}"] = total * scale if kind == "term" else total / count
+        return metrics

@@ -33,6 +33,13 @@ class _Share(FileModel):
     high: float
 
 
+class _Condition(FileModel):
+    held: _Share
+    value: _Mean | None = None
+    at_least: float | None = None
+    at_most: float | None = None
+
+
 Name = Annotated[str, Field(max_length=500)]
 
 
@@ -45,6 +52,7 @@ class _EvaluationRecord(FileModel):
     returns: Annotated[_Mean, Field(alias="return")]
     length: _Mean
     success: _Share | None = None
+    conditions: Annotated[dict[Name, _Condition], Field(max_length=1_000, default_factory=dict)]
     reward_terms: Annotated[dict[Name, _Mean], Field(max_length=10_000)]
     terminations: Annotated[dict[Name, _Share], Field(max_length=10_000)]
     diverged: Annotated[int, Field(ge=0)]
@@ -75,8 +83,8 @@ def read_evaluation(run: Run, step_name: str) -> dict[str, Any] | None:
 
     These entries are checked: `episodes`, `seed`, `return` and `length` (mean, std, low, high; for a single episode low
     and high are None), `reward_terms` (the same for each term, by name), `terminations` (rate, low, high for each
-    term, by name), `diverged`, `diverged_by`. `success` (rate, low, high) is missing for a task without a success
-    condition.
+    term, by name), `diverged`, `diverged_by`. `success` (rate, low, high) and `conditions` (by name: `held`, a share;
+    `value`, a mean, `at_least` and `at_most`, where the condition has them) are missing for a task without success.
 
     Raises:
         CheckpointError: if the file is malformed.

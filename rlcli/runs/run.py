@@ -74,6 +74,10 @@ class Run:
         except strict_yaml.YamlError as error:
             raise CheckpointError(f"{self.config}:{error.line}:{error.column} is corrupt: {error.message}") from None
 
+    def findings(self) -> list[str]:
+        """Return the findings of the training's health checks, a sentence each."""
+        return [f"{each['check']}: {each['message']}; try {each['hint']}" for each in self.record.get("health", ())]
+
     def update(self, **entries: Any) -> None:
         """Change entries of `record`, and write run.json."""
         self.record.update(entries)
@@ -282,6 +286,13 @@ class _InstalledTask(TaskRecord):
         return self
 
 
+class _Finding(FileModel):
+    check: Word
+    iteration: Annotated[int, Field(ge=0)]
+    message: Word
+    hint: Word
+
+
 class RunRecord(FileModel):
     """The entries of run.json that rlcli reads."""
 
@@ -291,6 +302,7 @@ class RunRecord(FileModel):
     best: int | None = None
     cpu: dict[str, Any] = Field(default_factory=dict)
     given: dict[str, Any] = Field(default_factory=dict)
+    health: Annotated[list[_Finding], Field(max_length=1000)] = Field(default_factory=list)
     init_from: str | None = None
     iteration: int = 0
     loggers: list[str] = Field(default_factory=list)

@@ -143,13 +143,15 @@ def dominant_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
 def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that the reward depends on the actions."""
     rewards = torch.cat([rollout.reward.flatten() for rollout in evidence.rollouts])
-    if any(bool(rollout.terminated.any()) for rollout in evidence.rollouts) or not rewards.numel():
-        return  # with terminations a constant reward still rewards long episodes
-    if bool((rewards == rewards[0]).all()):
-        value = float(rewards[0])
+    if not rewards.numel() or not bool((rewards == rewards[0]).all()):
+        return
+    value = float(rewards[0])
+    ends_early = any(bool(rollout.terminated.any()) for rollout in evidence.rollouts)
+    if not ends_early or value == 0.0:  # with terminations, any other constant rewards long or short episodes
+        reason = "" if ends_early else ", and no episode ends early"
         yield error_at(
             "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf",
-            f"is {value:g} in every step of all fixed policies, and no episode ends early: there is nothing to learn",
+            f"is {value:g} in every step of all fixed policies{reason}: there is nothing to learn",
             "compute the reward from the state or the action",
             {"value": value},
         )

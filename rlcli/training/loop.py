@@ -7,7 +7,7 @@ import logging
 import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING
 
 from rlcli.errors import DivergedError, Stopped
@@ -17,6 +17,7 @@ from rlcli.rl.trainer import Report, Trainer
 from rlcli.runs import checkpoint_reader
 from rlcli.runs.run import Run
 from rlcli.training.checkpoint_writer import CheckpointWriter
+from rlcli.training.health import Health, probe
 from rlcli.training.periodic_eval import PeriodicEval
 from rlcli.training.progress import Progress
 from rlcli.training.signals import Interrupted, StopRequest
@@ -51,11 +52,16 @@ class TrainLoop:
     """Number of iterations between checkpoints; None: a checkpoint every `SAVE_EVERY_S` seconds."""
     periodic_eval: PeriodicEval | None = None
     videos: TrainingVideos | None = None
+    health: Health | None = None
     show: Callable[[Progress], None] = lambda _: None
     """Called after each iteration."""
     count_divergences: Callable[[], int] = lambda: 0
     """Returns the number of environment steps that have diverged since the environment was built."""
     stop: StopRequest = field(default_factory=StopRequest)
+    metrics: dict[str, float] = field(init=False, default_factory=dict)
+    """Metrics of the newest iteration."""
+    reached: bool = field(init=False, default=False)
+    """Whether an evaluation has reached the bar that ends the training."""
     _ranks: distributed.ProcessGroup = field(init=False, default_factory=distributed.current)
     _boundary: tuple[int, int] = field(init=False, default=(0, 0))
     """Iteration and environment steps at the beginning of the current iteration."""
@@ -94,11 +100,12 @@ class TrainLoop:
             writer.wait()
         begin, first_step = time.monotonic(), trainer.env_steps
         # a signal on any rank stops all ranks at the same boundary
-        while not (stopped := any(self._ranks.sum(self.stop.signal is not None))) and not budget.spent(trainer):
+        while not (stopped := any(self._ranks.sum(self.stop.signal is not None))) and not self._is_over(budget):
             report, evaluation, is_best, must_save = self._iterate()
-            metrics = {**_with_rates(report, trainer.steps_per_iteration), **evaluation}
+            self.metrics = metrics = {**_with_rates(report, trainer.steps_per_iteration), **evaluation}
             for logger in self.loggers:
                 logger.write(trainer.iteration, trainer.env_steps, metrics)
+            self._check_health(metrics)
             self.show(self._progress(budget, report, metrics, time.monotonic() - begin, first_step))
             if must_save or writer.is_due(trainer.iteration, self.save_interval):
                 self._save()
@@ -111,8 +118,26 @@ class TrainLoop:
                 self.videos.record(trainer.policy, trainer.env_steps)
         self._save()
         writer.wait()
-        if stopped and not budget.spent(trainer):
+        if stopped and not self._is_over(budget):
             raise self._stopped(f"stopped at iteration {trainer.iteration}, checkpoint written")
+
+    def _is_over(self, budget: Budget) -> bool:
+        return self.reached or budget.spent(self.trainer)
+
+    def _check_health(self, metrics: dict[str, float]) -> None:
+        """Run the health checks; log new findings, and write the present ones into run.json."""
+        health = self.health
+        if health is None:
+            return
+        known = {finding.check for finding in health.findings}
+        probed = probe(self.trainer) if health.due(self.trainer.iteration) else {}
+        health.add(self.trainer.iteration, metrics | probed)
+        if health.findings or known:
+            self.run.record["health"] = [asdict(finding) for finding in health.findings]
+        for finding, text in zip(health.findings, self.run.findings(), strict=True):
+            if finding.check not in known:
+                self.run.update()
+                _log.warning("%s", text)
 
     def _iterate(self) -> tuple[Report, dict[str, float], bool, bool]:
         """Do one iteration and, if it is due, an evaluation.
@@ -136,7 +161,9 @@ class TrainLoop:
             unsaved_s = time.monotonic() - self._saved_at
             is_overdue = self.save_interval is None and self._ranks.is_rank_zero and unsaved_s > SAVE_EVERY_S
             new_divergences = self.count_divergences() - diverged_before
-            diverged, *must_save = self._ranks.sum(new_divergences, is_overdue, is_best)
+            reached = evaluator is not None and evaluator.reached
+            diverged, reached_on, *must_save = self._ranks.sum(new_divergences, reached, is_overdue, is_best)
+            self.reached = bool(reached_on)
             _require_stable(diverged, trainer)
         return report, evaluation, is_best, any(must_save)
 
@@ -182,7 +209,8 @@ class TrainLoop:
         rate = (trainer.env_steps - first_step) / max(elapsed_s, 1e-9)
         left = (iterations - trainer.iteration) * trainer.steps_per_iteration / max(rate, 1e-9)
         done = trainer.iteration, iterations, trainer.env_steps
-        return Progress(*done, elapsed_s, left, rate, report.seconds, metrics)
+        notes = [] if self.health is None else [*self.health.notes(metrics), *self.run.findings()]
+        return Progress(*done, elapsed_s, left, rate, report.seconds, metrics, notes)
 
     def _stopped(self, message: str) -> Stopped:
         """Return the error of a stopped run, with the command that resumes it."""

@@ -13,6 +13,7 @@ from rlcli.evaluation.evaluate import evaluate
 from rlcli.rl.acting import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators, undisturbed
+from rlcli.training.time_to_threshold import Threshold
 
 _SUCCESS, _RETURN, _LENGTH = "Eval/success_rate", "Eval/mean_reward", "Eval/mean_episode_length"
 
@@ -27,6 +28,7 @@ class PeriodicEval:
         episodes: number of episodes of an evaluation.
         interval: number of iterations between evaluations.
         history: metrics of the previous iterations; an iteration without an evaluation is ignored.
+        until: bar that ends the training.
     """
 
     def __init__(
@@ -35,7 +37,9 @@ class PeriodicEval:
         episodes: int,
         interval: int,
         history: Sequence[Mapping[str, Any]] = (),
+        until: Threshold | None = None,
     ) -> None:
+        self.until, self.reached = until, False
         self._make_env, self._episodes, self._interval = make_env, episodes, interval
         self._env: Environment | None = None
         self._initial_state: Mapping[str, Tensor] = {}
@@ -60,6 +64,7 @@ class PeriodicEval:
             self._env.load_state_dict(self._initial_state)
             seed_generators(self._env.seed)
             summary = evaluate(self._env, trained_policy(self._env, policy()), self._episodes).summary()
+        self.reached = self.until is not None and self.until.is_certain(summary)
         metrics = {_RETURN: summary["return"]["mean"], _LENGTH: summary["length"]["mean"]}
         return {**metrics, _SUCCESS: summary["success"]["rate"]} if "success" in summary else metrics
 

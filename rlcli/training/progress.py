@@ -27,6 +27,8 @@ class Progress:
     seconds: dict[str, float]
     """Part of an iteration -> its duration [s], or its share of the iteration."""
     metrics: dict[str, float]
+    notes: Sequence[str] = ()
+    """Conditions of success with their values, and findings of the health checks."""
 
 
 def progress_from_metrics(rows: Sequence[Mapping[str, Any]], iterations: int | None, elapsed_s: float) -> Progress:

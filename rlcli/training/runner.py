@@ -22,13 +22,16 @@ from rlcli.rl.trainer import Trainer
 from rlcli.runs.checkpoint_reader import steps
 from rlcli.runs.provenance import built_record, differences, environment_record
 from rlcli.runs.restore import resolve_run
+from rlcli.runs.run import Run
 from rlcli.training.checkpoint_writer import CheckpointWriter, Keep, manifest_entries
+from rlcli.training.health import Health
 from rlcli.training.job import Job, TrainingResult
 from rlcli.training.loggers import open_loggers, read_metrics
 from rlcli.training.loop import TrainLoop
 from rlcli.training.periodic_eval import PeriodicEval
 from rlcli.training.progress import Progress
 from rlcli.training.signals import StopRequest
+from rlcli.training.time_to_threshold import read_threshold, training_s
 
 if TYPE_CHECKING:
     from rlcli.training.trackers import Logger
@@ -111,8 +114,9 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
             writer,
             loggers,
             save_interval=agent.save_interval,
-            periodic_eval=_periodic_eval(job, writer, stop),
+            periodic_eval=_periodic_eval(job, writer, stop, budgets[-1].iterations(trainer)),
             videos=_training_videos(job, stop),
+            health=_health(job, budgets[-1].iterations(trainer)),
             show=view.show,
             count_divergences=lambda: env.divergences,
             stop=stop,
@@ -127,6 +131,12 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
             close(*_end_state(error))
         raise
     close("finished")
+    if job.writes and agent.until is not None:
+        _report_bar(run, agent.until, loop.reached)
+    for note in [] if loop.health is None else loop.health.notes(loop.metrics):
+        _log.info("%s", note)
+    for finding in run.findings() if job.writes else ():
+        _log.warning("at the end: %s", finding)
 
 
 def _open_writer(job: Job, env: Environment) -> CheckpointWriter:
@@ -182,24 +192,49 @@ def _make_play_env(job: Job, purpose: str, flags: dict[str, Any]) -> VecEnv:
     return make_env(resolved, seed=derive(job.run.record["seed"], purpose))
 
 
-def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest) -> PeriodicEval | None:
+def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest, iterations: int) -> PeriodicEval | None:
     """Return the evaluation between iterations, if the agent has one; only the rank that writes the run evaluates."""
     run, (agent, _) = job.run, job.resolved.require_agent()
-    if agent.eval_interval is None or not job.writes:
+    until = None if agent.until is None else read_threshold(agent.until)
+    if (agent.eval_interval is None and until is None) or not job.writes:
         return None
-    num_envs = min(agent.eval_episodes, job.resolved.task.scene.num_envs)
+    interval = agent.eval_interval or max(1, iterations // 20)
+    episodes = agent.eval_episodes if until is None else until.episodes(agent.eval_episodes)
+    num_envs = min(episodes, job.resolved.task.scene.num_envs)
 
     def make() -> Environment:
         env = _make_play_env(job, "evaluation", {"scene.num_envs": num_envs})
         env.observers.add(stop)
         return env
 
-    evaluator = PeriodicEval(make, agent.eval_episodes, agent.eval_interval, read_metrics(run.metrics))
+    evaluator = PeriodicEval(make, episodes, interval, read_metrics(run.metrics), until)
     writer.best = evaluator.best if evaluator.best in steps(run.checkpoints) else None
     # they differ if the run was killed before it wrote `best`, or is resumed from a step before its best evaluation
     if run.record.get("best") != writer.best:
         run.update(best=writer.best)
     return evaluator
+
+
+def _health(job: Job, iterations: int) -> Health | None:
+    """Return the health checks with the metrics of earlier iterations; only the rank that writes the run checks."""
+    if not job.writes:
+        return None
+    agent, _ = job.resolved.require_agent()
+    health = Health(job.resolved.task, agent, iterations)
+    for row in read_metrics(job.run.metrics) if job.resume_from is not None else ():
+        health.add(row["iteration"], {name: value for name, value in row.items() if "/" in name})
+    return health
+
+
+def _report_bar(run: Run, bar: str, reached: bool) -> None:
+    """Log and record the time and the steps that the training took to the bar of `--until`."""
+    rows = read_metrics(run.metrics)
+    seconds, step = sum(map(training_s, rows)), rows[-1]["step"] if rows else 0
+    run.update(until={"bar": bar, "reached": reached, "seconds": seconds, "step": step})
+    if reached:
+        _log.info(f"{bar} reached after {step:,} steps and {seconds:.1f} s of rollouts and updates")
+    else:
+        _log.warning(f"{bar} was not reached in {step:,} steps: the lower end of no evaluation's interval was so high")
 
 
 def _training_videos(job: Job, stop: StopRequest) -> TrainingVideos | None:

@@ -20,8 +20,8 @@ from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.loggers import read_metrics
 from rlcli.training.signals import StopRequest
 from rlcli.training.subprocesses import POLL_S, start_training
+from rlcli.training.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
 from rlcli.tuning.sweep import Sweep
-from rlcli.tuning.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
 
 _log = logging.getLogger(__name__)
 
@@ -136,7 +136,7 @@ def compare(
     comparison = Comparison(sweep.folder, sweep.settings["task"], threshold, best.number, seeds)
     with _request_of_sweep(sweep, request) as base:
         resolved, _ = base.resolve()
-        if resolved.task.success is None and until is None:
+        if not resolved.task.success and until is None:
             raise UsageError("the task defines no success, so --until is needed", hint="add --until return=X")
         require_success(resolved, [threshold.key], "--until return=X")
         if resolved.agent is not None and not resolved.agent.eval_interval:

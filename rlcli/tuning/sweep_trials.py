@@ -17,10 +17,10 @@ from rlcli.runs.run import Run, open_run
 from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.signals import StopRequest
 from rlcli.training.subprocesses import POLL_S, STOPPED, TrainingProcess, start_command, start_training
+from rlcli.training.time_to_threshold import training_s
 from rlcli.tuning.changed_settings import preset_of
 from rlcli.tuning.search_space import Objective, Parameter
 from rlcli.tuning.sweep import Sweep, Trial
-from rlcli.tuning.time_to_threshold import training_s
 
 _log = logging.getLogger(__name__)
 

@@ -79,6 +79,9 @@ def captions(view: View) -> tuple[str, str]:
         "episode": f"{view.episodes}, {view.episode_s:.2f} s",
         "reward": f"{view.reward:.4g}",
     }
+    for condition in view.conditions:
+        name, _, state = condition.partition(" ")
+        rows[f"success: {name}"] = state
     if view.checkpoint is not None:
         rows["checkpoint"] = f"{view.checkpoint}"
     for number, knob in enumerate(view.knobs):

@@ -268,6 +268,7 @@ class Playback:
             num_envs=self.env.num_envs,
             episode_s=float(self.env.episode_length_buf[shown]) * self.env.step_dt,
             reward=float(self._reward[shown]),
+            conditions=self.env.success_conditions(shown),
             episodes=int(self.ended[shown]),
             checkpoint=self.checkpoint,
             checkpoints=self._checkpoints,

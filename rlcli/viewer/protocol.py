@@ -67,6 +67,8 @@ class View:
     """Time since the shown episode began [s]."""
     reward: float
     """Reward of the last step in the shown environment."""
+    conditions: Sequence[str]
+    """Conditions of success of the shown environment, with their values and bounds."""
     episodes: int
     """Episodes of the shown environment that have ended."""
     checkpoint: int | None

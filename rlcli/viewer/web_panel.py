@@ -115,6 +115,8 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         imgui.PopItemWidth()
         imgui.Separator()
         imgui.TextUnformatted(f"episode {view.episodes}, {view.episode_s:.2f} s, reward {view.reward:.4g}")
+        for condition in view.conditions:
+            imgui.TextUnformatted(f"success: {condition}")
         if view.message:
             imgui.TextWrapped(view.message)
         self._rendering_options()

@@ -167,7 +167,8 @@ def test_manager_based_task_requires_sections(problems_of, old, new, said):
 @pytest.mark.parametrize(
     ("override", "said", "hint"),
     [
-        ("success={func: is_alive}", "success.func: no success term 'is_alive'", "'is_alive' is a term of rewards"),
+        ("success={near: {func: is_alive}}", "no success term 'is_alive'", "'is_alive' is a term of rewards"),
+        ("success={func: joint_error}", "success: a term needs a name", "success: {NAME: {func: joint_error, ...}}"),
         ("rewards.alive.func=time_oot", "no reward term 'time_oot'", "terms: "),
         ("rewards.alive.func=is_aliv", "no reward term 'is_aliv'", "did you mean 'is_alive'?"),
         (
@@ -187,14 +188,14 @@ def test_unknown_term_suggests_name_or_section(problems_of, override, said, hint
 
 def test_term_entries_returns_section_and_path():
     data = {
-        "success": {"func": "s"},
+        "success": {"near": {"func": "s"}},
         "rewards": {"a": {"func": "r"}, "b": 3, "c": None},
         "observations": {"policy": {"p": {"func": "o"}, "q": 1}, "critic": 5},
         "actions": 7,
     }
     found = {(section, path) for section, path, _ in term_entries(data)}
     assert found == {
-        ("success", ("success",)),
+        ("success", ("success", "near")),
         ("rewards", ("rewards", "a")),
         ("observations", ("observations", "policy", "p")),
     }
@@ -206,7 +207,7 @@ def test_removed_term_keeps_order_of_others(task):
     assert list(resolved.task.rewards) == ["near"]
     assert list(resolved.task.observations["policy"].terms) == ["pos", "vel"]
     assert resolved.task.rewards["near"].params == {"entity": "robot", "joints": ["slider"], "target": 0.0}
-    assert resolved.task.success is None
+    assert resolved.task.success == {}
 
 
 OWN = """

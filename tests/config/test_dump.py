@@ -177,7 +177,7 @@ def test_json_schema_accepts_built_in_tasks(name):
         (("rewards", "pole_pos", "target"), "far"),
         (("rewards", "alive", "func"), "is_alife"),
         (("observations", "policy", "joint_pos_rel", "scale"), "big"),
-        (("success", "tolerance"), None),
+        (("success", "pole", "at_most"), "far"),
     ],
 )
 def test_json_schema_refuses_invalid_values(path, value):

@@ -70,7 +70,7 @@ TYPOS = [
         None,
     ),
     ("params.x=1", "params: remove them: only direct tasks have params", None),
-    ("success={func: joints_near, joints: [a], target: 0, tolerance: 1, hold_s: -1}", "success.hold_s: expected", None),
+    ("success={near: {func: joint_error, joints: [a], at_most: 1, hold_s: -1}}", "success.near.hold_s: expected", None),
     ("agent.gamma=2", "agents.one.gamma: expected a number <= 1, found 2", None),
     ("agent.gama=0.9", "agents.one.gama: unknown key 'gama'", "did you mean 'gamma'?"),
     ("agent.policy.hiden=[1]", "agents.one.policy.hiden: unknown key 'hiden'", "did you mean 'hidden'?"),

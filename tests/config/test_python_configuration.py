@@ -91,7 +91,7 @@ def cartpole(**changes):
                 func="joint_pos_out_of_manual_limit", joints=["slider_to_cart"], bounds=(-3.0, 3.0)
             ),
         },
-        "success": SuccessConfig(func="joints_near", joints=["cart_to_pole"], target=0.0, tolerance=0.1, hold_s=1.0),
+        "success": {"pole": SuccessConfig(func="joint_error", joints=["cart_to_pole"], at_most=0.1)},
         "play": {"scene": {"num_envs": 16}},
     }
     return TaskConfig(**(parts | changes))

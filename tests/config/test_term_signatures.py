@@ -304,8 +304,8 @@ def test_direct_task_refuses_manager_terms(problems_of):
 
 
 def test_unknown_success_term_names_its_section(tmp_path):
-    task = edited(PENDULUM_TASK, success={"func": "joints_nera", "tolerance": 0.1})
-    with pytest.raises(ConfigError, match="no success term 'joints_nera'; did you mean 'joints_near'"):
+    task = edited(PENDULUM_TASK, success={"near": {"func": "joint_eror", "at_most": 0.1}})
+    with pytest.raises(ConfigError, match="no success term 'joint_eror'; did you mean 'joint_error'"):
         build(pendulum(tmp_path, task))
 
 

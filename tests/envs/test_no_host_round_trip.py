@@ -12,7 +12,7 @@ def every_term():
     """Return the critter's task with the remaining terms of the library."""
     task = yaml.safe_load(CRITTER_TASK)
     task["sim"]["engine"] = "warp"
-    task["success"] = {"func": "joints_near", "tolerance": 0.5, "hold_s": 0.1}
+    task["success"] = {"near": {"func": "joint_error", "at_most": 0.5, "hold_s": 0.1}}
     task["divergence_reward"] = -1.0
     task["actions"]["push"] = {"func": "joint_effort", "joints": ["hip_fl"], "scale": 0.1, "clip": [-1.0, 1.0]}
     task["observations"]["policy"]["vel"].pop("joints")

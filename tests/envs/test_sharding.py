@@ -56,7 +56,9 @@ terminations:
   time_out: {func: time_out, time_out: true}
   far: {func: too_far, limit: 1.0}
 curriculum: {weight: {func: interpolate, address: rewards.alive.weight, to: 0.5, end: 40}}
-success: {func: joints_near, joints: [slide], tolerance: 0.5}
+success:
+  near: {func: joint_error, joints: [slide], at_most: 0.5}
+  right: {func: joint_error, joints: [slide], target: 0.2, at_most: 0.5, hold_s: 0.2}
 """
 TERMS = """
 import torch

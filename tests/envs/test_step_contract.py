@@ -367,7 +367,7 @@ def test_step_rejects_nonfinite_or_misshaped_actions(tmp_path):
 
 def test_success_requires_condition_until_time_out(tmp_path):
     task = world(tmp_path, terminations=BEYOND,
-                 success={"func": "joints_near", "target": 0.0, "tolerance": 0.5, "hold_s": 0.1})  # fmt: skip
+                 success={"near": {"func": "joint_error", "at_most": 0.5, "hold_s": 0.1}})  # fmt: skip
     env = build(task, 4)
     env.reset()
     for step in range(10):

@@ -25,7 +25,7 @@ actions: {push: {func: joint_effort, joints: [slide], scale: 20.0}}
 observations: {policy: {vel: {func: joint_vel_rel, scale: 0.5}, pos: {func: joint_pos_rel, history: 2}}}
 rewards: {alive: {func: is_alive, weight: 1.0}}
 terminations: {time_out: {func: time_out, time_out: true}}
-success: {func: joints_near, joints: [slide], tolerance: 0.1, hold_s: 0.1}
+success: {slide: {func: joint_error, joints: [slide], at_most: 0.1, hold_s: 0.1}}
 """
 
 
@@ -89,8 +89,8 @@ def test_regulator_balances_the_cartpoles(name):
 @pytest.mark.parametrize(
     ("overrides", "more", "output"),
     [
-        (["success=null"], "", "defines no success"),
-        (["success.target=1.0"], "", "does not succeed at its default state"),
+        (["success.slide=null"], "", "defines no success"),
+        (["success.slide.target=1.0"], "", "does not succeed at its default state"),
         (["observations.policy.pos=null"], "", "do not determine the state: slide"),
         (["observations.policy.vel=null", "observations.policy.pos.history=1"], "", "the velocity of slide"),
         ([], '<body name="ball" pos="0 0 1"><joint type="ball"/><geom size="0.1"/></body>', "a ball joint"),

@@ -144,7 +144,17 @@ def test_stress_repeats_with_its_seed(cli):
 
 
 def test_task_without_success_uses_the_return(cli, coin):
-    words = ("stress", coin, "success=null", "--policy", "zero", "--sweep", "gravity=abs:0:1:2", "--episodes", 4)
+    words = (
+        "stress",
+        coin,
+        "success.centred=null",
+        "--policy",
+        "zero",
+        "--sweep",
+        "gravity=abs:0:1:2",
+        "--episodes",
+        4,
+    )
     done = cli(*words)
     assert done.code == 2  # the task has no gravity, so that it has no direction
     done = cli(*words[:-3], "body_mass=1:2:2", "--episodes", 4)

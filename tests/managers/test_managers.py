@@ -153,7 +153,7 @@ class Fussy:
             {"rewards": {"bad": {"func": "column", "weight": 1.0}}},
             "rewards.bad: 'column' returned {}(3, 1); return {}(3,)",
         ),
-        ({"success": {"func": "column"}}, "success: 'column' returned {}(3, 1); return {}(3,)"),
+        ({"success": {"bad": {"func": "column"}}}, "success.bad: 'column' returned {}(3, 1); return {}(3,)"),
         ({"terminations": {"bad": {"func": "column"}}}, "terminations.bad: 'column' returned {}(3, 1); return {}(3,)"),
         ({"observations": {"policy": {"bad": {"func": "flat"}}}}, "observations.policy.bad: 'flat' returned {}(3,)"),
         (

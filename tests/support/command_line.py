@@ -24,7 +24,7 @@ episode_length_s: 1.0
 sim: {dt: 0.01, gravity: [0, 0, 0]}
 scene: {num_envs: 32, entities: {robot: {model: model.xml}}}
 params: {chance: 0.5}
-success: {func: joints_near, joints: [slide], target: 0.0, tolerance: 0.1, hold_s: 0.5}
+success: {centred: {func: joint_error, joints: [slide], at_most: 0.1, hold_s: 0.5}}
 agents:
   ppo: {trainer: sb3, algorithm: ppo, max_iterations: 2, n_steps: 8, num_minibatches: 2}
 """

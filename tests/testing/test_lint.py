@@ -88,6 +88,12 @@ def test_constant_reward_finds_constant(direct):
     assert (remark.rule, remark.where) == ("constant-reward", "rew_buf")
 
 
+def test_constant_reward_finds_zero_with_termination(direct):
+    direct.replace("1.0 - self.obs_buf[:, 0].square()", "0.0")
+    (remark,) = [each for each in lint(direct) if each.rule == "constant-reward"]
+    assert "is 0 in every step" in remark.message
+
+
 def test_constant_reward_accepts_alive_bonus_with_termination(direct):
     direct.replace("1.0 - self.obs_buf[:, 0].square()", "1.0")
     assert lint(direct) == []

@@ -26,7 +26,7 @@ EXPECTED = {
     "Episode_Reward/terminating", "Episode_Reward/pole_pos", "Episode_Reward/cart_vel", "Episode_Reward/pole_vel",
     "Episode_Termination/time_out", "Episode_Termination/cart_out_of_bounds", "Perf/total_fps",
     "Perf/collection_time", "Perf/learning_time", "Perf/physics_share", "Perf/task_share", "Perf/policy_share",
-    "Perf/update_share",
+    "Perf/update_share", "Success/pole", "Success_Value/pole",
 }  # fmt: skip
 LENGTH_S = 0.2
 

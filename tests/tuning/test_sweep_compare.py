@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rlcli.errors import UsageError
-from rlcli.tuning.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
+from rlcli.training.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 

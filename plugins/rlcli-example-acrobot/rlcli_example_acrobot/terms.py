@@ -1,4 +1,4 @@
-"""Terms that rlcli does not have: height of the arm's tip, and thresholds of it."""
+"""Terms that rlcli does not have: height of the arm's tip, and a threshold of it."""
 
 from __future__ import annotations
 
@@ -27,15 +27,3 @@ def tip_below(
 ) -> Tensor:
     """Return whether the tip is lower than `height`, a fraction of the arm's length. (num_envs,) bool"""
     return tip_height(env, entity=entity, joints=joints, lengths=lengths) < height
-
-
-def tip_above(
-    env,
-    *,
-    entity: Entity = "robot",
-    joints: Joints = ("shoulder", "elbow"),
-    lengths: tuple[float, float],
-    height: float,
-) -> Tensor:
-    """Return whether the tip is higher than `height`, a fraction of the arm's length. (num_envs,) bool"""
-    return tip_height(env, entity=entity, joints=joints, lengths=lengths) > height

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from rlcli_example_acrobot.terms import tip_above, tip_below, tip_height
+from rlcli_example_acrobot.terms import tip_below, tip_height
 
 
 def arm(*angles):
@@ -26,8 +26,7 @@ def test_tip_height_is_fraction_of_arm_length(shoulder, elbow, expected):
     assert height.tolist() == pytest.approx([expected], abs=1e-6)
 
 
-def test_tip_above_and_below_split_environments():
+def test_tip_below_splits_environments():
     entity = arm((0.0, 0.0), (math.pi / 2, 0.0))
     parameters = {"entity": entity, "joints": slice(0, 2), "lengths": (0.5, 0.5), "height": 0.5}
-    assert tip_above(None, **parameters).tolist() == [True, False]
     assert tip_below(None, **parameters).tolist() == [False, True]

@@ -33,6 +33,7 @@ def command(
     num_envs: options.NumEnvs = None,
     max_iterations: options.MaxIterations = None,
     max_steps: options.MaxSteps = None,
+    until: Annotated[str | None, typer.Option(metavar="KEY=X")] = None,
     device: options.Device = "auto",
     gpus: Annotated[int | None, typer.Option(min=1)] = None,
     logger: Annotated[list[str] | None, choice("LOGGER", "tensorboard", "wandb", "mlflow", "trackio", "none")] = None,
@@ -50,6 +51,8 @@ def command(
         seed: Seed of all random numbers; -1 picks a random one and records it. [default: 42]
         seeds: Train one run for each of several seeds, in one study folder: 0..4 or 1,5,9.
         jobs: With --seeds: number of trainings at a time. [default: 1]
+        until: Stop when success, return or length reaches X with 95 % confidence in an evaluation between iterations,
+            as in success=0.97. [default: train the whole budget]
         gpus: Number of processes on this machine, one GPU each; each has its own num_envs environments. [default: 1
             process]
         logger: tensorboard, wandb, mlflow, trackio or none; repeatable. [default: the settings' loggers, or
@@ -78,7 +81,7 @@ def command(
     console.muted = not distributed.is_rank_zero()
     request = TrainingRequest(runs_dir or default_runs_dir(), None, resume, agent, device, gpus, config)
     request.overrides, request.flags = overrides or [], flags(scene__num_envs=num_envs)
-    request.budget = options.budget(max_iterations, max_steps)
+    request.budget = options.budget(max_iterations, max_steps) | options.until(until)
     request.seed = options.draw_seed(42 if seed is None else seed)
     request.loggers, request.init_from, request.video_every, request.name = logger, init_from, video_every, name
     study = _study(request, seeds, jobs, seed)

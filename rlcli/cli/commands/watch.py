@@ -76,7 +76,9 @@ def _progress(run: Run) -> Progress | None:
     rows = newest_rows(run)
     if not rows:
         return None
-    return progress_from_metrics(rows, count(run.record.get("iterations")), times(run)[1] or 0.0)
+    progress = progress_from_metrics(rows, count(run.record.get("iterations")), times(run)[1] or 0.0)
+    progress.notes = run.findings()
+    return progress
 
 
 def _report(final: Overview) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlcli.cli.ui.console import console
+from rlcli.config.schema import bound_text
 from rlcli.evaluation.limits import mean_or_rate
 
 if TYPE_CHECKING:
@@ -20,6 +21,10 @@ INTERVAL = "95 % INTERVAL"
 def show_summary(summary: Mapping[str, Any]) -> None:
     """Print the summary of an evaluation."""
     entries = [("success rate", summary["success"])] if "success" in summary else []
+    for name, condition in summary.get("conditions", {}).items():
+        entries.append((f"success: {name} held", condition["held"]))
+        if "value" in condition:
+            entries.append((f"success: {name}, {bound_text(condition)}", condition["value"]))
     entries += [("return", summary["return"]), ("length [steps]", summary["length"])]
     groups = {"reward": "reward_terms", "value": "values", "ended by": "terminations"}
     entries += [(f"{word} {name}", entry) for word, key in groups.items() for name, entry in summary[key].items()]

@@ -190,6 +190,8 @@ def _outcome(last: StepResult, env_id: int) -> dict[str, Any]:
         "ended_by": [name for name, fired in ended.causes.items() if bool(fired[row])],
         "truncated": bool(ended.truncated[row]),
         "success": None if ended.success is None else bool(ended.success[row]),
+        "conditions": {name: bool(held[row]) for name, held in ended.conditions.items()},
+        "condition_values": {name: float(values[row]) for name, values in ended.condition_values.items()},
     }
 
 
@@ -199,4 +201,7 @@ def _print_outcome(outcome: dict[str, Any]) -> None:
     rows.append(["ended by", ", ".join(outcome["ended_by"])])
     if outcome["success"] is not None:
         rows.append(["success", "yes" if outcome["success"] else "no"])
+    for name, held in outcome["conditions"].items():
+        value = outcome["condition_values"].get(name)
+        rows.append([f"success: {name}", ("held" if held else "failed") + ("" if value is None else f", {value:.4g}")])
     console.table(["", "EPISODE"], rows)

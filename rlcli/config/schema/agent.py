@@ -45,6 +45,10 @@ class AgentConfig(StrictModel):
     the checkpoint with the best evaluation."""
     eval_episodes: Count = 100
     """Number of episodes of each of these evaluations."""
+    until: Annotated[str, Field(pattern=r"^(success=0?\.\d+|(return|length)=-?[0-9.e+-]+)$")] | None = None
+    """Bar at which training ends before its budget: success=X, return=X or length=X. It is reached when the lower end
+    of an evaluation's 95 % interval is at least X. The bar sets `eval_interval` to a twentieth of the budget if it is
+    null, and raises `eval_episodes` to the number that the interval of a success rate needs."""
     autopsy: AutopsyConfig | None = AutopsyConfig()
     """Recording of failed and unusual episodes during training on a CPU; null: no recording."""
     torch_threads: Threads | None = None

@@ -106,8 +106,8 @@ class TaskConfig(StrictModel):
     """Termination terms."""
     curriculum: dict[str, CurriculumConfig | None] = {}
     """Curriculum terms."""
-    success: SuccessConfig | None = None
-    """Condition under which an episode counts as a success in `eval`."""
+    success: dict[str, SuccessConfig | None] = {}
+    """Conditions of success, by name; an episode succeeds if it times out while all of them hold."""
     reward_dt_scaling: bool = True
     """true: rewards of manager-based tasks are multiplied by step_dt, so that returns do not depend on the control
     rate."""

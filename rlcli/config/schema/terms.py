@@ -5,6 +5,7 @@ Each term has further keys, the keyword-only parameters of its function. `rlcli.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
@@ -232,7 +233,22 @@ class CurriculumConfig(TermConfig):
 
 
 class SuccessConfig(TermConfig):
-    """Condition of success: the episode times out, and the term was true during its last `hold_s` seconds."""
+    """A condition of success. An episode succeeds if it times out, and each condition held during its last `hold_s` s.
+
+    A term that returns a number needs `at_most` or `at_least`; a term that returns a truth value takes neither.
+    """
+
+    at_most: Number | None = None
+    """Largest value of the term with which the condition holds."""
+
+    at_least: Number | None = None
+    """Smallest value of the term with which the condition holds."""
 
     hold_s: NotNegative = 1.0
-    """How long the term must be true before the time-out [s]."""
+    """How long the condition must hold before the time-out [s]."""
+
+
+def bound_text(condition: Mapping[str, Any]) -> str:
+    """Return the bounds of a condition of success as text, as in `at most 0.1`; the empty text without a bound."""
+    keys = ("at_least", "at_most")
+    return " and ".join(f"{key.replace('_', ' ')} {condition[key]:g}" for key in keys if condition.get(key) is not None)

@@ -161,7 +161,7 @@ class ShardedEnv(Environment):
         return len(self._shards)
 
     def compute_success(self) -> Tensor | None:
-        """Return where the success condition holds in the current state; None without one. (num_envs,) bool"""
+        """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""
         parts = self.call_all(_success)
         return None if parts[0] is None else torch.cat(parts)
 

@@ -66,18 +66,20 @@ class Columns:
     terms: tuple[str, ...]
     causes: tuple[str, ...]
     metrics: tuple[str, ...]
-    success: bool
+    conditions: tuple[str, ...]
+    condition_values: tuple[str, ...]
 
     @staticmethod
     def of(episodes: Episodes) -> Columns:
         """Return the names of some episodes' columns."""
-        terms, causes, metrics = (tuple(part) for part in (episodes.reward_terms, episodes.causes, episodes.metrics))
-        return Columns(terms, causes, metrics, episodes.success is not None)
+        named = (episodes.reward_terms, episodes.causes, episodes.metrics)
+        return Columns(*(tuple(part) for part in (*named, episodes.conditions, episodes.condition_values)))
 
     @property
     def count(self) -> int:
         """Number of columns."""
-        return _FIXED_COLUMNS + len(self.terms) + len(self.causes) + len(self.metrics) + self.success
+        named = (self.terms, self.causes, self.metrics, self.conditions, self.condition_values)
+        return _FIXED_COLUMNS + sum(len(part) for part in named) + bool(self.conditions)
 
 
 def counter_specs(total: int) -> dict[str, ArraySpec]:
@@ -212,6 +214,7 @@ class ShardRunner:
                 )
             self._columns = self._new_columns = columns
         named = [*episodes.reward_terms.values(), *episodes.causes.values(), *episodes.metrics.values()]
+        named += [*episodes.conditions.values(), *episodes.condition_values.values()]
         fixed = [episodes.ids, episodes.returns, episodes.lengths, episodes.truncated]
         values = [*fixed, *named, *([] if episodes.success is None else [episodes.success])]
         for row, value in zip(self._episodes, values, strict=False):  # in numpy: its calls take a third of torch's time
@@ -269,14 +272,19 @@ def read_episodes(
         part = arrays["episodes"][: names.count, shard.first : shard.first + n].numpy()
         parts.append(part if names.causes == widest.causes else _with_causes(part, names, widest))
     table = torch.from_numpy(np.concatenate(parts, axis=1))
-    ids, lengths = table[0].long(), table[2].long()
     values, flags = table.float().unbind(), (table != 0.0).unbind()
-    first = _FIXED_COLUMNS + len(widest.terms)
-    second = first + len(widest.causes)
-    terms = dict(zip(widest.terms, values[_FIXED_COLUMNS:first], strict=True))
-    causes = dict(zip(widest.causes, flags[first:second], strict=True))
-    metrics = dict(zip(widest.metrics, values[second : second + len(widest.metrics)], strict=True))
-    return Episodes(ids, values[1], lengths, terms, causes, flags[3], flags[-1] if widest.success else None, metrics)
+    first = _FIXED_COLUMNS
+
+    def take(names: Sequence[str], columns: Sequence[Tensor]) -> dict[str, Tensor]:
+        nonlocal first
+        first += len(names)
+        return dict(zip(names, columns[first - len(names) : first], strict=True))
+
+    terms, causes, metrics = take(widest.terms, values), take(widest.causes, flags), take(widest.metrics, values)
+    conditions, condition_values = take(widest.conditions, flags), take(widest.condition_values, values)
+    success = flags[first] if widest.conditions else None
+    fixed = (table[0].long(), values[1], table[2].long(), terms, causes, flags[3])
+    return Episodes(*fixed, success, conditions, condition_values, metrics)
 
 
 def _with_causes(part: NDArray[np.float64], names: Columns, widest: Columns) -> NDArray[np.float64]:

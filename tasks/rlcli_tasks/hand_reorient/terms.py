@@ -1,4 +1,4 @@
-"""Success terms. (num_envs,) bool each."""
+"""Success terms. (num_envs,) each."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from torch import Tensor
 from rlcli.envs.direct import DirectEnv
 
 
-def goals_reached(env: DirectEnv, *, at_least: int) -> Tensor:
-    """Return where the current episode of `hand-reorient` has reached at least this many goals. (num_envs,)"""
-    return env.task.successes >= at_least  # type: ignore[attr-defined]
+def goals_reached(env: DirectEnv) -> Tensor:
+    """Return how many goals the current episode of `hand-reorient` has reached. (num_envs,)"""
+    return env.task.successes  # type: ignore[attr-defined]

@@ -55,7 +55,7 @@ def test_success_rate_of_deterministic_outcomes(cli, coin, chance, rate):
 
 
 def test_time_out_away_from_target_is_no_success(cli, coin):
-    arguments = ("params.chance=0.0", "success.target=1.0", "--policy", "zero", "--episodes", 3, "--json")
+    arguments = ("params.chance=0.0", "success.centred.target=1.0", "--policy", "zero", "--episodes", 3, "--json")
     assert cli("eval", coin, *arguments).json["success"]["rate"] == 0.0
 
 
@@ -164,7 +164,7 @@ def test_evaluation_is_not_saved_through_link(cli, trained, tmp_path):
 
 
 def test_success_limit_without_success_is_usage_error(cli, coin):
-    arguments = ("success=null", "--policy", "zero", "--episodes", 4)
+    arguments = ("success.centred=null", "--policy", "zero", "--episodes", 4)
     assert "success" not in cli("eval", coin, *arguments, "--json").json
     done = cli("eval", coin, *arguments, "--fail-under", "success=0.5")
     assert done.code == 2

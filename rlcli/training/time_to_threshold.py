@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rlcli.errors import UsageError
+from rlcli.rl.confidence import NORMAL
 from rlcli.safe_text import float_or_nan
 
 _METRICS = {"success": "Eval/success_rate", "return": "Eval/mean_reward", "length": "Eval/mean_episode_length"}
@@ -25,6 +26,25 @@ class Threshold:
     def reached_by(self, row: Mapping[str, Any]) -> bool:
         """Return whether the evaluation in a row of metrics reached the threshold."""
         return bool(row.get(_METRICS[self.key], -math.inf) >= self.value)
+
+    def is_certain(self, summary: Mapping[str, Any]) -> bool:
+        """Return whether the lower end of the interval in the summary of an evaluation reaches the threshold."""
+        low = summary[self.key]["low"] if self.key in summary else None
+        return low is not None and low >= self.value
+
+    def episodes(self, least: int) -> int:
+        """Return a number of episodes, at least `least`, in which the interval can reach a success rate.
+
+        Raises:
+            UsageError: for a success rate of 1, which the lower end of no interval reaches.
+        """
+        if self.key != "success":
+            return max(least, 2)
+        if self.value == 1.0:
+            hint = "as in --until success=0.97"
+            raise UsageError("no number of episodes shows a success rate of 1 with 95 % confidence", hint=hint)
+        # Wilson's lower end with n of n successes is n / (n + z^2); twice as many episodes leave room for failures
+        return max(least, 2 * math.ceil(NORMAL * NORMAL * self.value / (1.0 - self.value)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,352 @@
+"""Health checks of a training: they read the metrics of its iterations and name what prevents learning."""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from rlcli.config.schema import AgentConfig, TaskConfig, bound_text
+from rlcli.rl.rng import undisturbed
+from rlcli.rl.trainer import Trainer
+from rlcli.rl.trainer_base import BaseTrainer
+
+RETURN, LENGTH, SUCCESS = "Train/mean_reward", "Train/mean_episode_length", "Train/success_rate"
+_GROUPS = ("Train/", "Eval/success", "Loss/", "Policy/", "Episode_", "Success", "Health/")
+_TIMES = 40
+"""Number of times in a training at which the checks run."""
+_MIN_ITERATIONS = 8
+"""Number of iterations before the first check."""
+_SOLVED = 0.3
+"""Success rate above which only defects are reported, not signs of slow learning."""
+_AT = 1e-3
+"""Relative distance from a bound at which a value counts as at the bound."""
+
+Found = Iterator[tuple[str, str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Cause that may prevent learning."""
+
+    check: str
+    iteration: int
+    """Iteration in which the check first failed."""
+    message: str
+    """One sentence with the figure."""
+    hint: str
+    """What to try."""
+
+
+class Health:
+    """Health checks of one training. They run about 40 times in a training, so that an iteration costs nothing.
+
+    Args:
+        task: the task.
+        agent: the agent's configuration.
+        iterations: iterations of the whole training.
+    """
+
+    def __init__(self, task: TaskConfig, agent: AgentConfig, iterations: int) -> None:
+        self.task, self.iterations = task, max(1, iterations)
+        self.settings: dict[str, Any] = agent.model_dump()
+        self.iteration = 0
+        self.findings: list[Finding] = []
+        """Findings of the newest check that the check before it had, too."""
+        self._series: dict[str, list[float]] = {}
+        self._suspects: dict[str, Finding] = {}
+
+    @property
+    def progress(self) -> float:
+        """Share of the training that is done."""
+        return self.iteration / self.iterations
+
+    def due(self, iteration: int) -> bool:
+        """Return whether the checks run after this iteration."""
+        every = max(1, self.iterations // _TIMES)
+        return iteration >= _MIN_ITERATIONS and (iteration % every == 0 or iteration == self.iterations)
+
+    def add(self, iteration: int, metrics: Mapping[str, Any]) -> None:
+        """Add the metrics of an iteration, and run the checks if they are due."""
+        self.iteration = iteration
+        ended = any(name.startswith("Episode_") for name in metrics)  # without an episode, Train/* repeat old values
+        for name, value in metrics.items():
+            if name.startswith(_GROUPS) and (ended or not name.startswith("Train/")):
+                self._series.setdefault(name, []).append(float(value))
+        if not self.due(iteration):
+            return
+        found: dict[str, Finding] = {}
+        for name, check in CHECKS.items():
+            for message, hint in check(self):
+                begin = self._suspects[name].iteration if name in self._suspects else iteration
+                found.setdefault(name, Finding(name, begin, message, hint))
+        self.findings = [finding for name, finding in found.items() if name in self._suspects]
+        self._suspects = found
+
+    def notes(self, metrics: Mapping[str, float]) -> list[str]:
+        """Return a line for each condition of success, with its value and its bound."""
+        lines = []
+        for name, condition in self.task.success.items():
+            if condition is not None and f"Success/{name}" in metrics:
+                value = metrics.get(f"Success_Value/{name}")
+                bound = "" if value is None else f", value {value:.3g}, {bound_text(condition.model_dump())}"
+                lines.append(f"success: {name} held in {metrics[f'Success/{name}']:.1%}{bound}")
+        return lines
+
+    def names(self, prefix: str) -> list[str]:
+        """Return the metrics of a group."""
+        return [name for name in self._series if name.startswith(prefix)]
+
+    def values(self, name: str) -> list[float]:
+        """Return the values of a metric, oldest first."""
+        return self._series.get(name, [])
+
+    def first(self, name: str) -> list[float]:
+        """Return the oldest eighth of a metric's values, at least three."""
+        values = self.values(name)
+        return values[: max(3, len(values) // 8)]
+
+    def last(self, name: str) -> list[float]:
+        """Return the newest eighth of a metric's values, at least three."""
+        values = self.values(name)
+        return values[-max(3, len(values) // 8) :]
+
+    def change(self, name: str) -> float:
+        """Return the change of a metric since the beginning, in multiples of its noise or a tenth of its size."""
+        before, after = self.first(name), self.last(name)
+        if not before:
+            return 0.0
+        size = abs(statistics.fmean(before))
+        noise = max(statistics.pstdev(before), statistics.pstdev(after), 0.1 * size, 1e-9)
+        return (statistics.fmean(after) - statistics.fmean(before)) / noise
+
+    def median(self, name: str) -> float | None:
+        """Return the median of a metric's newest values; None without a value."""
+        return statistics.median(self.last(name)) if self.values(name) else None
+
+    def struggles(self, after: float) -> bool:
+        """Return whether a share of the training is done, and success is still rare or not defined."""
+        return self.progress >= after and all((self.median(n) or 0.0) < _SOLVED for n in (SUCCESS, "Eval/success_rate"))
+
+
+def probe(trainer: Trainer) -> dict[str, float]:
+    """Return shares of a trainer's newest observations and actions that are at a bound, or do not vary."""
+    if not isinstance(trainer, BaseTrainer) or len(trainer.recent_obs) < 2:
+        return {}
+    found, begin, obs = {}, 0, trainer.recent_obs
+    constant = (obs == obs[:1]).all(dim=0)
+    for term in trainer.env.layout.observations[trainer.spec.group]:
+        columns = slice(begin, begin + term.size)
+        begin += term.size
+        found[f"Health/constant/{term.name}"] = float(constant[columns].all())
+        if isinstance(term.clip, tuple) and isinstance(term.clip[0], float):
+            scale = torch.tensor(term.scale or (1.0,), device=obs.device)
+            edges = torch.tensor(term.clip, device=obs.device)[:, None] * scale
+            at_edge = ((obs[:, columns] - edges[:, None]).abs() <= _AT * edges[:, None].abs()).any(dim=0)
+            found[f"Health/clipped/{term.name}"] = float((at_edge & ~constant[columns]).float().mean())
+    with undisturbed():  # a new policy draws random weights
+        policy = trainer.policy().to(obs.device)
+    if policy.normalizer is not None and policy.normalizer.clip is not None:
+        normal = policy.normalizer(obs)
+        found["Health/normalized"] = float((normal.abs() >= policy.normalizer.clip * (1 - _AT)).float().mean())
+    bound = trainer.spec.action_bound
+    if bound is not None:
+        with torch.no_grad():
+            found["Health/at_bound"] = float((policy(obs).abs() >= bound * (1.0 - _AT)).float().mean())
+    return found
+
+
+def no_reward(health: Health) -> Found:
+    """Check that returns differ."""
+    values = health.values(RETURN)
+    if len(values) >= (_MIN_ITERATIONS if any(values) else 3) and max(values) - min(values) <= 1e-6 * abs(values[0]):
+        what = "every reward is 0" if values[0] == 0.0 else "the reward depends on nothing that the policy changes"
+        yield f"the return is {values[0]:g} in all {len(values)} iterations: {what}", "rlcli lint TASK, and the weights"
+
+
+def return_stands_still(health: Health) -> Found:
+    """Check that the return, the length of episodes or a value of the task moves."""
+    watched = [RETURN, LENGTH, *health.names("Episode_Reward/"), *health.names("Success_Value/")]
+    if health.struggles(0.15) and all(abs(health.change(name)) < 1.0 for name in watched):
+        value = statistics.fmean(health.last(RETURN)) if health.values(RETURN) else 0.0
+        done = f"{health.progress:.0%} of the training"
+        yield (
+            f"return, reward terms and episode length have not moved in {done} (return {value:.4g})",
+            ("rlcli lint TASK (dead-action, silent-reward), a larger agent.learning_rate, or larger actions"),
+        )
+
+
+def one_termination(health: Health) -> Found:
+    """Check that episodes do not all end by the same termination, ever as early."""
+    late = {name for name, term in health.task.terminations.items() if term is not None and term.time_out}
+    for metric in health.names("Episode_Termination/"):
+        name, share = metric.partition("/")[2], health.median(metric)
+        if name in late | {"time_out"} or share is None or share < 0.99 or not health.struggles(0.15):
+            continue
+        if health.change(LENGTH) < 1.0 and not _approaches(health.values(RETURN)):
+            length = statistics.fmean(health.last(LENGTH))
+            yield (
+                f"{share:.0%} of the episodes end by '{name}', after {length:.0f} steps, as at the beginning",
+                ("looser limits, an easier start of episodes, or a reward of each step alive"),
+            )
+
+
+def short_episodes(health: Health) -> Found:
+    """Check that episodes have more than a few steps."""
+    length, full = health.median(LENGTH), health.task.max_episode_length
+    if length is not None and length <= min(3.0, full / 4):
+        yield (
+            f"episodes end after {length:.3g} of {full} steps",
+            "rlcli lint TASK (early-resets)",
+        )
+
+
+def dying_pays(health: Health) -> Found:
+    """Check that the return does not rise while episodes get shorter."""
+    if health.struggles(0.1) and health.change(RETURN) > 1.0 and health.values(LENGTH):
+        before, after = (statistics.fmean(part) for part in (health.first(LENGTH), health.last(LENGTH)))
+        if after < 0.7 * before:
+            yield (
+                f"the return rises while episodes shrink from {before:.0f} to {after:.0f} steps: ending pays",
+                ("signs of the weights, a reward of each step alive, or a penalty for terminations"),
+            )
+
+
+def exploration(health: Health) -> Found:
+    """Check that the standard deviation of actions neither collapses nor explodes."""
+    std, begin = health.median("Policy/mean_std"), health.first("Policy/mean_std")
+    if std is None or not health.struggles(0.1):
+        return
+    start, bound = statistics.fmean(begin[:3]), health.settings.get("action_bound")
+    if std < 0.02 * start:
+        yield f"the standard deviation of actions has fallen from {start:.3g} to {std:.3g}", "a larger entropy_coef"
+    if std > 3.0 * (bound or float("inf")) or (std > 1.25 * start and std > (bound or 1.0) and _rises(health)):
+        limit = f", and the bound of actions is {bound:g}" if bound else ""
+        yield (
+            f"the standard deviation of actions is {std:.3g}, {std / start:.1f} times the first one{limit}",
+            ("a smaller entropy_coef or init_std, and rlcli lint TASK (dead-action)"),
+        )
+
+
+def _rises(health: Health) -> bool:
+    values = health.values("Policy/mean_std")
+    return sum(a < b for a, b in itertools.pairwise(values)) > 0.9 * (len(values) - 1)
+
+
+def update_size(health: Health) -> Found:
+    """Check that an update changes the policy neither too much nor hardly at all."""
+    kl, target = health.median("Loss/kl"), health.settings.get("desired_kl") or 0.05
+    if kl is None or not health.struggles(0.1):
+        return
+    if kl > 4.0 * target:
+        yield (
+            f"the KL divergence of an update is {kl:.3g}, and {target:g} is the target",
+            ("a smaller agent.learning_rate, fewer epochs, or schedule adaptive with desired_kl"),
+        )
+    if abs(kl) < 1e-6:
+        yield f"an update hardly changes the policy: its KL divergence is {kl:.1g}", "a larger agent.learning_rate"
+
+
+def learning_rate_floor(health: Health) -> Found:
+    """Check that an adaptive learning rate is not at its lowest value."""
+    rate, (floor, _) = health.median("Loss/learning_rate"), health.settings.get("learning_rate_range", (1e-5, 0.0))
+    adaptive = health.settings.get("schedule") == "adaptive"
+    if adaptive and rate is not None and rate <= 1.01 * floor and health.struggles(0.1):
+        yield (
+            f"the adaptive learning rate is at its floor, {rate:.1g}",
+            "a larger desired_kl, or normalised observations",
+        )
+
+
+def value_function(health: Health) -> Found:
+    """Check that the critic predicts returns."""
+    loss, explained = health.median("Loss/value"), health.median("Loss/explained_variance")
+    if loss is None or explained is None or not health.struggles(0.15):
+        return
+    start = statistics.median(health.first("Loss/value"))
+    if loss > 1000.0 * max(start, 1e-9) and explained < 0.1:
+        yield (
+            f"the value loss has grown from {start:.3g} to {loss:.3g}",
+            "a smaller agent.learning_rate or reward_scale",
+        )
+    elif explained < 0.02 and loss > 0.0 and not _approaches(health.values(RETURN)) and health.change(RETURN) < 1.0:
+        yield (
+            f"the critic explains {explained:.2f} of the variance of returns",
+            ("observations that show the state, normalize_observations, or another gamma"),
+        )
+
+
+def observations(health: Health) -> Found:
+    """Check that observations vary and are not at their clip."""
+    for metric in health.names("Health/constant/"):
+        if health.median(metric) == 1.0 and health.struggles(0.1):
+            yield f"the observation '{metric.rpartition('/')[2]}' is the same in all environments", "its scale and func"
+    for metric in [*health.names("Health/clipped/"), *health.names("Health/normalized")]:
+        share = health.median(metric) or 0.0
+        if share > 0.9 and health.struggles(0.1):
+            name = metric.partition("Health/clipped/")[2] or "normalised observations"
+            yield f"{share:.0%} of the values of '{name}' are at the clip", "a wider clip, or a smaller scale"
+
+
+def actions_at_bound(health: Health) -> Found:
+    """Check that mean actions are not all at their bound."""
+    share = health.median("Health/at_bound")
+    if share is not None and share > 0.9 and health.struggles(0.15):
+        yield f"{share:.0%} of the mean actions are at their bound", "a larger scale of the actions, or a larger bound"
+
+
+def blocked_success(health: Health) -> Found:
+    """Check that no condition of success fails while the others hold, or stands still far from its bound."""
+    for name, condition in health.task.success.items():
+        held, values = health.median(f"Success/{name}"), health.values(f"Success_Value/{name}")
+        if held is None or condition is None or not health.struggles(0.15):
+            continue
+        others = [health.median(n) or 0.0 for n in health.names("Success/") if n != f"Success/{name}"]
+        alone = bool(others) and min(others) > 0.5 and held < 0.1 * min(others) and health.progress == 1.0
+        learned = health.change(RETURN) > 1.0 and not _approaches(health.values(RETURN))
+        never = max(health.values(f"Success/{name}")) == 0.0 and (learned or health.progress == 1.0)
+        if (never and not _approaches(_gaps(values, condition.model_dump()))) or alone:
+            value = f", its value is {statistics.fmean(values[-3:]):.3g}, and the bound is" if values else ""
+            bound = bound_text(condition.model_dump())
+            yield (
+                f"the condition '{name}' of success holds in {held:.1%} of the episodes{value} {bound}".rstrip(),
+                (f"a larger reward for it, or another bound of success.{name}"),
+            )
+
+
+def _gaps(values: list[float], bounds: Mapping[str, Any]) -> list[float]:
+    """Return the distances of values to their bounds, negative: a rise is an approach."""
+    low, high = bounds.get("at_least"), bounds.get("at_most")
+    return [-max((low if low is not None else v) - v, v - (high if high is not None else v), 0.0) for v in values]
+
+
+def _approaches(values: list[float]) -> bool:
+    """Return whether values are higher than they were at half of their history; true for few values."""
+    part, middle = max(3, len(values) // 8), len(values) // 2
+    if len(values) < 4 * part:
+        return True
+    before, after = values[middle - part : middle], values[-part:]
+    rise = statistics.fmean(after) - statistics.fmean(before)
+    noise = statistics.median(abs(b - a) for a, b in itertools.pairwise(values))
+    return rise > max(0.05 * abs(statistics.fmean(before)), noise)
+
+
+CHECKS: dict[str, Callable[[Health], Found]] = {
+    "no-reward": no_reward,
+    "short-episodes": short_episodes,
+    "observations": observations,
+    "update-size": update_size,
+    "learning-rate-floor": learning_rate_floor,
+    "exploration": exploration,
+    "dying-pays": dying_pays,
+    "one-termination": one_termination,
+    "value-function": value_function,
+    "actions-at-bound": actions_at_bound,
+    "blocked-success": blocked_success,
+    "no-progress": return_stands_still,
+}
+"""Name -> check, in the order in which findings are listed."""

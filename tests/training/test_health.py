@@ -1,0 +1,111 @@
+"""Tests of the health checks of a training: metrics of real and of sabotaged trainings."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rlcli.cli.app import main
+from rlcli.config.load import resolve
+from rlcli.registry import find_task
+from rlcli.training.health import CHECKS, Health
+
+ITERATIONS = 80
+HEALTHY = {
+    "Train/mean_reward": lambda i: -2.0 + 0.1 * i,
+    "Train/mean_episode_length": lambda i: 100.0 + i,
+    "Train/success_rate": lambda i: min(1.0, max(0.0, 0.02 * (i - 20))),
+    "Success/pole": lambda i: min(1.0, max(0.0, 0.02 * (i - 10))),
+    "Success_Value/pole": lambda i: 2.0 / (1.0 + i),
+    "Episode_Termination/time_out": lambda i: min(1.0, 0.02 * i),
+    "Episode_Termination/cart_out_of_bounds": lambda i: max(0.0, 1.0 - 0.02 * i),
+    "Loss/kl": lambda i: 0.01,
+    "Loss/value": lambda i: 1.0,
+    "Loss/explained_variance": lambda i: 0.5,
+    "Loss/learning_rate": lambda i: 1e-3,
+    "Policy/mean_std": lambda i: 1.0 - 0.005 * i,
+}
+STILL = {"Train/mean_reward": lambda i: -2.0 + 0.01 * (i % 3)}
+FAILING = {"Train/success_rate": lambda i: 0.0, "Success/pole": lambda i: 0.0}
+
+
+def findings(changes, *overrides, until=0.25):
+    """Return the findings of a training of cartpole with these metrics, after a share of the budget."""
+    resolved = resolve(find_task("cartpole"), agent="ppo", overrides=overrides)
+    health = Health(resolved.task, resolved.agent, ITERATIONS)
+    for iteration in range(1, round(until * ITERATIONS) + 1):
+        metrics = {name: value(iteration) for name, value in {**HEALTHY, **changes}.items()}
+        health.add(iteration, metrics)
+    return {finding.check: finding for finding in health.findings}
+
+
+@pytest.mark.parametrize("until", [0.1, 0.25, 0.5, 1.0])
+def test_healthy_training_has_no_finding(until):
+    assert findings({}, until=until) == {}
+
+
+@pytest.mark.parametrize(
+    ("check", "changes", "figure"),
+    [
+        ("no-reward", {"Train/mean_reward": lambda i: 0.0}, "is 0 in all"),
+        ("short-episodes", {"Train/mean_episode_length": lambda i: 1.0}, "after 1 of 300 steps"),
+        ("observations", {"Health/constant/joint_pos_rel": lambda i: 1.0}, "'joint_pos_rel'"),
+        ("observations", {"Health/clipped/joint_pos_rel": lambda i: 0.97}, "97%"),
+        ("update-size", {"Loss/kl": lambda i: 0.3}, "is 0.3, and 0.01"),
+        ("update-size", {"Loss/kl": lambda i: 1e-9}, "1e-09"),
+        ("exploration", {"Policy/mean_std": lambda i: 1.05**i}, "the bound of actions is 1"),
+        ("exploration", {"Policy/mean_std": lambda i: 0.6**i}, "has fallen from"),
+        ("dying-pays", {"Train/mean_episode_length": lambda i: 300 / i}, "shrink from 183 to"),
+        ("value-function", {"Loss/explained_variance": lambda i: 0.0, **STILL}, "explains 0.00"),
+        ("actions-at-bound", {"Health/at_bound": lambda i: 1.0}, "100%"),
+    ],
+)
+def test_check_names_the_cause_within_a_quarter_of_the_budget(check, changes, figure):
+    found = findings({**FAILING, **changes})
+    assert figure in found[check].message
+    assert found[check].hint
+
+
+def test_training_that_does_not_move_has_findings():
+    still = {name: lambda i, name=name: HEALTHY[name](1) + 1e-3 * (i % 3) for name in HEALTHY}
+    found = findings({**still, **FAILING, "Episode_Termination/cart_out_of_bounds": lambda i: 1.0})
+    assert {"no-progress", "one-termination"} <= {*found}
+
+
+def test_adaptive_learning_rate_at_its_floor_is_found():
+    changes = {**FAILING, "Loss/learning_rate": lambda i: 1e-5}
+    assert "learning-rate-floor" in findings(changes, "agent.schedule=adaptive")
+    assert "learning-rate-floor" not in findings(changes)
+
+
+def test_condition_that_blocks_success_is_named_with_its_value():
+    plateau = {"Train/mean_reward": lambda i: 5.0 - 7.0 * 0.8**i, "Success_Value/pole": lambda i: 0.3}
+    found = findings({**FAILING, **plateau}, until=0.5)
+    assert "'pole' of success holds in 0.0%" in found["blocked-success"].message
+    assert "at most 0.1" in found["blocked-success"].message
+
+
+def test_every_check_is_on_the_page():
+    page = (Path(__file__).parents[2] / "docs/guides/training-does-not-learn.md").read_text()
+    assert [name for name in CHECKS if f"| `{name}` |" not in page] == []
+
+
+def test_training_without_rewards_records_and_prints_the_finding(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    weights = [f"rewards.{name}.weight=0" for name in ("alive", "terminating", "pole_pos", "cart_vel", "pole_vel")]
+    words = ["--num-envs", "8", "--logger", "none", "--max-iterations", "12", "episode_length_s=0.2"]
+    assert main(["train", "cartpole", *weights, *words, "--agent", "sb3-ppo"]) == 0
+    (file,) = Path("runs").glob("cartpole/*/run.json")
+    assert "no-reward" in [finding["check"] for finding in json.loads(file.read_text())["health"]]
+    assert "the return is 0 in all" in capsys.readouterr().err
+
+
+def test_training_stops_at_a_bar(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["--num-envs", "8", "--logger", "none", "--max-iterations", "40", "episode_length_s=0.2"]
+    settings = ["agent.eval_interval=2", "agent.eval_episodes=8", "success.pole.at_most=3.2", "success.pole.hold_s=0"]
+    assert main(["train", "cartpole", *settings, *words, "--until", "success=0.5"]) == 0
+    (file,) = Path("runs").glob("cartpole/*/run.json")
+    record = json.loads(file.read_text())
+    assert (record["state"], record["iteration"], record["until"]["reached"]) == ("finished", 2, True)
+    assert "success=0.5 reached after 256 steps" in capsys.readouterr().err
