@@ -49,7 +49,9 @@ _IGNORED = {
     "minibatch_size_per_env": "",
 }
 _KL_GRAINS = {"legacy": "minibatch", "standard": "epoch", "standard_epoch": "iteration"}
-_SCHEDULES = {"adaptive": "adaptive", "linear": "linear", "constant": "constant", "identity": "constant"}
+_SCHEDULES = {
+    "adaptive": "adaptive", "linear": "linear", "constant": "constant", "identity": "constant", "fixed": "constant"
+}  # fmt: skip
 _HANDLED = (
     "reward_shaper", "normalize_advantage", "lr_schedule", "kl_threshold", "grad_norm", "truncate_grads",
     "critic_coef", "clip_value", "value_bootstrap", "schedule_type", "clip_actions", "central_value_config",

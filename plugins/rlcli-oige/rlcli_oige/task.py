@@ -14,7 +14,9 @@ from rlcli.envs.direct import DirectTask
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli_oige.articulation_view import ArticulationView
 from rlcli_oige.randomization import Randomizer
-from rlcli_oige.stage import BASE, ZERO, GroundPlane, Prim, Stage
+from rlcli_oige.prim_paths import BASE, ZERO
+from rlcli_oige.shapes import GroundPlane
+from rlcli_oige.stage import Prim, Stage
 from rlcli_oige.views import RigidPrimView, XFormPrimView
 
 if TYPE_CHECKING:
@@ -179,7 +181,17 @@ class SceneRegistry:
     add_ground_plane = add_default_ground_plane
 
 
-class World:
+class SimulationContext:
+    """The simulation as a task steps it by itself, within `pre_physics_step`."""
+
+    _env: OigeEnv
+
+    def step(self, render: bool = True) -> None:
+        """Simulate one physics step."""
+        self._env.step_inside_action()
+
+
+class World(SimulationContext):
     """The simulation, with the methods that tasks call."""
 
     def __init__(self, env: OigeEnv) -> None:
@@ -383,7 +395,8 @@ class RLTask(DirectTask):
         copy_from_source: bool = False,
     ) -> None:
         """Place the environments on the grid. A task's own method calls this after it created its robots."""
-        self._env_pos = self._env.runner.grid
+        runner = self._env.runner
+        self._env_pos = runner.place_environments(getattr(self, "_env_spacing", runner.config.scene.env_spacing))
 
     def initialize_views(self, scene: Any) -> None:
         """Set the positions of the environments. rlcli does not call this: `set_up_scene` creates the views."""

@@ -62,6 +62,7 @@ SIM_KEYS: Mapping[str, tuple[Status, str]] = {
     "replicate_physics": ("ignored", "every environment is simulated separately"),
     "rendering_dt": ("approximated", "videos have one frame per step, or fewer with sim.render_interval"),
     "substeps": ("approximated", "for more than 1, set a smaller sim.dt and a larger decimation"),
+    "default_material": ("ignored", "OmniIsaacGymEnvs reads default_physics_material"),
     "gravity_mag": ("task", ""),
     "disable_gravity": ("task", ""),
     "add_damping": ("task", ""),

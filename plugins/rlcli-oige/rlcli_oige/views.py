@@ -16,7 +16,8 @@ from torch import Tensor
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.sim.rotations import rotate, rotate_inverse
-from rlcli_oige.stage import ZERO, path_pattern
+from rlcli_oige.prim_paths import ZERO, path_pattern
+from rlcli_oige.stage import note_ignored
 
 if TYPE_CHECKING:
     from rlcli_oige.env import OigeEnv
@@ -33,6 +34,9 @@ class XFormPrimView:
     def __init__(self, prim_paths_expr: str, name: str = "view", reset_xform_properties: bool = True, **kwargs: Any):
         self.prim_paths_expr = prim_paths_expr
         self.name = name
+        for option, value in kwargs.items():
+            if value is not None:
+                note_ignored(f"{type(self).__name__}({option}=...)", "set it with the view's methods", lost=True)
         self._non_root_link = False
         self._env: OigeEnv | None = None
 
@@ -254,8 +258,13 @@ class RigidPrimView(XFormPrimView):
         self, prim_paths_expr: str, name: str = "rigid_prim_view", reset_xform_properties: bool = True,
         track_contact_forces: bool = False, prepare_contact_sensors: bool = False, **kwargs: Any,
     ):  # fmt: skip
-        super().__init__(prim_paths_expr, name, reset_xform_properties)
+        self._initial_masses = kwargs.pop("masses", None)
+        super().__init__(prim_paths_expr, name, reset_xform_properties, **kwargs)
         self._track_contact_forces = track_contact_forces
+
+    def _bind(self) -> None:
+        if self._initial_masses is not None:
+            self.set_masses(self._initial_masses)
 
     def apply_forces(self, forces: Any, indices: Any = None, is_global: bool = True) -> None:
         """Apply forces at the centres of mass until the end of this step. (n, 3) [N], world or body frame"""
