@@ -17,7 +17,7 @@ from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, Vocabulary, params_model, read_params
 from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing
-from rlcli.formats import Note
+from rlcli.formats import MODELS, Note
 from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, formats, load_entry
 from rlcli.registry.imports import load_spec
 from rlcli.trainers import TrainerSpec
@@ -205,6 +205,13 @@ class TaskCheck:
                     self._no_agent(origin.where)
                     continue
                 path = ("agents", name, *path[1:])
+            if path[0] == MODELS and len(path) == 2:
+                form = formats.format_of_key(self.layers.data)
+                if form is None or not form.spec.models:
+                    hint = f"set scene.entities.{path[1]}.model"
+                    self.problems.append(Problem(f"--model {path[1]}", "", "this task names its models itself", hint))
+                    continue
+                path = tuple(path[1] if key == "{name}" else key for key in form.spec.models.split("."))
             if value is None and path[0] in SECTIONS and not isinstance(self.layers.get(path), dict):
                 # null removes a term; for a term that does not exist, suggest one with a similar name
                 similar = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))

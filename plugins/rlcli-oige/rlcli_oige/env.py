@@ -68,7 +68,6 @@ class OigeEnv(DirectEnv):
                 what = f"{task_class.__name__}.set_up_scene does not call RLTask.set_up_scene"
                 raise TaskError(what, hint="add super().set_up_scene(scene)")
             self.stage.attach(scene, joint_forces=self._mentions(_FORCE_METHODS))
-        self._log_ignored()
         if type(self.task).post_physics_step is not RLTask.post_physics_step:
             _LOG.warning(
                 "%s has its own post_physics_step: what it adds to observations after get_observations is missing in the"
@@ -129,8 +128,6 @@ class OigeEnv(DirectEnv):
         self.env_origins = self.env_origins * self._spacing_factor
         for view in self.handle.world.scene.views.values():
             view.bind(self)
-        for view in self.handle.world.scene.views.values():
-            view.initialize(None)
         if self.engine.model.nsensor:
             self.engine.field("sensordata")  # create it before the first reset: forces of an initial state are then 0
         for attribute in ("_max_episode_length", "max_episode_length"):
@@ -144,10 +141,18 @@ class OigeEnv(DirectEnv):
             break
         self._post_physics_is_own = type(self.task).post_physics_step is not RLTask.post_physics_step
         with current_stage(self.stage):
+            for view in self.handle.world.scene.views.values():
+                view.initialize(None)
             super()._build_workflow()
         self._resets_by_id = True
         self._randomizer = self.task._dr_randomizer
         self._randomizer.start()
+        # OmniIsaacGymEnvs' reset applies zero actions: attributes that pre_physics_step creates exist at an observation
+        with torch.random.fork_rng(devices=[]):
+            self.task.pre_physics_step(torch.zeros(self.num_envs, self.task.num_actions, device=self.device))
+            if self._post_physics_is_own:
+                self._run_hooks()
+        self._log_ignored()
 
     def _class_sets_length(self) -> bool:
         """Return whether the class sets the episode length: the user has not set `episode_length_s`."""
@@ -158,10 +163,11 @@ class OigeEnv(DirectEnv):
         """Import the class of the task; its file may belong to a package."""
         file, _, name = reference.rpartition(":")
         path = Path(file)
+        top = next((folder for folder in path.parents if folder.name == "omniisaacgymenvs"), None)
+        if top is not None:
+            refuse(".".join((top.name, *path.relative_to(top).with_suffix("").parts)), f"{path}:1: ")
         if not (path.parent / "__init__.py").is_file():
             return super()._import_task(reference)
-        top = next((folder for folder in path.parents if folder.name == "omniisaacgymenvs"), path.parent)
-        refuse(".".join((top.name, *path.relative_to(top).with_suffix("").parts)), f"{path}:1: ")
         try:
             return getattr(import_file(path), name)
         except ModuleNotFoundError as error:

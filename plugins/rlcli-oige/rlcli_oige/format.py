@@ -21,6 +21,7 @@ SPEC = FormatSpec(
     open_scene=True,
     environment="rlcli_oige.env:OigeEnv",
     importer="rlcli_oige.command:import_task",
+    models="oige.mjcf.{name}",
     aliases={
         "rlcli.oige": "rlcli_oige",
         "gym": "gymnasium",

@@ -40,6 +40,8 @@ _REASONS = {
 _REFUSED = {
     "omniisaacgymenvs.tasks.factory": "nut and bolt touch through signed distance fields of their meshes, which a rigid"
     " body of MJCF has not; there is no counterpart of Factory's tasks",
+    "omniisaacgymenvs.tasks.franka_deformable": "PhysX simulates deformable bodies on its GPU; rlcli simulates rigid"
+    " bodies",
     "omniisaacgymenvs.tasks.warp": "tasks with Warp arrays are not supported; use the task's torch version",
 }
 """Module of the user's package -> why a task that imports it cannot run."""

@@ -257,9 +257,10 @@ class Stage:
         where = f"mjcf.{key or path}"
         name = path.rpartition("/")[2]
         if file is None:
-            text = f"{user_location()}'{prim.prim_path}' has no model"
+            text = f"'{prim.prim_path}' has no model"
             text += f": rlcli does not load '{self.references[prim.prim_path]}'" if usd else ""
-            raise ConfigError([Problem(where, "", text, f"give an MJCF file: --model {name}=FILE.xml")])
+            place = user_location().removesuffix(": ") or where
+            raise ConfigError([Problem(place, "", text, f"give an MJCF file: --model {name}=FILE.xml")])
         if not file.is_file():
             have = listing(sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*.xml")))
             hint = f"MJCF files of the task: {have}" if have else f"--model {name}=FILE.xml"

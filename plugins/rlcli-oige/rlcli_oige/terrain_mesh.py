@@ -37,7 +37,7 @@ def add_terrain(scene: Scene, prim: Prim) -> None:
         x, y = grid[..., 0], grid[..., 1]
         ideal_x = np.linspace(x.min(), x.max(), grid.shape[0])[:, None]
         ideal_y = np.linspace(y.min(), y.max(), columns)[None, :]
-        cell = max(ideal_x[1, 0] - ideal_x[0, 0], ideal_y[0, 1] - ideal_y[0, 0]) + 1e-6
+        cell = max(ideal_x[1, 0] - ideal_x[0, 0], ideal_y[0, 1] - ideal_y[0, 0]) * 1.001
         if (np.abs(x - ideal_x) > cell).any() or (np.abs(y - ideal_y) > cell).any():
             grid = None
     if grid is None:

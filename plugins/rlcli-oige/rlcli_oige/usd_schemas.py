@@ -57,8 +57,12 @@ class Attribute:
         return self.value
 
     def Set(self, value: Any, time: Any = None) -> bool:  # noqa: N802
-        """Set the value."""
+        """Set the value. One that the model cannot have is recorded."""
         self.value = value
+        if self.schema and not self.schema.endswith("Joint") and self.name not in _APPLIED.get(self.schema, ()):
+            lost = self.name in _LOST and value not in (0, 0.0)
+            reason = _LOST[self.name] if lost else "MuJoCo has no such setting"
+            self.prim.stage.note_ignored(f"{self.schema}.{self.name}", reason, lost)
         return True
 
     def SetTargets(self, targets: list[Any]) -> bool:  # noqa: N802
@@ -156,19 +160,11 @@ class Schema(metaclass=_SchemaClass):
             attribute = self._prim.attributes[key] = Attribute(self._prim, schema, self._instance, name)
 
         def access(value: Any = None, *args: Any) -> Attribute:
-            self._note(schema, name)
             if method.startswith("Create") and value is not None:
                 attribute.Set(value)
             return attribute
 
         return access
-
-    def _note(self, schema: str, name: str) -> None:
-        """Record an attribute that has no effect."""
-        if name in _APPLIED.get(schema, ()) or schema.endswith("Joint"):
-            return
-        reason = _LOST.get(name, "MuJoCo has no such setting")
-        self._prim.stage.note_ignored(f"{schema}.{name}", reason, lost=name in _LOST)
 
 
 class Xformable(Schema):

@@ -14,6 +14,7 @@ from rlcli.cli.ui.completion import agents, checkpoints, runs, tasks, words
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.help_text import HelpCommand, read_docstring
 from rlcli.errors import MachineError, UsageError
+from rlcli.formats import MODELS, read_models
 
 CHOOSE = "auto"
 """Value of an option that is given without its value (`--video`)."""
@@ -77,6 +78,8 @@ def _set_verbosity(option: typer.CallbackParam, is_set: bool) -> bool:
     return is_set
 
 
+_MODEL = "MJCF file of a robot or object of a task in another framework's format, or a YAML file {NAME: FILE}; repeatable."
+_Models = Annotated[list[str] | None, typer.Option("--model", metavar="NAME=FILE", help=_MODEL)]
 _COMMON: dict[str, Any] = {
     "json": typer.Option("--json", help="Print one JSON document on stdout."),
     "quiet": typer.Option("--quiet", "-q", callback=_set_verbosity, help="Print only results and errors."),
@@ -110,11 +113,18 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
         for option, info in _COMMON.items()
     ]
 
+    parameters = [*signature.parameters.values(), *common]
+    if "overrides" in signature.parameters:
+        model = inspect.Parameter("model", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=_Models)
+        parameters.insert(len(signature.parameters), model)
+
     @functools.wraps(function)
-    def run(**values: Any) -> None:
+    def run(*, model: list[str] | None = None, **values: Any) -> None:
+        if model:
+            words = [f'{MODELS}."{name}"="{file}"' for name, file in read_models(model).items()]
+            values["overrides"] = [*(values["overrides"] or []), *words]
         function(**{option: value for option, value in values.items() if option not in _COMMON})
 
-    parameters = [*signature.parameters.values(), *common]
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     app.command(name, cls=HelpCommand, help=text, epilog=examples, **settings)(run)
