@@ -196,7 +196,8 @@ class OigeEnv(DirectEnv):
             (self.stage.ignored, _LOG.info, "ignored"),
         ):
             if found:
-                log("%s: %s", what, "; ".join(f"{name} ({reason})" for name, reason in found.items()))
+                log("%s: %s", what, "; ".join(f"{name} [{reason}]" for name, reason in found.items()))
+                found.clear()
 
     def queue_forces(self, view: RigidPrimView, rows: Tensor, forces: Tensor) -> None:
         """Apply forces in the next step. Forces that the task sets in that step replace them."""

@@ -15,19 +15,28 @@ FRAME, FORCE, TORQUE = ".frame", ".joint_force", ".joint_torque"
 """Suffixes of the sites and sensors that measure joint forces."""
 
 
-def apply_schemas(prim: Prim) -> bool:
-    """Write the attributes of USD schemas to a model. Return whether a joint got a drive with damping."""
-    damped = False
+_STIFF = 10.0
+"""Drives are stiff if their implicit inertia is this many times that of the joint."""
+
+
+def apply_schemas(prim: Prim, dt: float) -> bool:
+    """Write the attributes of USD schemas to a model. Return whether a joint got a drive.
+
+    Args:
+        prim: the model's prim.
+        dt: physics step [s].
+    """
+    driven = False
     for part in [prim, *prim.stage.parts.get(prim.prim_path, {}).values()]:
         values = {key: attribute.value for key, attribute in part.attributes.items() if attribute.value is not None}
         if part.is_joint():
-            damped |= _apply_to_joint(prim, part.element, values)
+            driven |= _apply_to_joint(prim, part.element, values, dt)
             continue
         bodies = [part.element] if part.is_body() else list(prim.child.bodies[1:]) if prim.child is not None else []
         for (schema, _, name), value in values.items():
             for body in bodies:
                 _apply_to_body(prim, body, schema, name, value)
-    return damped
+    return driven
 
 
 def _apply_to_body(prim: Prim, body: Any, schema: str, name: str, value: Any) -> None:
@@ -55,8 +64,13 @@ def _apply_to_body(prim: Prim, body: Any, schema: str, name: str, value: Any) ->
             body.mass = float(value)
 
 
-def _apply_to_joint(prim: Prim, joint: Any, values: dict[tuple[str, str, str], Any]) -> bool:
-    """Write drives, limits and armature of a joint. USD's angles are in degrees."""
+def _apply_to_joint(prim: Prim, joint: Any, values: dict[tuple[str, str, str], Any], dt: float) -> bool:
+    """Write drives, limits and armature of a joint. USD's angles are in degrees.
+
+    PhysX integrates drives implicitly: (M + A) dv = dt (kp (target - q - dt v) - kd v) with A = dt kd + dt^2 kp. MuJoCo's
+    Euler step of an actuator with damping kd + dt kp at a joint with armature A is the same equation. PhysX limits the
+    force at the end of the step, MuJoCo at its start, where that of a stiff drive is much larger: it gets no limit.
+    """
     hinge = joint.type == mujoco.mjtJoint.mjJNT_HINGE
     per_unit = 180.0 / math.pi if hinge else 1.0
     in_spec = 1.0 if not hinge or prim.child.compiler.degree else 1.0 / per_unit  # type: ignore[union-attr]
@@ -87,11 +101,23 @@ def _apply_to_joint(prim: Prim, joint: Any, values: dict[tuple[str, str, str], A
     actuator = prim.child.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
     actuator.gainprm[0] = stiffness or damping  # without stiffness the control is a velocity
-    actuator.biasprm[1], actuator.biasprm[2] = -stiffness, -damping
-    if math.isfinite(drive.get("MaxForce", math.inf)):
+    actuator.biasprm[1], actuator.biasprm[2] = -stiffness, -(damping + dt * stiffness)
+    implicit_inertia = dt * damping + dt**2 * stiffness
+    stiff = implicit_inertia > _STIFF * _inertia(prim.child, joint.name)
+    if stiff and "MaxForce" in drive:
+        reason = "MuJoCo would limit the force before its implicit step, PhysX limits it after the step"
+        prim.stage.note_ignored("DriveAPI.MaxForce of stiff drives", reason, lost=True)
+    elif math.isfinite(drive.get("MaxForce", math.inf)):
         actuator.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
         actuator.forcerange = [-drive["MaxForce"], drive["MaxForce"]]
-    return damping > 0.0
+    joint.armature += implicit_inertia
+    return True
+
+
+def _inertia(child: mujoco.MjSpec, joint: str) -> float:
+    """Return the inertia of a joint in the default pose [kg m^2 or kg]."""
+    model = child.compile()
+    return float(model.dof_M0[model.joint(joint).dofadr[0]])
 
 
 def apply_settings(prim: Prim, child: mujoco.MjSpec) -> None:

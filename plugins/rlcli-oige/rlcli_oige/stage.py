@@ -293,15 +293,14 @@ class Stage:
                 add_terrain(scene, prim)
             if prim.child is None:
                 continue
-            has_drives |= apply_schemas(prim)
+            has_drives |= apply_schemas(prim, scene.sim.dt)
             apply_settings(prim, prim.child)
             if joint_forces:
                 add_force_sensors(prim.child)
             entity = EntityConfig(model=prim.label, pos=prim.pos, quat=prim.quat)  # type: ignore[arg-type]
             scene.attach(prim.entity, entity, prim.child)
-        if has_drives and scene.sim.integrator is None:
-            # Euler's method is unstable with the damping of drives
-            scene.spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        if has_drives:  # with Euler's method the armatures of drives make their steps implicit
+            scene.spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
         for joint in joints:
             joint.kind = ""
             _add_joint(scene, joint)

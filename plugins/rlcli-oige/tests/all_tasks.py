@@ -92,7 +92,8 @@ def examine(name: str, checkout: Path, folder: Path, models: dict[str, Path]) ->
         if not row[stage] and not row["reason"]:
             row["reason"] = reason(output)
         lost = [line.removeprefix("not simulated: ") for line in output.splitlines() if line.startswith("not simulated")]
-        row["lost"] = row["lost"] or sorted({part.split(" (")[0] for line in lost for part in line.split("; ")})
+        parts = {part for line in lost for part in re.findall(r"(?:^|; )([^;[]+) \[", line)}
+        row["lost"] = row["lost"] or sorted(parts)
         if stage in ("builds", "steps") and not row[stage]:
             row["steps"] = row["trains"] = False
             break
