@@ -45,8 +45,8 @@ class FormatSpec:
             Typer's annotations.
         hint: `(error: BaseException) -> str | None`. Return what to do about an error of a task's code.
         agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration.
-        models: the key of a task's data where `--model NAME=FILE` sets a model, with `{name}`; empty: task files in this
-            format name their models themselves.
+        models: the key of a task's data where `--model NAME=FILE` sets a model, with `{name}`; empty: task files in
+            this format name their models themselves.
         aliases: module name -> module, or -> `module:function`. Imports of the first name, and of names below it, in
             files of a task resolve to the second. `function(name, file)` returns the module of a full name for the
             importing file, or None.

@@ -247,7 +247,12 @@ class ArticulationView(XFormPrimView):
             if values is not None and tendons:
                 field = self.env.engine.expand(name)
                 field[rows, tendons] = self._tensor(values).to(field.dtype).expand(len(rows), len(tendons))
-        others = {"limit_stiffnesses": limit_stiffnesses, "limits": limits, "rest_lengths": rest_lengths, "offsets": offsets}
+        others = {
+            "limit_stiffnesses": limit_stiffnesses,
+            "limits": limits,
+            "rest_lengths": rest_lengths,
+            "offsets": offsets,
+        }
         for name, values in others.items():
             if values is not None and tendons:
                 note_ignored(f"set_fixed_tendon_properties({name}=...)", "the MJCF's tendons set it", lost=True)

@@ -43,15 +43,6 @@ def compose(document: Document, file: FilePath, label: str) -> Document:
     return result
 
 
-def read_composed(file: FilePath) -> Document:
-    """Read a YAML file and compose it.
-
-    Raises:
-        ConfigError: if the file or one that it lists cannot be read.
-    """
-    return compose(read(file), file, str(file))
-
-
 def label_at(document: Document, path: Path, label: str) -> str:
     """Return the name of the file that has a key; `label` if the document is one file."""
     if not isinstance(document, Composed):
@@ -78,7 +69,9 @@ def _parts(
         target = _file(entry, file)
         if target is None:
             known = listing(sorted(path.stem for path in file.parent.glob("*.yaml") if path != file))
-            message = f"no file for '{entry}': rlcli reads only YAML files, no configurations that Python code registers"
+            message = (
+                f"no file for '{entry}': rlcli reads only YAML files, no configurations that Python code registers"
+            )
             raise ConfigError([Problem(place, DEFAULTS, message, f"files beside it: {known}")])
         if target.resolve() in active:
             message = f"'{entry}' lists itself; remove one of the entries"

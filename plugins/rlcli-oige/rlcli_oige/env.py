@@ -5,31 +5,36 @@ from __future__ import annotations
 import copy
 import logging
 import math
-import traceback
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rlcli.envs.build import grid
 from rlcli.envs.direct import DirectEnv
+from rlcli.envs.layout import Layout
 from rlcli.errors import DependencyError, TaskError
 from rlcli.registry import import_file, is_framework
 from rlcli.scene.scene import Scene
 from rlcli.sim.selection import Selection
 from rlcli_oige.articulation_view import ArticulationView
+from rlcli_oige.cameras import Replicator
 from rlcli_oige.modules import refuse
 from rlcli_oige.stage import Stage, current_stage
 from rlcli_oige.task import EnvHandle, RLTask, SimConfig
 from rlcli_oige.task_keys import MOVED_KEYS, ROOT_SETTINGS
 from rlcli_oige.task_yaml import is_oige_file
+from rlcli_oige.user_code import error_location
 from rlcli_oige.views import RigidPrimView
 
 _LOG = logging.getLogger(__name__)
 _FORCE_METHODS = ("get_measured_joint_forces", "get_force_sensor_forces", "get_net_contact_forces")
 _GRAVITY_METHODS = ("disable_gravities",)
+_IMAGE_DIMS = 4
 _TINY_GRAVITY_COMPENSATION = 1e-30
 
 
@@ -53,7 +58,9 @@ class OigeEnv(DirectEnv):
         self._spacing_factor = 1.0
         self._steps_inside, self._told_steps_inside = 0, False
         self._queued_forces: list[tuple[RigidPrimView, Tensor, Tensor]] = []
+        self.replicator = Replicator(self)
         self.handle = EnvHandle(self)
+        np.random.seed(self.seed)  # some tasks make their terrain with numpy
         with current_stage(self.stage):
             try:
                 name = str(self.block.get("name", source.name))
@@ -70,10 +77,11 @@ class OigeEnv(DirectEnv):
             self.stage.attach(scene, joint_forces=self._mentions(_FORCE_METHODS))
         if type(self.task).post_physics_step is not RLTask.post_physics_step:
             _LOG.warning(
-                "%s has its own post_physics_step: what it adds to observations after get_observations is missing in the"
-                " first observation of an episode, and a failure in the last step counts as a time-out",
+                "%s has its own post_physics_step: what it adds to observations after get_observations is missing in"
+                " the first observation of an episode, and a failure in the last step counts as a time-out",
                 task_class.__name__,
             )
+        self.replicator.add_to(scene)
         if self._mentions(_GRAVITY_METHODS):  # MuJoCo skips gravity compensation in a model without it
             scene.spec.bodies[-1].gravcomp = scene.spec.bodies[-1].gravcomp or _TINY_GRAVITY_COMPENSATION
         scene.joints.add_motors()
@@ -171,9 +179,7 @@ class OigeEnv(DirectEnv):
         try:
             return getattr(import_file(path), name)
         except ModuleNotFoundError as error:
-            where = next((f for f in reversed(traceback.extract_tb(error.__traceback__)) if f.filename[:1] != "<"), None)
-            place = f"{where.filename}:{where.lineno}" if where is not None else str(path)
-            message = f"{place}: the task imports '{error.name}', which is not installed"
+            message = f"{error_location(error) or path}: the task imports '{error.name}', which is not installed"
             raise DependencyError(message, hint=f"pip install {str(error.name).partition('.')[0]}") from error
 
     def place_environments(self, spacing: float) -> Tensor:
@@ -297,7 +303,16 @@ class OigeEnv(DirectEnv):
 
     def _group(self, obs: Tensor, states: Tensor) -> dict[str, Tensor]:
         self._last_states = states
+        if obs.dim() == _IMAGE_DIMS:  # (num_envs, columns, rows, channels), as rl_games expects images
+            obs = obs.permute(0, 3, 1, 2).flatten(1)
         return super()._group(obs, states)
+
+    def _make_layout(self) -> Layout:
+        layout, obs = super()._make_layout(), self.task.obs_buf
+        if obs.dim() == _IMAGE_DIMS:
+            policy = replace(layout.observations["policy"][0], shape=(obs.shape[3], obs.shape[1], obs.shape[2]))
+            layout = replace(layout, observations={**layout.observations, "policy": (policy,)})
+        return layout
 
     def _add_noise_and_clip(self, obs: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
         """Add noise and clip, in place. Rewards were computed before, from exact values."""

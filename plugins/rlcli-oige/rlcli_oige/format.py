@@ -25,6 +25,7 @@ SPEC = FormatSpec(
     aliases={
         "rlcli.oige": "rlcli_oige",
         "gym": "gymnasium",
+        "numpy": "rlcli_oige.modules:find_numpy",
         **dict.fromkeys(
             (
                 "omniisaacgymenvs.tasks.base",

@@ -67,9 +67,10 @@ def _apply_to_body(prim: Prim, body: Any, schema: str, name: str, value: Any) ->
 def _apply_to_joint(prim: Prim, joint: Any, values: dict[tuple[str, str, str], Any], dt: float) -> bool:
     """Write drives, limits and armature of a joint. USD's angles are in degrees.
 
-    PhysX integrates drives implicitly: (M + A) dv = dt (kp (target - q - dt v) - kd v) with A = dt kd + dt^2 kp. MuJoCo's
-    Euler step of an actuator with damping kd + dt kp at a joint with armature A is the same equation. PhysX limits the
-    force at the end of the step, MuJoCo at its start, where that of a stiff drive is much larger: it gets no limit.
+    PhysX integrates drives implicitly: (M + A) dv = dt (kp (target - q - dt v) - kd v) with A = dt kd + dt^2 kp.
+    MuJoCo's Euler step of an actuator with damping kd + dt kp at a joint with armature A is the same equation. PhysX
+    limits the force at the end of the step, MuJoCo at its start, where that of a stiff drive is much larger: such a
+    drive gets no limit.
     """
     hinge = joint.type == mujoco.mjtJoint.mjJNT_HINGE
     per_unit = 180.0 / math.pi if hinge else 1.0
@@ -83,7 +84,9 @@ def _apply_to_joint(prim: Prim, joint: Any, values: dict[tuple[str, str, str], A
         elif schema in ("RevoluteJoint", "PrismaticJoint", "LimitAPI") and name in ("UpperLimit", "High"):
             joint.range = [joint.range[0], float(value) * in_spec]
             joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
-    drive = {name: float(value) for (schema, _, name), value in values.items() if schema == "DriveAPI" and name != "Type"}
+    drive = {
+        name: float(value) for (schema, _, name), value in values.items() if schema == "DriveAPI" and name != "Type"
+    }
     if not drive:
         return False
     assert prim.child is not None

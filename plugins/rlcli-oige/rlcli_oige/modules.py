@@ -1,12 +1,14 @@
 """Modules that the unchanged import lines of task files get: `omni.*`, `pxr`, `carb`, `gym`, `omniisaacgymenvs.*`.
 
-Names that rlcli has are those of the flat vocabulary, whatever the module is. Names whose calls have no effect in MuJoCo
-are recorded when they are called; all others can be imported and raise an error when they are used.
+Names that rlcli has are those of the flat vocabulary, whatever the module is. Names whose calls have no effect in
+MuJoCo are recorded when they are called; all others can be imported and raise an error when they are used.
 """
 
 from __future__ import annotations
 
 import importlib
+import re
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -14,6 +16,7 @@ from rlcli.errors import TaskError
 from rlcli_oige import neighbours
 from rlcli_oige.usd import Ignored, UsdContext, missing
 
+_REMOVED = re.compile(r"\b(?:np|numpy)\.(?:Inf|Infinity|NaN|float_)\b")
 _modules: dict[str, ModuleType] = {}
 
 _IGNORED = {
@@ -42,6 +45,8 @@ _REFUSED = {
     " body of MJCF has not; there is no counterpart of Factory's tasks",
     "omniisaacgymenvs.tasks.franka_deformable": "PhysX simulates deformable bodies on its GPU; rlcli simulates rigid"
     " bodies",
+    "omniisaacgymenvs.tasks.target_following": "its reward reads images of instance segmentation, which rlcli's cameras"
+    " do not render",
     "omniisaacgymenvs.tasks.warp": "tasks with Warp arrays are not supported; use the task's torch version",
 }
 """Module of the user's package -> why a task that imports it cannot run."""
@@ -58,6 +63,19 @@ def find(name: str, file: str = "") -> ModuleType:
         parent, _, last = name.rpartition(".")
         if parent:
             setattr(find(parent), last, module)
+    return _modules[name]
+
+
+def find_numpy(name: str, file: str = "") -> ModuleType | None:
+    """Return numpy with the names that NumPy 2 has removed, for a file that uses one of them; None for other files."""
+    if name != "numpy" or not file or not _REMOVED.search(Path(file).read_text(encoding="utf-8", errors="replace")):
+        return None
+    if name not in _modules:
+        numpy = importlib.import_module(name)
+        module = _modules[name] = ModuleType(name)
+        vars(module).update(
+            {**vars(numpy), "Inf": numpy.inf, "Infinity": numpy.inf, "NaN": numpy.nan, "float_": numpy.float64}
+        )
     return _modules[name]
 
 

@@ -10,10 +10,10 @@ import numpy as np
 from rlcli.errors import TaskError
 from rlcli_oige.prim_paths import ZERO
 from rlcli_oige.stage import get_current_stage, to_floats
-from rlcli_oige.user_code import user_location
+from rlcli_oige.user_code import Counterpart, user_location
 
 
-class XFormPrim:
+class XFormPrim(Counterpart):
     """A frame."""
 
     def __init__(
@@ -196,7 +196,7 @@ class FixedCylinder(_Cylinder):
     free = False
 
 
-class Cloner:
+class Cloner(Counterpart):
     """Copier of prims. The environments themselves are copied by rlcli."""
 
     def __init__(self, spacing: float = 0.0, *args: Any, **kwargs: Any) -> None:
@@ -213,7 +213,12 @@ class Cloner:
         """Do nothing: environments never collide."""
 
     def clone(
-        self, source_prim_path: str, prim_paths: list[str], positions: Any = None, orientations: Any = None, **kwargs: Any
+        self,
+        source_prim_path: str,
+        prim_paths: list[str],
+        positions: Any = None,
+        orientations: Any = None,
+        **kwargs: Any,
     ) -> None:
         """Copy a prim with its model to other paths.
 
@@ -239,5 +244,3 @@ class GroundPlane:
 
     def __init__(self, prim_path: str = "/World/defaultGroundPlane", **kwargs: Any) -> None:
         self.prim_path = prim_path
-
-

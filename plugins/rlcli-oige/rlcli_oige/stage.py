@@ -19,7 +19,7 @@ from rlcli_oige.model_edits import add_force_sensors, apply_schemas, apply_setti
 from rlcli_oige.prim_paths import BASE, ZERO, path_pattern
 from rlcli_oige.task_yaml import home, relative
 from rlcli_oige.terrain_mesh import add_terrain
-from rlcli_oige.user_code import user_location
+from rlcli_oige.user_code import Counterpart, user_location
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -31,7 +31,7 @@ MODELS = Path(__file__).parent / "models"
 _CURRENT_STAGES: list[Stage] = []
 
 
-class Prim:
+class Prim(Counterpart):
     """An object of the stage: a model, or a body or joint of a model, or a frame.
 
     The prims of models are those of the first environment; every environment has a copy.
@@ -159,7 +159,7 @@ class Prim:
         return sorted({schema for schema, _, _ in self.attributes if schema})
 
 
-class Stage:
+class Stage(Counterpart):
     """Prims of a task under construction, by path.
 
     Args:
@@ -342,8 +342,8 @@ def _add_joint(scene: Scene, prim: Prim) -> None:
     world = len(first) == 1 and not prim.stage.GetPrimAtPath(first[0]).is_body()
     if not locked or not world or target is None or not target.is_body():
         raise TaskError(
-            f"{values.get('where', '')}the joint '{prim.prim_path}' has no counterpart: only a joint that locks the three"
-            " translations of a body to the ground has one",
+            f"{values.get('where', '')}the joint '{prim.prim_path}' has no counterpart: only a joint that locks the"
+            " three translations of a body to the ground has one",
             hint="add the constraint to the MJCF, as <equality>",
         )
     environment = prim.stage.GetPrimAtPath("/".join(prim.prim_path.split("/")[:4]))

@@ -58,7 +58,7 @@ SIM_KEYS: Mapping[str, tuple[Status, str]] = {
     "use_flatcache": ("ignored", "there is no USD stage"),
     "enable_scene_query_support": ("ignored", "rays are always available"),
     "disable_contact_processing": ("ignored", "contacts are always processed"),
-    "enable_cameras": ("ignored", "policies of such tasks have no camera observations"),
+    "enable_cameras": ("task", ""),
     "replicate_physics": ("ignored", "every environment is simulated separately"),
     "rendering_dt": ("approximated", "videos have one frame per step, or fewer with sim.render_interval"),
     "substeps": ("approximated", "for more than 1, set a smaller sim.dt and a larger decimation"),

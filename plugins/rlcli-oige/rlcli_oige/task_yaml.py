@@ -18,7 +18,7 @@ from rlcli.config.strict_yaml import Document, Path
 from rlcli.errors import ConfigError, did_you_mean, listing
 from rlcli.formats import Status, Translation
 from rlcli_oige import agent_yaml, randomization_yaml
-from rlcli_oige.composition import read_composed
+from rlcli_oige.composition import compose
 from rlcli_oige.hydra import evaluate
 from rlcli_oige.task_class import class_constant
 from rlcli_oige.task_keys import (
@@ -44,7 +44,7 @@ def is_oige(data: Mapping[str, Any]) -> bool:
 def is_oige_file(file: FilePath) -> bool:
     """Return whether a file can be read and has OmniIsaacGymEnvs' format."""
     try:
-        return is_oige(read_composed(file).data)
+        return is_oige(_composed_data(file))
     except ConfigError:
         return False
 
@@ -52,7 +52,7 @@ def is_oige_file(file: FilePath) -> bool:
 def task_name(file: FilePath) -> str | None:
     """Return the name of a task of OmniIsaacGymEnvs, imported or not; None for a file of another task."""
     try:
-        data = read_composed(file).data
+        data = _composed_data(file)
     except ConfigError:
         return None
     imported = _mapping(data.get("oige"))
@@ -280,6 +280,15 @@ def home(config: FilePath) -> FilePath:
     """Return the folder of a task's files: that of its YAML, or the package that contains its `cfg/task`."""
     inside = config.parent.parts[-2:] == ("cfg", "task")
     return config.parent.parent.parent if inside else config.parent
+
+
+def _composed_data(file: FilePath) -> dict[str, Any]:
+    """Return the data of a YAML file. A wrong `defaults:` list is not an error here: reading the task reports it."""
+    document = read(file)
+    try:
+        return compose(document, file, str(file)).data
+    except ConfigError:
+        return {"sim": {}, **document.data}
 
 
 def _mapping(value: Any) -> dict[str, Any]:

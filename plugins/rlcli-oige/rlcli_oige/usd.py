@@ -63,6 +63,7 @@ class Ignored:
         self._name, self._reason = name, reason
 
     def __call__(self, *args: Any, **kwargs: Any) -> Ignored:
+        """Record the call."""
         note_ignored(self._name, self._reason)
         return self
 

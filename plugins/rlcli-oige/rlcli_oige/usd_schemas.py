@@ -96,7 +96,9 @@ class Schema(metaclass=_SchemaClass):
                 raise TaskError(f"{user_location()}{name}: {reason}")
         if name in ("DriveAPI", "PhysxJointAPI") and not self._prim.is_joint() and not self._prim.kind:
             owner = self._prim.owner
-            owner = next((p for p in owner.stage.prims.values() if self._prim.prim_path.startswith(f"{p.prim_path}/")), owner)
+            owner = next(
+                (p for p in owner.stage.prims.values() if self._prim.prim_path.startswith(f"{p.prim_path}/")), owner
+            )
             joints = [] if owner.child is None else [joint.name for joint in owner.child.joints]
             hint = f"joints of {owner.label}: {', '.join(filter(None, joints))}" if joints else None
             missing = self._prim.prim_path.rpartition("/")[2]

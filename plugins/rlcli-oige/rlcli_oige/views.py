@@ -18,12 +18,13 @@ from rlcli.scene.entity import Entity
 from rlcli.sim.rotations import rotate, rotate_inverse
 from rlcli_oige.prim_paths import ZERO, path_pattern
 from rlcli_oige.stage import note_ignored
+from rlcli_oige.user_code import Counterpart
 
 if TYPE_CHECKING:
     from rlcli_oige.env import OigeEnv
 
 
-class XFormPrimView:
+class XFormPrimView(Counterpart):
     """Frames or bodies that a path expression matches, in every environment. Rows are ordered by environment.
 
     Args:

@@ -4,6 +4,7 @@
 from rlcli_oige.articulation_view import ArticulationView
 from rlcli_oige.maths import *  # noqa: F403
 from rlcli_oige.maths import TENSOR_NAMES
+from rlcli_oige.randomization import Randomizer
 from rlcli_oige.rotations import *  # noqa: F403
 from rlcli_oige.rotations import ROTATION_NAMES
 from rlcli_oige.shapes import (
@@ -39,7 +40,6 @@ from rlcli_oige.stage import (
     is_prim_path_valid,
 )
 from rlcli_oige.task import RLTask, SimConfig, SimulationContext, World
-from rlcli_oige.randomization import Randomizer
 from rlcli_oige.usd import ArticulationAction, Gf, PhysxSchema, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, carb
 from rlcli_oige.views import RigidPrimView, XFormPrimView
 
@@ -49,7 +49,8 @@ MATHS = [*TENSOR_NAMES, *ROTATION_NAMES]
 NAMES = [
     *MATHS,
     "Ant", "ArticulationAction", "ArticulationView", "Cartpole", "Cloner", "Crazyflie", "DynamicCuboid",
-    "DynamicCylinder", "DynamicSphere", "FixedCuboid", "FixedCylinder", "FixedSphere", "Gf", "GridCloner", "GroundPlane",
+    "DynamicCylinder", "DynamicSphere", "FixedCuboid", "FixedCylinder", "FixedSphere", "Gf", "GridCloner",
+    "GroundPlane",
     "Humanoid", "Ingenuity", "PhysxSchema", "Quadcopter", "RLTask", "Randomizer", "RigidPrim", "RigidPrimView", "Robot",
     "Sdf", "SimConfig", "SimulationContext", "Usd", "UsdGeom", "UsdLux", "UsdPhysics", "UsdShade", "VisualCuboid",
     "VisualSphere", "WheeledRobot", "World", "XFormPrim", "XFormPrimView", "add_reference_to_stage", "carb",

@@ -11,7 +11,9 @@ QUADRANTS = {"LF": (0.3, 0.2), "LH": (-0.3, 0.2), "RF": (0.3, -0.2), "RH": (-0.3
 FINGERS = ("FF", "MF", "RF", "LF")
 
 
-def body(name: str, inner: str, pos: str = "0 0 0", joint: str = "", axis: str = "0 1 0", span: str = "-1.5 1.5") -> str:
+def body(
+    name: str, inner: str, pos: str = "0 0 0", joint: str = "", axis: str = "0 1 0", span: str = "-1.5 1.5"
+) -> str:
     """Return a body with one joint (slide: its name has the prefix `slide:`)."""
     kind, _, label = joint.rpartition(":")
     text = f'<body name="{name}" pos="{pos}">'
@@ -52,8 +54,8 @@ def balance_bot() -> str:
 
 def franka() -> str:
     fingers = "".join(
-        body(f"panda_{side}finger", geom("0.01 0.01 0.02", 0.05, kind="box"), "0 0 0.058", f"slide:panda_finger_joint{n}",
-             axis, "0 0.04")
+        body(f"panda_{side}finger", geom("0.01 0.01 0.02", 0.05, kind="box"), "0 0 0.058",
+             f"slide:panda_finger_joint{n}", axis, "0 0.04")
         for n, side, axis in ((1, "left", "0 1 0"), (2, "right", "0 -1 0"))
     )  # fmt: skip
     inner = body("panda_hand", geom("0.03", 0.5) + fingers, "0 0 0.107")

@@ -78,7 +78,9 @@ def _set_verbosity(option: typer.CallbackParam, is_set: bool) -> bool:
     return is_set
 
 
-_MODEL = "MJCF file of a robot or object of a task in another framework's format, or a YAML file {NAME: FILE}; repeatable."
+_MODEL = (
+    "MJCF file of a robot or object of a task in another framework's format, or a YAML file {NAME: FILE}; repeatable."
+)
 _Models = Annotated[list[str] | None, typer.Option("--model", metavar="NAME=FILE", help=_MODEL)]
 _COMMON: dict[str, Any] = {
     "json": typer.Option("--json", help="Print one JSON document on stdout."),
