@@ -1,4 +1,4 @@
-"""USD calls of tasks on prims: drives, limits, masses, clones, references, joints and terrain meshes act on the model."""
+"""USD calls of tasks on prims: drives, limits, masses, clones, references, joints and terrains act on the model."""
 
 import math
 import types
