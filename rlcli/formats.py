@@ -42,8 +42,9 @@ class FormatSpec:
             Typer's annotations.
         hint: `(error: BaseException) -> str | None`. Return what to do about an error of a task's code.
         agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration.
-        aliases: module name -> module. While a task's files are imported, the first name (and names below it) resolves
-            to the second.
+        aliases: module name -> module, or -> `module:function`. Imports of the first name, and of names below it, in
+            files of a task resolve to the second. `function(name, file)` returns the module of a full name for the
+            importing file, or None.
         api: the `API_VERSION` that the format was written for.
     """
 

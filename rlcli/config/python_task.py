@@ -7,7 +7,6 @@ is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
 
 from __future__ import annotations
 
-import sys
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,10 +18,11 @@ from pydantic import BaseModel, ValidationError
 
 from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
-from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, listing
+from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing
 from rlcli.formats import Note
-from rlcli.registry import TaskSource, import_file, is_framework, load_object
+from rlcli.registry import TaskSource, import_file, is_framework, load_module, load_object
 from rlcli.registry.formats import Format, format_of_module, installed_formats, require_module
+from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registrations
 
 _OWN = "rlcli.mdp."
 _AGENTS = "agents/*.py"
@@ -200,6 +200,9 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         value = getattr(value, part)
     if agents or not hasattr(value, "__rlcli_task__"):
         return value, agents
+    uses = [kwargs for kwargs in registrations.values() if _names(kwargs[CONFIGURATION], module.__name__, attribute)]
+    if uses:
+        return _with_environment(value, uses[0]), _registered_agents(uses[0])
     folder, form = FilePath(file).parent, format_of_module(value.__rlcli_task__.__module__)
     files = sorted(folder.glob(_AGENTS))
     if form is not None and form.spec.agents_beside:
@@ -215,6 +218,8 @@ def _agents_in_modules(modules: Iterable[Any]) -> dict[str, Any]:
         for name, item in vars(module).items()
         if hasattr(item, "__rlcli_agent__") and not is_framework(str(getattr(item, "__module__", "")))
     }
+    inner = {base for item in found.values() if isinstance(item, type) for base in item.__mro__[1:]}
+    found = {name: item for name, item in found.items() if item not in inner} or found
     if len(found) == 1:
         item = next(iter(found.values()))
         return {item.__rlcli_library__: item}
@@ -227,27 +232,44 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     They are the arguments `env_cfg_entry_point` and `AGENT_cfg_entry_point` of the registration.
     """
     module = import_file(source.root / "__init__.py")
-    gymnasium = sys.modules.get("gymnasium")
-    registry = gymnasium.envs.registry if gymnasium is not None else {}
-    found = {
-        name: spec.kwargs
-        for name, spec in registry.items()
-        if _module_of(spec.kwargs.get("env_cfg_entry_point")).startswith(module.__name__)
-    }
     wanted = str(source.python).removeprefix(str(source.root)).removeprefix(":")
+    found = {
+        name: kwargs
+        for name, kwargs in registrations.items()
+        if _module_of(kwargs[CONFIGURATION]).startswith(module.__name__)
+    }
     if wanted and wanted not in found:
-        raise TaskError(f"{source.root} does not register '{wanted}'", hint=f"it registers {listing(found)}")
+        hint = did_you_mean(wanted, found) or f"it registers {listing(found)}"
+        raise TaskError(f"{source.root} does not register '{wanted}'", hint=hint)
     if not wanted and len(found) != 1:
-        hint = f"name one: {' or '.join(f'{source.root}:{name}' for name in found)}" if found else None
-        raise TaskError(f"{source.root} registers {len(found)} tasks with env_cfg_entry_point, expected 1", hint=hint)
+        hint = f"name one: {listing(f'{source.root}:{name}' for name in found)}" if found else None
+        raise TaskError(f"{source.root} registers {len(found)} tasks with {CONFIGURATION}, expected 1", hint=hint)
     kwargs = found[wanted or next(iter(found))]
+    return _with_environment(_object(kwargs[CONFIGURATION]), kwargs), _registered_agents(kwargs)
+
+
+def _with_environment(value: Any, kwargs: Mapping[str, Any]) -> Any:
+    """Return a configuration that knows the environment class of its registration, if its format needs the class."""
+    value = value() if isinstance(value, type) else value
+    if hasattr(value, "__rlcli_environment__"):
+        value.__rlcli_environment__(kwargs[ENVIRONMENT])
+    return value
+
+
+def _registered_agents(kwargs: Mapping[str, Any]) -> dict[str, Any]:
     ending = "_cfg_entry_point"
-    agents = {
+    return {
         key.removesuffix(ending).replace("_", "-"): _object(value)
         for key, value in kwargs.items()
-        if key.endswith(ending) and key != "env_cfg_entry_point"
+        if key.endswith(ending) and key != CONFIGURATION
     }
-    return _object(kwargs["env_cfg_entry_point"]), agents
+
+
+def _names(entry: object, module: str, attribute: str) -> bool:
+    """Return whether the entry of a registration is this object of a module."""
+    if isinstance(entry, str):
+        return entry == f"{module}:{attribute}"
+    return getattr(entry, "__module__", "") == module and getattr(entry, "__qualname__", "") == attribute
 
 
 def _module_of(entry: object) -> str:
@@ -255,15 +277,18 @@ def _module_of(entry: object) -> str:
 
 
 def _object(entry: object) -> Any:
-    """Import the object of a reference `module:name`; return other objects, and names of YAML files, unchanged."""
+    """Import the object of a reference `module:name`; return the path of a file, and other objects unchanged."""
     if not isinstance(entry, str):
         return entry
-    return entry if entry.endswith((".yaml", ".yml")) else load_object(entry)
+    if not entry.endswith((".yaml", ".yml", ".json")):
+        return load_object(entry)
+    module, _, file = entry.rpartition(":")
+    return FilePath(str(load_module(module).__file__)).parent / file if module else FilePath(file)
 
 
 def _add_agent(task: PythonTask, name: str, agent: object) -> None:
-    if isinstance(agent, str) or not (isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__")):
-        what = agent if isinstance(agent, str) else type(agent).__name__
+    if not (isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__")):
+        what = str(agent) if isinstance(agent, str | FilePath) else type(agent).__name__
         task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}: write a mapping"))
         return
     agents = task.data.setdefault("agents", {})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -12,10 +13,12 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem, match
-from rlcli.sim.rotations import rotate, rotate_inverse
+from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
+from rlcli_isaaclab.absent import NoEffect
 
 _DATA_NAMES = {
     "applied_torque": "applied_effort",
+    "root_link_heading_w": "heading_w",
     "computed_torque": "computed_effort",
     "root_link_pos_w": "root_pos_w",
     "root_link_quat_w": "root_quat_w",
@@ -55,6 +58,14 @@ class Data:
     def joint_pos_limits(self) -> Tensor:
         """Lower and upper position limits. (num_envs, joints, 2) [m or rad]"""
         return self._expand_to_envs(self._data.joint_pos_limits)
+
+    @property
+    def joint_vel_limits(self) -> Tensor:
+        """Speed limits. (num_envs, joints) [m/s or rad/s]"""
+        limits = self._data.joint_vel_limits
+        return limits if limits.dim() == 2 else limits.expand(self._env.num_envs, -1)
+
+    soft_joint_vel_limits = joint_vel_limits
 
     @property
     def soft_joint_pos_limits(self) -> Tensor:
@@ -177,6 +188,142 @@ class Asset:
         self._env.sim.refresh()
 
 
+class FrameTransformer:
+    """Poses of frames that are fixed to bodies, under Isaac Lab's names; `data` is the object itself."""
+
+    def __init__(self, assets: Mapping[str, Asset], settings: Mapping[str, Any]) -> None:
+        self.data = self
+        self._source = self._bodies(assets, settings["source"])[0]
+        self._targets, self.target_frame_names = [], []
+        for target in settings["targets"]:
+            found = self._bodies(assets, target)
+            self._targets += found
+            names = [asset.body_names[index] for asset, index, _ in found]
+            self.target_frame_names += [target["name"]] * len(found) if target["name"] else names
+        self.body_names, self.joint_names = self.target_frame_names, []
+
+    @staticmethod
+    def _bodies(assets: Mapping[str, Asset], frame: Mapping[str, Any]) -> list[tuple[Asset, int, Mapping[str, Any]]]:
+        asset = assets[frame["entity"]]
+        wanted = frame["body"]
+        ids = [0] if wanted is None else asset.find_bodies(wanted)[0]
+        return [(asset, index, frame) for index in ids]
+
+    @staticmethod
+    def _pose(frame: tuple[Asset, int, Mapping[str, Any]]) -> tuple[Tensor, Tensor]:
+        asset, index, settings = frame
+        pos, quat = asset.data.body_pos_w[:, index], asset.data.body_quat_w[:, index]
+        offset = torch.tensor(settings["pos"], device=pos.device).expand_as(pos)
+        turn = torch.tensor(settings["rot"], device=pos.device).expand_as(quat)
+        return pos + rotate(quat, offset), multiply(quat, turn)
+
+    @property
+    def source_pos_w(self) -> Tensor:
+        """Position of the source frame, world frame. (num_envs, 3) [m]"""
+        return self._pose(self._source)[0]
+
+    @property
+    def source_quat_w(self) -> Tensor:
+        """Orientation of the source frame (w, x, y, z), world frame. (num_envs, 4)"""
+        return self._pose(self._source)[1]
+
+    @property
+    def target_pos_w(self) -> Tensor:
+        """Positions of the target frames, world frame. (num_envs, frames, 3) [m]"""
+        return torch.stack([self._pose(target)[0] for target in self._targets], dim=1)
+
+    @property
+    def target_quat_w(self) -> Tensor:
+        """Orientations of the target frames (w, x, y, z), world frame. (num_envs, frames, 4)"""
+        return torch.stack([self._pose(target)[1] for target in self._targets], dim=1)
+
+    @property
+    def target_pos_source(self) -> Tensor:
+        """Positions of the target frames in the source frame. (num_envs, frames, 3) [m]"""
+        pos, quat = self._pose(self._source)
+        return torch.stack([rotate_inverse(quat, self._pose(t)[0] - pos) for t in self._targets], dim=1)
+
+    @property
+    def target_quat_source(self) -> Tensor:
+        """Orientations of the target frames in the source frame. (num_envs, frames, 4)"""
+        back = conjugate(self._pose(self._source)[1])
+        return torch.stack([multiply(back, self._pose(t)[1]) for t in self._targets], dim=1)
+
+
+class CameraView:
+    """A camera under Isaac Lab's names; `data` is the object itself."""
+
+    def __init__(self, sensor: Any) -> None:
+        self._sensor, self.data = sensor, self
+        self.body_names: list[str] = []
+        self.joint_names: list[str] = []
+
+    @property
+    def output(self) -> Mapping[str, Tensor]:
+        """Images by type of data, channels last. (num_envs, h, w, c)"""
+        kind, image = self._sensor.config.data, self._sensor.image
+        names = {"rgb": ("rgb",), "depth": ("depth", "distance_to_image_plane"), "distance": ("distance_to_camera",)}
+        return dict.fromkeys(names[kind], image)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Height and width [pixels]."""
+        return self._sensor.config.height, self._sensor.config.width
+
+
+class TerrainView:
+    """The terrain under Isaac Lab's names."""
+
+    def __init__(self, env: VecEnv, terrain: Any) -> None:
+        self._env, self._terrain = env, terrain
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._terrain, name)
+
+    @property
+    def cfg(self) -> Any:
+        """Configuration of the terrain in Isaac Lab's form, as far as terms read it."""
+        config: Any = self._env.config.scene.terrain
+        return SimpleNamespace(terrain_type="generator", terrain_generator=SimpleNamespace(
+            size=tuple(config.patch), num_rows=self._terrain.rows, num_cols=self._terrain.origins.shape[1],
+            curriculum=config.curriculum,
+        ))  # fmt: skip
+
+    @property
+    def terrain_levels(self) -> Tensor:
+        """Level of each environment. (num_envs,) int64"""
+        return self._terrain.levels
+
+    @property
+    def terrain_types(self) -> Tensor:
+        """Column of each environment. (num_envs,) int64"""
+        return self._terrain.types
+
+    @property
+    def terrain_origins(self) -> Tensor:
+        """Start positions by level and column. (rows, columns, 3) [m]"""
+        return self._terrain.origins
+
+    @property
+    def env_origins(self) -> Tensor:
+        """Start position of each environment. (num_envs, 3) [m]"""
+        return self._env.origins
+
+    def update_env_origins(self, env_ids: Any, move_up: Tensor, move_down: Tensor) -> None:
+        """Move environments a level up or down. env_ids are those of the running curriculum term."""
+        from rlcli_isaaclab.runtime import facade_of
+
+        selection = facade_of(self._env).selection
+        self._terrain.move(selection, move_up.bool(), move_down.bool())
+
+
+def camera_or_sensor(sensor: Any) -> Any:
+    """Return the facade of a sensor."""
+    return CameraView(sensor) if getattr(getattr(sensor, "config", None), "kind", "") == "camera" else Sensor(sensor)
+
+
 class Scene(Mapping[str, Any]):
     """Assets and sensors by name."""
 
@@ -185,10 +332,23 @@ class Scene(Mapping[str, Any]):
         self.articulations = {name: Asset(env, entity) for name, entity in env.entities.items()}
         self.rigid_objects = {name: a for name, a in self.articulations.items() if not a.joint_names}
 
+        self._frames: dict[str, FrameTransformer] = {}
+        self.looks: dict[str, Any] = {}
+        """Lights and other assets that only change how a scene looks."""
+
+    def add_frames(self, frames: Mapping[str, Any]) -> None:
+        """Add frame transformers by their settings (`sensor_reader.py`), and lights, which have none."""
+        for name, settings in frames.items():
+            if settings is None:
+                self.looks[name] = SimpleNamespace(prims=[NoEffect(f"the light '{name}'")], body_names=[], joint_names=[])
+                continue
+            self._frames.setdefault(name, FrameTransformer(self.articulations, settings))
+
     @property
     def sensors(self) -> Mapping[str, Any]:
         """Sensors by name."""
-        return {name: Sensor(sensor) for name, sensor in getattr(self._env, "sensors", {}).items()}
+        sensors = getattr(self._env, "sensors", {}).items()
+        return {name: camera_or_sensor(sensor) for name, sensor in sensors} | self._frames
 
     @property
     def num_envs(self) -> int:
@@ -204,7 +364,8 @@ class Scene(Mapping[str, Any]):
     @property
     def terrain(self) -> Any:
         """Terrain, or None."""
-        return getattr(self._env, "terrain", None)
+        terrain = getattr(self._env, "terrain", None)
+        return None if terrain is None else TerrainView(self._env, terrain)
 
     def __getitem__(self, name: str) -> Any:
         if name in self.articulations:
@@ -214,13 +375,15 @@ class Scene(Mapping[str, Any]):
             return sensors[name]
         if name == "terrain" and self.terrain is not None:
             return self.terrain
+        if name in self.looks:
+            return self.looks[name]
         raise KeyError(f"no '{name}' in the scene; entities and sensors: {listing([*self.articulations, *sensors])}")
 
     def __iter__(self) -> Iterator[str]:
-        return iter([*self.articulations, *self.sensors])
+        return iter([*self.articulations, *self.sensors, *self.looks])
 
     def __len__(self) -> int:
-        return len(self.articulations) + len(self.sensors)
+        return len(self.articulations) + len(self.sensors) + len(self.looks)
 
     def resolve(self, cfg: Any) -> None:
         """Resolve the names of a `SceneEntityCfg` to ids.

@@ -5,6 +5,7 @@ Settings of Isaac Sim without a counterpart are accepted and reported; docs/guid
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 from rlcli_isaaclab.config_class import configclass
@@ -22,9 +23,11 @@ class _OpenSettings:
 
     def replace(self, **changes: Any) -> Any:
         """Return a copy with some members changed."""
-        copy = type(self)()
-        vars(copy).update({**vars(self), **changes})
-        return copy
+        copied = copy.deepcopy(self)
+        vars(copied).update(changes)
+        return copied
+
+    copy = replace
 
 
 def _settings_class(name: str, doc: str, **fixed: Any) -> Any:

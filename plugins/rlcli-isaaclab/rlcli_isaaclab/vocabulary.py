@@ -47,9 +47,10 @@ from rlcli_isaaclab.scene_facade import Asset as RigidObject
 from rlcli_isaaclab.scene_facade import Sensor as ContactSensor
 from rlcli_isaaclab.scene_facade import Sensor as RayCaster
 from rlcli_isaaclab.sensors import ContactSensorCfg, RayCasterCfg, patterns
+from rlcli_isaaclab.sensors.patterns import GridPatternCfg
 from rlcli_isaaclab.sim import *  # noqa: F403
 from rlcli_isaaclab.sim import __all__ as _sim
-from rlcli_isaaclab.terrains import TerrainGeneratorCfg, TerrainImporterCfg
+from rlcli_isaaclab.terrains import ROUGH_TERRAINS_CFG, TerrainGeneratorCfg, TerrainImporterCfg
 from rlcli_isaaclab.utils.assets import ISAAC_NUCLEUS_DIR, ISAACLAB_NUCLEUS_DIR
 from rlcli_isaaclab.utils.math import *  # noqa: F403
 from rlcli_isaaclab.utils.math import __all__ as _math
