@@ -64,8 +64,9 @@ def is_alias(name: str) -> bool:
 
 
 def import_by_name(name: str) -> Any:
-    """Import a module by the name that a task file would write."""
-    module, _ = _resolve(name, {})
+    """Import a module by the name that a task file would write. Folders of imported task files come first."""
+    tree = next((module for module, own in _trees.items() if own == name.partition(".")[0] != module), "")
+    module, _ = _resolve(name, {"__name__": tree})
     return importlib.import_module(name) if module is None else module
 
 

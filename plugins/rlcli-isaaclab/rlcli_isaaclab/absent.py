@@ -110,6 +110,10 @@ class AbsentModule(ModuleType):
             raise AttributeError(name)
         if self.__name__.endswith("settings") and name in ("get_settings", "acquire_settings_interface"):
             return _NoSettings
+        if self.__name__ == "pxr" and name == "UsdGeom":
+            from rlcli_isaaclab.usd_stage import UsdGeom
+
+            return UsdGeom
         if name[:1].isupper():
             return absent_class(f"{self.__name__}.{name}")
         if self.__name__ in ("carb", "omni.log") and name.startswith(("log", "info", "warn", "error", "verbose")):

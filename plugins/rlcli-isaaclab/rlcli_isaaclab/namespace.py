@@ -27,6 +27,7 @@ _EXTRA = {
     "isaaclab_assets": ("assets",),
     "isaaclab_tasks": ("mdp", "task_utils"),
     "isaaclab.envs.mdp": ("mdp",),
+    "isaaclab.sim": ("usd_stage",),
 }
 """Module of Isaac Lab -> modules of this package that define further names of it."""
 _TEXTS = ("isaaclab_tasks", "isaaclab_assets")
@@ -66,6 +67,8 @@ def module_of(name: str, file: str) -> ModuleType | None:
             return import_from(folder, inner, run_start=top != "isaaclab_tasks")  # it imports every task
     if top == "toml":
         return None if importlib.util.find_spec(top) else importlib.import_module(f"{_OWN}.toml_reader")
+    if name == "isaacsim.core.utils.stage":
+        return importlib.import_module(f"{_OWN}.usd_stage")
     if name in _SIM:
         return importlib.import_module(f"{_OWN}.{_SIM[name]}")
     if not top.startswith("isaaclab"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any
@@ -10,11 +11,13 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import did_you_mean, listing
+from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem, match
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
 from rlcli_isaaclab.absent import NoEffect
+from rlcli_isaaclab.asset_commands import BodyWrench, JointDrive, PhysxView
+from rlcli_isaaclab.setup_scene import current_setup
 
 _DATA_NAMES = {
     "applied_torque": "applied_effort",
@@ -90,6 +93,18 @@ class Data:
     root_link_pose_w, root_link_vel_w, root_link_state_w = root_pose_w, root_vel_w, root_state_w
 
     @property
+    def body_vel_w(self) -> Tensor:
+        """Linear [m/s] and angular [rad/s] velocities of all bodies, world frame. (num_envs, bodies, 6)"""
+        return torch.cat([self._data.body_lin_vel_w, self._data.body_ang_vel_w], dim=-1)
+
+    @property
+    def body_pose_w(self) -> Tensor:
+        """Positions [m] and quaternions (w, x, y, z) of all bodies, world frame. (num_envs, bodies, 7)"""
+        return torch.cat([self._data.body_pos_w, self._data.body_quat_w], dim=-1)
+
+    body_link_pose_w, body_com_vel_w = body_pose_w, body_vel_w
+
+    @property
     def body_state_w(self) -> Tensor:
         """Poses and velocities of all bodies, world frame. (num_envs, bodies, 13)"""
         d: Any = self._data
@@ -115,14 +130,75 @@ class Data:
 class Asset:
     """A robot or an object."""
 
-    def __init__(self, env: VecEnv, entity: Entity) -> None:
+    def __init__(self, cfg: Any) -> None:
+        current_setup().add(self, cfg)
+
+    @classmethod
+    def of(cls, env: VecEnv, entity: Entity) -> Asset:
+        """Return the asset of an entity."""
+        asset = cls.__new__(cls)
+        asset.cfg = entity.config
+        asset.bind(env, entity)
+        return asset
+
+    cfg: Any
+
+    def bind(self, env: VecEnv, entity: Entity) -> None:
+        """Connect the asset with an entity of the simulation."""
         self._env, self._entity = env, entity
-        self.cfg = entity.config
+        self._drives: dict[str, JointDrive] = {}
+        self._wrench = BodyWrench(env, entity)
         self.data = Data(env, entity)
         self.joint_names, self.body_names = self.data.joint_names, self.data.body_names
         self.num_joints, self.num_bodies = len(self.joint_names), len(self.body_names)
         self.num_instances, self.device = env.num_envs, env.device
         self.is_fixed_base = not entity.is_floating
+        self._ALL_INDICES = torch.arange(env.num_envs, device=env.device)
+        self.root_physx_view = PhysxView(env, entity)
+
+    @property
+    def permanent_wrench_composer(self) -> BodyWrench:
+        """Writer of forces on bodies, which act until they change."""
+        return self._wrench
+
+    instantaneous_wrench_composer = permanent_wrench_composer
+
+    def set_external_force_and_torque(
+        self, forces: Tensor, torques: Tensor, body_ids: Any = None, env_ids: Any = None, **frame: Any
+    ) -> None:
+        """Apply forces [N] and torques [N m] to bodies, in their own frames, until they change. (rows, bodies, 3)"""
+        self._wrench.set_forces_and_torques(forces, torques, body_ids=body_ids, env_ids=env_ids, **frame)
+
+    def apply_wrenches(self) -> None:
+        """Write the forces on bodies for the next physics step."""
+        self._wrench.apply()
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Remove forces on bodies."""
+        self._wrench.reset(env_ids)
+
+    def set_joint_effort_target(self, target: Tensor, joint_ids: Any = None, env_ids: Any = None) -> None:
+        """Set efforts of joints. (rows, joints) [N or N m]"""
+        self._drive("motor").set(target, joint_ids, env_ids)
+
+    def set_joint_position_target(self, target: Tensor, joint_ids: Any = None, env_ids: Any = None) -> None:
+        """Set position targets of joints. (rows, joints) [m or rad]"""
+        self._drive("position").set(target, joint_ids, env_ids)
+
+    def set_joint_velocity_target(self, target: Tensor, joint_ids: Any = None, env_ids: Any = None) -> None:
+        """Set velocity targets of joints. (rows, joints) [m/s or rad/s]"""
+        self._drive("velocity").set(target, joint_ids, env_ids)
+
+    def write_data_to_sim(self) -> None:
+        """Do nothing: targets are written when they are set."""
+
+    def update(self, dt: float) -> None:
+        """Do nothing: data are computed when they are read."""
+
+    def _drive(self, kind: str) -> JointDrive:
+        if kind not in self._drives:
+            self._drives[kind] = JointDrive(self._env, self._entity, kind)
+        return self._drives[kind]
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -158,12 +234,17 @@ class Asset:
 
     def write_root_pose_to_sim(self, root_pose: Tensor, env_ids: Any = None) -> None:
         """Set the root's position [m] and quaternion (w, x, y, z). (rows, 7)"""
+        if not self._entity.is_floating:
+            self._require_same_base(root_pose, env_ids)
+            return
         root, _ = self._entity.floating()
         columns = torch.arange(root, root + 7, device=self._env.device)
         self._write("qpos", columns, root_pose, None, env_ids)
 
     def write_root_velocity_to_sim(self, root_velocity: Tensor, env_ids: Any = None) -> None:
         """Set the root's linear [m/s] and angular [rad/s] velocity, world frame. Set the pose first. (rows, 6)"""
+        if not self._entity.is_floating:
+            return  # a fixed base does not move
         root, dof = self._entity.floating()
         rows = slice(None) if env_ids is None else env_ids
         quat = self._env.engine.field("qpos")[rows, root + 3 : root + 7].float()
@@ -179,6 +260,16 @@ class Asset:
 
     write_root_link_pose_to_sim, write_root_com_velocity_to_sim = write_root_pose_to_sim, write_root_velocity_to_sim
     write_root_link_state_to_sim, write_root_link_velocity_to_sim = write_root_state_to_sim, write_root_velocity_to_sim
+
+    def _require_same_base(self, root_pose: Tensor, env_ids: Any) -> None:
+        """Check that the pose of a fixed base does not change."""
+        rows = slice(None) if env_ids is None else env_ids
+        now = self.data.root_pos_w[rows]
+        if not torch.allclose(root_pose[:, :3], now, atol=1e-4):
+            raise TaskError(
+                f"the base of '{self._entity.name}' is fixed in its MJCF, and the task moves it",
+                hint="add a <freejoint/> to the MJCF, or remove the change of the root's position",
+            )
 
     def _write(self, field: str, columns: Tensor, values: Tensor, joint_ids: Any, env_ids: Any) -> None:
         target = self._env.engine.field(field)
@@ -253,7 +344,13 @@ class FrameTransformer:
 class CameraView:
     """A camera under Isaac Lab's names; `data` is the object itself."""
 
-    def __init__(self, sensor: Any) -> None:
+    def __init__(self, cfg: Any) -> None:
+        current_setup().add(self, cfg)
+
+    cfg: Any
+
+    def bind(self, sensor: Any) -> None:
+        """Connect the camera with a sensor of the simulation."""
         self._sensor, self.data = sensor, self
         self.body_names: list[str] = []
         self.joint_names: list[str] = []
@@ -271,10 +368,14 @@ class CameraView:
         return self._sensor.config.height, self._sensor.config.width
 
 
-class TerrainView:
+class TerrainImporter:
     """The terrain under Isaac Lab's names."""
 
-    def __init__(self, env: VecEnv, terrain: Any) -> None:
+    def __init__(self, cfg: Any) -> None:
+        current_setup().add(self, cfg)
+
+    def bind(self, env: VecEnv, terrain: Any) -> None:
+        """Connect the object with the terrain of the simulation; None: a plane."""
         self._env, self._terrain = env, terrain
 
     def __getattr__(self, name: str) -> Any:
@@ -282,7 +383,7 @@ class TerrainView:
             raise AttributeError(name)
         return getattr(self._terrain, name)
 
-    @property
+    @functools.cached_property
     def cfg(self) -> Any:
         """Configuration of the terrain in Isaac Lab's form, as far as terms read it."""
         config: Any = self._env.config.scene.terrain
@@ -321,7 +422,15 @@ class TerrainView:
 
 def camera_or_sensor(sensor: Any) -> Any:
     """Return the facade of a sensor."""
-    return CameraView(sensor) if getattr(getattr(sensor, "config", None), "kind", "") == "camera" else Sensor(sensor)
+    is_camera = getattr(getattr(sensor, "config", None), "kind", "") == "camera"
+    return _bound(CameraView if is_camera else Sensor, sensor)
+
+
+def _bound(kind: Any, *parts: Any) -> Any:
+    """Return an object of a class that is connected with parts of the simulation."""
+    made = kind.__new__(kind)
+    made.bind(*parts)
+    return made
 
 
 class Scene(Mapping[str, Any]):
@@ -329,7 +438,7 @@ class Scene(Mapping[str, Any]):
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
-        self.articulations = {name: Asset(env, entity) for name, entity in env.entities.items()}
+        self.articulations = {name: Asset.of(env, entity) for name, entity in env.entities.items()}
         self.rigid_objects = {name: a for name, a in self.articulations.items() if not a.joint_names}
 
         self._frames: dict[str, FrameTransformer] = {}
@@ -350,6 +459,16 @@ class Scene(Mapping[str, Any]):
         sensors = getattr(self._env, "sensors", {}).items()
         return {name: camera_or_sensor(sensor) for name, sensor in sensors} | self._frames
 
+    def clone_environments(self, *args: Any, **options: Any) -> None:
+        """Do nothing: every environment has its own simulation."""
+
+    filter_collisions = clone_environments
+
+    @property
+    def cfg(self) -> Any:
+        """Settings of the scene: num_envs and env_spacing."""
+        return self._env.config.scene
+
     @property
     def num_envs(self) -> int:
         """Number of environments."""
@@ -365,7 +484,7 @@ class Scene(Mapping[str, Any]):
     def terrain(self) -> Any:
         """Terrain, or None."""
         terrain = getattr(self._env, "terrain", None)
-        return None if terrain is None else TerrainView(self._env, terrain)
+        return None if terrain is None else _bound(TerrainImporter, self._env, terrain)
 
     def __getitem__(self, name: str) -> Any:
         if name in self.articulations:
@@ -418,7 +537,13 @@ class Sensor:
         "pos_w": "position",
     }
 
-    def __init__(self, sensor: Any) -> None:
+    def __init__(self, cfg: Any) -> None:
+        current_setup().add(self, cfg)
+
+    cfg: Any
+
+    def bind(self, sensor: Any) -> None:
+        """Connect the object with a sensor of the simulation."""
         self._sensor = sensor
         self.data = self
         self.body_names = list(getattr(sensor, "names", []))

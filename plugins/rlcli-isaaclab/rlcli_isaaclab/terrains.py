@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rlcli_isaaclab.config_class import MISSING, configclass, make_config_class
+from rlcli_isaaclab.scene_facade import TerrainImporter
 from rlcli_isaaclab.sim import RigidBodyMaterialCfg
 
 
@@ -34,7 +35,7 @@ class TerrainGeneratorCfg:
 class TerrainImporterCfg:
     """A plane, or the terrain of a generator."""
 
-    class_type: Any = "TerrainImporter"
+    class_type: Any = TerrainImporter
     collision_group: int = -1
     prim_path: str = MISSING
     num_envs: Any = 1

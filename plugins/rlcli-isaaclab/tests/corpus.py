@@ -53,11 +53,9 @@ def run(name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: st
         import torch
 
         from rlcli.config.load import resolve
-        from rlcli.config.python_task import _registered_agents
         from rlcli.envs.make import make_env
         from rlcli.registry import python_task
         from rlcli.registry.task_imports import load_object
-        from rlcli_isaaclab.config_class import to_dict
 
         torch.set_num_threads(1)
         entry = kwargs["env_cfg_entry_point"]
@@ -65,7 +63,7 @@ def run(name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: st
         stage = 1
         if last == "imports":
             return stage, "", facts
-        write(to_dict(value), folder)
+        write(settings_of(value, kwargs), folder)
         os.environ["RLCLI_MODELS"] = str(folder)
         source = python_task(f"{package}:{name}")
         resolved = resolve(source)
@@ -96,6 +94,21 @@ def run(name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: st
         at = f" [{frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno}]" if frames and not problems else ""
         return stage, f"{type(error).__name__}: {text[:600]}{at}", facts
     return stage, "", facts
+
+
+def settings_of(value: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of an environment as nested dicts; for a direct task with the assets that its code creates."""
+    from rlcli_isaaclab.config_class import to_dict
+    from rlcli_isaaclab.direct_env import DirectRLEnvCfg, _environment_class, record
+
+    if not isinstance(value, DirectRLEnvCfg):
+        return to_dict(value)
+    from rlcli_isaaclab.direct_convert import _names
+
+    value.__rlcli_environment__(kwargs["entry_point"])
+    setup, env = record(_environment_class(value), value)
+    made = zip(_names(setup, env), setup.created, strict=True)
+    return {"scene": {name: to_dict(cfg) for name, (_, cfg) in made}, "rest": to_dict(value)}
 
 
 def train(reference: str, folder: Path) -> None:

@@ -20,7 +20,23 @@ FLOATING = (
 )
 SIDES = ("left", "right")
 EXTRA_BODIES = {"spot": ["fl_foot", "fr_foot", "hl_foot", "hr_foot", "body"], "ur10e": ["wrist_3_link"], "panda": ["panda_link0", "panda_hand", "panda_leftfinger", "panda_rightfinger", "panda_link7"]}
-EXTRA_JOINTS: dict[str, list[str]] = {}
+LEGS = [f"{side}_{part}" for part in ("HAA", "HFE", "KFE") for side in ("LF", "LH", "RF", "RH")]
+JOINTS: dict[str, list[str]] = {
+    "anymal": LEGS,
+    "ant_instanceable": [*(f"{p}_{s}_leg" for p in ("front", "back") for s in SIDES), "front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot"],
+    "humanoid_instanceable": [
+        "lower_waist:0", "lower_waist:1", "pelvis",
+        *(f"{s}_{p}" for p in ("upper_arm:0", "upper_arm:2", "lower_arm", "thigh:0", "thigh:1", "thigh:2", "shin", "foot:0", "foot:1") for s in SIDES),
+    ],
+    "panda_instanceable": [*(f"panda_joint{i}" for i in range(1, 8)), "panda_finger_joint1", "panda_finger_joint2"],
+}  # fmt: skip
+"""Part of a path -> all joints of the robot, for tasks whose code needs their number."""
+BODIES: dict[str, list[str]] = {
+    "anymal": ["base", *(f"{side}_{part}" for part in ("HIP", "THIGH", "SHANK", "FOOT") for side in ("LF", "LH", "RF", "RH"))],
+    "cf2x": ["body", "m1_prop", "m2_prop", "m3_prop", "m4_prop"],
+    "sektion_cabinet": ["sektion", "drawer_top", "drawer_handle_top"],
+    "panda_instanceable": [*(f"panda_link{i}" for i in range(8)), "panda_hand", "panda_leftfinger", "panda_rightfinger"],
+}
 
 
 def strings(pattern: str) -> list[str]:
@@ -157,6 +173,11 @@ def collect(data: Any) -> dict[str, dict[str, list[str]]]:
             for parameter in inspect.signature(value).parameters.values():
                 walk(parameter.default)
 
+    for item in data.get("rest", {}).items():
+        for key, kind in (("finger", "body"), ("body_names", "body"), ("joint_names", "joint"), ("dof_name", "joint")):
+            if key in item[0] and isinstance(item[1], str | list) and scene:
+                first = next(iter(scene))
+                add(first, kind, item[1])
     walk({key: value for key, value in data.items() if key != "scene"})
     return found
 
@@ -190,6 +211,8 @@ def mjcf(name: str, path: str, joints: list[str], bodies: list[str], articulated
     drives = "".join(f'<position name="{joint}" joint="{joint}" kp="30" kv="1"/>' for joint in joints if driven)
     motors = f"<actuator>{drives}</actuator>" if driven else ""
     free = "<freejoint/>" if floating else ""
+    if "shadow" in path.lower():
+        motors += f'<tendon><fixed name="tendon"><joint joint="{joints[0]}" coef="1"/><joint joint="{joints[1]}" coef="-1"/></fixed></tendon>'
     return (
         f'<mujoco model="{name}"><compiler angle="radian"/><worldbody><body name="{root}">{free}'
         f'<geom type="box" size=".15 .1 .05" mass="4"/>{inner}{fixed}</body></worldbody>{motors}</mujoco>'
@@ -210,7 +233,12 @@ def write(data: Any, folder: Path) -> None:
         groups = item.get("actuators")
         values = list(groups.values()) if isinstance(groups, Mapping) else []
         driven = any(isinstance(a, Mapping) and a.get("stiffness", 0) is None and "network_file" not in a for a in values)
-        text = mjcf(name, path, names_of(wanted["joint"]), names_of([*wanted["body"], *extra]), bool(item.get("actuators")) or bool(wanted["joint"]), driven)
+        joints, bodies = names_of(wanted["joint"]), names_of([*wanted["body"], *extra])
+        for table, target in ((JOINTS, joints), (BODIES, bodies)):
+            for word, names in table.items():
+                if word in path.lower():
+                    target[:] = names
+        text = mjcf(name, path, joints, bodies, bool(item.get("actuators")) or bool(wanted["joint"]), driven)
         (folder / f"{name}.xml").write_text(text)
         networks = [g for g, a in groups.items() if "network_file" in a] if isinstance(groups, Mapping) else []
         gains = ", ".join(f"{group}: {{stiffness: 40.0, damping: 2.0}}" for group in networks)
