@@ -7,6 +7,8 @@ is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
 
 from __future__ import annotations
 
+import functools
+import logging
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,6 +26,7 @@ from rlcli.registry import TaskSource, import_file, is_framework, load_module, l
 from rlcli.registry.formats import Format, format_of_module, installed_formats, require_module
 from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registrations
 
+_log = logging.getLogger(__name__)
 _OWN = "rlcli.mdp."
 _AGENTS = "agents/*.py"
 
@@ -64,8 +67,7 @@ def load(source: TaskSource) -> PythonTask:
     try:
         value, agents = _import_configuration(source)
         task = to_task(value, source.label, source.root)
-        for name, agent in agents.items():
-            _add_agent(task, name, agent)
+        _add_agents(task, agents)
     except ValidationError as error:
         items = error.errors(include_url=False)
         problems = [Problem(source.label, ".".join(map(str, item["loc"])), item["msg"]) for item in items]
@@ -286,14 +288,48 @@ def _object(entry: object) -> Any:
     return FilePath(str(load_module(module).__file__)).parent / file if module else FilePath(file)
 
 
-def _add_agent(task: PythonTask, name: str, agent: object) -> None:
-    if not (isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__")):
-        what = str(agent) if isinstance(agent, str | FilePath) else type(agent).__name__
-        task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}: write a mapping"))
-        return
-    agents = task.data.setdefault("agents", {})
-    agents.setdefault("default", name)
-    agents[name] = agent_data(agent, task.notes)
+def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
+    """Add agents to a task. The default is the first one in the order of the task's format, or the only one.
+
+    An agent among several that rlcli cannot read is left out, with a note.
+    """
+    order = task.format.spec.agent_order if task.format is not None else ()
+    found: dict[str, Any] = {}
+    for name, agent in agents.items():
+        try:
+            data = _read_agent(task, name, agent)
+        except ConfigError as error:
+            if len(agents) == 1:
+                raise
+            task.notes.append(Note("", f"agents.{name}", "ignored", "; ".join(map(str, error.problems))))
+            continue
+        if data is None:
+            what = str(agent) if isinstance(agent, str | FilePath) else type(agent).__name__
+            task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}: write a mapping"))
+        else:
+            found[name] = data
+    ranked = [name for name in order if name in found]
+    default = ranked[0] if ranked else next(iter(found), None) if len(found) == 1 or not order else None
+    if found:
+        task.data.setdefault("agents", {}).update({"default": default} if default else {}, **found)
+    if default is not None and len(found) > 1 and order:
+        others = listing(name for name in found if name != default)
+        _report_choice(f"agent '{default}'; --agent chooses another one: {others}")
+
+
+def _read_agent(task: PythonTask, name: str, agent: object) -> dict[str, Any] | None:
+    """Return the settings of an agent; None if rlcli cannot read it."""
+    if isinstance(agent, FilePath):
+        read = task.format.spec.agent_file if task.format is not None else ""
+        return task.format.load(read)(agent, name, task.notes) if task.format is not None and read else None
+    if isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__"):
+        return agent_data(agent, task.notes)
+    return None
+
+
+@functools.cache
+def _report_choice(message: str) -> None:
+    _log.info(message)
 
 
 def _location(error: BaseException) -> str:

@@ -24,6 +24,8 @@ SPEC = FormatSpec(
     find="rlcli_isaaclab.format:find",
     importer="rlcli_isaaclab.command:import_run",
     hint="rlcli_isaaclab.import_hints:import_hint",
+    agent_file="rlcli_isaaclab.agent_files:read_agent",
+    agent_order=("rsl-rl", "rl-games", "skrl", "sb3"),
     agents_beside="rlcli_isaaclab.format:agents_beside",
     aliases={"rlcli.isaaclab": "rlcli_isaaclab", **dict.fromkeys(FOREIGN, "rlcli_isaaclab.namespace:module_of")},
 )

@@ -43,8 +43,8 @@ class GivenModels:
 def given_models(root: Path) -> GivenModels:
     """Return what every `models.yaml` of a task gives for entities, or for ends of paths.
 
-    The files are those in the task's folder, in the folders above it that belong to its package, in the current folder,
-    and in the folders of RLCLI_MODELS. Earlier files win.
+    The files are those in the task's folder, in the folders above it that belong to its package, and in the folders of
+    RLCLI_MODELS. Earlier files win.
 
     Raises:
         TaskError: if a file is not a mapping of text, or names a file that does not exist.
@@ -105,9 +105,6 @@ def _folders(root: Path) -> Iterator[tuple[Path, str]]:
     while (folder / "__init__.py").is_file() and (folder.parent / "__init__.py").is_file():
         folder = folder.parent
         yield folder, f"{os.path.relpath(folder, root)}/"
-    here = Path.cwd()
-    if here != root:
-        yield here, f"{here}/"
     for name in os.environ.get(MODELS, "").split(os.pathsep):
         if name:
             yield Path(name).expanduser(), "models:"

@@ -116,7 +116,8 @@ def train(reference: str, folder: Path) -> None:
     from rlcli.cli.app import main
 
     words = ["train", reference, "--num-envs", str(ENVS), "--max-iterations", str(ITERATIONS), "--name", "t"]
-    os.chdir(folder)
+    (folder / "here").mkdir()
+    os.chdir(folder / "here")
     sys.argv = ["rlcli", *words, "--quiet", "--device", "cpu"]
     log = folder / "train.log"
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
