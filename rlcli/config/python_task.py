@@ -7,7 +7,8 @@ is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
 
 from __future__ import annotations
 
-import sys
+import functools
+import logging
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,11 +20,13 @@ from pydantic import BaseModel, ValidationError
 
 from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
-from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, listing
+from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing
 from rlcli.formats import Note
-from rlcli.registry import TaskSource, import_file, is_framework, load_object
+from rlcli.registry import TaskSource, import_file, is_framework, load_module, load_object
 from rlcli.registry.formats import Format, format_of_module, installed_formats, require_module
+from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registrations
 
+_log = logging.getLogger(__name__)
 _OWN = "rlcli.mdp."
 _AGENTS = "agents/*.py"
 
@@ -64,8 +67,7 @@ def load(source: TaskSource) -> PythonTask:
     try:
         value, agents = _import_configuration(source)
         task = to_task(value, source.label, source.root)
-        for name, agent in agents.items():
-            _add_agent(task, name, agent)
+        _add_agents(task, agents)
     except ValidationError as error:
         items = error.errors(include_url=False)
         problems = [Problem(source.label, ".".join(map(str, item["loc"])), item["msg"]) for item in items]
@@ -200,6 +202,9 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         value = getattr(value, part)
     if agents or not hasattr(value, "__rlcli_task__"):
         return value, agents
+    uses = [kwargs for kwargs in registrations.values() if _names(kwargs[CONFIGURATION], module.__name__, attribute)]
+    if uses:
+        return _with_environment(value, uses[0]), _registered_agents(uses[0])
     folder, form = FilePath(file).parent, format_of_module(value.__rlcli_task__.__module__)
     files = sorted(folder.glob(_AGENTS))
     if form is not None and form.spec.agents_beside:
@@ -215,6 +220,8 @@ def _agents_in_modules(modules: Iterable[Any]) -> dict[str, Any]:
         for name, item in vars(module).items()
         if hasattr(item, "__rlcli_agent__") and not is_framework(str(getattr(item, "__module__", "")))
     }
+    inner = {base for item in found.values() if isinstance(item, type) for base in item.__mro__[1:]}
+    found = {name: item for name, item in found.items() if item not in inner} or found
     if len(found) == 1:
         item = next(iter(found.values()))
         return {item.__rlcli_library__: item}
@@ -227,27 +234,44 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     They are the arguments `env_cfg_entry_point` and `AGENT_cfg_entry_point` of the registration.
     """
     module = import_file(source.root / "__init__.py")
-    gymnasium = sys.modules.get("gymnasium")
-    registry = gymnasium.envs.registry if gymnasium is not None else {}
-    found = {
-        name: spec.kwargs
-        for name, spec in registry.items()
-        if _module_of(spec.kwargs.get("env_cfg_entry_point")).startswith(module.__name__)
-    }
     wanted = str(source.python).removeprefix(str(source.root)).removeprefix(":")
+    found = {
+        name: kwargs
+        for name, kwargs in registrations.items()
+        if _module_of(kwargs[CONFIGURATION]).startswith(module.__name__)
+    }
     if wanted and wanted not in found:
-        raise TaskError(f"{source.root} does not register '{wanted}'", hint=f"it registers {listing(found)}")
+        hint = did_you_mean(wanted, found) or f"it registers {listing(found)}"
+        raise TaskError(f"{source.root} does not register '{wanted}'", hint=hint)
     if not wanted and len(found) != 1:
-        hint = f"name one: {' or '.join(f'{source.root}:{name}' for name in found)}" if found else None
-        raise TaskError(f"{source.root} registers {len(found)} tasks with env_cfg_entry_point, expected 1", hint=hint)
+        hint = f"name one: {listing(f'{source.root}:{name}' for name in found)}" if found else None
+        raise TaskError(f"{source.root} registers {len(found)} tasks with {CONFIGURATION}, expected 1", hint=hint)
     kwargs = found[wanted or next(iter(found))]
+    return _with_environment(_object(kwargs[CONFIGURATION]), kwargs), _registered_agents(kwargs)
+
+
+def _with_environment(value: Any, kwargs: Mapping[str, Any]) -> Any:
+    """Return a configuration that knows the environment class of its registration, if its format needs the class."""
+    value = value() if isinstance(value, type) else value
+    if hasattr(value, "__rlcli_environment__"):
+        value.__rlcli_environment__(kwargs[ENVIRONMENT])
+    return value
+
+
+def _registered_agents(kwargs: Mapping[str, Any]) -> dict[str, Any]:
     ending = "_cfg_entry_point"
-    agents = {
+    return {
         key.removesuffix(ending).replace("_", "-"): _object(value)
         for key, value in kwargs.items()
-        if key.endswith(ending) and key != "env_cfg_entry_point"
+        if key.endswith(ending) and key != CONFIGURATION
     }
-    return _object(kwargs["env_cfg_entry_point"]), agents
+
+
+def _names(entry: object, module: str, attribute: str) -> bool:
+    """Return whether the entry of a registration is this object of a module."""
+    if isinstance(entry, str):
+        return entry == f"{module}:{attribute}"
+    return getattr(entry, "__module__", "") == module and getattr(entry, "__qualname__", "") == attribute
 
 
 def _module_of(entry: object) -> str:
@@ -255,20 +279,57 @@ def _module_of(entry: object) -> str:
 
 
 def _object(entry: object) -> Any:
-    """Import the object of a reference `module:name`; return other objects, and names of YAML files, unchanged."""
+    """Import the object of a reference `module:name`; return the path of a file, and other objects unchanged."""
     if not isinstance(entry, str):
         return entry
-    return entry if entry.endswith((".yaml", ".yml")) else load_object(entry)
+    if not entry.endswith((".yaml", ".yml", ".json")):
+        return load_object(entry)
+    module, _, file = entry.rpartition(":")
+    return FilePath(str(load_module(module).__file__)).parent / file if module else FilePath(file)
 
 
-def _add_agent(task: PythonTask, name: str, agent: object) -> None:
-    if isinstance(agent, str) or not (isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__")):
-        what = agent if isinstance(agent, str) else type(agent).__name__
-        task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}: write a mapping"))
-        return
-    agents = task.data.setdefault("agents", {})
-    agents.setdefault("default", name)
-    agents[name] = agent_data(agent, task.notes)
+def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
+    """Add agents to a task. The default is the first one in the order of the task's format, or the only one.
+
+    An agent among several that rlcli cannot read is left out, with a note.
+    """
+    order = task.format.spec.agent_order if task.format is not None else ()
+    found: dict[str, Any] = {}
+    for name, agent in agents.items():
+        try:
+            data = _read_agent(task, name, agent)
+        except ConfigError as error:
+            if len(agents) == 1:
+                raise
+            task.notes.append(Note("", f"agents.{name}", "ignored", "; ".join(map(str, error.problems))))
+            continue
+        if data is None:
+            what = str(agent) if isinstance(agent, str | FilePath) else type(agent).__name__
+            task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}: write a mapping"))
+        else:
+            found[name] = data
+    ranked = [name for name in order if name in found]
+    default = ranked[0] if ranked else next(iter(found), None) if len(found) == 1 or not order else None
+    if found:
+        task.data.setdefault("agents", {}).update({"default": default} if default else {}, **found)
+    if default is not None and len(found) > 1 and order:
+        others = listing(name for name in found if name != default)
+        _report_choice(f"agent '{default}'; --agent chooses another one: {others}")
+
+
+def _read_agent(task: PythonTask, name: str, agent: object) -> dict[str, Any] | None:
+    """Return the settings of an agent; None if rlcli cannot read it."""
+    if isinstance(agent, FilePath):
+        read = task.format.spec.agent_file if task.format is not None else ""
+        return task.format.load(read)(agent, name, task.notes) if task.format is not None and read else None
+    if isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__"):
+        return agent_data(agent, task.notes)
+    return None
+
+
+@functools.cache
+def _report_choice(message: str) -> None:
+    _log.info(message)
 
 
 def _location(error: BaseException) -> str:

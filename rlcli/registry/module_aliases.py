@@ -64,8 +64,9 @@ def is_alias(name: str) -> bool:
 
 
 def import_by_name(name: str) -> Any:
-    """Import a module by the name that a task file would write."""
-    module, _ = _resolve(name, {})
+    """Import a module by the name that a task file would write. Folders of imported task files come first."""
+    tree = next((module for module, own in _trees.items() if own == name.partition(".")[0] != module), "")
+    module, _ = _resolve(name, {"__name__": tree})
     return importlib.import_module(name) if module is None else module
 
 
@@ -146,9 +147,7 @@ def _alias_module(form: Format, name: str, file: str, below_top: bool = False) -
 @functools.cache
 def _formats_for(first: str, file: str) -> tuple[Format, ...]:
     """Return the formats with an alias below a name; first those whose other aliases the importing file mentions."""
-    forms = [
-        form for form in aliasing_formats() if any(alias.partition(".")[0] == first for alias in form.spec.aliases)
-    ]
+    forms = [form for form in aliasing_formats() if any(alias.partition(".")[0] == first for alias in form.spec.aliases)]
     if len(forms) < 2 or not file.endswith(".py"):
         return tuple(forms)
     text = Path(file).read_text(encoding="utf-8", errors="replace")

@@ -166,12 +166,14 @@ def _siblings_importable(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _registrations_kept() -> Iterator[None]:
-    """Move what task files register with Gymnasium to `registrations`, so that `gymnasium.make` does not find it."""
+    """Copy what task files register with Gymnasium to `registrations`."""
     try:
         yield
     finally:
         gymnasium = sys.modules.get("gymnasium")
         registry = gymnasium.envs.registry if gymnasium is not None else {}
         for name in [name for name, spec in registry.items() if CONFIGURATION in spec.kwargs]:
-            spec = registry.pop(name)
+            spec = registry[name]
             registrations[name] = {**spec.kwargs, ENVIRONMENT: spec.entry_point}
+            if isinstance(spec.entry_point, str) and is_alias(spec.entry_point.partition(".")[0]):
+                del registry[name]  # no module has the name for `gymnasium.make`

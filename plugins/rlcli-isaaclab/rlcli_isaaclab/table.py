@@ -39,6 +39,10 @@ def _xyz(value: Mapping[str, Any]) -> dict[str, Any]:
     return {axis: value[axis] for axis in ("x", "y", "z") if axis in value}
 
 
+def _nothing(value: Any) -> dict[str, Any]:
+    return {}
+
+
 def _names(value: Any) -> dict[str, Any]:
     return {"terms": [value] if isinstance(value, str) else list(value)}
 
@@ -54,6 +58,7 @@ _TARGET: dict[str, str | Translate] = {"target_pos": "target"}
 
 TERMS: dict[str, dict[str, Entry]] = {
     "observations": {
+        "image": Entry(params=dict.fromkeys(("data_type", "convert_perspective_to_orthogonal", "permute"), _nothing)),
         "base_heading_proj": Entry(params=_TARGET),
         "base_angle_to_target": Entry(params=_TARGET),
         "fingertips_pos": Entry("ee_pos"),

@@ -65,7 +65,7 @@ class ManagerBasedRLEnvCfg(ManagerBasedEnvCfg):
         from rlcli_isaaclab.settings import Report
 
         report = Report()
-        data = task(to_dict(self), report, root)
+        data = task(to_dict(self), report, root, cfg=self)
         return PythonTask(data, notes=report.user_notes())
 
 
