@@ -21,6 +21,7 @@ from typing import Any
 
 from rlcli.registry.formats import Format, aliasing_formats
 
+_MOST_FILES = 200
 _python_import = builtins.__import__
 _trees: dict[str, str] = {}
 """Module name of an imported package or folder -> name under which its own files import it."""
@@ -146,13 +147,30 @@ def _alias_module(form: Format, name: str, file: str, below_top: bool = False) -
 
 @functools.cache
 def _formats_for(first: str, file: str) -> tuple[Format, ...]:
-    """Return the formats with an alias below a name; first those whose other aliases the importing file mentions."""
-    forms = [form for form in aliasing_formats() if any(alias.partition(".")[0] == first for alias in form.spec.aliases)]
+    """Return the formats with an alias below a name; first the one whose other aliases the importing file mentions.
+
+    If the file mentions none, the other files of its task decide.
+    """
+    forms = [
+        form for form in aliasing_formats() if any(alias.partition(".")[0] == first for alias in form.spec.aliases)
+    ]
     if len(forms) < 2 or not file.endswith(".py"):
         return tuple(forms)
-    text = Path(file).read_text(encoding="utf-8", errors="replace")
     shared = set.intersection(*(set(form.spec.aliases) for form in forms))
-    return tuple(sorted(forms, key=lambda form: -sum(text.count(alias) for alias in set(form.spec.aliases) - shared)))
+    own = {form.name: tuple(set(form.spec.aliases) - shared) for form in forms}
+    counts = {name: _mentions(file, aliases) for name, aliases in own.items()}
+    if len(set(counts.values())) == 1:
+        root = next((root for root in _roots if Path(file).is_relative_to(root)), Path(file).parent)
+        files = sorted(root.rglob("*.py"))[:_MOST_FILES]
+        counts = {name: sum(_mentions(str(path), aliases) for path in files) for name, aliases in own.items()}
+    return tuple(sorted(forms, key=lambda form: -counts[form.name]))
+
+
+@functools.cache
+def _mentions(file: str, aliases: tuple[str, ...]) -> int:
+    """Return how often a file mentions one of the names."""
+    text = Path(file).read_text(encoding="utf-8", errors="replace")
+    return sum(text.count(alias) for alias in aliases)
 
 
 _FINDER = _TaskFinder()

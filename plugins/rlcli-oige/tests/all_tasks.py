@@ -114,7 +114,9 @@ def table(rows: list[dict[str, object]], checkout: Path) -> str:
         "|---|---|---|---|---|---|",
     ]
     for row in rows:
-        text = str(row["reason"]).replace(f"{checkout}/", "") or ", ".join(f"`{part}`" for part in row["lost"])  # type: ignore[attr-defined]
+        text = str(row["reason"]).replace(f"{checkout}/omniisaacgymenvs/", "") or ", ".join(
+            f"`{part}`" for part in row["lost"]
+        )  # type: ignore[attr-defined]
         cells = [str(row["task"]), *(yes[bool(row[key])] for key in ("validates", "builds", "steps", "trains")), text]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
