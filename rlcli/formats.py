@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rlcli.task import API_VERSION
@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from rlcli.config.layers import Origin
 
 _log = logging.getLogger(__name__)
-
-MODELS = "models"
-"""First key of the overrides that `--model` becomes."""
 
 Status = Literal["mapped", "approximated", "ignored", "task", "default", "to do"]
 """mapped, approximated, ignored: translated exactly, translated with a difference, not translated; task: read by the
@@ -47,8 +44,8 @@ class FormatSpec:
         agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration.
         models: the key of a task's data where `--model NAME=FILE` sets a model, with `{name}`; empty: task files in
             this format name their models themselves.
-        agent_file: `(file: Path, library: str, notes: list[Note]) -> dict | None`. Return the settings of an agent that a
-            registration names by a file; None if the format does not read the library's files.
+        agent_file: `(file: Path, library: str, notes: list[Note]) -> dict | None`. Return the settings of an agent that
+            a registration names by a file; None if the format does not read the library's files.
         agent_order: libraries of agents, best first; the first one that a registration names is the default agent.
         aliases: module name -> module, or -> `module:function`. Imports of the first name, and of names below it, in
             files of a task resolve to the second. `function(name, file)` returns the module of a full name for the
@@ -90,8 +87,8 @@ class Translation:
 class Imported:
     """Result of an importer: the files that it wrote, and one note for each key of the source."""
 
-    folder: FilePath
-    files: list[FilePath]
+    folder: Path
+    files: list[Path]
     notes: list[Note]
     messages: list[str] = field(default_factory=list)
     """What the user still has to do."""
@@ -113,32 +110,6 @@ class Note:
         where = f"{self.where}: " if self.where else ""
         text = f": {self.text}" if self.text else ""
         return f"{where}{self.key}: {status}{text}"
-
-
-def read_models(words: Iterable[str]) -> dict[str, FilePath]:
-    """Return the MJCF file of each robot or object: of `NAME=FILE`, or of a YAML file `{NAME: FILE}`.
-
-    The paths in a YAML file are relative to that file.
-
-    Raises:
-        ConfigError: if a YAML file cannot be read, or is not such a mapping.
-        UsageError: if a model file does not exist.
-    """
-    from rlcli.config.layers import read
-    from rlcli.errors import UsageError
-
-    found: dict[str, FilePath] = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        entries = {name: FilePath(value)} if equals else {}
-        if not equals:
-            entries = {key: FilePath(word).parent / str(file) for key, file in read(FilePath(word)).data.items()}
-        for key, file in entries.items():
-            if not key or not file.is_file():
-                hint = "write --model NAME=FILE.xml, or --model FILE.yaml with a mapping {NAME: FILE.xml}"
-                raise UsageError(f"--model {word}: there is no file '{file}'", hint=hint)
-            found[key] = file.resolve()
-    return found
 
 
 def summary(notes: Iterable[Note]) -> list[str]:

@@ -12,12 +12,13 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, python_task
 from rlcli.config.foreign_keys import move_foreign_keys
+from rlcli.config.given_models import MODELS
 from rlcli.config.layers import Layers, Origin, document_origins, parse_override, read
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, Vocabulary, params_model, read_params
 from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing
-from rlcli.formats import MODELS, Note
+from rlcli.formats import Note
 from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, formats, load_entry
 from rlcli.registry.imports import load_spec
 from rlcli.trainers import TrainerSpec

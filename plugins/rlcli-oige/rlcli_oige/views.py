@@ -166,7 +166,7 @@ class XFormPrimView(Counterpart):
                     self._write("qpos", rows, slice(entity.root_qpos + start, entity.root_qpos + start + size), new)
 
     def get_velocities(self, indices: Any = None, clone: bool = True) -> Tensor:
-        """Return velocities of the centres of mass (as PhysX) and angular velocities, world frame. (n, 6) [m/s, rad/s]"""
+        """Return velocities of the centres of mass (as PhysX) and angular ones, world frame. (n, 6) [m/s, rad/s]"""
         found = []
         for entity, body, root in zip(self._entities, self._bodies, self._roots, strict=True):
             if root and entity.root_dof is not None and entity.root_qpos is not None:

@@ -60,9 +60,9 @@ def step(name: str, config: str, models: list[str]) -> None:
 
     import torch
 
+    from rlcli.config.given_models import MODELS, read_models
     from rlcli.config.load import resolve
     from rlcli.envs.make import make_env
-    from rlcli.formats import MODELS, read_models
     from rlcli.registry import task_source
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")

@@ -14,7 +14,6 @@ from rlcli.cli.ui.completion import agents, checkpoints, runs, tasks, words
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.help_text import HelpCommand, read_docstring
 from rlcli.errors import MachineError, UsageError
-from rlcli.formats import MODELS, read_models
 
 CHOOSE = "auto"
 """Value of an option that is given without its value (`--video`)."""
@@ -123,6 +122,8 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
     @functools.wraps(function)
     def run(*, model: list[str] | None = None, **values: Any) -> None:
         if model:
+            from rlcli.config.given_models import MODELS, read_models
+
             words = [f'{MODELS}."{name}"="{file}"' for name, file in read_models(model).items()]
             values["overrides"] = [*(values["overrides"] or []), *words]
         function(**{option: value for option, value in values.items() if option not in _COMMON})
