@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, python_task
 from rlcli.config.foreign_keys import move_foreign_keys
-from rlcli.config.given_models import MODELS
+from rlcli.config.given_models import MODELS, model_path
 from rlcli.config.layers import Layers, Origin, document_origins, parse_override, read
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
@@ -206,13 +206,12 @@ class TaskCheck:
                     self._no_agent(origin.where)
                     continue
                 path = ("agents", name, *path[1:])
-            if path[0] == MODELS and len(path) == 2:
-                form = formats.format_of_key(self.layers.data)
-                if form is None or not form.spec.models:
-                    hint = f"set scene.entities.{path[1]}.model"
-                    self.problems.append(Problem(f"--model {path[1]}", "", "this task names its models itself", hint))
+            if path[0] == MODELS:
+                try:
+                    path = model_path(path, formats.format_of_key(self.layers.data))
+                except ConfigError as error:
+                    self.problems += error.problems
                     continue
-                path = tuple(path[1] if key == "{name}" else key for key in form.spec.models.split("."))
             if value is None and path[0] in SECTIONS and not isinstance(self.layers.get(path), dict):
                 # null removes a term; for a term that does not exist, suggest one with a similar name
                 similar = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))
