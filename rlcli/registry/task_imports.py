@@ -173,7 +173,4 @@ def _registrations_kept() -> Iterator[None]:
         gymnasium = sys.modules.get("gymnasium")
         registry = gymnasium.envs.registry if gymnasium is not None else {}
         for name in [name for name, spec in registry.items() if CONFIGURATION in spec.kwargs]:
-            spec = registry[name]
-            registrations[name] = {**spec.kwargs, ENVIRONMENT: spec.entry_point}
-            if isinstance(spec.entry_point, str) and is_alias(spec.entry_point.partition(".")[0]):
-                del registry[name]  # no module has the name for `gymnasium.make`
+            registrations[name] = {**registry[name].kwargs, ENVIRONMENT: registry[name].entry_point}

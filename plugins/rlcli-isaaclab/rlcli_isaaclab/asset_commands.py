@@ -11,6 +11,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.actuators import JointCommand
 from rlcli.scene.entity import Entity
+from rlcli.scene.jacobian import Jacobian
 from rlcli.sim.rotations import rotate
 
 
@@ -83,6 +84,7 @@ class PhysxView:
 
     def __init__(self, env: VecEnv, entity: Entity) -> None:
         self._env, self._entity = env, entity
+        self._jacobians: list[Jacobian] | None = None
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -103,6 +105,20 @@ class PhysxView:
         """Return position limits of the joints. (num_envs, joints, 2) [m or rad]"""
         limits = self._entity.data.joint_pos_limits
         return limits.expand(self._env.num_envs, *limits.shape[-2:]).clone()
+
+    def get_jacobians(self) -> Tensor:
+        """Return the Jacobians of the bodies' origins, world frame: without the first body, which is fixed.
+
+        (num_envs, bodies - 1, 6, joints), linear before angular
+        """
+        if self._entity.is_floating:
+            raise TaskError("root_physx_view.get_jacobians cannot be used for a floating base", hint="fix the base")
+        count = len(self._entity.names["Bodies"])
+        if self._jacobians is None:
+            columns = list(range(len(self._entity.joint_names)))
+            self._jacobians = [Jacobian(self._entity, columns, body) for body in range(1, count)]
+        positions = self._entity.data.body_pos_w
+        return torch.stack([jacobian(positions[:, i + 1]) for i, jacobian in enumerate(self._jacobians)], dim=1)
 
     def get_link_incoming_joint_force(self) -> Tensor:
         """Return force and torque of each body's parent on the body, body frame. (num_envs, bodies, 6) [N, N m]"""

@@ -182,7 +182,7 @@ def main_() -> None:
             if number % parts != part or options.kind == ("manager" if direct else "direct"):
                 continue
             package = source / "isaaclab_tasks" / "isaaclab_tasks"
-            stage, reason, facts = isolated(240, run, name, found[name], package, Path(folder) / name, options.stage)
+            stage, reason, facts = isolated(900, run, name, found[name], package, Path(folder) / name, options.stage)
             with_agent = any(key.endswith("_cfg_entry_point") and key not in ("env_cfg_entry_point",) and "robomimic" not in key for key in found[name])
             rows[name] = {"direct": direct, "stage": stage, "reason": reason, "agent": with_agent, **facts}
             print(f"{stage} {name}: {reason[:400]}", flush=True)

@@ -34,7 +34,7 @@ JOINTS: dict[str, list[str]] = {
 BODIES: dict[str, list[str]] = {
     "anymal": ["base", *(f"{side}_{part}" for part in ("HIP", "THIGH", "SHANK", "FOOT") for side in ("LF", "LH", "RF", "RH"))],
     "cf2x": ["body", "m1_prop", "m2_prop", "m3_prop", "m4_prop"],
-    "sektion_cabinet": ["sektion", "drawer_top", "drawer_handle_top"],
+    "sektion_cabinet": ["sektion", "drawer_top", "drawer_handle_top", "drawer_bottom", "drawer_handle_bottom"],
     "panda_instanceable": [*(f"panda_link{i}" for i in range(8)), "panda_hand", "panda_leftfinger", "panda_rightfinger"],
 }
 
@@ -132,6 +132,9 @@ def collect(data: Any) -> dict[str, dict[str, list[str]]]:
             return prims[last]
         return None
 
+    for item in scene.values():
+        if "data_types" in item:
+            add_prim(str(item["prim_path"]).rpartition("/")[0])
     for name, item in scene.items():
         if any(key in item for key in ("pattern_cfg", "target_frames", "track_air_time")):
             entity = add_prim(item["prim_path"])
