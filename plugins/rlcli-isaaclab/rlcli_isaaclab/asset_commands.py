@@ -22,24 +22,33 @@ class JointDrive:
         count = len(entity.joint_names)
         modelled = {joint for actuator in entity.actuators for joint in actuator.joints}
         self._columns = [c for c in range(count) if c in modelled or c in dict(entity.actuators_of(kind))]
-        if not self._columns:
-            raise TaskError(
-                f"no joint of '{entity.name}' has a {kind} actuator, but the task sets its target",
-                hint="add actuators to the MJCF, or gains to the ArticulationCfg",
-            )
-        self._command = JointCommand(entity, kind, self._columns)
+        self._undriven = [c for c in range(count) if c not in self._columns] if kind != "position" else []
+        self._name, self._kind, self._joints = entity.name, kind, list(entity.joint_names)
+        self._command = JointCommand(entity, kind, self._columns) if self._columns else None
         self.target = torch.zeros(env.num_envs, count, device=env.device)
         if kind == "position":
             self.target.copy_(entity.data.default_joint_pos)
 
     def set(self, target: Tensor, joint_ids: Any, env_ids: Any) -> None:
-        """Set targets of joints. Joints without gains ignore them."""
+        """Set targets of joints. Joints without gains ignore position targets; other targets must be 0 there.
+
+        Raises:
+            TaskError: for a target that nothing drives.
+        """
         rows = slice(None) if env_ids is None else torch.as_tensor(env_ids)[:, None]
         if joint_ids is None:
             self.target[rows if env_ids is None else rows[:, 0]] = target
         else:
             self.target[rows, joint_ids] = target
-        self._command.write(self.target[:, self._columns])
+        if self._undriven and bool(self.target[:, self._undriven].any()):
+            wrong = self.target[:, self._undriven].any(dim=0).nonzero()[:, 0].tolist()
+            raise TaskError(
+                f"the task sets a {self._kind} target of joints of '{self._name}' without such an actuator:"
+                f" {listing(self._joints[self._undriven[i]] for i in wrong)}",
+                hint="add actuators of this kind to the MJCF",
+            )
+        if self._command is not None:
+            self._command.write(self.target[:, self._columns])
 
 
 class BodyWrench:

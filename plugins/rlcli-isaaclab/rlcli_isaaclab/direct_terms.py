@@ -86,7 +86,9 @@ class DirectRunner:
         self.lab._pre_physics_step(self.action_noise(action.clone()))
 
     def compute_dones(self) -> None:
-        """Call `_get_dones`."""
+        """Call `_get_dones`. Managers also compute a first value before the first reset: the hooks are not called then."""
+        if self.phase == "build":
+            return
         lab = self.lab
         terminated, time_outs = lab._get_dones()
         lab.reset_terminated[:], lab.reset_time_outs[:] = terminated, time_outs

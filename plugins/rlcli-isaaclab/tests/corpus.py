@@ -46,7 +46,7 @@ def is_direct(entry: Any) -> bool:
     return "ManagerBasedRLEnv" not in str(entry)
 
 
-def run(name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: str) -> tuple[int, str, dict[str, Any]]:
+def run(name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: str, steps: int) -> tuple[int, str, dict[str, Any]]:
     """Return the number of stages that a task passes, the reason why it stops, and facts about it."""
     stage, facts = 0, {}
     try:
@@ -75,7 +75,7 @@ def run(name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: st
         env = make_env(resolved.with_num_envs(ENVS), seed=1)
         env.reset()
         generator = torch.Generator().manual_seed(0)
-        for _ in range(STEPS):
+        for _ in range(steps):
             result = env.step(torch.rand(ENVS, env.layout.action_size, generator=generator) * 2 - 1)
             assert bool(result.reward.isfinite().all())
         facts["diverged"] = env.causes
@@ -165,6 +165,7 @@ def main_() -> None:
     parser.add_argument("--kind", choices=("manager", "direct", "all"), default="all")
     parser.add_argument("--stage", choices=STAGES, default="trains")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--steps", type=int, default=STEPS, help="steps of the stage `steps`")
     parser.add_argument("--part", default="0/1", help="i/n: every n-th task")
     options = parser.parse_args()
     source = Path(os.environ[SOURCE])
@@ -182,7 +183,7 @@ def main_() -> None:
             if number % parts != part or options.kind == ("manager" if direct else "direct"):
                 continue
             package = source / "isaaclab_tasks" / "isaaclab_tasks"
-            stage, reason, facts = isolated(900, run, name, found[name], package, Path(folder) / name, options.stage)
+            stage, reason, facts = isolated(900, run, name, found[name], package, Path(folder) / name, options.stage, options.steps)
             with_agent = any(key.endswith("_cfg_entry_point") and key not in ("env_cfg_entry_point",) and "robomimic" not in key for key in found[name])
             rows[name] = {"direct": direct, "stage": stage, "reason": reason, "agent": with_agent, **facts}
             print(f"{stage} {name}: {reason[:400]}", flush=True)
