@@ -328,7 +328,7 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
         else:
             found[name] = data
     ranked = [name for name in order if name in found]
-    default = ranked[0] if ranked else next(iter(found), None) if len(found) == 1 or not order else None
+    default = next(iter(ranked or (found if len(found) == 1 or not order else ())), None)
     if found:
         task.data.setdefault("agents", {}).update({"default": default} if default else {}, **found)
     if default is not None and len(found) > 1 and order:

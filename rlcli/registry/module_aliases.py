@@ -156,7 +156,9 @@ def _alias_module(form: Format, name: str, file: str) -> Any:
 @functools.cache
 def _formats_for(first: str, file: str) -> tuple[Format, ...]:
     """Return the formats with an alias below a name; first those whose other aliases the importing file mentions."""
-    forms = [form for form in aliasing_formats() if any(alias.partition(".")[0] == first for alias in form.spec.aliases)]
+    forms = [
+        form for form in aliasing_formats() if any(alias.partition(".")[0] == first for alias in form.spec.aliases)
+    ]
     if len(forms) < 2 or not file.endswith(".py"):
         return tuple(forms)
     text = Path(file).read_text(encoding="utf-8", errors="replace")

@@ -48,7 +48,8 @@ def load_module(name: str) -> Any:
         alias = f"rlcli_folder_task_{digest}_{file.stem}"
         if alias not in sys.modules:
             spec = importlib.util.spec_from_file_location(alias, file, loader=TaskFileLoader(alias, str(file)))
-            assert spec is not None and spec.loader is not None
+            assert spec is not None
+            assert spec.loader is not None
             module = importlib.util.module_from_spec(spec)
             sys.modules[alias] = module
             try:

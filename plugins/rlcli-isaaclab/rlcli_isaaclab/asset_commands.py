@@ -35,11 +35,13 @@ class JointDrive:
         Raises:
             TaskError: for a target that nothing drives.
         """
-        rows = slice(None) if env_ids is None else torch.as_tensor(env_ids)[:, None]
+        rows = torch.arange(len(self.target)) if env_ids is None else torch.as_tensor(env_ids)
         if joint_ids is None:
-            self.target[rows if env_ids is None else rows[:, 0]] = target
-        else:
+            self.target[rows] = target
+        elif isinstance(joint_ids, slice):
             self.target[rows, joint_ids] = target
+        else:
+            self.target[rows[:, None], torch.as_tensor(joint_ids)] = target
         if self._undriven and bool(self.target[:, self._undriven].any()):
             wrong = self.target[:, self._undriven].any(dim=0).nonzero()[:, 0].tolist()
             raise TaskError(
@@ -59,7 +61,14 @@ class BodyWrench:
         self._local: Tensor | None = None
 
     def set_forces_and_torques(
-        self, forces: Any = None, torques: Any = None, *, body_ids: Any = None, env_ids: Any = None, is_global: bool = False, **other: Any
+        self,
+        forces: Any = None,
+        torques: Any = None,
+        *,
+        body_ids: Any = None,
+        env_ids: Any = None,
+        is_global: bool = False,
+        **other: Any,
     ) -> None:
         """Replace forces [N] and torques [N m]. (rows, bodies, 3) each"""
         count = len(self._entity.names["Bodies"])

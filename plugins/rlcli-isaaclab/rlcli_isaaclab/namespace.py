@@ -35,7 +35,8 @@ _TEXTS = ("isaaclab_tasks", "isaaclab_assets")
 _LIBRARIES = ("toml", "torchvision", "trimesh")
 """Libraries that come with Isaac Lab: an installed one is imported, a missing one raises an error when it is used."""
 _SIM = {"isaacsim.core.utils.torch": "isaacsim_torch", "isaacsim.core.utils.torch.rotations": "isaacsim_torch",
-        "isaacsim.core.utils.torch.maths": "isaacsim_torch", "isaacsim.core.utils.torch.transformations": "isaacsim_torch"}  # fmt: skip
+        "isaacsim.core.utils.torch.maths": "isaacsim_torch",
+    "isaacsim.core.utils.torch.transformations": "isaacsim_torch"}  # fmt: skip
 """Module of Isaac Sim -> module of this package with its functions."""
 
 
@@ -53,7 +54,7 @@ class LabModule(ModuleType):
 
 
 SOURCE = "RLCLI_ISAACLAB"
-"""Environment variable with the folder `source` of Isaac Lab, for the text of `isaaclab_tasks` and `isaaclab_assets`."""
+"""Environment variable with Isaac Lab's folder `source`, for the files of `isaaclab_tasks` and `isaaclab_assets`."""
 
 
 def module_of(name: str, file: str) -> ModuleType | None:
@@ -109,7 +110,9 @@ def _lab_module(name: str) -> LabModule:
 def _member(module: str, name: str) -> Any:
     path = f"{module}.{name}"
     if path not in _packages() and name not in _definitions():  # a package that its parent imports from further below
-        below = (found for found in sorted(_packages()) if found.startswith(f"{module}.") and found.endswith(f".{name}"))
+        below = (
+            found for found in sorted(_packages()) if found.startswith(f"{module}.") and found.endswith(f".{name}")
+        )
         path = next(below, path)
     for candidate in _homes(module):
         value = getattr(candidate, name, None)
@@ -208,7 +211,7 @@ def _packages() -> frozenset[str]:
 
 @functools.cache
 def _definitions() -> dict[str, tuple[str, Any]]:
-    """Return name -> module that defines it, and its kind. Names of isaaclab itself win over those of other packages."""
+    """Return name -> module that defines it, and its kind. Names of isaaclab itself win over others."""
     found: dict[str, tuple[str, Any]] = {}
     for module, names in sorted(_table().items(), key=lambda item: item[0].split(".")[0] != "isaaclab"):
         for name, kind in names.items():

@@ -1,3 +1,4 @@
+# ruff: noqa: E501
 """Task files of Isaac Lab run without a changed line: imports, models beside the files, agents, and direct tasks."""
 
 import os
@@ -19,7 +20,9 @@ from rlcli.registry import find_task
 
 def original(text):
     """Return a file as it is in Isaac Lab."""
-    text = text.replace("rlcli_isaaclab.rsl_rl", "isaaclab_rl.rsl_rl").replace("from rlcli_isaaclab import mdp", "import isaaclab.envs.mdp as mdp")
+    text = text.replace("rlcli_isaaclab.rsl_rl", "isaaclab_rl.rsl_rl").replace(
+        "from rlcli_isaaclab import mdp", "import isaaclab.envs.mdp as mdp"
+    )
     return text.replace("rlcli_isaaclab", "isaaclab")
 
 
@@ -204,8 +207,14 @@ def test_mapping_file_with_a_file_that_does_not_exist(direct):
 
 def test_actuator_network_needs_gains_of_the_mapping_file(direct):
     network = 'ActuatorNetLSTMCfg(joint_names_expr=["slider_to_cart"], network_file="net.jit", saturation_effort=9.0, velocity_limit=3.0, effort_limit=8.0)'
-    text = DIRECT.replace('ImplicitActuatorCfg(joint_names_expr=["slider_to_cart"], stiffness=0.0, damping=0.0)', network)
-    direct.write_text(text.replace("import ImplicitActuatorCfg", "import ActuatorNetLSTMCfg").replace("effort_target", "position_target"))
+    text = DIRECT.replace(
+        'ImplicitActuatorCfg(joint_names_expr=["slider_to_cart"], stiffness=0.0, damping=0.0)', network
+    )
+    direct.write_text(
+        text.replace("import ImplicitActuatorCfg", "import ActuatorNetLSTMCfg").replace(
+            "effort_target", "position_target"
+        )
+    )
     with pytest.raises(ConfigError) as caught:
         resolve(find_task(f"{direct}:PoleEnvCfg"))
     assert "gains: {cart: {stiffness: S, damping: D}}" in caught.value.problems[0].hint
@@ -288,7 +297,10 @@ def test_several_runners_beside_a_file_need_a_choice(unchanged):
     runner.write_text(inner.read_text())
     inner.unlink()
     name = next(line for line in runner.read_text().splitlines() if line.startswith("class ")).split("(")[0].split()[1]
-    text = runner.read_text() + f"\n\n@configclass\nclass Other(RslRlOnPolicyRunnerCfg):\n    policy = {name}().policy\n    algorithm = {name}().algorithm\n    num_steps_per_env = 8\n    max_iterations = 2\n    save_interval = 2\n    experiment_name = 'x'\n"
+    text = (
+        runner.read_text()
+        + f"\n\n@configclass\nclass Other(RslRlOnPolicyRunnerCfg):\n    policy = {name}().policy\n    algorithm = {name}().algorithm\n    num_steps_per_env = 8\n    max_iterations = 2\n    save_interval = 2\n    experiment_name = 'x'\n"
+    )
     runner.write_text(text)
     file = next(unchanged.glob("*env_cfg.py"))
     resolved = resolve(find_task(f"{file}:CartpoleEnvCfg"))
