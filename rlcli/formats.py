@@ -44,8 +44,8 @@ class FormatSpec:
         agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration.
         models: the key of a task's data where `--model NAME=FILE` sets a model, with `{name}`; empty: task files in
             this format name their models themselves.
-        agent_file: `(file: Path, library: str, notes: list[Note]) -> dict | None`. Return the settings of an agent that
-            a registration names by a file; None if the format does not read the library's files.
+        agent_file: `(file: Path, library: str, notes: list[Note]) -> dict | None`. Return the settings of an agent
+            that a registration names by a file; None if the format does not read the library's files.
         agent_order: libraries of agents, best first; the first one that a registration names is the default agent.
         aliases: module name -> module, or -> `module:function`. Imports of the first name, and of names below it, in
             files of a task resolve to the second. `function(name, file)` returns the module of a full name for the

@@ -8,6 +8,7 @@ is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
 from __future__ import annotations
 
 import functools
+import inspect
 import logging
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,6 +41,8 @@ class PythonTask:
     notes: list[Note] = field(default_factory=list)
     format: Format | None = None
     """The other framework's format to whose classes the configuration belongs; None: rlcli's own."""
+    place: str = ""
+    """File and line of the configuration's class; empty if unknown."""
 
 
 def source_of(value: object, root: FilePath | None = None, name: str = "task") -> TaskSource:
@@ -64,16 +67,19 @@ def load(source: TaskSource) -> PythonTask:
     if source.value is not None:
         return to_task(source.value, source.label, source.root)
     assert source.python is not None
+    place = ""
     try:
         value, agents = _import_configuration(source)
+        place = _place_of(value)
         task = to_task(value, source.label, source.root)
+        task.place = place
         _add_agents(task, agents)
     except ValidationError as error:
         items = error.errors(include_url=False)
         problems = [Problem(source.label, ".".join(map(str, item["loc"])), item["msg"]) for item in items]
         raise ConfigError(problems) from None
     except ConfigError as error:
-        label = source.label
+        label = place or source.label
         problems = [replace(p, where=label) if p.where == "configuration" else p for p in error.problems]
         raise ConfigError(problems) from None
     except RlcliError:
@@ -119,6 +125,19 @@ def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
     if not isinstance(plain, dict):
         raise TypeError(f"the agent is of type {type(value).__name__}; write a mapping of settings")
     return plain
+
+
+def _place_of(value: object) -> str:
+    """Return `file:line` of the class of a configuration in another framework's form; empty for others."""
+    kind = value if isinstance(value, type) else type(value)
+    if not hasattr(kind, "__rlcli_task__") or is_framework(kind.__module__):
+        return ""
+    try:
+        file, line = inspect.getsourcefile(kind), inspect.getsourcelines(kind)[1]
+    except (OSError, TypeError):
+        return ""
+    path = FilePath(str(file))
+    return f"{path.relative_to(FilePath.cwd()) if path.is_relative_to(FilePath.cwd()) else path}:{line}"
 
 
 class _PlainData:
@@ -309,7 +328,7 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
         else:
             found[name] = data
     ranked = [name for name in order if name in found]
-    default = ranked[0] if ranked else next(iter(found), None) if len(found) == 1 or not order else None
+    default = next(iter(ranked or (found if len(found) == 1 or not order else ())), None)
     if found:
         task.data.setdefault("agents", {}).update({"default": default} if default else {}, **found)
     if default is not None and len(found) > 1 and order:

@@ -65,13 +65,15 @@ class TaskCheck:
     functions: dict[str, Signature] = field(default_factory=dict)
     notes: list[Note] = field(default_factory=list)
     format: formats.Format | None = None
+    place: str = ""
+    """File and line of a configuration's class in another framework's form; empty for others."""
 
     def document(self) -> Document:
         """Return the content of the task's file. For a configuration in Python, also store its functions and notes."""
         if self.source.python is None and self.source.value is None:
             return read(self.source.config, self.source.label)
         task = python_task.load(self.source)
-        self.functions, self.notes, self.format = task.terms, task.notes, task.format
+        self.functions, self.notes, self.format, self.place = task.terms, task.notes, task.format, task.place
         if self.source.config.suffix == ".py":
             return Document(task.data)
         return read(self.source.config, self.source.label)  # the record of a run, which is YAML
@@ -91,7 +93,8 @@ class TaskCheck:
     def read_task(self, document: Document) -> None:
         """Merge the content of the task's file, which may be in another framework's format."""
         if not self._read_other_format(document):
-            self.layers.merge(document.data, document_origins(document, self.source.label, "task"))
+            label = self.place or self.source.label
+            self.layers.merge(document.data, document_origins(document, label, "task"))
 
     def _read_other_format(self, document: Document) -> bool:
         """Merge a document in another framework's format. Return False for a document in rlcli's own format.

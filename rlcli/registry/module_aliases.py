@@ -100,9 +100,11 @@ def _import(
     scope = module_globals or {}
     module, top = _resolve(name, scope) if level == 0 else (None, None)
     if module is None:
-        return _python_import(name, scope, module_locals or {}, fromlist or (), level)
+        found = _python_import(name, scope, module_locals or {}, fromlist or (), level)
+        below = {part: _resolve(f"{name}.{part}", scope)[0] for part in fromlist or () if level == 0 and is_alias(name)}
+        return _with_members(found, {part: alias for part, alias in below.items() if alias is not None})
     for part in fromlist or ():
-        if part != "*" and not hasattr(module, part) and hasattr(module, "__path__"):
+        if part != "*" and not hasattr(module, part) and module.__spec__ is not None:
             inner = f"{module.__name__}.{part}"
             try:
                 importlib.import_module(inner)
@@ -110,6 +112,15 @@ def _import(
                 if error.name != inner:
                     raise
     return module if fromlist else top
+
+
+def _with_members(module: ModuleType, members: Mapping[str, Any]) -> ModuleType:
+    """Return a module, or a copy of it that has modules of a format as members."""
+    if not members:
+        return module
+    copy = ModuleType(module.__name__)
+    vars(copy).update({**vars(module), **members})
+    return copy
 
 
 def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
@@ -121,10 +132,16 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
     for form in _formats_for(first, file):
         module = _alias_module(form, name, file, below_top=in_tree)
         if module is not None:
-            return module, _alias_module(form, first, file) or sys.modules.get(first)
+            return module, _alias_module(form, first, file) or _above_alias(form, name, file)
     if in_tree:
         return importlib.import_module(f"{own}.{rest}" if rest else own), sys.modules[own]
     return None, None
+
+
+def _above_alias(form: Format, name: str, file: str) -> Any:
+    """Return the package of which an alias is a part, with the alias as a member: `rlcli` of `rlcli.FORMAT.module`."""
+    first, second, *_ = name.split(".")
+    return _with_members(sys.modules[first], {second: _alias_module(form, f"{first}.{second}", file)})
 
 
 def _alias_module(form: Format, name: str, file: str, below_top: bool = False) -> Any:

@@ -48,7 +48,8 @@ def load_module(name: str) -> Any:
         alias = f"rlcli_folder_task_{digest}_{file.stem}"
         if alias not in sys.modules:
             spec = importlib.util.spec_from_file_location(alias, file, loader=TaskFileLoader(alias, str(file)))
-            assert spec is not None and spec.loader is not None
+            assert spec is not None
+            assert spec.loader is not None
             module = importlib.util.module_from_spec(spec)
             sys.modules[alias] = module
             try:
@@ -173,7 +174,4 @@ def _registrations_kept() -> Iterator[None]:
         gymnasium = sys.modules.get("gymnasium")
         registry = gymnasium.envs.registry if gymnasium is not None else {}
         for name in [name for name, spec in registry.items() if CONFIGURATION in spec.kwargs]:
-            spec = registry[name]
-            registrations[name] = {**spec.kwargs, ENVIRONMENT: spec.entry_point}
-            if isinstance(spec.entry_point, str) and is_alias(spec.entry_point.partition(".")[0]):
-                del registry[name]  # no module has the name for `gymnasium.make`
+            registrations[name] = {**registry[name].kwargs, ENVIRONMENT: registry[name].entry_point}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import sys
 from types import ModuleType
 from typing import Any
 
@@ -16,14 +17,23 @@ _REASONS = {
     "devices": ("devices for teleoperation belong to Isaac Sim", "rlcli trains policies: remove the use of the device"),
     "recorder": ("recorders write files of Isaac Lab", "use `rlcli eval --record`"),
     "operationalspace": ("rlcli has no operational space control", "use DifferentialInverseKinematicsActionCfg"),
-    "pretrainedpolicy": ("it loads a TorchScript policy, and rlcli unpickles nothing", "train the low-level policy, and write the task without it"),
+    "pretrainedpolicy": (
+        "it loads a TorchScript policy, and rlcli unpickles nothing",
+        "train the low-level policy, and write the task without it",
+    ),
     "rigidobjectcollection": ("it holds assets that differ by environment", "use one RigidObjectCfg for each object"),
     "multirotor": ("rlcli has no rotors", "write a DirectRLEnv that sets forces"),
     "nonholonomic": ("rlcli has no action for wheeled bases", "use JointVelocityActionCfg"),
     "surfacegripper": ("a suction gripper has no counterpart in plain MuJoCo", "use a gripper with joints"),
     "image_features": ("its networks are downloads in TorchScript or pickles", "train a CNN on `mdp.image`"),
     "thrust": ("rlcli has no action for thrusters", "write a DirectRLEnv that sets forces"),
-    "agile": ("it loads a TorchScript policy, and rlcli unpickles nothing", "train the low-level policy, and write the task without it"),
+    "agile": (
+        "it loads a TorchScript policy, and rlcli unpickles nothing",
+        "train the low-level policy, and write the task without it",
+    ),
+    "torchvision": ("the library is not installed", "pip install torchvision"),
+    "trimesh": ("the library is not installed", "pip install trimesh"),
+    "nodal": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
     "deformable": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
     "omni": ("it belongs to Isaac Sim's USD stage", "change the model (MJCF) instead"),
     "pxr": ("it belongs to Isaac Sim's USD stage", "change the model (MJCF) instead"),
@@ -46,7 +56,20 @@ def reason_of(name: str) -> tuple[str, str]:
 def absence(name: str) -> TaskError:
     """Return the error that a name of Isaac Lab or Isaac Sim cannot be used."""
     reason, hint = reason_of(name)
-    return TaskError(f"{name} cannot be used: {reason}", hint=hint)
+    return TaskError(f"{_user_place()}{name} cannot be used: {reason}", hint=hint)
+
+
+def _user_place() -> str:
+    """Return `file:line: ` of the task's code that runs; empty if none does."""
+    from rlcli.registry import is_framework
+
+    frame = sys._getframe(2)
+    while frame is not None:
+        file, module = frame.f_code.co_filename, str(frame.f_globals.get("__name__", ""))
+        if not is_framework(module) and not file.startswith("<") and not module.startswith(("importlib", "torch")):
+            return f"{file}:{frame.f_lineno}: "
+        frame = frame.f_back  # type: ignore[assignment]
+    return ""
 
 
 class _AbsentMeta(type):

@@ -49,7 +49,8 @@ def read_actuators(
             settings = {**gains, **passive, "effort_limit": effort_limit}
         elif kind in _NETWORKS and group not in replaced:
             what = f"the actuator network of '{kind}' is a TorchScript file, which rlcli does not load"
-            hint = f"give gains in models.yaml: {entity}: {{model: FILE.xml, gains: {{{group}: {{stiffness: S, damping: D}}}}}}"
+            gains_key = f"{group}: {{stiffness: S, damping: D}}"
+            hint = f"give gains in models.yaml: {entity}: {{model: FILE.xml, gains: {{{gains_key}}}}}"
             item.report.problem(item.key, what, hint)
             continue
         elif kind in _EXPLICIT or kind in _NETWORKS:

@@ -1,4 +1,4 @@
-"""Agents that a task registers as YAML files of rl_games, skrl and Stable-Baselines3, as settings of the trainer `ppo`."""
+"""Agents in YAML files of rl_games, skrl and Stable-Baselines3, as settings of the trainer `ppo`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import yaml
 from rlcli.errors import ConfigError, Problem
 from rlcli.formats import Note
 from rlcli_isaaclab.settings import Node, Report
+
 
 def read_agent(file: Path, library: str, notes: list[Note]) -> dict[str, Any] | None:
     """Return the settings of an agent file; None if its library is not read. Append what is not mapped to `notes`.
@@ -181,7 +182,10 @@ def _read_skrl(top: Node) -> dict[str, Any]:
     if cnn:
         found["cnn"] = cnn
     if agent.data.get("time_limit_bootstrap") is False:
-        agent.report.entries[("agent", "time_limit_bootstrap")] = ("approximated", "rlcli always bootstraps at a time-out")
+        agent.report.entries[("agent", "time_limit_bootstrap")] = (
+            "approximated",
+            "rlcli always bootstraps at a time-out",
+        )
     agent.skip("state_preprocessor_kwargs", "value_preprocessor_kwargs", "random_timesteps", "learning_starts")
     agent.skip("kl_threshold", "experiment", "mixed_precision", "learning_rate_scheduler_kwargs")
     for model in (policy, value):
@@ -253,4 +257,4 @@ _READERS: dict[str, Callable[[Node], Mapping[str, Any]]] = {
     "rl-games": _read_rl_games,
     "skrl": _read_skrl,
     "sb3": _read_sb3,
-}  # type: ignore[dict-item]
+}

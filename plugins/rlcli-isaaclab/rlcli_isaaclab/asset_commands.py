@@ -11,6 +11,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.actuators import JointCommand
 from rlcli.scene.entity import Entity
+from rlcli.scene.jacobian import Jacobian
 from rlcli.sim.rotations import rotate
 
 
@@ -21,24 +22,35 @@ class JointDrive:
         count = len(entity.joint_names)
         modelled = {joint for actuator in entity.actuators for joint in actuator.joints}
         self._columns = [c for c in range(count) if c in modelled or c in dict(entity.actuators_of(kind))]
-        if not self._columns:
-            raise TaskError(
-                f"no joint of '{entity.name}' has a {kind} actuator, but the task sets its target",
-                hint="add actuators to the MJCF, or gains to the ArticulationCfg",
-            )
-        self._command = JointCommand(entity, kind, self._columns)
+        self._undriven = [c for c in range(count) if c not in self._columns] if kind != "position" else []
+        self._name, self._kind, self._joints = entity.name, kind, list(entity.joint_names)
+        self._command = JointCommand(entity, kind, self._columns) if self._columns else None
         self.target = torch.zeros(env.num_envs, count, device=env.device)
         if kind == "position":
             self.target.copy_(entity.data.default_joint_pos)
 
     def set(self, target: Tensor, joint_ids: Any, env_ids: Any) -> None:
-        """Set targets of joints. Joints without gains ignore them."""
-        rows = slice(None) if env_ids is None else torch.as_tensor(env_ids)[:, None]
+        """Set targets of joints. Joints without gains ignore position targets; other targets must be 0 there.
+
+        Raises:
+            TaskError: for a target that nothing drives.
+        """
+        rows = torch.arange(len(self.target)) if env_ids is None else torch.as_tensor(env_ids)
         if joint_ids is None:
-            self.target[rows if env_ids is None else rows[:, 0]] = target
-        else:
+            self.target[rows] = target
+        elif isinstance(joint_ids, slice):
             self.target[rows, joint_ids] = target
-        self._command.write(self.target[:, self._columns])
+        else:
+            self.target[rows[:, None], torch.as_tensor(joint_ids)] = target
+        if self._undriven and bool(self.target[:, self._undriven].any()):
+            wrong = self.target[:, self._undriven].any(dim=0).nonzero()[:, 0].tolist()
+            raise TaskError(
+                f"the task sets a {self._kind} target of joints of '{self._name}' without such an actuator:"
+                f" {listing(self._joints[self._undriven[i]] for i in wrong)}",
+                hint="add actuators of this kind to the MJCF",
+            )
+        if self._command is not None:
+            self._command.write(self.target[:, self._columns])
 
 
 class BodyWrench:
@@ -49,7 +61,14 @@ class BodyWrench:
         self._local: Tensor | None = None
 
     def set_forces_and_torques(
-        self, forces: Any = None, torques: Any = None, *, body_ids: Any = None, env_ids: Any = None, is_global: bool = False, **other: Any
+        self,
+        forces: Any = None,
+        torques: Any = None,
+        *,
+        body_ids: Any = None,
+        env_ids: Any = None,
+        is_global: bool = False,
+        **other: Any,
     ) -> None:
         """Replace forces [N] and torques [N m]. (rows, bodies, 3) each"""
         count = len(self._entity.names["Bodies"])
@@ -83,6 +102,7 @@ class PhysxView:
 
     def __init__(self, env: VecEnv, entity: Entity) -> None:
         self._env, self._entity = env, entity
+        self._jacobians: list[Jacobian] | None = None
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -103,6 +123,20 @@ class PhysxView:
         """Return position limits of the joints. (num_envs, joints, 2) [m or rad]"""
         limits = self._entity.data.joint_pos_limits
         return limits.expand(self._env.num_envs, *limits.shape[-2:]).clone()
+
+    def get_jacobians(self) -> Tensor:
+        """Return the Jacobians of the bodies' origins, world frame: without the first body, which is fixed.
+
+        (num_envs, bodies - 1, 6, joints), linear before angular
+        """
+        if self._entity.is_floating:
+            raise TaskError("root_physx_view.get_jacobians cannot be used for a floating base", hint="fix the base")
+        count = len(self._entity.names["Bodies"])
+        if self._jacobians is None:
+            columns = list(range(len(self._entity.joint_names)))
+            self._jacobians = [Jacobian(self._entity, columns, body) for body in range(1, count)]
+        positions = self._entity.data.body_pos_w
+        return torch.stack([jacobian(positions[:, i + 1]) for i, jacobian in enumerate(self._jacobians)], dim=1)
 
     def get_link_incoming_joint_force(self) -> Tensor:
         """Return force and torque of each body's parent on the body, body frame. (num_envs, bodies, 6) [N, N m]"""

@@ -15,6 +15,7 @@ from rlcli_isaaclab.scene_facade import Asset as RigidObject
 from rlcli_isaaclab.sim import UsdFileCfg
 from rlcli_isaaclab.utils.assets import ISAAC_NUCLEUS_DIR, ISAACLAB_NUCLEUS_DIR
 
+
 @configclass
 class AssetBaseCfg:
     """Configuration of an asset of the scene."""

@@ -91,10 +91,18 @@ class _Hooks:
 
 def _require_values(cfg: Any) -> None:
     """Check that every setting without a default is set; older files have `num_actions` for `action_space`."""
-    for space, number in (("action_space", "num_actions"), ("observation_space", "num_observations"), ("state_space", "num_states")):
+    for space, number in (
+        ("action_space", "num_actions"),
+        ("observation_space", "num_observations"),
+        ("state_space", "num_states"),
+    ):
         if getattr(cfg, number, None) and (is_missing(getattr(cfg, space)) or getattr(cfg, space) is None):
             setattr(cfg, space, getattr(cfg, number))
-    missing = [name for name in ("decimation", "episode_length_s", "scene", "action_space", "observation_space") if is_missing(getattr(cfg, name))]
+    missing = [
+        name
+        for name in ("decimation", "episode_length_s", "scene", "action_space", "observation_space")
+        if is_missing(getattr(cfg, name))
+    ]
     if missing:
         raise ConfigError([Problem("configuration", name, "missing; give it a value") for name in missing])
 

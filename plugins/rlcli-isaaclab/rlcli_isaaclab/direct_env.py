@@ -227,7 +227,16 @@ class DirectMARLEnvCfg:
 
     def __rlcli_task__(self, root: Path) -> Any:
         """Raise the error that it cannot be used."""
-        raise ConfigError([Problem("configuration", "", "a DirectMARLEnv has several agents, and rlcli has no multi-agent tasks", "write a DirectRLEnv with one agent")])
+        raise ConfigError(
+            [
+                Problem(
+                    "configuration",
+                    "",
+                    "a DirectMARLEnv has several agents, and rlcli has no multi-agent tasks",
+                    "write a DirectRLEnv with one agent",
+                )
+            ]
+        )
 
 
 def _environment_class(cfg: Any) -> type[DirectRLEnv]:
@@ -244,7 +253,9 @@ def _environment_class(cfg: Any) -> type[DirectRLEnv]:
         kinds = [kind for kind in kinds if not any(issubclass(k, kind) and k is not kind for k in kinds)]
         if len(kinds) != 1:
             what = f"the module of {type(cfg).__name__} has {len(kinds)} classes of a DirectRLEnv, expected 1"
-            raise ConfigError([Problem("configuration", "", what, "name the task that the package registers: FOLDER:ID")])
+            raise ConfigError(
+                [Problem("configuration", "", what, "name the task that the package registers: FOLDER:ID")]
+            )
         found = kinds[0]
     if not (isinstance(found, type) and issubclass(found, DirectRLEnv)):
         raise ConfigError([Problem("configuration", "", f"{entry} is not a DirectRLEnv", "derive it from DirectRLEnv")])
@@ -290,12 +301,12 @@ def _space(value: Any, name: str) -> Any:
         return gymnasium.spaces.Box(-np.inf, np.inf, (value,))
     if isinstance(value, list | tuple) and value and all(isinstance(size, int) for size in value):
         return gymnasium.spaces.Box(-np.inf, np.inf, tuple(value))
-    what = f"a space of type {type(value).__name__} has no counterpart in rlcli, which has continuous actions and arrays"
+    what = (
+        f"a space of type {type(value).__name__} has no counterpart in rlcli, which has continuous actions and arrays"
+    )
     raise ConfigError([Problem("configuration", name, what, "write a number of columns, or the shape of an image")])
 
 
 def shape_of(value: Any, name: str) -> tuple[int, ...]:
     """Return the shape of a space; see `_space` for errors."""
     return tuple(_space(value, name).shape)
-
-

@@ -38,7 +38,9 @@ class HookTerm:
     def __rlcli_term__(self, name: str) -> Signature:
         """Return the signature of the term under a name."""
         file = Path(inspect.getsourcefile(self.env_class) or "?")
-        return Signature(name, self.__name__, True, file, 1, f"Hook of {self.env_class.__name__}.", (), target=self.target)
+        return Signature(
+            name, self.__name__, True, file, 1, f"Hook of {self.env_class.__name__}.", (), target=self.target
+        )
 
 
 class DirectRunner:
@@ -86,7 +88,9 @@ class DirectRunner:
         self.lab._pre_physics_step(self.action_noise(action.clone()))
 
     def compute_dones(self) -> None:
-        """Call `_get_dones`."""
+        """Call `_get_dones`, but not for the first value that managers compute before the first reset."""
+        if self.phase == "build":
+            return
         lab = self.lab
         terminated, time_outs = lab._get_dones()
         lab.reset_terminated[:], lab.reset_time_outs[:] = terminated, time_outs

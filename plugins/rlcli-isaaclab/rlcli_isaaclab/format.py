@@ -15,7 +15,7 @@ _RUNNER = b"RslRlOnPolicyRunnerCfg"
 
 FOREIGN = (
     *("isaaclab", "isaaclab_tasks", "isaaclab_assets", "isaaclab_rl", "isaaclab_contrib", "isaaclab_mimic"),
-    *("isaacsim", "omni", "pxr", "carb", "usdrt", "toml", "pink", "pinocchio"),
+    *("isaacsim", "omni", "pxr", "carb", "usdrt", "toml", "pink", "pinocchio", "torchvision", "trimesh"),
 )
 """Packages whose modules `namespace.py` replaces in task files."""
 

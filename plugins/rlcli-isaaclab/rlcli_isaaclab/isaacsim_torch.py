@@ -96,7 +96,12 @@ def compute_heading_and_up(
 
 
 def compute_rot(
-    torso_quat: Tensor, velocity: Tensor, ang_velocity: Tensor, targets: Tensor, torso_positions: Tensor, extrinsic: bool = True
+    torso_quat: Tensor,
+    velocity: Tensor,
+    ang_velocity: Tensor,
+    targets: Tensor,
+    torso_positions: Tensor,
+    extrinsic: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return velocities in the torso's frame, roll, pitch, yaw and the angle to the target [rad]."""
     roll, pitch, yaw = get_euler_xyz(torso_quat)

@@ -94,7 +94,8 @@ def mjcf_of(usd: str, root: Path, given: Mapping[str, str], entity: str) -> str:
     near = did_you_mean(Path(path).name, [Path(end).name for end in USD_TO_MJCF])
     raise TaskError(
         f"no MJCF model is known for '{path.rsplit('/', 1)[-1]}'",
-        hint=f"write the line {entity}: FILE.xml into {MODEL_MAP} in {root}, or put {file} there" + (f"; {near}" if near else ""),
+        hint=f"write the line {entity}: FILE.xml into {MODEL_MAP} in {root}, or put {file} there"
+        + (f"; {near}" if near else ""),
     )
 
 
@@ -108,4 +109,3 @@ def _folders(root: Path) -> Iterator[tuple[Path, str]]:
     for name in os.environ.get(MODELS, "").split(os.pathsep):
         if name:
             yield Path(name).expanduser(), "models:"
-

@@ -32,8 +32,11 @@ _EXTRA = {
 """Module of Isaac Lab -> modules of this package that define further names of it."""
 _TEXTS = ("isaaclab_tasks", "isaaclab_assets")
 """Packages whose own files are imported where they are found: they only use other modules of Isaac Lab."""
+_LIBRARIES = ("toml", "torchvision", "trimesh")
+"""Libraries that come with Isaac Lab: an installed one is imported, a missing one raises an error when it is used."""
 _SIM = {"isaacsim.core.utils.torch": "isaacsim_torch", "isaacsim.core.utils.torch.rotations": "isaacsim_torch",
-        "isaacsim.core.utils.torch.maths": "isaacsim_torch", "isaacsim.core.utils.torch.transformations": "isaacsim_torch"}  # fmt: skip
+        "isaacsim.core.utils.torch.maths": "isaacsim_torch",
+    "isaacsim.core.utils.torch.transformations": "isaacsim_torch"}  # fmt: skip
 """Module of Isaac Sim -> module of this package with its functions."""
 
 
@@ -42,7 +45,7 @@ class LabModule(ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         if name == "__all__":
-            return _public(self.__name__)
+            return public_names(self.__name__)
         if name.startswith("__"):
             raise AttributeError(name)
         value = _member(self.__name__, name)
@@ -51,7 +54,7 @@ class LabModule(ModuleType):
 
 
 SOURCE = "RLCLI_ISAACLAB"
-"""Environment variable with the folder `source` of Isaac Lab, for the text of `isaaclab_tasks` and `isaaclab_assets`."""
+"""Environment variable with Isaac Lab's folder `source`, for the files of `isaaclab_tasks` and `isaaclab_assets`."""
 
 
 def module_of(name: str, file: str) -> ModuleType | None:
@@ -65,8 +68,10 @@ def module_of(name: str, file: str) -> ModuleType | None:
         folder = _text_folder(top, Path(file).parent)
         if folder is not None:
             return import_from(folder, inner, run_start=top != "isaaclab_tasks")  # it imports every task
+    if top in _LIBRARIES and importlib.util.find_spec(top) is not None:
+        return None
     if top == "toml":
-        return None if importlib.util.find_spec(top) else importlib.import_module(f"{_OWN}.toml_reader")
+        return importlib.import_module(f"{_OWN}.toml_reader")
     if name == "isaacsim.core.utils.stage":
         return importlib.import_module(f"{_OWN}.usd_stage")
     if name in _SIM:
@@ -105,7 +110,9 @@ def _lab_module(name: str) -> LabModule:
 def _member(module: str, name: str) -> Any:
     path = f"{module}.{name}"
     if path not in _packages() and name not in _definitions():  # a package that its parent imports from further below
-        below = (found for found in sorted(_packages()) if found.startswith(f"{module}.") and found.endswith(f".{name}"))
+        below = (
+            found for found in sorted(_packages()) if found.startswith(f"{module}.") and found.endswith(f".{name}")
+        )
         path = next(below, path)
     for candidate in _homes(module):
         value = getattr(candidate, name, None)
@@ -115,7 +122,7 @@ def _member(module: str, name: str) -> Any:
         return _lab_module(path)
     found = _definitions().get(name)
     if found is None:
-        near = did_you_mean(name, _public(module)) or did_you_mean(name, list(_definitions()))
+        near = did_you_mean(name, public_names(module)) or did_you_mean(name, list(_definitions()))
         raise AttributeError(f"Isaac Lab 2.3.2 has no '{name}' in '{module}'" + (f"; {near}" if near else ""))
     return lab_name(name)
 
@@ -204,7 +211,7 @@ def _packages() -> frozenset[str]:
 
 @functools.cache
 def _definitions() -> dict[str, tuple[str, Any]]:
-    """Return name -> module that defines it, and its kind. Names of isaaclab itself win over those of other packages."""
+    """Return name -> module that defines it, and its kind. Names of isaaclab itself win over others."""
     found: dict[str, tuple[str, Any]] = {}
     for module, names in sorted(_table().items(), key=lambda item: item[0].split(".")[0] != "isaaclab"):
         for name, kind in names.items():
@@ -214,7 +221,7 @@ def _definitions() -> dict[str, tuple[str, Any]]:
 
 
 @functools.cache
-def _public(module: str) -> list[str]:
+def public_names(module: str) -> list[str]:
     """Return the names that `from module import *` imports: those of the module and the modules below it."""
     below = [names for name, names in _table().items() if f"{name}.".startswith(f"{module}.")]
     return sorted({name for names in below for name in names if name != "logger"})

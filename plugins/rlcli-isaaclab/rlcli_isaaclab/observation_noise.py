@@ -15,6 +15,7 @@ class NoNoise:
     """No noise."""
 
     def __call__(self, data: Tensor) -> Tensor:
+        """Return the data with noise."""
         return data
 
     def reset(self, env_ids: Any) -> None:
@@ -28,6 +29,7 @@ class NoiseModel(NoNoise):
         self._cfg = cfg
 
     def __call__(self, data: Tensor) -> Tensor:
+        """Return the data with noise."""
         return _with_noise(self._cfg.noise_cfg, data)
 
 
@@ -40,6 +42,7 @@ class NoiseModelWithAdditiveBias(NoiseModel):
         self._per_component = bool(getattr(cfg, "sample_bias_per_component", True))
 
     def __call__(self, data: Tensor) -> Tensor:
+        """Return the data with noise."""
         if self._per_component and self._bias.shape[1] != data.shape[1]:
             self._bias = self._bias.repeat(1, data.shape[1])
             self.reset(slice(None))

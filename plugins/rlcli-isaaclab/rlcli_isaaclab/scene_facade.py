@@ -285,13 +285,15 @@ class FrameTransformer:
     def __init__(self, assets: Mapping[str, Asset], settings: Mapping[str, Any]) -> None:
         self.data = self
         self._source = self._bodies(assets, settings["source"])[0]
-        self._targets, self.target_frame_names = [], []
+        self._targets: list[tuple[Asset, int, Mapping[str, Any]]] = []
+        self.target_frame_names: list[str] = []
         for target in settings["targets"]:
             found = self._bodies(assets, target)
             self._targets += found
             names = [asset.body_names[index] for asset, index, _ in found]
             self.target_frame_names += [target["name"]] * len(found) if target["name"] else names
-        self.body_names, self.joint_names = self.target_frame_names, []
+        self.body_names = self.target_frame_names
+        self.joint_names: list[str] = []
 
     @staticmethod
     def _bodies(assets: Mapping[str, Asset], frame: Mapping[str, Any]) -> list[tuple[Asset, int, Mapping[str, Any]]]:
@@ -449,7 +451,9 @@ class Scene(Mapping[str, Any]):
         """Add frame transformers by their settings (`sensor_reader.py`), and lights, which have none."""
         for name, settings in frames.items():
             if settings is None:
-                self.looks[name] = SimpleNamespace(prims=[NoEffect(f"the light '{name}'")], body_names=[], joint_names=[])
+                self.looks[name] = SimpleNamespace(
+                    prims=[NoEffect(f"the light '{name}'")], body_names=[], joint_names=[]
+                )
                 continue
             self._frames.setdefault(name, FrameTransformer(self.articulations, settings))
 

@@ -21,6 +21,7 @@ class SceneReader:
 
     def __init__(self, node: Node, root: Path, models: Mapping[str, str] | None = None) -> None:
         self.node, self.root, self.report = node, root, node.report
+        self._asked = models
         self._given = given_models(root)
         self._given_models = {**self._given.files, **(models or {})}
         self.entities: dict[str, dict[str, Any]] = {}
@@ -199,7 +200,8 @@ class SceneReader:
         try:
             model = mjcf_of(path, self.root, self._given_models, name)
         except TaskError as error:
-            self.report.problem((*spawn.key, "usd_path"), error.message, error.hint)
+            hint = error.hint if self._asked is None else f"give a model: --model {name}=FILE.xml"
+            self.report.problem((*spawn.key, "usd_path"), error.message, hint)
             return
         spawn.skip("func", "visible", "copy_from_source", "activate_contact_sensors", "semantic_tags")
         spawn.skip("visual_material_path", "variants")

@@ -54,7 +54,9 @@ def _read_frames(item: Node, entity: str, body: str | None, prims: Mapping[str, 
         parts = [part for part in str(frame.get("prim_path")).split("/") if part]
         owner = next((name for name, last in prims.items() if last in parts), entity)
         inside = parts[parts.index(prims[owner]) + 1 :] if prims[owner] in parts else []
-        targets.append({"name": frame.get("name"), **_frame(owner, inside[-1] if inside else None, frame.node("offset"))})
+        targets.append(
+            {"name": frame.get("name"), **_frame(owner, inside[-1] if inside else None, frame.node("offset"))}
+        )
     return {"source": _frame(entity, body, item.node("source_frame_offset")), "targets": targets}
 
 
@@ -63,8 +65,18 @@ def _frame(entity: str, body: str | None, offset: Node) -> dict[str, Any]:
     return {"entity": entity, "body": body, "pos": [as_float(v) for v in pos], "rot": [as_float(v) for v in rot]}
 
 
-_CAMERA_DATA = {"rgb": "rgb", "rgba": "rgb", "depth": "depth", "distance_to_image_plane": "depth", "distance_to_camera": "distance"}
-_FORWARD = {"world": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), "ros": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)), "opengl": ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0))}
+_CAMERA_DATA = {
+    "rgb": "rgb",
+    "rgba": "rgb",
+    "depth": "depth",
+    "distance_to_image_plane": "depth",
+    "distance_to_camera": "distance",
+}
+_FORWARD = {
+    "world": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "ros": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
+    "opengl": ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+}
 """Convention -> the camera's viewing direction and its upward direction in the frame of `rot`."""
 
 
@@ -101,9 +113,29 @@ def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, 
         config["entity"] = entity
         if inside:
             config["body"] = inside[-1]
-    spawn.skip("func", "focus_distance", "f_stop", "projection_type", "visible", "semantic_tags", "copy_from_source", "lock_camera")
-    item.skip("update_latest_camera_pose", "semantic_filter", "depth_clipping_behavior", "prim_path", "colorize_semantic_segmentation")
-    item.skip("colorize_instance_id_segmentation", "colorize_instance_segmentation", "semantic_segmentation_mapping", "history_length")
+    spawn.skip(
+        "func",
+        "focus_distance",
+        "f_stop",
+        "projection_type",
+        "visible",
+        "semantic_tags",
+        "copy_from_source",
+        "lock_camera",
+    )
+    item.skip(
+        "update_latest_camera_pose",
+        "semantic_filter",
+        "depth_clipping_behavior",
+        "prim_path",
+        "colorize_semantic_segmentation",
+    )
+    item.skip(
+        "colorize_instance_id_segmentation",
+        "colorize_instance_segmentation",
+        "semantic_segmentation_mapping",
+        "history_length",
+    )
     return config
 
 

@@ -1,4 +1,4 @@
-"""What a direct task creates in `_setup_scene`: recorded to build the scene, then bound to the entities of the scene."""
+"""What a direct task creates in `_setup_scene`: recorded to build the scene, then bound to its entities."""
 
 from __future__ import annotations
 
@@ -69,7 +69,9 @@ class Spawn:
     def __reduce__(self) -> Any:
         return Spawn, (self.__name__,)
 
-    def __call__(self, prim_path: str, cfg: Any, translation: Any = None, orientation: Any = None, **other: Any) -> None:
+    def __call__(
+        self, prim_path: str, cfg: Any, translation: Any = None, orientation: Any = None, **other: Any
+    ) -> None:
         """Store what is spawned."""
         current_setup().spawned.append((prim_path, cfg))
 

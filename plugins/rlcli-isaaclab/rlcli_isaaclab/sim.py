@@ -51,16 +51,24 @@ MdlFileCfg = _settings_class("MdlFileCfg", "A material of Isaac Sim.", func=Spaw
 PhysxCfg = _settings_class("PhysxCfg", "The PhysX solver.")
 RenderCfg = _settings_class("RenderCfg", "The renderer.")
 
-GroundPlaneCfg = _settings_class("GroundPlaneCfg", "A ground plane.", func=Spawn("spawn_ground_plane"), size=(100.0, 100.0))
-DomeLightCfg = _settings_class("DomeLightCfg", "Light from everywhere.", func=Spawn("spawn_light"), prim_type="DomeLight")
-DistantLightCfg = _settings_class("DistantLightCfg", "Parallel light.", func=Spawn("spawn_light"), prim_type="DistantLight")
+GroundPlaneCfg = _settings_class(
+    "GroundPlaneCfg", "A ground plane.", func=Spawn("spawn_ground_plane"), size=(100.0, 100.0)
+)
+DomeLightCfg = _settings_class(
+    "DomeLightCfg", "Light from everywhere.", func=Spawn("spawn_light"), prim_type="DomeLight"
+)
+DistantLightCfg = _settings_class(
+    "DistantLightCfg", "Parallel light.", func=Spawn("spawn_light"), prim_type="DistantLight"
+)
 SphereLightCfg = _settings_class("SphereLightCfg", "A lamp.", func=Spawn("spawn_light"), prim_type="SphereLight")
 DiskLightCfg = _settings_class("DiskLightCfg", "A lamp.", func=Spawn("spawn_light"), prim_type="DiskLight")
 CylinderLightCfg = _settings_class("CylinderLightCfg", "A lamp.", func=Spawn("spawn_light"), prim_type="CylinderLight")
 UsdFileCfg = _settings_class(
     "UsdFileCfg", "A model by its USD path; assets.py maps it to an MJCF.", func=Spawn("spawn_from_usd")
 )
-UrdfFileCfg = _settings_class("UrdfFileCfg", "A model by its URDF path; assets.py maps it.", func=Spawn("spawn_from_urdf"))
+UrdfFileCfg = _settings_class(
+    "UrdfFileCfg", "A model by its URDF path; assets.py maps it.", func=Spawn("spawn_from_urdf")
+)
 CuboidCfg = _settings_class("CuboidCfg", "A box; `size` are its edges [m].", func=Spawn("spawn_cuboid"))
 SphereCfg = _settings_class("SphereCfg", "A sphere.", func=Spawn("spawn_sphere"))
 CapsuleCfg = _settings_class("CapsuleCfg", "A capsule.", func=Spawn("spawn_capsule"))

@@ -10,8 +10,8 @@ from rlcli.config.term_signatures import Signature, SignatureError, builtin_term
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.config_class import is_missing
-from rlcli_isaaclab.managers import CommandTerm, SceneEntityCfg
 from rlcli_isaaclab.lab_terms import LAB_TERMS
+from rlcli_isaaclab.managers import CommandTerm, SceneEntityCfg
 from rlcli_isaaclab.mdp import MdpFunction
 from rlcli_isaaclab.observation_reader import read_processing
 from rlcli_isaaclab.randomization import EVENTS, translate_event

@@ -181,6 +181,8 @@ class _Bound:
             # a curriculum term may return several values to log; rlcli logs one
             return next(iter(value.values()), None) if isinstance(value, dict) else value
         value = self.term(self._env, **self._params)
+        if self._section == "observations" and value.dim() == 1:
+            return value.unsqueeze(1).float()  # a group that is not concatenated may have such terms
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
 
 
@@ -218,9 +220,7 @@ class _BoundCommand(_BoundObject):
 
     def resample(self, selection: Selection) -> None:
         """Sample new commands."""
-        env_ids = selection.env_ids()
-        self.term._resample_command(env_ids)
-        self.term.command_counter[env_ids] += 1
+        self.term._resample(selection.env_ids())
         self.command.copy_(self.term.command)
         self._has_command = True
 

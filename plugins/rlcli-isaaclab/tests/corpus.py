@@ -1,3 +1,4 @@
+# ruff: noqa: T201
 """Run every task that Isaac Lab registers, unchanged, and report how far it gets: imports, validates, steps, trains.
 
 Usage: python corpus.py [--only WORD] [--stage NAME] [--out FILE.json], with the environment variable ISAACLAB_SOURCE at
@@ -46,7 +47,9 @@ def is_direct(entry: Any) -> bool:
     return "ManagerBasedRLEnv" not in str(entry)
 
 
-def run(name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: str) -> tuple[int, str, dict[str, Any]]:
+def run(
+    name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: str, steps: int
+) -> tuple[int, str, dict[str, Any]]:
     """Return the number of stages that a task passes, the reason why it stops, and facts about it."""
     stage, facts = 0, {}
     try:
@@ -75,7 +78,7 @@ def run(name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: st
         env = make_env(resolved.with_num_envs(ENVS), seed=1)
         env.reset()
         generator = torch.Generator().manual_seed(0)
-        for _ in range(STEPS):
+        for _ in range(steps):
             result = env.step(torch.rand(ENVS, env.layout.action_size, generator=generator) * 2 - 1)
             assert bool(result.reward.isfinite().all())
         facts["diverged"] = env.causes
@@ -97,7 +100,7 @@ def run(name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: st
 
 
 def settings_of(value: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of an environment as nested dicts; for a direct task with the assets that its code creates."""
+    """Return the settings of an environment as nested dicts, with the assets that a direct task creates."""
     from rlcli_isaaclab.config_class import to_dict
     from rlcli_isaaclab.direct_env import DirectRLEnvCfg, _environment_class, record
 
@@ -165,6 +168,7 @@ def main_() -> None:
     parser.add_argument("--kind", choices=("manager", "direct", "all"), default="all")
     parser.add_argument("--stage", choices=STAGES, default="trains")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--steps", type=int, default=STEPS, help="steps of the stage `steps`")
     parser.add_argument("--part", default="0/1", help="i/n: every n-th task")
     options = parser.parse_args()
     source = Path(os.environ[SOURCE])
@@ -182,8 +186,13 @@ def main_() -> None:
             if number % parts != part or options.kind == ("manager" if direct else "direct"):
                 continue
             package = source / "isaaclab_tasks" / "isaaclab_tasks"
-            stage, reason, facts = isolated(240, run, name, found[name], package, Path(folder) / name, options.stage)
-            with_agent = any(key.endswith("_cfg_entry_point") and key not in ("env_cfg_entry_point",) and "robomimic" not in key for key in found[name])
+            stage, reason, facts = isolated(
+                900, run, name, found[name], package, Path(folder) / name, options.stage, options.steps
+            )
+            with_agent = any(
+                key.endswith("_cfg_entry_point") and key not in ("env_cfg_entry_point",) and "robomimic" not in key
+                for key in found[name]
+            )
             rows[name] = {"direct": direct, "stage": stage, "reason": reason, "agent": with_agent, **facts}
             print(f"{stage} {name}: {reason[:400]}", flush=True)
             if options.out:

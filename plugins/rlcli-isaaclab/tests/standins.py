@@ -1,3 +1,4 @@
+# ruff: noqa: E501
 """Stand-in models: MJCF files with the joints and bodies that the settings of a task of Isaac Lab mention."""
 
 from __future__ import annotations
@@ -19,7 +20,11 @@ FLOATING = (
     *("cf2x", "arl_robot", "gr1", "nova_carter"),
 )
 SIDES = ("left", "right")
-EXTRA_BODIES = {"spot": ["fl_foot", "fr_foot", "hl_foot", "hr_foot", "body"], "ur10e": ["wrist_3_link"], "panda": ["panda_link0", "panda_hand", "panda_leftfinger", "panda_rightfinger", "panda_link7"]}
+EXTRA_BODIES = {
+    "spot": ["fl_foot", "fr_foot", "hl_foot", "hr_foot", "body"],
+    "ur10e": ["wrist_3_link"],
+    "panda": ["panda_link0", "panda_hand", "panda_leftfinger", "panda_rightfinger", "panda_link7"],
+}
 LEGS = [f"{side}_{part}" for part in ("HAA", "HFE", "KFE") for side in ("LF", "LH", "RF", "RH")]
 JOINTS: dict[str, list[str]] = {
     "anymal": LEGS,
@@ -32,10 +37,18 @@ JOINTS: dict[str, list[str]] = {
 }  # fmt: skip
 """Part of a path -> all joints of the robot, for tasks whose code needs their number."""
 BODIES: dict[str, list[str]] = {
-    "anymal": ["base", *(f"{side}_{part}" for part in ("HIP", "THIGH", "SHANK", "FOOT") for side in ("LF", "LH", "RF", "RH"))],
+    "anymal": [
+        "base",
+        *(f"{side}_{part}" for part in ("HIP", "THIGH", "SHANK", "FOOT") for side in ("LF", "LH", "RF", "RH")),
+    ],
     "cf2x": ["body", "m1_prop", "m2_prop", "m3_prop", "m4_prop"],
-    "sektion_cabinet": ["sektion", "drawer_top", "drawer_handle_top"],
-    "panda_instanceable": [*(f"panda_link{i}" for i in range(8)), "panda_hand", "panda_leftfinger", "panda_rightfinger"],
+    "sektion_cabinet": ["sektion", "drawer_top", "drawer_handle_top", "drawer_bottom", "drawer_handle_bottom"],
+    "panda_instanceable": [
+        *(f"panda_link{i}" for i in range(8)),
+        "panda_hand",
+        "panda_leftfinger",
+        "panda_rightfinger",
+    ],
 }
 
 
@@ -111,8 +124,11 @@ def collect(data: Any) -> dict[str, dict[str, list[str]]]:
     """Return entity -> joint and body regexes of all settings (nested dicts) of an environment."""
     scene = {k: v for k, v in data["scene"].items() if isinstance(v, Mapping) and "prim_path" in v}
     found = {name: {"joint": [], "body": []} for name in scene}
-    prims = {str(item["prim_path"]).rstrip("/").rsplit("/", 1)[-1]: name for name, item in scene.items()
-             if not any(key in item for key in ("pattern_cfg", "target_frames", "track_air_time"))}
+    prims = {
+        str(item["prim_path"]).rstrip("/").rsplit("/", 1)[-1]: name
+        for name, item in scene.items()
+        if not any(key in item for key in ("pattern_cfg", "target_frames", "track_air_time"))
+    }
     owner = {}
 
     def add(entity: Any, kind: str, value: Any) -> None:
@@ -132,6 +148,9 @@ def collect(data: Any) -> dict[str, dict[str, list[str]]]:
             return prims[last]
         return None
 
+    for item in scene.values():
+        if "data_types" in item:
+            add_prim(str(item["prim_path"]).rpartition("/")[0])
     for name, item in scene.items():
         if any(key in item for key in ("pattern_cfg", "target_frames", "track_air_time")):
             entity = add_prim(item["prim_path"])
@@ -185,12 +204,18 @@ def collect(data: Any) -> dict[str, dict[str, list[str]]]:
 def mjcf(name: str, path: str, joints: list[str], bodies: list[str], articulated: bool, driven: bool = False) -> str:
     """Return an MJCF with these joints and bodies: a chain on a fixed base, or legs on a floating one."""
     if not articulated:
-        parts = "".join(f'<body name="{b}" pos="0 0 {0.05 * i}"><geom size="0.02"/></body>' for i, b in enumerate(bodies))
+        parts = "".join(
+            f'<body name="{b}" pos="0 0 {0.05 * i}"><geom size="0.02"/></body>' for i, b in enumerate(bodies)
+        )
         return f'<mujoco><worldbody><body name="{name}"><freejoint/><geom type="box" size=".03 .03 .03"/>{parts}</body></worldbody></mujoco>'
     floating = any(word in path.lower() for word in FLOATING)
     root_words = ("base", "trunk", "torso", "pelvis", "body", "root", "link0", "base_link", "torso_link")
     root = next((b for word in root_words for b in bodies if b == word), None)
-    root = root or next((b for b in bodies if "base" in b or "pelvis" in b), None) or ("base" if joints else (bodies or [name])[0])
+    root = (
+        root
+        or next((b for b in bodies if "base" in b or "pelvis" in b), None)
+        or ("base" if joints else (bodies or [name])[0])
+    )
     rest = [b for b in bodies if b != root]
     owned = {joint: (rest.pop(0) if rest else f"{joint}_link") for joint in joints}
     fixed = "".join(
@@ -199,7 +224,9 @@ def mjcf(name: str, path: str, joints: list[str], bodies: list[str], articulated
     )
     inner = ""
     for number, joint in enumerate(joints if floating else reversed(joints)):
-        kind = "slide" if any(word in joint.lower() for word in ("finger", "slider", "prismatic", "drawer")) else "hinge"
+        kind = (
+            "slide" if any(word in joint.lower() for word in ("finger", "slider", "prismatic", "drawer")) else "hinge"
+        )
         limits = "0 0.08" if kind == "slide" else "-2 2"
         if "cart" in joint:
             limits = "-4 4"
@@ -232,7 +259,9 @@ def write(data: Any, folder: Path) -> None:
         extra = [b for word, names in EXTRA_BODIES.items() if word in path.lower() for b in names]
         groups = item.get("actuators")
         values = list(groups.values()) if isinstance(groups, Mapping) else []
-        driven = any(isinstance(a, Mapping) and a.get("stiffness", 0) is None and "network_file" not in a for a in values)
+        driven = any(
+            isinstance(a, Mapping) and a.get("stiffness", 0) is None and "network_file" not in a for a in values
+        )
         joints, bodies = names_of(wanted["joint"]), names_of([*wanted["body"], *extra])
         for table, target in ((JOINTS, joints), (BODIES, bodies)):
             for word, names in table.items():

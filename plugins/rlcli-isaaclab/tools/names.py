@@ -1,6 +1,6 @@
 """Write `rlcli_isaaclab/names.json`: the public names of each module of Isaac Lab, read from its files without import.
 
-Usage: python names.py FOLDER, where FOLDER has `isaaclab/isaaclab`, `isaaclab_rl/isaaclab_rl`, ... as in Isaac Lab's `source`.
+Usage: python names.py FOLDER, where FOLDER is Isaac Lab's `source`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ def public_names(tree: ast.Module) -> dict[str, Any]:
             if isinstance(node, kind) and not node.name.startswith("_"):
                 is_settings = isinstance(node, ast.ClassDef) and node.name.endswith("Cfg")
                 found[node.name] = settings(node) if is_settings else word
-        targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+        targets = (
+            node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+        )
         for target in targets:
             if isinstance(target, ast.Name) and not target.id.startswith("_"):
                 found[target.id] = "value"

@@ -141,7 +141,7 @@ def matrix_from_quat(quaternions: Tensor) -> Tensor:
         twice * (x * y + z * w), 1.0 - twice * (x * x + z * z), twice * (y * z - x * w),
         twice * (x * z - y * w), twice * (y * z + x * w), 1.0 - twice * (x * x + y * y),
     ]  # fmt: skip
-    return torch.stack(rows, dim=-1).reshape(quaternions.shape[:-1] + (3, 3))
+    return torch.stack(rows, dim=-1).reshape((*quaternions.shape[:-1], 3, 3))
 
 
 def quat_from_matrix(matrix: Tensor) -> Tensor:
@@ -151,10 +151,15 @@ def quat_from_matrix(matrix: Tensor) -> Tensor:
     squares = torch.stack([1 + a + b + c, 1 + a - b - c, 1 - a + b - c, 1 - a - b + c], dim=1)
     wx, wy, wz = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
     xy, xz, yz = m[:, 1, 0] + m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 2, 1] + m[:, 1, 2]
-    rows = [[squares[:, 0], wx, wy, wz], [wx, squares[:, 1], xy, xz], [wy, xy, squares[:, 2], yz], [wz, xz, yz, squares[:, 3]]]
+    rows = [
+        [squares[:, 0], wx, wy, wz],
+        [wx, squares[:, 1], xy, xz],
+        [wy, xy, squares[:, 2], yz],
+        [wz, xz, yz, squares[:, 3]],
+    ]
     table = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
     best = table[torch.arange(len(m), device=m.device), squares.argmax(dim=1)]  # the largest divisor is the most exact
-    return quat_unique(normalize(best)).reshape(matrix.shape[:-2] + (4,))
+    return quat_unique(normalize(best)).reshape((*matrix.shape[:-2], 4))
 
 
 def convert_quat(quat: Any, to: str = "xyzw") -> Any:
@@ -190,8 +195,8 @@ def apply_delta_pose(source_pos: Tensor, source_rot: Tensor, delta_pose: Tensor,
 def transform_points(points: Tensor, pos: Tensor | None = None, quat: Tensor | None = None) -> Tensor:
     """Rotate, then move points. (..., p, 3)"""
     if quat is not None:
-        wide = quat if quat.dim() == 1 else quat.unsqueeze(-2).expand(points.shape[:-1] + (4,))
-        points = quat_apply(wide.expand(points.shape[:-1] + (4,)), points)
+        wide = quat if quat.dim() == 1 else quat.unsqueeze(-2).expand((*points.shape[:-1], 4))
+        points = quat_apply(wide.expand((*points.shape[:-1], 4)), points)
     if pos is None:
         return points
     return points + (pos if pos.dim() == 1 else pos.unsqueeze(-2))
@@ -201,7 +206,7 @@ def skew_symmetric_matrix(vec: Tensor) -> Tensor:
     """Return the matrix of the cross product with a vector. (..., 3) -> (..., 3, 3)"""
     x, y, z = vec.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(vec.shape[:-1] + (3, 3))
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape((*vec.shape[:-1], 3, 3))
 
 
 def default_orientation(num: int, device: Any) -> Tensor:
@@ -227,7 +232,9 @@ def sample_cylinder(radius: float, h_range: Any, size: Any, device: Any) -> Tens
     low, high = (0.0, float(h_range)) if isinstance(h_range, int | float) else h_range
     distance = radius * torch.rand(*shape, device=device).sqrt()
     angle = 2.0 * torch.pi * torch.rand(*shape, device=device)
-    return torch.stack([distance * angle.cos(), distance * angle.sin(), sample_uniform(low, high, shape, device)], dim=-1)
+    return torch.stack(
+        [distance * angle.cos(), distance * angle.sin(), sample_uniform(low, high, shape, device)], dim=-1
+    )
 
 
 def orthogonalize_perspective_depth(depth: Tensor, intrinsics: Tensor) -> Tensor:
