@@ -7,7 +7,7 @@ from pathlib import Path as FilePath
 
 from rlcli.config.layers import read
 from rlcli.config.strict_yaml import Path
-from rlcli.errors import ConfigError, Problem, UsageError
+from rlcli.errors import Problem, UsageError
 from rlcli.registry.formats import Format
 
 MODELS = "models"
@@ -37,14 +37,14 @@ def read_models(words: Iterable[str]) -> dict[str, FilePath]:
     return found
 
 
-def model_path(path: Path, form: Format | None) -> Path:
+def model_path(path: Path, form: Format | None, problems: list[Problem]) -> Path:
     """Return the key of a task's data that an override `models.NAME` sets.
 
-    Raises:
-        ConfigError: if the task's format has no such key.
+    If the task's format has no such key, add a problem and return an empty path.
     """
     name = ".".join(map(str, path[1:]))
     if form is None or not form.spec.models:
         hint = f"set scene.entities.{name}.model"
-        raise ConfigError([Problem(f"--model {name}", "", "this task names its models itself", hint)])
+        problems.append(Problem(f"--model {name}", "", "this task names its models itself", hint))
+        return ()
     return tuple(name if key == "{name}" else key for key in form.spec.models.split("."))

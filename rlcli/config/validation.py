@@ -209,12 +209,9 @@ class TaskCheck:
                     self._no_agent(origin.where)
                     continue
                 path = ("agents", name, *path[1:])
-            if path[0] == MODELS:
-                try:
-                    path = model_path(path, formats.format_of_key(self.layers.data))
-                except ConfigError as error:
-                    self.problems += error.problems
-                    continue
+            form = formats.format_of_key(self.layers.data) if path[0] == MODELS else None
+            if path[0] == MODELS and not (path := model_path(path, form, self.problems)):
+                continue
             if value is None and path[0] in SECTIONS and not isinstance(self.layers.get(path), dict):
                 # null removes a term; for a term that does not exist, suggest one with a similar name
                 similar = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))
