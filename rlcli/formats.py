@@ -42,8 +42,14 @@ class FormatSpec:
             Typer's annotations.
         hint: `(error: BaseException) -> str | None`. Return what to do about an error of a task's code.
         agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration.
-        aliases: module name -> module. While a task's files are imported, the first name (and names below it) resolves
-            to the second.
+        models: the key of a task's data where `--model NAME=FILE` sets a model, with `{name}`; empty: task files in
+            this format name their models themselves.
+        agent_file: `(file: Path, library: str, notes: list[Note]) -> dict | None`. Return the settings of an agent
+            that a registration names by a file; None if the format does not read the library's files.
+        agent_order: libraries of agents, best first; the first one that a registration names is the default agent.
+        aliases: module name -> module, or -> `module:function`. Imports of the first name, and of names below it, in
+            files of a task resolve to the second. `function(name, file)` returns the module of a full name for the
+            importing file, or None.
         api: the `API_VERSION` that the format was written for.
     """
 
@@ -57,6 +63,9 @@ class FormatSpec:
     importer: str = ""
     hint: str = ""
     agents_beside: str = ""
+    models: str = ""
+    agent_file: str = ""
+    agent_order: tuple[str, ...] = ()
     aliases: Mapping[str, str] = field(default_factory=dict)
     api: int = API_VERSION
 

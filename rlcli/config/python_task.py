@@ -7,7 +7,9 @@ is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
 
 from __future__ import annotations
 
-import sys
+import functools
+import inspect
+import logging
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,11 +21,13 @@ from pydantic import BaseModel, ValidationError
 
 from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
-from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, listing
+from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing
 from rlcli.formats import Note
-from rlcli.registry import TaskSource, import_file, is_framework, load_object
+from rlcli.registry import TaskSource, import_file, is_framework, load_module, load_object
 from rlcli.registry.formats import Format, format_of_module, installed_formats, require_module
+from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registrations
 
+_log = logging.getLogger(__name__)
 _OWN = "rlcli.mdp."
 _AGENTS = "agents/*.py"
 
@@ -37,6 +41,8 @@ class PythonTask:
     notes: list[Note] = field(default_factory=list)
     format: Format | None = None
     """The other framework's format to whose classes the configuration belongs; None: rlcli's own."""
+    place: str = ""
+    """File and line of the configuration's class; empty if unknown."""
 
 
 def source_of(value: object, root: FilePath | None = None, name: str = "task") -> TaskSource:
@@ -61,17 +67,19 @@ def load(source: TaskSource) -> PythonTask:
     if source.value is not None:
         return to_task(source.value, source.label, source.root)
     assert source.python is not None
+    place = ""
     try:
         value, agents = _import_configuration(source)
+        place = _place_of(value)
         task = to_task(value, source.label, source.root)
-        for name, agent in agents.items():
-            _add_agent(task, name, agent)
+        task.place = place
+        _add_agents(task, agents)
     except ValidationError as error:
         items = error.errors(include_url=False)
         problems = [Problem(source.label, ".".join(map(str, item["loc"])), item["msg"]) for item in items]
         raise ConfigError(problems) from None
     except ConfigError as error:
-        label = source.label
+        label = place or source.label
         problems = [replace(p, where=label) if p.where == "configuration" else p for p in error.problems]
         raise ConfigError(problems) from None
     except RlcliError:
@@ -117,6 +125,19 @@ def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
     if not isinstance(plain, dict):
         raise TypeError(f"the agent is of type {type(value).__name__}; write a mapping of settings")
     return plain
+
+
+def _place_of(value: object) -> str:
+    """Return `file:line` of the class of a configuration in another framework's form; empty for others."""
+    kind = value if isinstance(value, type) else type(value)
+    if not hasattr(kind, "__rlcli_task__") or is_framework(kind.__module__):
+        return ""
+    try:
+        file, line = inspect.getsourcefile(kind), inspect.getsourcelines(kind)[1]
+    except (OSError, TypeError):
+        return ""
+    path = FilePath(str(file))
+    return f"{path.relative_to(FilePath.cwd()) if path.is_relative_to(FilePath.cwd()) else path}:{line}"
 
 
 class _PlainData:
@@ -200,6 +221,9 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         value = getattr(value, part)
     if agents or not hasattr(value, "__rlcli_task__"):
         return value, agents
+    uses = [kwargs for kwargs in registrations.values() if _names(kwargs[CONFIGURATION], module.__name__, attribute)]
+    if uses:
+        return _with_environment(value, uses[0]), _registered_agents(uses[0])
     folder, form = FilePath(file).parent, format_of_module(value.__rlcli_task__.__module__)
     files = sorted(folder.glob(_AGENTS))
     if form is not None and form.spec.agents_beside:
@@ -215,6 +239,8 @@ def _agents_in_modules(modules: Iterable[Any]) -> dict[str, Any]:
         for name, item in vars(module).items()
         if hasattr(item, "__rlcli_agent__") and not is_framework(str(getattr(item, "__module__", "")))
     }
+    inner = {base for item in found.values() if isinstance(item, type) for base in item.__mro__[1:]}
+    found = {name: item for name, item in found.items() if item not in inner} or found
     if len(found) == 1:
         item = next(iter(found.values()))
         return {item.__rlcli_library__: item}
@@ -227,27 +253,44 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     They are the arguments `env_cfg_entry_point` and `AGENT_cfg_entry_point` of the registration.
     """
     module = import_file(source.root / "__init__.py")
-    gymnasium = sys.modules.get("gymnasium")
-    registry = gymnasium.envs.registry if gymnasium is not None else {}
-    found = {
-        name: spec.kwargs
-        for name, spec in registry.items()
-        if _module_of(spec.kwargs.get("env_cfg_entry_point")).startswith(module.__name__)
-    }
     wanted = str(source.python).removeprefix(str(source.root)).removeprefix(":")
+    found = {
+        name: kwargs
+        for name, kwargs in registrations.items()
+        if _module_of(kwargs[CONFIGURATION]).startswith(module.__name__)
+    }
     if wanted and wanted not in found:
-        raise TaskError(f"{source.root} does not register '{wanted}'", hint=f"it registers {listing(found)}")
+        hint = did_you_mean(wanted, found) or f"it registers {listing(found)}"
+        raise TaskError(f"{source.root} does not register '{wanted}'", hint=hint)
     if not wanted and len(found) != 1:
-        hint = f"name one: {' or '.join(f'{source.root}:{name}' for name in found)}" if found else None
-        raise TaskError(f"{source.root} registers {len(found)} tasks with env_cfg_entry_point, expected 1", hint=hint)
+        hint = f"name one: {listing(f'{source.root}:{name}' for name in found)}" if found else None
+        raise TaskError(f"{source.root} registers {len(found)} tasks with {CONFIGURATION}, expected 1", hint=hint)
     kwargs = found[wanted or next(iter(found))]
+    return _with_environment(_object(kwargs[CONFIGURATION]), kwargs), _registered_agents(kwargs)
+
+
+def _with_environment(value: Any, kwargs: Mapping[str, Any]) -> Any:
+    """Return a configuration that knows the environment class of its registration, if its format needs the class."""
+    value = value() if isinstance(value, type) else value
+    if hasattr(value, "__rlcli_environment__"):
+        value.__rlcli_environment__(kwargs[ENVIRONMENT])
+    return value
+
+
+def _registered_agents(kwargs: Mapping[str, Any]) -> dict[str, Any]:
     ending = "_cfg_entry_point"
-    agents = {
+    return {
         key.removesuffix(ending).replace("_", "-"): _object(value)
         for key, value in kwargs.items()
-        if key.endswith(ending) and key != "env_cfg_entry_point"
+        if key.endswith(ending) and key != CONFIGURATION
     }
-    return _object(kwargs["env_cfg_entry_point"]), agents
+
+
+def _names(entry: object, module: str, attribute: str) -> bool:
+    """Return whether the entry of a registration is this object of a module."""
+    if isinstance(entry, str):
+        return entry == f"{module}:{attribute}"
+    return getattr(entry, "__module__", "") == module and getattr(entry, "__qualname__", "") == attribute
 
 
 def _module_of(entry: object) -> str:
@@ -255,20 +298,57 @@ def _module_of(entry: object) -> str:
 
 
 def _object(entry: object) -> Any:
-    """Import the object of a reference `module:name`; return other objects, and names of YAML files, unchanged."""
+    """Import the object of a reference `module:name`; return the path of a file, and other objects unchanged."""
     if not isinstance(entry, str):
         return entry
-    return entry if entry.endswith((".yaml", ".yml")) else load_object(entry)
+    if not entry.endswith((".yaml", ".yml", ".json")):
+        return load_object(entry)
+    module, _, file = entry.rpartition(":")
+    return FilePath(str(load_module(module).__file__)).parent / file if module else FilePath(file)
 
 
-def _add_agent(task: PythonTask, name: str, agent: object) -> None:
-    if isinstance(agent, str) or not (isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__")):
-        what = agent if isinstance(agent, str) else type(agent).__name__
-        task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}: write a mapping"))
-        return
-    agents = task.data.setdefault("agents", {})
-    agents.setdefault("default", name)
-    agents[name] = agent_data(agent, task.notes)
+def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
+    """Add agents to a task. The default is the first one in the order of the task's format, or the only one.
+
+    An agent among several that rlcli cannot read is left out, with a note.
+    """
+    order = task.format.spec.agent_order if task.format is not None else ()
+    found: dict[str, Any] = {}
+    for name, agent in agents.items():
+        try:
+            data = _read_agent(task, name, agent)
+        except ConfigError as error:
+            if len(agents) == 1:
+                raise
+            task.notes.append(Note("", f"agents.{name}", "ignored", "; ".join(map(str, error.problems))))
+            continue
+        if data is None:
+            what = str(agent) if isinstance(agent, str | FilePath) else type(agent).__name__
+            task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}: write a mapping"))
+        else:
+            found[name] = data
+    ranked = [name for name in order if name in found]
+    default = next(iter(ranked or (found if len(found) == 1 or not order else ())), None)
+    if found:
+        task.data.setdefault("agents", {}).update({"default": default} if default else {}, **found)
+    if default is not None and len(found) > 1 and order:
+        others = listing(name for name in found if name != default)
+        _report_choice(f"agent '{default}'; --agent chooses another one: {others}")
+
+
+def _read_agent(task: PythonTask, name: str, agent: object) -> dict[str, Any] | None:
+    """Return the settings of an agent; None if rlcli cannot read it."""
+    if isinstance(agent, FilePath):
+        read = task.format.spec.agent_file if task.format is not None else ""
+        return task.format.load(read)(agent, name, task.notes) if task.format is not None and read else None
+    if isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__"):
+        return agent_data(agent, task.notes)
+    return None
+
+
+@functools.cache
+def _report_choice(message: str) -> None:
+    _log.info(message)
 
 
 def _location(error: BaseException) -> str:

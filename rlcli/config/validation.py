@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, python_task
 from rlcli.config.foreign_keys import move_foreign_keys
+from rlcli.config.given_models import MODELS, model_path
 from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
@@ -73,13 +74,15 @@ class TaskCheck:
     functions: dict[str, Signature] = field(default_factory=dict)
     notes: list[Note] = field(default_factory=list)
     format: formats.Format | None = None
+    place: str = ""
+    """File and line of a configuration's class in another framework's form; empty for others."""
 
     def document(self) -> Document:
         """Return the content of the task's file. For a configuration in Python, also store its functions and notes."""
         if self.source.python is None and self.source.value is None:
             return read(self.source.config, self.source.label)
         task = python_task.load(self.source)
-        self.functions, self.notes, self.format = task.terms, task.notes, task.format
+        self.functions, self.notes, self.format, self.place = task.terms, task.notes, task.format, task.place
         if self.source.config.suffix == ".py":
             return Document(task.data)
         return read(self.source.config, self.source.label)  # the record of a run, which is YAML
@@ -110,7 +113,8 @@ class TaskCheck:
     def read_task(self, document: Document) -> None:
         """Merge the content of the task's file, which may be in another framework's format."""
         if not self._read_other_format(document):
-            self.layers.merge(document.data, document_origins(document, self.source.label, "task"))
+            label = self.place or self.source.label
+            self.layers.merge(document.data, document_origins(document, label, "task"))
 
     def _read_other_format(self, document: Document) -> bool:
         """Merge a document in another framework's format. Return False for a document in rlcli's own format.
@@ -225,6 +229,9 @@ class TaskCheck:
                     self._no_agent(origin.where)
                     continue
                 path = ("agents", name, *path[1:])
+            form = formats.format_of_key(self.layers.data) if path[0] == MODELS else None
+            if path[0] == MODELS and not (path := model_path(path, form, self.problems)):
+                continue
             if value is None and path[0] in SECTIONS and not isinstance(self.layers.get(path), dict):
                 # null removes a term; for a term that does not exist, suggest one with a similar name
                 similar = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))

@@ -176,7 +176,7 @@ class DirectEnv(VecEnv):
         source = self.resolved.source
         assert source.task is not None
         try:
-            task_class = load_object(source.task)
+            task_class = self._import_task(source.task)
         except RlcliError:
             raise
         except Exception as error:
@@ -186,6 +186,10 @@ class DirectEnv(VecEnv):
         if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
             raise TaskError(f"task '{source.name}' is broken: derive {source.task} from DirectTask")
         return task_class
+
+    def _import_task(self, reference: str) -> Any:
+        """Import the class of the task."""
+        return load_object(reference)
 
     def _build_workflow(self) -> None:
         for view in self.views:
@@ -278,10 +282,7 @@ class DirectEnv(VecEnv):
 
     def _compute_rewards_and_dones(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         task = self.task
-        task.progress_buf += 1
-        self._fill_buffers()
-        task.calculate_metrics()
-        task.is_done()
+        self._run_hooks()
         failed, truncated = self._compute_dones()
         self._episode_causes = {"time_out": truncated, "task": failed}
         reward = next(self._rewards).copy_(task.rew_buf)
@@ -296,6 +297,13 @@ class DirectEnv(VecEnv):
         self._returns += reward
         self._obs_current = True
         return reward, failed, truncated
+
+    def _run_hooks(self) -> None:
+        """Call the task's hooks that follow physics."""
+        self.task.progress_buf += 1
+        self._fill_buffers()
+        self.task.calculate_metrics()
+        self.task.is_done()
 
     def _compute_dones(self) -> tuple[Tensor, Tensor]:
         """Return where the task ended the episode, and where it timed out. (num_envs,) bool each"""

@@ -187,9 +187,10 @@ def require_module(error: BaseException) -> None:
             raise form.missing(f"import of '{name}'") from error
 
 
-def format_aliases() -> dict[str, str]:
-    """Return the aliases of installed formats: module name -> the module that is imported instead."""
-    return {alias: module for form in usable_formats() for alias, module in form.spec.aliases.items()}
+@functools.cache
+def aliasing_formats() -> tuple[Format, ...]:
+    """Return the installed formats that work and have aliases for imports of task files."""
+    return tuple(form for form in usable_formats() if form.spec.aliases)
 
 
 def _load(entry: Entry) -> Format:

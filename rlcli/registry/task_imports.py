@@ -1,4 +1,4 @@
-"""Import of task files by module name or path, with the aliases of installed formats."""
+"""Import of task files by module name or path."""
 
 from __future__ import annotations
 
@@ -14,7 +14,16 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.registry.imports import contain_side_effects
-from rlcli.registry.module_aliases import aliases_resolved
+from rlcli.registry.module_aliases import TaskFileLoader, files_below, import_by_name, is_alias, package_tree
+
+CONFIGURATION = "env_cfg_entry_point"
+"""Argument of a registration with Gymnasium that names the configuration of a task."""
+
+ENVIRONMENT = "entry_point"
+"""Key under which `registrations` has the environment class of a task."""
+
+registrations: dict[str, dict[str, Any]] = {}
+"""ID -> arguments of every task that imported files have registered with Gymnasium."""
 
 _imported: dict[tuple[Path, str], None] = {}
 """Imported task files, in order, with the name of the function that imported them."""
@@ -31,16 +40,16 @@ def load_module(name: str) -> Any:
 
     The module name of a file is derived from its path, so that `task.py` of two folders are two modules.
     """
-    with contain_side_effects(), aliases_resolved():
+    with contain_side_effects(), _registrations_kept():
         if not name.endswith(".py"):
-            return importlib.import_module(name)
+            return import_by_name(name)
         file = Path(name)
         digest = hashlib.blake2b(str(file.resolve()).encode(), digest_size=8).hexdigest()
         alias = f"rlcli_folder_task_{digest}_{file.stem}"
         if alias not in sys.modules:
-            spec = importlib.util.spec_from_file_location(alias, file)
-            if spec is None or spec.loader is None:
-                raise ImportError(f"cannot import {file}: Python finds no loader for this file; name a .py file")
+            spec = importlib.util.spec_from_file_location(alias, file, loader=TaskFileLoader(alias, str(file)))
+            assert spec is not None
+            assert spec.loader is not None
             module = importlib.util.module_from_spec(spec)
             sys.modules[alias] = module
             try:
@@ -58,18 +67,25 @@ def import_file(file: Path) -> Any:
 
     If the folder is no package, the file can import the modules beside it, as a script can.
     """
-    with contain_side_effects(), aliases_resolved():
+    with contain_side_effects(), _registrations_kept():
         top = file.parent
         while (top.parent / "__init__.py").is_file() and (top / "__init__.py").is_file():
             top = top.parent
         name = _package(top)
         inner = file.parent.relative_to(top).parts + (() if file.stem == "__init__" else (file.stem,))
-        sys.path.append(str(top))
         _imported[file, import_file.__name__] = None
-        try:
+        with _siblings_importable(top):
             return importlib.import_module(".".join((name, *inner)))
-        finally:
-            sys.path.remove(str(top))
+
+
+def import_from(package: Path, inner: str, *, run_start: bool = True) -> Any:
+    """Import a module of a package folder, for example `robots.arm`; an empty text is the package itself.
+
+    Without `run_start`, the package's `__init__.py` is not executed.
+    """
+    with contain_side_effects(), _registrations_kept():
+        name = _package(package, run_start)
+        return importlib.import_module(f"{name}.{inner}" if inner else name)
 
 
 def imported_files() -> list[tuple[Path, str]]:
@@ -93,7 +109,8 @@ def _sibling_modules(folder: Path) -> Iterator[None]:
     sys.path.insert(0, str(folder))
     importlib.invalidate_caches()
     try:
-        yield
+        with files_below(folder):
+            yield
     finally:
         sys.path.remove(str(folder))
         for name in set(sys.modules) - before:
@@ -102,34 +119,59 @@ def _sibling_modules(folder: Path) -> Iterator[None]:
                 del sys.modules[name]
 
 
-def _package(folder: Path) -> str:
+def _package(folder: Path, run_start: bool = True) -> str:
     """Import a folder as a package and return its module name: the folder's name, or a unique one if that is taken."""
     digest = hashlib.blake2b(str(folder).encode(), digest_size=8).hexdigest()
     name = f"rlcli_folder_{digest}"
-    if folder.name.isidentifier():
+    if folder.name.isidentifier() and not is_alias(folder.name):
         existing = sys.modules.get(folder.name)
         is_folder = existing is not None and str(folder) in list(getattr(existing, "__path__", ()))
         if is_folder or (existing is None and importlib.util.find_spec(folder.name) is None):
             name = folder.name
     if name in sys.modules:
         return name
+    package_tree(name, folder, folder.name)
     start = folder / "__init__.py"
-    if start.is_file():
-        spec = importlib.util.spec_from_file_location(name, start, submodule_search_locations=[str(folder)])
+    if start.is_file() and run_start:
+        loader = TaskFileLoader(name, str(start))
+        spec = importlib.util.spec_from_file_location(
+            name, start, loader=loader, submodule_search_locations=[str(folder)]
+        )
     else:
         spec = ModuleSpec(name, None, is_package=True)
         spec.submodule_search_locations = [str(folder)]
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    if spec.loader is not None and start.is_file():
-        sys.path.append(str(folder))
+    if spec.loader is not None:
         try:
-            spec.loader.exec_module(module)
+            with _siblings_importable(folder):
+                spec.loader.exec_module(module)
         except BaseException:
             for imported in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
                 del sys.modules[imported]
             raise
-        finally:
-            sys.path.remove(str(folder))
     return name
+
+
+@contextlib.contextmanager
+def _siblings_importable(folder: Path) -> Iterator[None]:
+    """Let files of a folder import the files beside them by name, if no installed module has the name."""
+    sys.path.append(str(folder))
+    try:
+        with files_below(folder):
+            yield
+    finally:
+        sys.path.remove(str(folder))
+
+
+@contextlib.contextmanager
+def _registrations_kept() -> Iterator[None]:
+    """Copy what task files register with Gymnasium to `registrations`."""
+    try:
+        yield
+    finally:
+        gymnasium = sys.modules.get("gymnasium")
+        registry = gymnasium.envs.registry if gymnasium is not None else {}
+        for name in [name for name, spec in registry.items() if CONFIGURATION in spec.kwargs]:
+            registrations[name] = {**registry[name].kwargs, ENVIRONMENT: registry[name].entry_point}

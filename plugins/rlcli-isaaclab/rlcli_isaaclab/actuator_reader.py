@@ -8,18 +8,26 @@ from typing import Any
 
 from rlcli_isaaclab.settings import Node, Report, as_float, kind_of, to_plain
 
+_EXPLICIT = ("IdealPDActuator", "DCMotor", "DelayedPDActuator", "RemotizedPDActuator")
+_NETWORKS = ("ActuatorNetLSTM", "ActuatorNetMLP")
+
 JointSettings = list[tuple[str, dict[str, Any], list[str]]]
 """(regex of joints, settings, regexes of all joints of the group); later entries override earlier ones."""
 
 
 def read_actuators(
-    actuators: Node, order_joints: Callable[[list[str], Node], Any]
+    actuators: Node,
+    order_joints: Callable[[list[str], Node], Any],
+    entity: str,
+    replaced: Mapping[str, Mapping[str, float]],
 ) -> tuple[JointSettings, dict[str, Any]]:
     """Return the settings of the joints, and the explicit actuator models by group.
 
     Args:
         actuators: groups of actuators.
         order_joints: returns the names or regexes of a group's joints in the model's order.
+        entity: name of the entity, for messages.
+        replaced: group -> gains that replace its actuator network.
     """
     joints: JointSettings = []
     models: dict[str, Any] = {}
@@ -37,7 +45,23 @@ def read_actuators(
         gains = {"stiffness": item.get("stiffness"), "damping": item.get("damping")}
         if kind == "ImplicitActuator":
             settings = {**gains, **passive, **_read_implicit_limits(item)}
-        elif kind in ("IdealPDActuator", "DCMotor", "DelayedPDActuator"):
+        elif kind in _NETWORKS and group not in replaced:
+            what = f"the actuator network of '{kind}' is a TorchScript file, which rlcli does not load"
+            gains_key = f"{group}: {{stiffness: S, damping: D}}"
+            hint = f"give gains in models.yaml: {entity}: {{model: FILE.xml, gains: {{{gains_key}}}}}"
+            item.report.problem(item.key, what, hint)
+            continue
+        elif kind in _EXPLICIT or kind in _NETWORKS:
+            if kind in _NETWORKS:
+                gains = dict(replaced[group])
+                item.note("approximated", "network_file", "replaced by the gains of models.yaml")
+                item.skip("pos_scale", "vel_scale", "torque_scale", "input_order", "input_idx")
+                kind = "DCMotor"
+            elif kind == "RemotizedPDActuator":
+                limits = [row[2] for row in item.get("joint_parameter_lookup") or [[0, 0, 0]]]
+                effort_limit = max(limits) if item.get("effort_limit") is None else effort_limit
+                item.note("approximated", "joint_parameter_lookup", "the effort limit is the largest of the table")
+                kind = "DelayedPDActuator"
             models[group] = _read_explicit_actuator(item, kind, order_joints(patterns, item), gains)
             speed = None if kind == "DCMotor" else _speed_limit(item)  # terms read that of a DC motor by themselves
             settings = {**passive, "velocity_limit": speed}

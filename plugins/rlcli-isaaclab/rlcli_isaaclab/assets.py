@@ -1,4 +1,4 @@
-"""Configuration classes of robots and objects, and the MJCF that replaces each USD file.
+"""Configuration classes of robots and objects.
 
 Names as in `isaaclab.assets` and `isaaclab_assets`.
 """
@@ -7,46 +7,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli_isaaclab.actuators import ImplicitActuatorCfg
 from rlcli_isaaclab.config_class import MISSING, configclass
+from rlcli_isaaclab.model_lookup import USD_TO_MJCF, map_usd
 from rlcli_isaaclab.scene_facade import Asset as Articulation
 from rlcli_isaaclab.scene_facade import Asset as RigidObject
 from rlcli_isaaclab.sim import UsdFileCfg
 from rlcli_isaaclab.utils.assets import ISAAC_NUCLEUS_DIR, ISAACLAB_NUCLEUS_DIR
-
-USD_TO_MJCF: dict[str, str] = {
-    "Robots/Classic/Cartpole/cartpole.usd": "cartpole:cartpole.xml",
-    "Robots/Cartpole/cartpole.usd": "cartpole:cartpole.xml",
-    "Robots/IsaacSim/Ant/ant_instanceable.usd": "ant-direct:ant.xml",
-    "Robots/Ant/ant_instanceable.usd": "ant-direct:ant.xml",
-}
-"""End of a USD path -> MJCF: a file relative to the task's folder, or `TASK:FILE` of an installed task."""
-
-
-def map_usd(usd: str, mjcf: str) -> None:
-    """Replace a USD file by an MJCF; the end of the USD's path is enough. Call it before creating the configuration."""
-    USD_TO_MJCF[usd] = mjcf
-
-
-def mjcf_of(usd: str) -> str:
-    """Return the MJCF that replaces a USD file; an `.xml` file is returned unchanged.
-
-    Raises:
-        TaskError: if no MJCF is known for it.
-    """
-    if usd.endswith(".xml"):
-        return usd
-    for end, mjcf in USD_TO_MJCF.items():
-        if usd.replace("\\", "/").endswith(end):
-            return mjcf
-    near = did_you_mean(usd.rsplit("/", 1)[-1], [end.rsplit("/", 1)[-1] for end in USD_TO_MJCF])
-    known = f"known: {listing(USD_TO_MJCF)}"
-    raise TaskError(
-        f"no MJCF model is known for the USD file '{usd}'",
-        hint=f"rlcli_isaaclab.assets.map_usd('{'/'.join(usd.split('/')[-2:])}', 'model.xml') sets it;"
-        f" {near + ' ' if near else ''}{known}",
-    )
 
 
 @configclass
@@ -135,5 +102,4 @@ __all__ = [
     "RigidObject",
     "RigidObjectCfg",
     "map_usd",
-    "mjcf_of",
 ]

@@ -28,7 +28,13 @@ def configclass(cls: type[T]) -> type[T]:
     for name, method in (("to_dict", to_dict), ("replace", _replace), ("copy", _copy), ("from_dict", _from_dict)):
         if name not in vars(cls):
             setattr(cls, name, method)
+    if not hasattr(cls, "__post_init__"):
+        cls.__post_init__ = _post_init  # type: ignore[attr-defined]
     return dataclasses.dataclass(cls)
+
+
+def _post_init(self: Any) -> None:
+    """Do nothing: a subclass can always call `super().__post_init__()`."""
 
 
 def make_config_class(name: str, doc: str, bases: tuple[type, ...] = (), **members: Any) -> Any:

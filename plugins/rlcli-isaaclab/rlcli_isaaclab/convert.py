@@ -21,6 +21,7 @@ def task(
     root: Path,
     defaults: Any = None,
     models: Mapping[str, str] | None = None,
+    cfg: Any = None,
 ) -> dict[str, Any]:
     """Return the task that the settings of a `ManagerBasedRLEnvCfg` describe.
 
@@ -30,6 +31,7 @@ def task(
         root: folder that model paths are relative to.
         defaults: default settings, as nested dicts; keys that equal them are not reported.
         models: entity -> MJCF that replaces its USD file.
+        cfg: the user's configuration object, which the user's terms may read.
 
     Raises:
         ConfigError: if the settings do not describe a valid task.
@@ -45,13 +47,15 @@ def task(
     }
     scene = SceneReader(top.node("scene"), root, models)
     config["scene"] = scene.read()
-    terms = TermReader(scene, report)
+    terms = TermReader(scene, report, cfg)
     terms.record_driven_joints(top.node("actions"))
     config["actions"] = {name: terms.read_action(node) for name, node in top.node("actions").nodes()}
     config["observations"] = {name: terms.read_group(node) for name, node in top.node("observations").nodes()}
     for section in ("events", "rewards", "terminations", "curriculum"):
         terms_of_section = (terms.read_terms(section, *member) for member in top.node(section).nodes())
         config[section] = {name: term for pairs in terms_of_section for name, term in pairs}
+    if not config["rewards"]:
+        config["rewards"] = {"no_reward": {"func": "is_alive", "weight": 0.0}}
     config["commands"] = {name: terms.read_command(node) for name, node in top.node("commands").nodes()}
     scene.add_joint_settings(terms.driven_joints)
     for section in ("events", "curriculum", "commands"):

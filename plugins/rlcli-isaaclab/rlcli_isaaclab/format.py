@@ -13,13 +13,21 @@ if TYPE_CHECKING:
 
 _RUNNER = b"RslRlOnPolicyRunnerCfg"
 
+FOREIGN = (
+    *("isaaclab", "isaaclab_tasks", "isaaclab_assets", "isaaclab_rl", "isaaclab_contrib", "isaaclab_mimic"),
+    *("isaacsim", "omni", "pxr", "carb", "usdrt", "toml", "pink", "pinocchio", "torchvision", "trimesh"),
+)
+"""Packages whose modules `namespace.py` replaces in task files."""
+
 SPEC = FormatSpec(
     summary="tasks of Isaac Lab",
     find="rlcli_isaaclab.format:find",
     importer="rlcli_isaaclab.command:import_run",
     hint="rlcli_isaaclab.import_hints:import_hint",
+    agent_file="rlcli_isaaclab.agent_files:read_agent",
+    agent_order=("rsl-rl", "rl-games", "skrl", "sb3"),
     agents_beside="rlcli_isaaclab.format:agents_beside",
-    aliases={"rlcli.isaaclab": "rlcli_isaaclab"},
+    aliases={"rlcli.isaaclab": "rlcli_isaaclab", **dict.fromkeys(FOREIGN, "rlcli_isaaclab.namespace:module_of")},
 )
 
 

@@ -39,7 +39,38 @@ class ActionManagerFacade(ManagerFacade):
 
     def get_term(self, name: str) -> Any:
         """Return an action term; its `processed_actions` are the commands to the joints."""
-        return _find_term(self._manager.terms, name, "action")
+        return ActionTermFacade(_find_term(self._manager.terms, name, "action"), self._manager)
+
+
+class ActionTermFacade:
+    """An action term with Isaac Lab's attributes."""
+
+    def __init__(self, term: Any, manager: Any) -> None:
+        self._term, self._manager = term, manager
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._term, name)
+
+    @property
+    def raw_actions(self) -> Tensor:
+        """The policy's actions for this term. (num_envs, k)"""
+        start = 0
+        for bound in self._manager.terms:
+            if bound.instance is self._term:
+                return self._manager.action[:, start : start + bound.instance.size]
+            start += bound.instance.size
+        raise LookupError("the term does not belong to this environment")
+
+
+class ObservationManagerFacade(ManagerFacade):
+    """Observation manager with Isaac Lab's attributes."""
+
+    @property
+    def active_terms(self) -> Any:
+        """Names of the terms of each group, in order."""
+        return {name: [term.name for term in group.terms] for name, group in self._manager.groups.items()}
 
 
 class TerminationManagerFacade(ManagerFacade):

@@ -170,6 +170,11 @@ class CommandTerm(ManagerTermBase):
         """Do nothing: commands are not shown. Returns False."""
         return False
 
+    def _resample(self, env_ids: Any) -> None:
+        """Sample new commands now; `_update_command` may call it before their time is up."""
+        self._resample_command(env_ids)
+        self.command_counter[env_ids] += 1
+
     def _update_metrics(self) -> None:
         """Update the metrics, once per step, before commands are resampled."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from rlcli.errors import did_you_mean, listing
 from rlcli_isaaclab.manager_facade import (
     ActionManagerFacade,
     CommandManagerFacade,
+    ObservationManagerFacade,
     RewardManagerFacade,
     TerminationManagerFacade,
 )
@@ -54,6 +56,9 @@ class ManagerBasedRLEnv(gymnasium.Env):
     managed: Any
     cfg: Any
     extras: dict[str, Any]
+    selection: Any = None
+    """The environments for which a term is called; None outside of such a call."""
+    _context: Any = None
     _scene: Scene | None
     _manager_facades: dict[str, Any]
 
@@ -171,6 +176,28 @@ class ManagerBasedRLEnv(gymnasium.Env):
     def close(self) -> None:
         """Close the engine."""
         self.managed.close()
+
+    def use(self, context: Any) -> None:
+        """Take over the parts of the user's configuration that terms read."""
+        self.scene.add_frames(context.frames)
+        if context.cfg is not None and self._context is not context:
+            self._context, self.cfg = context, copy.deepcopy(context.cfg)
+            self.cfg.scene.num_envs = self.managed.num_envs
+
+    @property
+    def unwrapped(self) -> Any:
+        """The environment itself."""
+        return self
+
+    @property
+    def observation_manager(self) -> Any:
+        """Observation manager."""
+        return self._manager("observation_manager", ObservationManagerFacade)
+
+    @property
+    def obs_buf(self) -> Any:
+        """Observations of the last step, by group."""
+        return self.managed._last_obs
 
     def open_weights(self) -> None:
         """Make the weights of all rewards changeable. Call this before the reward manager is created."""

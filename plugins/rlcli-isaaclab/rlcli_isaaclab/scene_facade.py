@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import did_you_mean, listing
+from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem, match
-from rlcli.sim.rotations import rotate, rotate_inverse
+from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
 from rlcli.sim.selection import ALL
+from rlcli_isaaclab.absent import NoEffect
+from rlcli_isaaclab.asset_commands import BodyWrench, JointDrive, PhysxView
+from rlcli_isaaclab.setup_scene import current_setup
 
 _DATA_NAMES = {
     "applied_torque": "applied_effort",
+    "root_link_heading_w": "heading_w",
     "computed_torque": "computed_effort",
     "root_link_pos_w": "root_pos_w",
     "root_link_quat_w": "root_quat_w",
@@ -61,6 +67,14 @@ class Data:
         return self._expand_to_envs(self._data.joint_pos_limits)
 
     @property
+    def joint_vel_limits(self) -> Tensor:
+        """Speed limits. (num_envs, joints) [m/s or rad/s]"""
+        limits = self._data.joint_vel_limits
+        return limits if limits.dim() == 2 else limits.expand(self._env.num_envs, -1)
+
+    soft_joint_vel_limits = joint_vel_limits
+
+    @property
     def soft_joint_pos_limits(self) -> Tensor:
         """Lower and upper soft limits. (num_envs, joints, 2) [m or rad]"""
         return self._expand_to_envs(self._data.soft_joint_pos_limits)
@@ -69,13 +83,6 @@ class Data:
     def root_pose_w(self) -> Tensor:
         """Root position [m] and quaternion (w, x, y, z), world frame. (num_envs, 7)"""
         return torch.cat([self._data.root_pos_w, self._data.root_quat_w], dim=1)
-
-    @property
-    def soft_joint_vel_limits(self) -> Tensor:
-        """Speed limits of the actuators. (num_envs, joints) [m/s or rad/s]"""
-        return self._data.joint_vel_limits.expand(self._env.num_envs, -1)
-
-    joint_vel_limits = soft_joint_vel_limits
 
     @property
     def root_lin_vel_b(self) -> Tensor:
@@ -145,6 +152,18 @@ class Data:
         return torch.cat([self.body_link_lin_vel_w, self._data.body_ang_vel_w], dim=-1)
 
     @property
+    def body_vel_w(self) -> Tensor:
+        """Linear [m/s] and angular [rad/s] velocities of all bodies, world frame. (num_envs, bodies, 6)"""
+        return torch.cat([self._data.body_lin_vel_w, self._data.body_ang_vel_w], dim=-1)
+
+    @property
+    def body_pose_w(self) -> Tensor:
+        """Positions [m] and quaternions (w, x, y, z) of all bodies, world frame. (num_envs, bodies, 7)"""
+        return torch.cat([self._data.body_pos_w, self._data.body_quat_w], dim=-1)
+
+    body_link_pose_w, body_com_vel_w = body_pose_w, body_vel_w
+
+    @property
     def body_state_w(self) -> Tensor:
         """Poses of all bodies, and velocities of their centres of mass, world frame. (num_envs, bodies, 13)"""
         return torch.cat([self.body_pose_w, self.body_vel_w], dim=-1)
@@ -174,14 +193,75 @@ class Data:
 class Asset:
     """A robot or an object."""
 
-    def __init__(self, env: VecEnv, entity: Entity) -> None:
+    def __init__(self, cfg: Any) -> None:
+        current_setup().add(self, cfg)
+
+    @classmethod
+    def of(cls, env: VecEnv, entity: Entity) -> Asset:
+        """Return the asset of an entity."""
+        asset = cls.__new__(cls)
+        asset.cfg = entity.config
+        asset.bind(env, entity)
+        return asset
+
+    cfg: Any
+
+    def bind(self, env: VecEnv, entity: Entity) -> None:
+        """Connect the asset with an entity of the simulation."""
         self._env, self._entity = env, entity
-        self.cfg = entity.config
+        self._drives: dict[str, JointDrive] = {}
+        self._wrench = BodyWrench(env, entity)
         self.data = Data(env, entity)
         self.joint_names, self.body_names = self.data.joint_names, self.data.body_names
         self.num_joints, self.num_bodies = len(self.joint_names), len(self.body_names)
         self.num_instances, self.device = env.num_envs, env.device
         self.is_fixed_base = not entity.is_floating
+        self._ALL_INDICES = torch.arange(env.num_envs, device=env.device)
+        self.root_physx_view = PhysxView(env, entity)
+
+    @property
+    def permanent_wrench_composer(self) -> BodyWrench:
+        """Writer of forces on bodies, which act until they change."""
+        return self._wrench
+
+    instantaneous_wrench_composer = permanent_wrench_composer
+
+    def set_external_force_and_torque(
+        self, forces: Tensor, torques: Tensor, body_ids: Any = None, env_ids: Any = None, **frame: Any
+    ) -> None:
+        """Apply forces [N] and torques [N m] to bodies, in their own frames, until they change. (rows, bodies, 3)"""
+        self._wrench.set_forces_and_torques(forces, torques, body_ids=body_ids, env_ids=env_ids, **frame)
+
+    def apply_wrenches(self) -> None:
+        """Write the forces on bodies for the next physics step."""
+        self._wrench.apply()
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Remove forces on bodies."""
+        self._wrench.reset(env_ids)
+
+    def set_joint_effort_target(self, target: Tensor, joint_ids: Any = None, env_ids: Any = None) -> None:
+        """Set efforts of joints. (rows, joints) [N or N m]"""
+        self._drive("motor").set(target, joint_ids, env_ids)
+
+    def set_joint_position_target(self, target: Tensor, joint_ids: Any = None, env_ids: Any = None) -> None:
+        """Set position targets of joints. (rows, joints) [m or rad]"""
+        self._drive("position").set(target, joint_ids, env_ids)
+
+    def set_joint_velocity_target(self, target: Tensor, joint_ids: Any = None, env_ids: Any = None) -> None:
+        """Set velocity targets of joints. (rows, joints) [m/s or rad/s]"""
+        self._drive("velocity").set(target, joint_ids, env_ids)
+
+    def write_data_to_sim(self) -> None:
+        """Do nothing: targets are written when they are set."""
+
+    def update(self, dt: float) -> None:
+        """Do nothing: data are computed when they are read."""
+
+    def _drive(self, kind: str) -> JointDrive:
+        if kind not in self._drives:
+            self._drives[kind] = JointDrive(self._env, self._entity, kind)
+        return self._drives[kind]
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -217,6 +297,9 @@ class Asset:
 
     def write_root_pose_to_sim(self, root_pose: Tensor, env_ids: Any = None) -> None:
         """Set the root's position [m] and quaternion (w, x, y, z). (rows, 7)"""
+        if not self._entity.is_floating:
+            self._require_same_base(root_pose, env_ids)
+            return
         root, _ = self._entity.floating()
         columns = torch.arange(root, root + 7, device=self._env.device)
         self._write("qpos", columns, root_pose, None, env_ids)
@@ -226,6 +309,8 @@ class Asset:
 
         Set the pose first.
         """
+        if not self._entity.is_floating:
+            return  # a fixed base does not move
         root, _ = self._entity.floating()
         rows = slice(None) if env_ids is None else env_ids
         quat = self._env.engine.field("qpos")[:, root + 3 : root + 7].float()
@@ -239,6 +324,8 @@ class Asset:
 
         Set the pose first.
         """
+        if not self._entity.is_floating:
+            return
         root, dof = self._entity.floating()
         rows = slice(None) if env_ids is None else env_ids
         quat = self._env.engine.field("qpos")[rows, root + 3 : root + 7].float()
@@ -259,6 +346,16 @@ class Asset:
 
     write_root_link_pose_to_sim, write_root_com_velocity_to_sim = write_root_pose_to_sim, write_root_velocity_to_sim
 
+    def _require_same_base(self, root_pose: Tensor, env_ids: Any) -> None:
+        """Check that the pose of a fixed base does not change."""
+        rows = slice(None) if env_ids is None else env_ids
+        now = self.data.root_pos_w[rows]
+        if not torch.allclose(root_pose[:, :3], now, atol=1e-4):
+            raise TaskError(
+                f"the base of '{self._entity.name}' is fixed in its MJCF, and the task moves it",
+                hint="add a <freejoint/> to the MJCF, or remove the change of the root's position",
+            )
+
     def _write(self, field: str, columns: Tensor, values: Tensor, joint_ids: Any, env_ids: Any) -> None:
         target = self._env.engine.field(field)
         columns = columns if joint_ids is None else columns[joint_ids].reshape(-1)
@@ -267,18 +364,199 @@ class Asset:
         self._env.sim.refresh()
 
 
+class FrameTransformer:
+    """Poses of frames that are fixed to bodies, under Isaac Lab's names; `data` is the object itself."""
+
+    def __init__(self, assets: Mapping[str, Asset], settings: Mapping[str, Any]) -> None:
+        self.data = self
+        self._source = self._bodies(assets, settings["source"])[0]
+        self._targets: list[tuple[Asset, int, Mapping[str, Any]]] = []
+        self.target_frame_names: list[str] = []
+        for target in settings["targets"]:
+            found = self._bodies(assets, target)
+            self._targets += found
+            names = [asset.body_names[index] for asset, index, _ in found]
+            self.target_frame_names += [target["name"]] * len(found) if target["name"] else names
+        self.body_names = self.target_frame_names
+        self.joint_names: list[str] = []
+
+    @staticmethod
+    def _bodies(assets: Mapping[str, Asset], frame: Mapping[str, Any]) -> list[tuple[Asset, int, Mapping[str, Any]]]:
+        asset = assets[frame["entity"]]
+        wanted = frame["body"]
+        ids = [0] if wanted is None else asset.find_bodies(wanted)[0]
+        return [(asset, index, frame) for index in ids]
+
+    @staticmethod
+    def _pose(frame: tuple[Asset, int, Mapping[str, Any]]) -> tuple[Tensor, Tensor]:
+        asset, index, settings = frame
+        pos, quat = asset.data.body_pos_w[:, index], asset.data.body_quat_w[:, index]
+        offset = torch.tensor(settings["pos"], device=pos.device).expand_as(pos)
+        turn = torch.tensor(settings["rot"], device=pos.device).expand_as(quat)
+        return pos + rotate(quat, offset), multiply(quat, turn)
+
+    @property
+    def source_pos_w(self) -> Tensor:
+        """Position of the source frame, world frame. (num_envs, 3) [m]"""
+        return self._pose(self._source)[0]
+
+    @property
+    def source_quat_w(self) -> Tensor:
+        """Orientation of the source frame (w, x, y, z), world frame. (num_envs, 4)"""
+        return self._pose(self._source)[1]
+
+    @property
+    def target_pos_w(self) -> Tensor:
+        """Positions of the target frames, world frame. (num_envs, frames, 3) [m]"""
+        return torch.stack([self._pose(target)[0] for target in self._targets], dim=1)
+
+    @property
+    def target_quat_w(self) -> Tensor:
+        """Orientations of the target frames (w, x, y, z), world frame. (num_envs, frames, 4)"""
+        return torch.stack([self._pose(target)[1] for target in self._targets], dim=1)
+
+    @property
+    def target_pos_source(self) -> Tensor:
+        """Positions of the target frames in the source frame. (num_envs, frames, 3) [m]"""
+        pos, quat = self._pose(self._source)
+        return torch.stack([rotate_inverse(quat, self._pose(t)[0] - pos) for t in self._targets], dim=1)
+
+    @property
+    def target_quat_source(self) -> Tensor:
+        """Orientations of the target frames in the source frame. (num_envs, frames, 4)"""
+        back = conjugate(self._pose(self._source)[1])
+        return torch.stack([multiply(back, self._pose(t)[1]) for t in self._targets], dim=1)
+
+
+class CameraView:
+    """A camera under Isaac Lab's names; `data` is the object itself."""
+
+    def __init__(self, cfg: Any) -> None:
+        current_setup().add(self, cfg)
+
+    cfg: Any
+
+    def bind(self, sensor: Any) -> None:
+        """Connect the camera with a sensor of the simulation."""
+        self._sensor, self.data = sensor, self
+        self.body_names: list[str] = []
+        self.joint_names: list[str] = []
+
+    @property
+    def output(self) -> Mapping[str, Tensor]:
+        """Images by type of data, channels last. (num_envs, h, w, c)"""
+        kind, image = self._sensor.config.data, self._sensor.image
+        names = {"rgb": ("rgb",), "depth": ("depth", "distance_to_image_plane"), "distance": ("distance_to_camera",)}
+        return dict.fromkeys(names[kind], image)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Height and width [pixels]."""
+        return self._sensor.config.height, self._sensor.config.width
+
+
+class TerrainImporter:
+    """The terrain under Isaac Lab's names."""
+
+    def __init__(self, cfg: Any) -> None:
+        current_setup().add(self, cfg)
+
+    def bind(self, env: VecEnv, terrain: Any) -> None:
+        """Connect the object with the terrain of the simulation; None: a plane."""
+        self._env, self._terrain = env, terrain
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._terrain, name)
+
+    @functools.cached_property
+    def cfg(self) -> Any:
+        """Configuration of the terrain in Isaac Lab's form, as far as terms read it."""
+        config: Any = self._env.config.scene.terrain
+        return SimpleNamespace(terrain_type="generator", terrain_generator=SimpleNamespace(
+            size=tuple(config.patch), num_rows=self._terrain.rows, num_cols=self._terrain.origins.shape[1],
+            curriculum=config.curriculum,
+        ))  # fmt: skip
+
+    @property
+    def terrain_levels(self) -> Tensor:
+        """Level of each environment. (num_envs,) int64"""
+        return self._terrain.levels
+
+    @property
+    def terrain_types(self) -> Tensor:
+        """Column of each environment. (num_envs,) int64"""
+        return self._terrain.types
+
+    @property
+    def terrain_origins(self) -> Tensor:
+        """Start positions by level and column. (rows, columns, 3) [m]"""
+        return self._terrain.origins
+
+    @property
+    def env_origins(self) -> Tensor:
+        """Start position of each environment. (num_envs, 3) [m]"""
+        return self._env.origins
+
+    def update_env_origins(self, env_ids: Any, move_up: Tensor, move_down: Tensor) -> None:
+        """Move environments a level up or down. env_ids are those of the running curriculum term."""
+        from rlcli_isaaclab.runtime import facade_of
+
+        selection = facade_of(self._env).selection
+        self._terrain.move(selection, move_up.bool(), move_down.bool())
+
+
+def camera_or_sensor(sensor: Any) -> Any:
+    """Return the facade of a sensor."""
+    is_camera = getattr(getattr(sensor, "config", None), "kind", "") == "camera"
+    return _bound(CameraView if is_camera else Sensor, sensor)
+
+
+def _bound(kind: Any, *parts: Any) -> Any:
+    """Return an object of a class that is connected with parts of the simulation."""
+    made = kind.__new__(kind)
+    made.bind(*parts)
+    return made
+
+
 class Scene(Mapping[str, Any]):
     """Assets and sensors by name."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
-        self.articulations = {name: Asset(env, entity) for name, entity in env.entities.items()}
+        self.articulations = {name: Asset.of(env, entity) for name, entity in env.entities.items()}
         self.rigid_objects = {name: a for name, a in self.articulations.items() if not a.joint_names}
+
+        self._frames: dict[str, FrameTransformer] = {}
+        self.looks: dict[str, Any] = {}
+        """Lights and other assets that only change how a scene looks."""
+
+    def add_frames(self, frames: Mapping[str, Any]) -> None:
+        """Add frame transformers by their settings (`sensor_reader.py`), and lights, which have none."""
+        for name, settings in frames.items():
+            if settings is None:
+                self.looks[name] = SimpleNamespace(
+                    prims=[NoEffect(f"the light '{name}'")], body_names=[], joint_names=[]
+                )
+                continue
+            self._frames.setdefault(name, FrameTransformer(self.articulations, settings))
 
     @property
     def sensors(self) -> Mapping[str, Any]:
         """Sensors by name."""
-        return {name: Sensor(sensor) for name, sensor in getattr(self._env, "sensors", {}).items()}
+        sensors = getattr(self._env, "sensors", {}).items()
+        return {name: camera_or_sensor(sensor) for name, sensor in sensors} | self._frames
+
+    def clone_environments(self, *args: Any, **options: Any) -> None:
+        """Do nothing: every environment has its own simulation."""
+
+    filter_collisions = clone_environments
+
+    @property
+    def cfg(self) -> Any:
+        """Settings of the scene: num_envs and env_spacing."""
+        return self._env.config.scene
 
     @property
     def num_envs(self) -> int:
@@ -294,7 +572,8 @@ class Scene(Mapping[str, Any]):
     @property
     def terrain(self) -> Any:
         """Terrain, or None."""
-        return getattr(self._env, "terrain", None)
+        terrain = getattr(self._env, "terrain", None)
+        return None if terrain is None else _bound(TerrainImporter, self._env, terrain)
 
     def __getitem__(self, name: str) -> Any:
         if name in self.articulations:
@@ -304,13 +583,15 @@ class Scene(Mapping[str, Any]):
             return sensors[name]
         if name == "terrain" and self.terrain is not None:
             return self.terrain
+        if name in self.looks:
+            return self.looks[name]
         raise KeyError(f"no '{name}' in the scene; entities and sensors: {listing([*self.articulations, *sensors])}")
 
     def __iter__(self) -> Iterator[str]:
-        return iter([*self.articulations, *self.sensors])
+        return iter([*self.articulations, *self.sensors, *self.looks])
 
     def __len__(self) -> int:
-        return len(self.articulations) + len(self.sensors)
+        return len(self.articulations) + len(self.sensors) + len(self.looks)
 
     def resolve(self, cfg: Any) -> None:
         """Resolve the names of a `SceneEntityCfg` to ids.
@@ -345,7 +626,13 @@ class Sensor:
         "pos_w": "position",
     }
 
-    def __init__(self, sensor: Any) -> None:
+    def __init__(self, cfg: Any) -> None:
+        current_setup().add(self, cfg)
+
+    cfg: Any
+
+    def bind(self, sensor: Any) -> None:
+        """Connect the object with a sensor of the simulation."""
         self._sensor = sensor
         self.data = self
         self.body_names = list(getattr(sensor, "names", []))

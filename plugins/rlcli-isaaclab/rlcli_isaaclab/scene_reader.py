@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import TaskError
-from rlcli_isaaclab import assets
+from rlcli_isaaclab.absent import reason_of
 from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
+from rlcli_isaaclab.model_lookup import given_models, mjcf_of
 from rlcli_isaaclab.sensor_reader import read_sensor
 from rlcli_isaaclab.settings import Key, Node, as_float, kind_of
 from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
@@ -20,12 +21,16 @@ class SceneReader:
 
     def __init__(self, node: Node, root: Path, models: Mapping[str, str] | None = None) -> None:
         self.node, self.root, self.report = node, root, node.report
-        self._given_models = dict(models or {})
+        self._asked = models
+        self._given = given_models(root)
+        self._given_models = {**self._given.files, **(models or {})}
         self.entities: dict[str, dict[str, Any]] = {}
         self.prims: dict[str, str] = {}
         """Entity -> the last part of its prim path."""
         self.sensors: dict[str, dict[str, Any]] = {}
         self.has_terrain = False
+        self.frames: dict[str, dict[str, Any] | None] = {}
+        """Frame transformers, and lights (None), which only the user's terms read."""
         self._models: dict[str, Any] = {}
         self._joint_settings: dict[str, JointSettings] = {}
 
@@ -46,6 +51,9 @@ class SceneReader:
             spawn_function = kind_of(spawn.data.get("func")) if spawn else ""
             if kind in ("Articulation", "RigidObject"):
                 self._read_entity(name, item, spawn)
+            elif kind in ("RigidObjectCollection", "DeformableObject", "SurfaceGripper", "Multirotor"):
+                reason, hint = reason_of(kind)
+                self.report.problem(item.key, f"a {kind} cannot be used: {reason}", hint)
             elif kind == "TerrainImporter":
                 ground = read_terrain(item, config)
             elif kind:
@@ -54,13 +62,14 @@ class SceneReader:
                 ground = read_ground(item, spawn)
             elif spawn_function == "spawn_light" and spawn:
                 self._read_light(item, spawn, lights)
+                self.frames[name] = None
             elif spawn:
                 self._read_entity(name, item, spawn)
             else:
                 self.report.entries[item.key] = ("ignored", "MuJoCo has no counterpart of this asset")
         # Sensors come last: their prim paths refer to entities that may be listed after them.
         for kind, item in sensors:
-            sensor = read_sensor(kind, item, self.prims)
+            sensor = read_sensor(kind, item, self.prims, self.frames)
             if sensor is not None:
                 self.sensors[item.key[-1]] = sensor
         config["ground"] = ground
@@ -202,9 +211,10 @@ class SceneReader:
             return
         spawn = spawn or item.node("spawn")
         try:
-            model = assets.mjcf_of(path)
+            model = mjcf_of(path, self.root, self._given_models, name)
         except TaskError as error:
-            self.report.problem((*spawn.key, "usd_path"), error.message, error.hint)
+            hint = error.hint if self._asked is None else f"give a model: --model {name}=FILE.xml"
+            self.report.problem((*spawn.key, "usd_path"), error.message, hint)
             return
         spawn.skip("func", "visible", "copy_from_source", "activate_contact_sensors", "semantic_tags")
         spawn.skip("visual_material_path", "variants")
@@ -226,6 +236,8 @@ class SceneReader:
         self._joint_settings[name], explicit = read_actuators(
             item.node("actuators"),
             lambda patterns, group: self.order_names(name, "joint", patterns, False, group.key),
+            name,
+            self._given.gains.get(name, {}),
         )
         if explicit:
             entity["actuators"] = explicit

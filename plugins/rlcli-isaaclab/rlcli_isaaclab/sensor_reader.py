@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,18 +10,21 @@ from rlcli.errors import listing
 from rlcli_isaaclab.settings import Node, as_float, kind_of, to_plain
 
 
-def read_sensor(kind: str, item: Node, prims: Mapping[str, str]) -> dict[str, Any] | None:
+def read_sensor(kind: str, item: Node, prims: Mapping[str, str], frames: dict[str, Any]) -> dict[str, Any] | None:
     """Return the settings of one sensor; None if it has no counterpart.
 
     Args:
         kind: Isaac Lab's class of the sensor.
         item: settings of the sensor.
         prims: entity -> the last part of its prim path.
+        frames: receives the settings of frame transformers, which only the user's terms read.
     """
     item.skip("class_type", "debug_vis", "visualizer_cfg", "track_pose", "max_contact_data_count_per_prim")
     prim = str(item.get("prim_path") or "")
     parts = [part for part in prim.split("/") if part]
     entity = next((name for name, last in prims.items() if last in parts), None)
+    if kind in ("Camera", "TiledCamera"):
+        return read_camera(item, entity, parts[parts.index(prims[entity]) + 1 : -1] if entity else [])
     if entity is None:
         hint = f"prims: {listing(prims)}"
         item.report.problem((*item.key, "prim_path"), f"'{prim}' is not inside an entity", hint)
@@ -35,8 +39,114 @@ def read_sensor(kind: str, item: Node, prims: Mapping[str, str]) -> dict[str, An
         return _read_contact_sensor(item, entity, body)
     if kind == "RayCaster":
         return _read_ray_sensor(item, entity, body)
+    if kind == "FrameTransformer":
+        frames[item.key[-1]] = _read_frames(item, entity, body, prims)
+        return None
     item.report.entries[item.key] = ("ignored", "read the MJCF's own sensors with the term `sensor_data`")
     return None
+
+
+def _read_frames(item: Node, entity: str, body: str | None, prims: Mapping[str, str]) -> dict[str, Any]:
+    """Return the settings of a frame transformer: the source frame, and a list of target frames."""
+    targets = []
+    for target in item.get("target_frames") or ():
+        frame = Node(target, (*item.key, "target_frames"), item.report)
+        parts = [part for part in str(frame.get("prim_path")).split("/") if part]
+        owner = next((name for name, last in prims.items() if last in parts), entity)
+        inside = parts[parts.index(prims[owner]) + 1 :] if prims[owner] in parts else []
+        targets.append(
+            {"name": frame.get("name"), **_frame(owner, inside[-1] if inside else None, frame.node("offset"))}
+        )
+    return {"source": _frame(entity, body, item.node("source_frame_offset")), "targets": targets}
+
+
+def _frame(entity: str, body: str | None, offset: Node) -> dict[str, Any]:
+    pos, rot = offset.get("pos", (0.0, 0.0, 0.0)), offset.get("rot", (1.0, 0.0, 0.0, 0.0))
+    return {"entity": entity, "body": body, "pos": [as_float(v) for v in pos], "rot": [as_float(v) for v in rot]}
+
+
+_CAMERA_DATA = {
+    "rgb": "rgb",
+    "rgba": "rgb",
+    "depth": "depth",
+    "distance_to_image_plane": "depth",
+    "distance_to_camera": "distance",
+}
+_FORWARD = {
+    "world": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "ros": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
+    "opengl": ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+}
+"""Convention -> the camera's viewing direction and its upward direction in the frame of `rot`."""
+
+
+def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, Any] | None:
+    """Return the settings of a camera, which is fixed in the environment or to a body of an entity."""
+    wanted = list(item.get("data_types", ["rgb"]))
+    if len(wanted) != 1 or wanted[0] not in _CAMERA_DATA:
+        what = f"a camera has one of {listing(_CAMERA_DATA)}; found {listing(wanted)}"
+        if not wanted or wanted[0] not in _CAMERA_DATA:
+            item.report.problem((*item.key, "data_types"), what, "segmentation and normals have no counterpart")
+            return None
+        item.report.entries[(*item.key, "data_types")] = ("approximated", what)
+    offset, spawn = item.node("offset"), item.node("spawn")
+    convention = offset.get("convention", "ros")
+    eye = [as_float(v) for v in offset.get("pos", (0.0, 0.0, 0.0))]
+    rot = [as_float(v) for v in offset.get("rot", (1.0, 0.0, 0.0, 0.0))]
+    forward, up = (_rotated(rot, axis) for axis in _FORWARD.get(convention, _FORWARD["ros"]))
+    if up[2] < 0.5 * (1.0 - forward[2] ** 2) ** 0.5 - 1e-3:
+        offset.note("approximated", "rot", "the camera does not roll: its upper edge is horizontal")
+    width, height = item.require("width"), item.require("height")
+    aperture = spawn.get("vertical_aperture") or spawn.get("horizontal_aperture", 20.955) * height / width
+    near, far = spawn.get("clipping_range", (0.01, 1e6))
+    config: dict[str, Any] = {
+        "kind": "camera",
+        "data": _CAMERA_DATA[wanted[0]],
+        "width": width,
+        "height": height,
+        "eye": eye,
+        "lookat": [a + b for a, b in zip(eye, forward, strict=True)],
+        "fov": math.degrees(2.0 * math.atan(aperture / (2.0 * spawn.get("focal_length", 24.0)))),
+        "clip": [as_float(near), min(as_float(far), 1e4)],
+    }
+    if entity is not None:
+        config["entity"] = entity
+        if inside:
+            config["body"] = inside[-1]
+    spawn.skip(
+        "func",
+        "focus_distance",
+        "f_stop",
+        "projection_type",
+        "visible",
+        "semantic_tags",
+        "copy_from_source",
+        "lock_camera",
+    )
+    item.skip(
+        "update_latest_camera_pose",
+        "semantic_filter",
+        "depth_clipping_behavior",
+        "prim_path",
+        "colorize_semantic_segmentation",
+    )
+    item.skip(
+        "colorize_instance_id_segmentation",
+        "colorize_instance_segmentation",
+        "semantic_segmentation_mapping",
+        "history_length",
+    )
+    return config
+
+
+def _rotated(quat: list[float], axis: tuple[float, float, float]) -> list[float]:
+    w, x, y, z = quat
+    a, b, c = axis
+    return [
+        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * c,
+        2 * (x * y + w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - w * x) * c,
+        2 * (x * z - w * y) * a + 2 * (y * z + w * x) * b + (1 - 2 * (x * x + y * y)) * c,
+    ]
 
 
 def _read_contact_sensor(item: Node, entity: str, body: str | None) -> dict[str, Any]:

@@ -5,9 +5,11 @@ Settings of Isaac Sim without a counterpart are accepted and reported; docs/guid
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 from rlcli_isaaclab.config_class import configclass
+from rlcli_isaaclab.setup_scene import Spawn
 
 
 class _OpenSettings:
@@ -22,9 +24,11 @@ class _OpenSettings:
 
     def replace(self, **changes: Any) -> Any:
         """Return a copy with some members changed."""
-        copy = type(self)()
-        vars(copy).update({**vars(self), **changes})
-        return copy
+        copied = copy.deepcopy(self)
+        vars(copied).update(changes)
+        return copied
+
+    copy = replace
 
 
 def _settings_class(name: str, doc: str, **fixed: Any) -> Any:
@@ -39,29 +43,37 @@ JointDrivePropertiesCfg = _settings_class("JointDrivePropertiesCfg", "PhysX sett
 FixedTendonPropertiesCfg = _settings_class("FixedTendonPropertiesCfg", "PhysX settings of tendons.")
 DeformableBodyPropertiesCfg = _settings_class("DeformableBodyPropertiesCfg", "PhysX settings of soft bodies.")
 RigidBodyMaterialCfg = _settings_class(
-    "RigidBodyMaterialCfg", "Friction and restitution.", func="spawn_rigid_body_material", static_friction=0.5,
+    "RigidBodyMaterialCfg", "Friction and restitution.", func=Spawn("spawn_rigid_body_material"), static_friction=0.5,
     dynamic_friction=0.5, restitution=0.0,
 )  # fmt: skip
-PreviewSurfaceCfg = _settings_class("PreviewSurfaceCfg", "A colour.", func="spawn_preview_surface")
-MdlFileCfg = _settings_class("MdlFileCfg", "A material of Isaac Sim.", func="spawn_from_mdl_file")
+PreviewSurfaceCfg = _settings_class("PreviewSurfaceCfg", "A colour.", func=Spawn("spawn_preview_surface"))
+MdlFileCfg = _settings_class("MdlFileCfg", "A material of Isaac Sim.", func=Spawn("spawn_from_mdl_file"))
 PhysxCfg = _settings_class("PhysxCfg", "The PhysX solver.")
 RenderCfg = _settings_class("RenderCfg", "The renderer.")
 
-GroundPlaneCfg = _settings_class("GroundPlaneCfg", "A ground plane.", func="spawn_ground_plane", size=(100.0, 100.0))
-DomeLightCfg = _settings_class("DomeLightCfg", "Light from everywhere.", func="spawn_light", prim_type="DomeLight")
-DistantLightCfg = _settings_class("DistantLightCfg", "Parallel light.", func="spawn_light", prim_type="DistantLight")
-SphereLightCfg = _settings_class("SphereLightCfg", "A lamp.", func="spawn_light", prim_type="SphereLight")
-DiskLightCfg = _settings_class("DiskLightCfg", "A lamp.", func="spawn_light", prim_type="DiskLight")
-CylinderLightCfg = _settings_class("CylinderLightCfg", "A lamp.", func="spawn_light", prim_type="CylinderLight")
-UsdFileCfg = _settings_class(
-    "UsdFileCfg", "A model by its USD path; assets.py maps it to an MJCF.", func="spawn_from_usd"
+GroundPlaneCfg = _settings_class(
+    "GroundPlaneCfg", "A ground plane.", func=Spawn("spawn_ground_plane"), size=(100.0, 100.0)
 )
-UrdfFileCfg = _settings_class("UrdfFileCfg", "A model by its URDF path; assets.py maps it.", func="spawn_from_urdf")
-CuboidCfg = _settings_class("CuboidCfg", "A box; `size` are its edges [m].", func="spawn_cuboid")
-SphereCfg = _settings_class("SphereCfg", "A sphere.", func="spawn_sphere")
-CapsuleCfg = _settings_class("CapsuleCfg", "A capsule.", func="spawn_capsule")
-CylinderCfg = _settings_class("CylinderCfg", "A cylinder.", func="spawn_cylinder")
-ConeCfg = _settings_class("ConeCfg", "A cone.", func="spawn_cone")
+DomeLightCfg = _settings_class(
+    "DomeLightCfg", "Light from everywhere.", func=Spawn("spawn_light"), prim_type="DomeLight"
+)
+DistantLightCfg = _settings_class(
+    "DistantLightCfg", "Parallel light.", func=Spawn("spawn_light"), prim_type="DistantLight"
+)
+SphereLightCfg = _settings_class("SphereLightCfg", "A lamp.", func=Spawn("spawn_light"), prim_type="SphereLight")
+DiskLightCfg = _settings_class("DiskLightCfg", "A lamp.", func=Spawn("spawn_light"), prim_type="DiskLight")
+CylinderLightCfg = _settings_class("CylinderLightCfg", "A lamp.", func=Spawn("spawn_light"), prim_type="CylinderLight")
+UsdFileCfg = _settings_class(
+    "UsdFileCfg", "A model by its USD path; assets.py maps it to an MJCF.", func=Spawn("spawn_from_usd")
+)
+UrdfFileCfg = _settings_class(
+    "UrdfFileCfg", "A model by its URDF path; assets.py maps it.", func=Spawn("spawn_from_urdf")
+)
+CuboidCfg = _settings_class("CuboidCfg", "A box; `size` are its edges [m].", func=Spawn("spawn_cuboid"))
+SphereCfg = _settings_class("SphereCfg", "A sphere.", func=Spawn("spawn_sphere"))
+CapsuleCfg = _settings_class("CapsuleCfg", "A capsule.", func=Spawn("spawn_capsule"))
+CylinderCfg = _settings_class("CylinderCfg", "A cylinder.", func=Spawn("spawn_cylinder"))
+ConeCfg = _settings_class("ConeCfg", "A cone.", func=Spawn("spawn_cone"))
 
 
 @configclass

@@ -44,6 +44,10 @@ def _bounds(value: Mapping[str, Any]) -> dict[str, Any]:
     return {axis: value.get(axis, (0.0, 0.0)) for axis in ("x", "y", "z")}
 
 
+def _nothing(value: Any) -> dict[str, Any]:
+    return {}
+
+
 def _names(value: Any) -> dict[str, Any]:
     return {"terms": [value] if isinstance(value, str) else list(value)}
 
@@ -65,6 +69,7 @@ TERMS: dict[str, dict[str, Entry]] = {
         "height_scan": Entry(note="a ray without a hit has its full length, not infinity"),
         "body_incoming_wrench": Entry(note="about the body's origin, in its frame; PhysX: in the frame of the joint"),
         "imu_lin_acc": Entry(note=_ACCELERATION),
+        "image": Entry(params=dict.fromkeys(("data_type", "convert_perspective_to_orthogonal", "permute"), _nothing)),
         "base_heading_proj": Entry(params=_TARGET),
         "base_angle_to_target": Entry(params=_TARGET),
         "fingertips_pos": Entry("ee_pos"),

@@ -8,7 +8,9 @@ from typing import Any
 
 from rlcli.config.term_signatures import Signature, SignatureError, builtin_terms, snake_case
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
+from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.config_class import is_missing
+from rlcli_isaaclab.lab_terms import LAB_TERMS
 from rlcli_isaaclab.managers import CommandTerm, SceneEntityCfg
 from rlcli_isaaclab.mdp import MdpFunction
 from rlcli_isaaclab.observation_reader import read_processing
@@ -24,8 +26,12 @@ _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
 class TermReader:
     """Reader of the terms of all sections."""
 
-    def __init__(self, scene: SceneReader, report: Report) -> None:
+    def __init__(self, scene: SceneReader, report: Report, cfg: Any = None) -> None:
+        from rlcli_isaaclab.terms import TermContext
+
         self.scene, self.report = scene, report
+        self.context = TermContext(cfg, scene.frames)
+        self._user_terms: dict[Any, Any] = {}
         self.driven_joints: dict[str, dict[str, str]] = {}
         """Entity -> joint -> what an action commands: effort, velocity or position."""
         self.stubs: dict[str, tuple[str, dict[str, Any]]] = {}
@@ -50,8 +56,8 @@ class TermReader:
         name = ACTIONS.get(kind)
         signature = builtin_terms("actions").get(name or "")
         if name is None or signature is None:
-            near = did_you_mean(kind, ACTIONS) or f"actions: {listing(ACTIONS)}"
-            self.report.problem(node.key, f"the action '{kind}' has no counterpart in rlcli", near)
+            reason, hint = reason_of(kind)
+            self.report.problem(node.key, f"the action '{kind}' cannot be used: {reason}", hint)
             return {"func": "joint_effort"}
         node.skip("debug_vis")
         entity = node.get("asset_name", "robot")
@@ -185,6 +191,9 @@ class TermReader:
     def read_terms(self, section: str, name: str, node: Node) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield the rlcli terms that replace one term of Isaac Lab, usually one; names of several get a suffix."""
         function = _builtin_name(node.data.get("func"))
+        if section == "events" and function in _LOOKS:
+            self.report.entries[node.key] = ("ignored", "rlcli does not randomize colours and textures")
+            return
         if section == "events" and function in EVENTS:
             node.get("func")
             parts = translate_event(function, node.node("params"), self.scene)
@@ -197,6 +206,10 @@ class TermReader:
     def read_term(self, section: str, node: Node) -> dict[str, Any]:
         """Return a term with its function and parameters."""
         function, params = node.require("func"), node.node("params")
+        if isinstance(function, AbsentValue):
+            reason, hint = reason_of(function.absent_name)
+            self.report.problem((*node.key, "func"), f"{function.absent_name} cannot be used: {reason}", hint)
+            return {"func": "missing"}
         if not callable(function) and not isinstance(function, str):
             if function is not None:
                 hint = "another member of the same name replaces the function"
@@ -211,6 +224,9 @@ class TermReader:
             what = f"'{name}' has no counterpart, because it calls a function that edits the configuration"
             self.report.problem(node.key, what, hint)
             return {"func": "stages", "address": "", "steps": [], "values": []}
+        special = LAB_TERMS.get(name or "")
+        if special is not None and special.needed(params.data):
+            return self._read_user_term(section, special.function, None, node, params)
         ours, entry = self._find_builtin(section, name)
         config: dict[str, Any]
         if ours is not None and name is not None:
@@ -319,7 +335,7 @@ class TermReader:
         stem = key.removesuffix("_cfg")
         config: dict[str, Any] = {}
         name = settings["name"]
-        sensor = next((by_alias[a] for a in ("ContactSensor", "RaySensor") if a in by_alias), None)
+        sensor = next((by_alias[a] for a in ("ContactSensor", "RaySensor", "CameraSensor") if a in by_alias), None)
         preserve = bool(settings.get("preserve_order"))
         if sensor is not None and (name in self.scene.sensors or key == "sensor_cfg"):
             config[sensor.name] = self.scene.sensor_of_bodies(name, settings.get("body_names"), preserve, at)
@@ -345,7 +361,7 @@ class TermReader:
         self, section: str, function: Any, name: str | None, node: Node, params: Node
     ) -> dict[str, Any]:
         """Return a term for the user's own function. A YAML file has only its name: then write a stub."""
-        from rlcli_isaaclab.terms import entity_data, key_of, user_term
+        from rlcli_isaaclab.terms import entity_data, key_of
 
         common = self._read_common(section, node)
         if isinstance(function, MdpFunction) or (name is not None and name.split(".")[0] == "isaaclab"):
@@ -353,12 +369,14 @@ class TermReader:
             self.report.problem((*node.key, "func"), f"no {section.rstrip('s')} term '{name}'", near)
             return {"func": str(name), **common}
         values = {key: params.get(key) for key in params.data}
+        objects = {key: value for key, value in values.items() if not is_entity(value) and not _is_plain(value)}
         if isinstance(function, str):
             stub = self._write_stub(section, function, values, node)
             return {"func": stub} | common | self.stubs[stub][1]
         entities = frozenset(key for key, value in values.items() if is_entity(value))
         try:
-            term = user_term(function, section, entities, tuple(values))
+            values = {key: value for key, value in values.items() if key not in objects}
+            term = self._user_term(function, section, entities, tuple(values), objects)
         except SignatureError as error:
             self.report.problem((*node.key, "func"), f"'{function.__name__}': {error}")
             return {"func": "missing", **common}
@@ -377,6 +395,19 @@ class TermReader:
             else:
                 config[key_of(key)] = to_plain(value)
         return {"func": term, **common, **config}
+
+    def _user_term(
+        self, function: Any, section: str, entities: frozenset[str], names: tuple[str, ...], objects: dict[str, Any]
+    ) -> Any:
+        """Return the term of a function; the same object for the same arguments."""
+        from rlcli_isaaclab.terms import UserTerm
+
+        key = (function, section, entities, names)
+        if objects:
+            return UserTerm(function, section, entities, names, objects, self.context)
+        if key not in self._user_terms:
+            self._user_terms[key] = UserTerm(function, section, entities, names, None, self.context)
+        return self._user_terms[key]
 
     def _write_stub(self, section: str, function: str, values: Mapping[str, Any], node: Node) -> str:
         """Record a function whose code is not available, with its parameters under rlcli's names. Return its name."""
@@ -398,6 +429,9 @@ class TermReader:
         self.report.entries[(*node.key, "func")] = ("to do", f"write '{name}' in terms.py")
         return name
 
+
+_LOOKS = ("randomize_visual_color", "randomize_visual_texture_material")
+"""Events that only change how a scene looks."""
 
 _COMMAND_KEYS = ("class_type", "resampling_time_range", "debug_vis")
 

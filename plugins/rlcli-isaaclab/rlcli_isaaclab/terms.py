@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import inspect
 import typing
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -35,11 +37,39 @@ class EntityModel(StrictModel):
     """Whether to keep the written order instead of the model's."""
 
 
-class UserTerm:
-    """The user's function or class as a term of one section."""
+@dataclass(slots=True)
+class TermContext:
+    """Parts of a configuration that only the user's terms read."""
 
-    def __init__(self, function: Any, section: str, entities: frozenset[str], extra: tuple[str, ...]) -> None:
-        self.function, self.section = function, section
+    cfg: Any = None
+    """The user's configuration object; None: that of rlcli."""
+    frames: dict[str, Any] = field(default_factory=dict)
+    """Settings of the frame transformers, by name."""
+
+
+class UserTerm:
+    """The user's function or class as a term of one section.
+
+    Args:
+        function: the user's function or class.
+        section: section of the configuration.
+        entities: names of the parameters that are a `SceneEntityCfg`.
+        extra: names of all parameters that the configuration sets; those not declared go to `**kwargs`.
+        objects: parameters that no file can hold, such as functions.
+        context: parts of the configuration that the function may read from the environment.
+    """
+
+    def __init__(
+        self,
+        function: Any,
+        section: str,
+        entities: frozenset[str],
+        extra: tuple[str, ...],
+        objects: Mapping[str, Any] | None = None,
+        context: TermContext | None = None,
+    ) -> None:
+        self.context = context or TermContext()
+        self.function, self.section, self.objects = function, section, dict(objects or {})
         self.is_class = isinstance(function, type)
         self.__name__, self.__module__ = function.__name__, function.__module__
         self.target = functools.partial(_bind_term, self)
@@ -52,6 +82,7 @@ class UserTerm:
             raise SignatureError(f"a term of {section} must take {expected}")
         hints = _type_hints(call)
         named = [p for p in declared[self._skip :] if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+        named = [p for p in named if p.name not in self.objects]
         self.parameters = [self._parameter(p, hints.get(p.name), entities) for p in named]
         if any(p.kind is p.VAR_KEYWORD for p in declared):
             known = {p.name for p in named}
@@ -118,19 +149,6 @@ def key_of(name: str) -> str:
     return f"{name}_" if name in _RESERVED else name
 
 
-@functools.cache
-def user_term(function: Any, section: str, entities: frozenset[str], extra: tuple[str, ...]) -> UserTerm:
-    """Return the term of a function; the same object for the same arguments.
-
-    Args:
-        function: the user's function or class.
-        section: section of the configuration.
-        entities: names of the parameters that are a `SceneEntityCfg`.
-        extra: names of all parameters that the configuration sets; those not declared go to `**kwargs`.
-    """
-    return UserTerm(function, section, entities, extra)
-
-
 def entity_data(settings: Any) -> dict[str, Any]:
     """Return the settings of a `SceneEntityCfg` that are not at their default.
 
@@ -158,10 +176,13 @@ class _Bound:
 
     def __call__(self, selection: Selection | None = None) -> Any:
         if selection is not None:
+            self._env.selection = selection
             value = self.term(self._env, selection.env_ids(), **self._params)
             # a curriculum term may return several values to log; rlcli logs one
             return next(iter(value.values()), None) if isinstance(value, dict) else value
         value = self.term(self._env, **self._params)
+        if self._section == "observations" and value.dim() == 1:
+            return value.unsqueeze(1).float()  # a group that is not concatenated may have such terms
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
 
 
@@ -199,9 +220,7 @@ class _BoundCommand(_BoundObject):
 
     def resample(self, selection: Selection) -> None:
         """Sample new commands."""
-        env_ids = selection.env_ids()
-        self.term._resample_command(env_ids)
-        self.term.command_counter[env_ids] += 1
+        self.term._resample(selection.env_ids())
         self.command.copy_(self.term.command)
         self._has_command = True
 
@@ -231,6 +250,20 @@ def _bind_command(term: UserCommand, env: Any, **params: Any) -> _BoundCommand:
     return _BoundCommand(term.function(cfg, facade_of(env)))
 
 
+def _resolved(value: Any, scene: Any) -> Any:
+    """Return a parameter with every `SceneEntityCfg` in it resolved."""
+    if isinstance(value, list | tuple):
+        return type(value)(_resolved(item, scene) for item in value)
+    if isinstance(value, Mapping) and {"name", "joint_names", "body_names"} <= set(value):
+        value = SceneEntityCfg(**value)
+    elif isinstance(value, Mapping):
+        return {key: _resolved(item, scene) for key, item in value.items()}
+    if isinstance(value, SceneEntityCfg):
+        value = copy.deepcopy(value)
+        scene.resolve(value)
+    return value
+
+
 def _to_namespace(value: Any) -> Any:
     """Return nested mappings as objects with attributes, where all keys are identifiers; other values unchanged."""
     if isinstance(value, dict) and all(str(key).isidentifier() for key in value):
@@ -242,9 +275,10 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
     from rlcli_isaaclab.runtime import facade_of
 
     facade = facade_of(env)
+    facade.use(term.context)
     if term.section == "curriculum":
         facade.open_weights()  # before the reward manager is created, which fixes the weights otherwise
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = {key: _resolved(value, facade.scene) for key, value in term.objects.items()}
     for key, value in params.items():
         if isinstance(value, EntityModel):
             value = SceneEntityCfg(**value.model_dump())
@@ -252,7 +286,7 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
         values[term.original[key]] = value
     if not term.is_class:
         return _Bound(term.function, term.section, facade, values)
-    instance = term.function(ManagerTermBaseCfg(func=term.function, params=values), facade)
+    instance = term.function(cfg=ManagerTermBaseCfg(func=term.function, params=values), env=facade)
     return _BoundClass(instance, term.section, facade, values)
 
 

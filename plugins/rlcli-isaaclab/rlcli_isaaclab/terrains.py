@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rlcli_isaaclab.config_class import MISSING, configclass, make_config_class
+from rlcli_isaaclab.scene_facade import TerrainImporter
 from rlcli_isaaclab.sim import RigidBodyMaterialCfg
 
 
@@ -34,7 +35,7 @@ class TerrainGeneratorCfg:
 class TerrainImporterCfg:
     """A plane, or the terrain of a generator."""
 
-    class_type: Any = "TerrainImporter"
+    class_type: Any = TerrainImporter
     collision_group: int = -1
     prim_path: str = MISSING
     num_envs: Any = 1
@@ -91,3 +92,36 @@ MeshRandomGridTerrainCfg = _sub_terrain(
     "MeshRandomGridTerrainCfg", "random_grid_terrain", grid_width=MISSING, grid_height_range=MISSING,
     platform_width=1.0, holes=False,
 )  # fmt: skip
+
+MeshRepeatedBoxesTerrainCfg = _sub_terrain(
+    "MeshRepeatedBoxesTerrainCfg", "repeated_boxes_terrain", object_params_start=MISSING, object_params_end=MISSING,
+    platform_width=1.0,
+)  # fmt: skip
+
+ROUGH_TERRAINS_CFG = TerrainGeneratorCfg(
+    size=(8.0, 8.0),
+    border_width=20.0,
+    num_rows=10,
+    num_cols=20,
+    sub_terrains={
+        "pyramid_stairs": MeshPyramidStairsTerrainCfg(
+            proportion=0.2, step_height_range=(0.05, 0.23), step_width=0.3, platform_width=3.0, border_width=1.0
+        ),
+        "pyramid_stairs_inv": MeshInvertedPyramidStairsTerrainCfg(
+            proportion=0.2, step_height_range=(0.05, 0.23), step_width=0.3, platform_width=3.0, border_width=1.0
+        ),
+        "boxes": MeshRandomGridTerrainCfg(
+            proportion=0.2, grid_width=0.45, grid_height_range=(0.05, 0.2), platform_width=2.0
+        ),
+        "random_rough": HfRandomUniformTerrainCfg(
+            proportion=0.2, noise_range=(0.02, 0.10), noise_step=0.02, border_width=0.25
+        ),
+        "hf_pyramid_slope": HfPyramidSlopedTerrainCfg(
+            proportion=0.1, slope_range=(0.0, 0.4), platform_width=2.0, border_width=0.25
+        ),
+        "hf_pyramid_slope_inv": HfInvertedPyramidSlopedTerrainCfg(
+            proportion=0.1, slope_range=(0.0, 0.4), platform_width=2.0, border_width=0.25
+        ),
+    },
+)
+"""Stairs, boxes, rough ground and slopes."""

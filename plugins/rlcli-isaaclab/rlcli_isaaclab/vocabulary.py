@@ -12,6 +12,7 @@ from rlcli_isaaclab.actuators import (
 )
 from rlcli_isaaclab.assets import ANT_CFG, CARTPOLE_CFG, ArticulationCfg, AssetBaseCfg, RigidObjectCfg, map_usd
 from rlcli_isaaclab.config_class import MISSING, configclass
+from rlcli_isaaclab.direct_env import DirectMARLEnv, DirectMARLEnvCfg, DirectRLEnv, DirectRLEnvCfg
 from rlcli_isaaclab.envs import ManagerBasedEnv, ManagerBasedEnvCfg, ManagerBasedRLEnvCfg, ViewerCfg
 from rlcli_isaaclab.managers import (
     ActionTermCfg,
@@ -34,6 +35,7 @@ from rlcli_isaaclab.managers import (
     SceneEntityCfg,
     TerminationTermCfg,
 )
+from rlcli_isaaclab.markers import VisualizationMarkers
 from rlcli_isaaclab.rsl_rl import (
     RslRlOnPolicyRunnerCfg,
     RslRlPpoActorCriticCfg,
@@ -44,12 +46,17 @@ from rlcli_isaaclab.runtime import ManagerBasedRLEnv
 from rlcli_isaaclab.scene import InteractiveSceneCfg
 from rlcli_isaaclab.scene_facade import Asset as Articulation
 from rlcli_isaaclab.scene_facade import Asset as RigidObject
+from rlcli_isaaclab.scene_facade import CameraView as Camera
+from rlcli_isaaclab.scene_facade import CameraView as TiledCamera
+from rlcli_isaaclab.scene_facade import FrameTransformer, TerrainImporter
 from rlcli_isaaclab.scene_facade import Sensor as ContactSensor
 from rlcli_isaaclab.scene_facade import Sensor as RayCaster
 from rlcli_isaaclab.sensors import ContactSensorCfg, RayCasterCfg, patterns
+from rlcli_isaaclab.sensors.patterns import GridPatternCfg
+from rlcli_isaaclab.setup_scene import spawn_from_usd, spawn_ground_plane, spawn_light
 from rlcli_isaaclab.sim import *  # noqa: F403
 from rlcli_isaaclab.sim import __all__ as _sim
-from rlcli_isaaclab.terrains import TerrainGeneratorCfg, TerrainImporterCfg
+from rlcli_isaaclab.terrains import ROUGH_TERRAINS_CFG, TerrainGeneratorCfg, TerrainImporterCfg
 from rlcli_isaaclab.utils.assets import ISAAC_NUCLEUS_DIR, ISAACLAB_NUCLEUS_DIR
 from rlcli_isaaclab.utils.math import *  # noqa: F403
 from rlcli_isaaclab.utils.math import __all__ as _math

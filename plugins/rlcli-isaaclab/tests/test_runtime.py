@@ -8,6 +8,7 @@ import pytest
 import torch
 from support.worlds import CRITTER, CRITTER_TASK, build, critter, edited, write
 
+from rlcli.errors import TaskError
 from rlcli.scene.names import NameProblem
 from rlcli_isaaclab.runtime import facade_of
 from rlcli_isaaclab.utils import math as lab
@@ -128,8 +129,8 @@ def test_scene_is_mapping_and_errors_list_names(env):
         env.scene["terrain"]
     with pytest.raises(AttributeError, match=r"data has no 'joint_poss'; did you mean 'joint_pos"):
         env.scene["robot"].data.joint_poss  # noqa: B018
-    with pytest.raises(AttributeError, match="an asset has no 'root_physx_view'; rlcli has no PhysX"):
-        env.scene["robot"].root_physx_view  # noqa: B018
+    with pytest.raises(TaskError, match=r"root_physx_view\.get_forces cannot be used: rlcli has no PhysX"):
+        env.scene["robot"].root_physx_view.get_forces()
     with pytest.raises(AttributeError, match="env has no 'step_dtt'; did you mean 'step_dt'"):
         env.step_dtt  # noqa: B018
     assert not hasattr(env.scene["robot"], "actuators")

@@ -23,6 +23,8 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module(f"{__name__}.{name}")
     if name == "torch_utils":
         return sys.modules[__name__]
+    if name == "omni":
+        return importlib.import_module(f"{__name__}.modules").find(name)
     vocabulary = importlib.import_module(f"{__name__}.vocabulary")
     if name in vocabulary.NAMES:
         return getattr(vocabulary, name)

@@ -49,7 +49,9 @@ _IGNORED = {
     "minibatch_size_per_env": "",
 }
 _KL_GRAINS = {"legacy": "minibatch", "standard": "epoch", "standard_epoch": "iteration"}
-_SCHEDULES = {"adaptive": "adaptive", "linear": "linear", "constant": "constant", "identity": "constant"}
+_SCHEDULES = {
+    "adaptive": "adaptive", "linear": "linear", "constant": "constant", "identity": "constant", "fixed": "constant"
+}  # fmt: skip
 _HANDLED = (
     "reward_shaper", "normalize_advantage", "lr_schedule", "kl_threshold", "grad_norm", "truncate_grads",
     "critic_coef", "clip_value", "value_bootstrap", "schedule_type", "clip_actions", "central_value_config",
@@ -154,8 +156,10 @@ class _Translator(YamlTranslator):
                 self._space((*at, key), value)
             elif key == "rnn":
                 self._rnn((*at, key), value)
+            elif key == "cnn":
+                self._cnn((*at, key), value, network.get("mlp"))
             else:
-                self.problem((*at, key), f"unknown key '{key}'", "keys: name, separate, space, mlp, rnn")
+                self.problem((*at, key), f"unknown key '{key}'", "keys: name, separate, space, mlp, rnn, cnn")
 
     def _mlp(self, at: Path, mlp: Any) -> None:
         if not isinstance(mlp, dict):
@@ -212,6 +216,29 @@ class _Translator(YamlTranslator):
         for key, value in rnn.items():
             is_exact = key in ("name", "units", "layers") or (key == "before_mlp" and value is True) or not value
             self.note((*at, key), "mapped" if is_exact else "approximated", "rnn")
+
+    def _cnn(self, at: Path, cnn: Any, mlp: Any) -> None:
+        convs = cnn.get("convs") if isinstance(cnn, dict) else None
+        if not isinstance(convs, list) or not convs or not all(isinstance(layer, dict) for layer in convs):
+            hint = "write {type: conv2d, convs: [{filters: 32, kernel_size: 8, strides: 4, padding: 0}, ...]}"
+            self.problem(at, "expected layers of convolutions", hint)
+            return
+        if cnn.get("type") != "conv2d":
+            self.problem((*at, "type"), f"'{cnn.get('type')}' has no counterpart", "expected 'conv2d'")
+        for number, layer in enumerate(convs):
+            if layer.get("padding", 0) != 0:
+                self.problem(
+                    (*at, "convs", number, "padding"), "rlcli's convolutions have no padding", "write padding: 0"
+                )
+        layers = {"channels": "filters", "kernels": "kernel_size", "strides": "strides"}
+        self.put(("cnn",), {name: [layer.get(key) for layer in convs] for name, key in layers.items()}, at)
+        for key, value in cnn.items():
+            other = key == "activation" and isinstance(mlp, dict) and value != mlp.get("activation")
+            if other:
+                self.note((*at, key), "approximated", "the convolutions have the activation of the MLP")
+            else:
+                ignored = key in ("initializer", "regularizer")
+                self.note((*at, key), "ignored" if ignored else "mapped", "" if ignored else "cnn")
 
     def _config(self, config: Mapping[str, Any]) -> None:
         at = ("params", "config")

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import TaskError, did_you_mean, listing
-from rlcli_oige.stage import FORCE, TORQUE
+from rlcli_oige.model_edits import FORCE, TORQUE
+from rlcli_oige.stage import note_ignored
 from rlcli_oige.views import XFormPrimView, select_rows
 
 
@@ -22,7 +23,7 @@ class ArticulationView(XFormPrimView):
         self, prim_paths_expr: str, name: str = "articulation_prim_view", reset_xform_properties: bool = True,
         enable_dof_force_sensors: bool = False, **kwargs: Any,
     ):  # fmt: skip
-        super().__init__(prim_paths_expr, name, reset_xform_properties)
+        super().__init__(prim_paths_expr, name, reset_xform_properties, **kwargs)
 
     def _bind(self) -> None:
         entity = self._entities[0]
@@ -230,6 +231,36 @@ class ArticulationView(XFormPrimView):
         inertia[rows, ids] *= (new / mass[rows, ids].clamp(min=1e-12))[..., None]
         mass[rows, ids] = new
         engine.set_constants()
+
+    @property
+    def num_fixed_tendons(self) -> int:
+        """Number of tendons of the robot."""
+        return len(self._tendons())
+
+    def set_fixed_tendon_properties(
+        self, stiffnesses: Any = None, dampings: Any = None, limit_stiffnesses: Any = None, limits: Any = None,
+        rest_lengths: Any = None, offsets: Any = None, indices: Any = None,
+    ) -> None:  # fmt: skip
+        """Set stiffness and damping of the tendons. (tendons,) or (n, tendons) [N/m, N s/m]"""
+        tendons, rows = self._tendons(), self._env_rows(indices)[:, None]
+        for name, values in (("tendon_stiffness", stiffnesses), ("tendon_damping", dampings)):
+            if values is not None and tendons:
+                field = self.env.engine.expand(name)
+                field[rows, tendons] = self._tensor(values).to(field.dtype).expand(len(rows), len(tendons))
+        others = {
+            "limit_stiffnesses": limit_stiffnesses,
+            "limits": limits,
+            "rest_lengths": rest_lengths,
+            "offsets": offsets,
+        }
+        for name, values in others.items():
+            if values is not None and tendons:
+                note_ignored(f"set_fixed_tendon_properties({name}=...)", "the MJCF's tendons set it", lost=True)
+
+    def _tendons(self) -> list[int]:
+        model = self.env.engine.model
+        prefix = f"{self.entity.name}/"
+        return [number for number in range(model.ntendon) if model.tendon(number).name.startswith(prefix)]
 
     def set_effort_modes(self, mode: str, indices: Any = None, joint_indices: Any = None) -> None:
         """Do nothing: efforts are always forces or torques."""

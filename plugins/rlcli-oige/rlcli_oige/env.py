@@ -3,28 +3,38 @@
 from __future__ import annotations
 
 import copy
+import logging
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rlcli.envs.build import grid
 from rlcli.envs.direct import DirectEnv
-from rlcli.errors import TaskError
-from rlcli.registry import is_framework
+from rlcli.envs.layout import Layout
+from rlcli.errors import DependencyError, TaskError
+from rlcli.registry import import_file, is_framework
 from rlcli.scene.scene import Scene
 from rlcli.sim.selection import Selection
 from rlcli_oige.articulation_view import ArticulationView
+from rlcli_oige.cameras import Replicator
+from rlcli_oige.modules import refuse
 from rlcli_oige.stage import Stage, current_stage
 from rlcli_oige.task import EnvHandle, RLTask, SimConfig
 from rlcli_oige.task_keys import MOVED_KEYS, ROOT_SETTINGS
+from rlcli_oige.task_yaml import is_oige_file
+from rlcli_oige.user_code import error_location
 from rlcli_oige.views import RigidPrimView
 
+_LOG = logging.getLogger(__name__)
 _FORCE_METHODS = ("get_measured_joint_forces", "get_force_sensor_forces", "get_net_contact_forces")
 _GRAVITY_METHODS = ("disable_gravities",)
+_IMAGE_DIMS = 4
 _TINY_GRAVITY_COMPENSATION = 1e-30
 
 
@@ -41,12 +51,16 @@ class OigeEnv(DirectEnv):
             hint = "its YAML has OmniIsaacGymEnvs' form: derive the class from rlcli_oige.RLTask"
             raise TaskError(f"task '{source.name}' is broken: {source.task} is not an RLTask", hint=hint)
         self.block = config.foreign["oige"]
-        self.stage = Stage(self.block.get("mjcf", {}), source.root)
         self.grid = grid(self.num_envs, config.scene.env_spacing).to(self.device)
+        self.stage = Stage(self.block.get("mjcf", {}), source.root, self.grid)
         self.settings = self._settings()
         self.forces_applied = True
+        self._spacing_factor = 1.0
+        self._steps_inside, self._told_steps_inside = 0, False
         self._queued_forces: list[tuple[RigidPrimView, Tensor, Tensor]] = []
+        self.replicator = Replicator(self)
         self.handle = EnvHandle(self)
+        np.random.seed(self.seed)  # some tasks make their terrain with numpy
         with current_stage(self.stage):
             try:
                 name = str(self.block.get("name", source.name))
@@ -61,6 +75,13 @@ class OigeEnv(DirectEnv):
                 what = f"{task_class.__name__}.set_up_scene does not call RLTask.set_up_scene"
                 raise TaskError(what, hint="add super().set_up_scene(scene)")
             self.stage.attach(scene, joint_forces=self._mentions(_FORCE_METHODS))
+        if type(self.task).post_physics_step is not RLTask.post_physics_step:
+            _LOG.warning(
+                "%s has its own post_physics_step: what it adds to observations after get_observations is missing in"
+                " the first observation of an episode, and a failure in the last step counts as a time-out",
+                task_class.__name__,
+            )
+        self.replicator.add_to(scene)
         if self._mentions(_GRAVITY_METHODS):  # MuJoCo skips gravity compensation in a model without it
             scene.spec.bodies[-1].gravcomp = scene.spec.bodies[-1].gravcomp or _TINY_GRAVITY_COMPENSATION
         scene.joints.add_motors()
@@ -112,26 +133,77 @@ class OigeEnv(DirectEnv):
         return any(name in text for name in names for text in texts)
 
     def _build_workflow(self) -> None:
+        self.env_origins = self.env_origins * self._spacing_factor
         for view in self.handle.world.scene.views.values():
             view.bind(self)
         if self.engine.model.nsensor:
             self.engine.field("sensordata")  # create it before the first reset: forces of an initial state are then 0
-        if hasattr(self.task, "_max_episode_length"):
-            length = self.task._max_episode_length
-            if self._has_default_length():
+        for attribute in ("_max_episode_length", "max_episode_length"):
+            length = getattr(self.task, attribute, None)
+            if length is None:
+                continue
+            if self._class_sets_length():
                 self.max_episode_length = int(length)
             elif int(length) != self.max_episode_length:
-                self.task._max_episode_length = self.max_episode_length
+                setattr(self.task, attribute, self.max_episode_length)
+            break
+        self._post_physics_is_own = type(self.task).post_physics_step is not RLTask.post_physics_step
         with current_stage(self.stage):
+            for view in self.handle.world.scene.views.values():
+                view.initialize(None)
             super()._build_workflow()
         self._resets_by_id = True
         self._randomizer = self.task._dr_randomizer
         self._randomizer.start()
+        # OmniIsaacGymEnvs' reset applies zero actions: attributes that pre_physics_step creates exist at an observation
+        with torch.random.fork_rng(devices=[]):
+            self.task.pre_physics_step(torch.zeros(self.num_envs, self.task.num_actions, device=self.device))
+            if self._post_physics_is_own:
+                self._run_hooks()
+        self._log_ignored()
 
-    def _has_default_length(self) -> bool:
-        """Return whether the episode length is the default: not in the YAML, on the command line or in the class."""
+    def _class_sets_length(self) -> bool:
+        """Return whether the class sets the episode length: the user has not set `episode_length_s`."""
         origin = self.resolved.layers.origin(("episode_length_s",))
-        return origin is not None and origin.layer == "task" and self.max_episode_length == 1000
+        return origin is not None and origin.layer == "task" and is_oige_file(self.resolved.source.config)
+
+    def _import_task(self, reference: str) -> Any:
+        """Import the class of the task; its file may belong to a package."""
+        file, _, name = reference.rpartition(":")
+        path = Path(file)
+        top = next((folder for folder in path.parents if folder.name == "omniisaacgymenvs"), None)
+        if top is not None:
+            refuse(".".join((top.name, *path.relative_to(top).with_suffix("").parts)), f"{path}:1: ")
+        if not (path.parent / "__init__.py").is_file():
+            return super()._import_task(reference)
+        try:
+            return getattr(import_file(path), name)
+        except ModuleNotFoundError as error:
+            message = f"{error_location(error) or path}: the task imports '{error.name}', which is not installed"
+            raise DependencyError(message, hint=f"pip install {str(error.name).partition('.')[0]}") from error
+
+    def place_environments(self, spacing: float) -> Tensor:
+        """Set the distance of the environments on the grid [m], and return their positions. (num_envs, 3)"""
+        if spacing != self.config.scene.env_spacing:
+            self._spacing_factor = spacing / self.config.scene.env_spacing
+            self.grid.copy_(self.grid * self._spacing_factor)
+        return self.grid
+
+    def step_inside_action(self) -> None:
+        """Simulate one physics step inside of `pre_physics_step`."""
+        self.engine.step(1)
+        self.sim.refresh()
+        self._steps_inside += 1
+
+    def _log_ignored(self) -> None:
+        """Log the calls of the task that have no effect, once."""
+        for found, log, what in (
+            (self.stage.lost, _LOG.warning, "not simulated"),
+            (self.stage.ignored, _LOG.info, "ignored"),
+        ):
+            if found:
+                log("%s: %s", what, "; ".join(f"{name} [{reason}]" for name, reason in found.items()))
+                found.clear()
 
     def queue_forces(self, view: RigidPrimView, rows: Tensor, forces: Tensor) -> None:
         """Apply forces in the next step. Forces that the task sets in that step replace them."""
@@ -160,12 +232,28 @@ class OigeEnv(DirectEnv):
         for view, rows, forces in self._queued_forces:
             view.apply_forces(forces, rows)
         self._queued_forces.clear()
+        self._steps_inside = 0
         super()._apply_action(self._randomizer.add_action_noise(action))
+        if self._steps_inside and not self._told_steps_inside:
+            self._told_steps_inside = True
+            seconds = (self.config.decimation + self._steps_inside) * self.physics_dt
+            text = "pre_physics_step simulates %d physics steps of its own: a step lasts %g s, and not step_dt = %g s"
+            _LOG.warning(text, self._steps_inside, seconds, self.step_dt)
 
     def _compute_rewards_and_dones(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         result = super()._compute_rewards_and_dones(diverged)
         self._randomizer.after_step()
         return result
+
+    def _run_hooks(self) -> None:
+        if not self._post_physics_is_own:
+            super()._run_hooks()
+            return
+        self.task.reset_idx = lambda env_ids: None  # type: ignore[method-assign]  # the environment resets later
+        try:
+            self.task.post_physics_step()
+        finally:
+            self.task.reset_idx = self._reset_stale  # type: ignore[method-assign]
 
     def _compute_dones(self) -> tuple[Tensor, Tensor]:
         self.task.get_extras()
@@ -180,6 +268,8 @@ class OigeEnv(DirectEnv):
         late = done & (task.progress_buf >= int(length) - 1)
         if not bool(late.any()):
             return done, late
+        if self._post_physics_is_own:  # its flags cannot be computed again
+            return done & ~late, late
         # evaluate is_done again with an early progress: flags that are still set do not depend on the time
         flags, progress = task.reset_buf.clone(), task.progress_buf.clone()
         task.reset_buf.zero_()
@@ -213,7 +303,16 @@ class OigeEnv(DirectEnv):
 
     def _group(self, obs: Tensor, states: Tensor) -> dict[str, Tensor]:
         self._last_states = states
+        if obs.dim() == _IMAGE_DIMS:  # (num_envs, columns, rows, channels), as rl_games expects images
+            obs = obs.permute(0, 3, 1, 2).flatten(1)
         return super()._group(obs, states)
+
+    def _make_layout(self) -> Layout:
+        layout, obs = super()._make_layout(), self.task.obs_buf
+        if obs.dim() == _IMAGE_DIMS:
+            policy = replace(layout.observations["policy"][0], shape=(obs.shape[3], obs.shape[1], obs.shape[2]))
+            layout = replace(layout, observations={**layout.observations, "policy": (policy,)})
+        return layout
 
     def _add_noise_and_clip(self, obs: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
         """Add noise and clip, in place. Rewards were computed before, from exact values."""

@@ -21,7 +21,24 @@ SPEC = FormatSpec(
     open_scene=True,
     environment="rlcli_oige.env:OigeEnv",
     importer="rlcli_oige.command:import_task",
-    aliases={"rlcli.oige": "rlcli_oige"},
+    models="oige.mjcf.{name}",
+    aliases={
+        "rlcli.oige": "rlcli_oige",
+        "gym": "gymnasium",
+        "numpy": "rlcli_oige.modules:find_numpy",
+        **dict.fromkeys(
+            (
+                "omniisaacgymenvs.tasks.base",
+                "omniisaacgymenvs.utils.domain_randomization",
+                "omniisaacgymenvs.utils.config_utils.sim_config",
+                "omniisaacgymenvs",
+                "omni",
+                "pxr",
+                "carb",
+            ),
+            "rlcli_oige.modules:find",
+        ),
+    },
 )
 
 
@@ -40,8 +57,10 @@ def find(path: Path) -> TaskSource | None:
 
 def read(document: Document, source: TaskSource) -> Translation | None:
     """Return a YAML document of OmniIsaacGymEnvs as the data of a task; None for another document."""
+    from rlcli_oige.composition import compose
     from rlcli_oige.task_yaml import agent_file, is_oige, translate
 
+    document = compose(document, source.config, source.label)
     if not is_oige(document.data):
         return None
     return translate(

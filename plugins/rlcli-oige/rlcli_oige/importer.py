@@ -14,6 +14,7 @@ from rlcli.config.layers import read
 from rlcli.errors import ConfigError, Problem, TaskError, UsageError
 from rlcli.formats import Imported, Note
 from rlcli_oige import task_yaml
+from rlcli_oige.composition import compose
 from rlcli_oige.task_class import find_class, parse_file
 
 _IMPORT = re.compile(r"^(\s*)from\s+(?:omni|pxr|omniisaacgymenvs)(?:\.[\w.]+)?\s+import\s+(.*)$")
@@ -44,7 +45,7 @@ def convert(files: list[Path], output: Path | None) -> Imported:
             f"expected one or two files, found {len(files)}", hint="rlcli import oige TASK.yaml [TRAINPPO.yaml]"
         )
     source = files[0]
-    document = read(source)
+    document = compose(read(source), source, str(source))
     if not task_yaml.is_oige(document.data):
         message = (
             "this YAML is not a task of OmniIsaacGymEnvs, because it has no keys env and sim; give cfg/task/NAME.yaml"

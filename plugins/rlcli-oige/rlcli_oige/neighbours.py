@@ -11,6 +11,7 @@ from typing import Any
 
 from rlcli.errors import did_you_mean
 from rlcli.registry import load_module
+from rlcli.registry.module_aliases import TaskFileLoader
 from rlcli_oige.task_class import parse_file
 from rlcli_oige.task_yaml import is_oige_file
 
@@ -73,11 +74,9 @@ def _yamls(folder: Path) -> Iterator[Path]:
 def _importer() -> Path | None:
     """Return the file whose import statement is running; None if the import is inside a function."""
     frame = sys._getframe(1)
-    own = Path(__file__).parent
     while frame is not None:
-        file = frame.f_code.co_filename
-        if not file.startswith("<") and Path(file).parent != own:
-            return Path(file).resolve() if frame.f_code.co_name == "<module>" else None
+        if isinstance(frame.f_globals.get("__loader__"), TaskFileLoader):
+            return Path(frame.f_code.co_filename).resolve() if frame.f_code.co_name == "<module>" else None
         frame = frame.f_back  # type: ignore[assignment]
     return None
 

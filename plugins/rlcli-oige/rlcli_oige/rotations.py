@@ -41,8 +41,8 @@ def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
 
 
 def quat_apply(a: Tensor, b: Tensor) -> Tensor:
-    """Rotate a vector, like `quat_rotate`."""
-    return quat_rotate(a, b)
+    """Rotate vectors, like `quat_rotate`; quaternions and vectors may have different dimensions. -> shape of b"""
+    return quat_rotate(a.reshape(-1, 4), b.reshape(-1, 3)).reshape(b.shape)
 
 
 def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:

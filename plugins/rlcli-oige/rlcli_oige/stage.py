@@ -1,12 +1,12 @@
-"""Stage, prims, robots and shapes that a task builds its scene from. Each becomes an MJCF model of the scene."""
+"""Stage and prims that a task builds its scene from. Each robot, object and shape becomes an entity of the scene."""
 
 from __future__ import annotations
 
 import contextlib
-import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -15,67 +15,190 @@ from rlcli.config.schema import EntityConfig
 from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
 from rlcli.scene.scene import Scene
 from rlcli.scene.untrusted_mjcf import BadModel, package_roots, read_mjcf
+from rlcli_oige.model_edits import add_force_sensors, apply_schemas, apply_settings
+from rlcli_oige.prim_paths import BASE, ZERO, path_pattern
 from rlcli_oige.task_yaml import home, relative
+from rlcli_oige.terrain_mesh import add_terrain
+from rlcli_oige.user_code import Counterpart, user_location
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rlcli_oige.usd_schemas import Attribute
 
 MODELS = Path(__file__).parent / "models"
-BASE = "/World/envs"
-ZERO = f"{BASE}/env_0"
 
 _CURRENT_STAGES: list[Stage] = []
 
 
-class Prim:
-    """A robot or a shape of the first environment; every environment gets a copy."""
+class Prim(Counterpart):
+    """An object of the stage: a model, or a body or joint of a model, or a frame.
 
-    def __init__(self, stage: Stage, path: str) -> None:
+    The prims of models are those of the first environment; every environment has a copy.
+    """
+
+    def __init__(self, stage: Stage, path: str, owner: Prim | None = None, element: Any = None) -> None:
         self.stage = stage
         self.prim_path = path
+        self.owner = owner or self
+        self.element = element
+        """The body or joint of the owner's model; None: the prim is the whole model, or it has no model."""
         self.child: mujoco.MjSpec | None = None
         self.label = ""
         self.shape = False
-        self.pos: tuple[float, ...] | None = None
-        self.quat: tuple[float, ...] | None = None
-        self.settings: dict[str, Any] = {}
+        self.pos: tuple[float, ...] = (0.0, 0.0, 0.0)
+        self.quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+        self.given: set[str] = set()
+        """Which of `pos` and `quat` the task gives; the model has the others."""
         self.names: dict[str, Mapping[str, str]] = {}
+        self.kind = ""
+        """Type of the prim in USD, for prims without a model."""
+        self.attributes: dict[tuple[str, str, str], Attribute] = {}
+        """(schema, instance of the schema, name) -> attribute."""
+        self._settings: dict[str, Any] = {}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings of the actor that the prim belongs to."""
+        return self.owner._settings
 
     @property
     def entity(self) -> str:
         """Name of the entity in rlcli's scene."""
         return relative(self.prim_path).replace("/", "_")
 
-    def GetPath(self) -> str:  # noqa: N802  (USD's name)
+    def is_body(self) -> bool:
+        """Return whether the prim is a body of a model."""
+        return isinstance(self.element, mujoco.MjsBody)
+
+    def is_joint(self) -> bool:
+        """Return whether the prim is a joint of a model."""
+        return isinstance(self.element, mujoco.MjsJoint)
+
+    def GetPath(self) -> str:  # noqa: N802  (USD's names)
         """Return the path."""
         return self.prim_path
+
+    GetPrimPath = GetPath
+
+    def GetPrim(self) -> Prim:  # noqa: N802
+        """Return the prim itself."""
+        return self
 
     def GetName(self) -> str:  # noqa: N802
         """Return the last part of the path."""
         return self.prim_path.rpartition("/")[2]
 
+    def GetStage(self) -> Stage:  # noqa: N802
+        """Return the stage."""
+        return self.stage
+
+    def GetTypeName(self) -> str:  # noqa: N802
+        """Return the type of the prim in USD."""
+        return self.kind or "Xform"
+
     def IsValid(self) -> bool:  # noqa: N802
-        """Return True: every prim that was found is valid."""
-        return True
+        """Return whether the prim exists."""
+        return self.stage.prims.get(self.prim_path) is self or self.element is not None
+
+    __bool__ = IsValid
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Prim) and other.prim_path == self.prim_path
+
+    def __hash__(self) -> int:
+        return hash(self.prim_path)
 
     def GetChildren(self) -> list[Prim]:  # noqa: N802
-        """Return an empty list: the elements of a model are no prims."""
-        return []
+        """Return the bodies of a model, the joints below a body, or the prims below a frame."""
+        child = self.owner.child
+        if child is None:
+            depth = self.prim_path.count("/") + 1
+            below = (prim for path, prim in self.stage.prims.items() if path.startswith(f"{self.prim_path}/"))
+            return [prim for prim in below if prim.prim_path.count("/") == depth]
+        if self.is_body():
+            joints = [joint for body in self.element.bodies for joint in body.joints]
+            return [self._part(f"{self.prim_path}/{joint.name}", joint) for joint in joints]
+        if self.is_joint():
+            return []
+        return [self._part(f"{self.prim_path}/{body.name}", body) for body in child.bodies[1:]]
+
+    def part(self, path: str) -> Prim:
+        """Return the body or joint of the model that the last part of a path names; the prim is invalid if none is."""
+        name = path.rpartition("/")[2]
+        assert self.child is not None
+        below_joints = path.removeprefix(self.prim_path).count("/") > 1
+        kinds = (self.child.joints, self.child.bodies) if below_joints else (self.child.bodies, self.child.joints)
+        element = next((element for kind in kinds for element in kind if element.name == name), None)
+        return self._part(path, element)
+
+    def _part(self, path: str, element: Any) -> Prim:
+        parts = self.stage.parts.setdefault(self.prim_path if element is None else self.owner.prim_path, {})
+        key = path if element is None else f"{type(element).__name__}/{element.name}"
+        if key not in parts:
+            parts[key] = Prim(self.stage, path, self.owner, element)
+        return parts[key]
+
+    # USD's methods for schemas and attributes
+
+    def HasAPI(self, schema: Any, instance: str = "") -> bool:  # noqa: N802
+        """Return whether a schema is applied to the prim, or belongs to the prims of its kind."""
+        return bool(schema.is_on(self))
+
+    def GetAttribute(self, name: str) -> Attribute:  # noqa: N802
+        """Return an attribute. The position of an environment is its position on the grid."""
+        from rlcli_oige.usd_schemas import Attribute
+
+        attribute = self.attributes.setdefault(("", "", name), Attribute(self, "", "", name))
+        if name == "xformOp:translate" and attribute.value is None:
+            attribute.value = self.stage.position(self)
+        return attribute
+
+    CreateAttribute = HasAttribute = GetAttribute
+
+    def GetAppliedSchemas(self) -> list[str]:  # noqa: N802
+        """Return the names of the schemas whose attributes were set."""
+        return sorted({schema for schema, _, _ in self.attributes if schema})
 
 
-class Stage:
+class Stage(Counterpart):
     """Prims of a task under construction, by path.
 
     Args:
-        models: robot, by its path in an environment -> model file and names, as the task's `mjcf:` has it.
+        models: name of a robot or object -> model file and names, as `mjcf:` and `--model` set it.
         root: the task's folder.
+        grid: position of each environment. (num_envs, 3) [m]
     """
 
-    def __init__(self, models: Mapping[str, Any], root: Path) -> None:
+    def __init__(self, models: Mapping[str, Any], root: Path, grid: Tensor | None = None) -> None:
         self.models = models
         self.root = root
+        self.grid = grid
         self.prims: dict[str, Prim] = {}
+        self.parts: dict[str, dict[str, Prim]] = {}
+        self.references: dict[str, str] = {}
+        """Path of a prim -> USD file that the task refers to."""
+        self.ignored: dict[str, str] = {}
+        """Call of the task that has no effect -> where it is, and the reason."""
+        self.lost: dict[str, str] = {}
+        """Like `ignored`, for calls that change the motion in OmniIsaacGymEnvs."""
 
-    def GetPrimAtPath(self, path: str) -> Prim:  # noqa: N802
-        """Return the prim at a path, like `find`."""
-        return self.find(path)
+    def GetPrimAtPath(self, path: Any) -> Prim:  # noqa: N802
+        """Return the prim at a path. It is invalid if there is none."""
+        path = str(path).rstrip("/")
+        if path in self.prims:
+            return self.prims[path]
+        in_first = f"{ZERO}/" + "/".join(path.split("/")[4:])
+        if path.startswith(f"{BASE}/env_") and not path.startswith(f"{ZERO}/") and path.count("/") > 3:
+            return self.GetPrimAtPath(in_first)
+        if path.startswith(f"{BASE}/env_") and path.count("/") == 3:
+            return self.define(path, None, None)
+        prefix = path
+        while prefix := prefix.rpartition("/")[0]:
+            owner = self.prims.get(prefix)
+            if owner is not None and owner.child is not None:
+                return owner.part(path)
+        return Prim(self, path)
 
     def find(self, path: str) -> Prim:
         """Return the prim at a path, or the prim whose model contains the path.
@@ -83,56 +206,115 @@ class Stage:
         Raises:
             TaskError: if there is none.
         """
-        prefix = str(path)
-        while prefix and prefix != "/":
-            if prefix in self.prims:
-                return self.prims[prefix]
-            prefix = prefix.rpartition("/")[0]
-        raise TaskError(f"no prim at '{path}'", hint=f"prims: {listing(self.prims)}")
-
-    def define(self, path: str, pos: Any, quat: Any) -> Prim:
-        """Add a prim."""
-        prim = self.prims[path] = Prim(self, path)
-        prim.pos, prim.quat = (None if value is None else _to_floats(value, ()) for value in (pos, quat))
+        prim = self.GetPrimAtPath(path)
+        if prim.owner is prim and not prim.IsValid():
+            raise TaskError(f"{user_location()}no prim at '{path}'", hint=f"prims: {listing(self.prims)}")
         return prim
 
+    def DefinePrim(self, path: Any, kind: str = "Xform") -> Prim:  # noqa: N802
+        """Add a prim without a model."""
+        prim = self.define(str(path), None, None)
+        prim.kind = kind
+        return prim
+
+    def RemovePrim(self, path: Any) -> None:  # noqa: N802
+        """Remove a prim."""
+        self.prims.pop(str(path), None)
+
+    def define(self, path: str, pos: Any, quat: Any) -> Prim:
+        """Add a prim, or place the one that is there: below a reference, the pose is that of the reference's model."""
+        reference = next((ref for ref in self.references if path == ref or path.startswith(f"{ref}/")), None)
+        if reference is not None and reference not in self.prims and reference != path:
+            self.define(reference, None, None)
+            self.load(self.prims[reference], [])
+        prim = self.prims.get(path if reference is None else reference) or Prim(self, path)
+        if pos is not None:
+            prim.pos = to_floats(pos, ())
+            prim.given.add("pos")
+        if quat is not None:
+            prim.quat = to_floats(quat, ())
+            prim.given.add("quat")
+        self.prims[prim.prim_path] = prim
+        return prim if path == prim.prim_path else prim.part(path)
+
+    def position(self, prim: Prim) -> Any:
+        """Return the position of an environment on the grid, or of a prim in its environment. (3,) [m]"""
+        parts = prim.prim_path.split("/")
+        if self.grid is not None and len(parts) == 4 and parts[3].removeprefix("env_").isdigit():
+            return self.grid[int(parts[3].removeprefix("env_"))].cpu().numpy().astype(float)
+        return np.array(prim.owner.pos, dtype=float)
+
     def load(self, prim: Prim, kinds: list[str]) -> None:
-        """Load a robot's model: the file that the YAML names, or the built-in one of its class.
+        """Load a model: the file that `--model` or the YAML names, or the built-in one of its class.
 
         Raises:
             ConfigError: if there is no model, or it cannot be read.
         """
         path = relative(prim.prim_path)
-        key = next((k for k in (path, path.rpartition("/")[2], *kinds) if k in self.models), None)
+        usd = Path(self.references.get(prim.prim_path, "")).stem
+        names = (path, path.rpartition("/")[2], *kinds, usd)
+        key = next((name for name in names if name and name in self.models), None)
         entry = self.models[key] if key is not None else {}
-        built_in = next((MODELS / f"{kind.lower()}.xml" for kind in kinds if kind in ROBOTS), None)
+        entry = {"model": entry} if isinstance(entry, str) else entry
+        built_in = next((MODELS / f"{kind.lower()}.xml" for kind in kinds if kind in BUILT_IN), None)
         file = (self.root / entry["model"]).resolve() if entry else built_in
         where = f"mjcf.{key or path}"
+        name = path.rpartition("/")[2]
         if file is None:
-            hint = f"add mjcf: {{{path}: FILE.xml}} to the task's YAML"
-            raise ConfigError([Problem(where, "", f"the robot at '{prim.prim_path}' has no model", hint)])
+            text = f"'{prim.prim_path}' has no model"
+            text += f": rlcli does not load '{self.references[prim.prim_path]}'" if usd else ""
+            place = user_location().removesuffix(": ") or where
+            raise ConfigError([Problem(place, "", text, f"give an MJCF file: --model {name}=FILE.xml")])
         if not file.is_file():
             have = listing(sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*.xml")))
-            raise ConfigError([Problem(where, "", f"no file '{file}'", f"MJCF files of the task: {have}")])
+            hint = f"MJCF files of the task: {have}" if have else f"--model {name}=FILE.xml"
+            raise ConfigError([Problem(where, "", f"no file '{file}'", hint)])
         try:
-            prim.child = read_mjcf(file, [*package_roots(self.root), home(self.root / "task.yaml"), MODELS])
+            beside = [file.parent] if entry and Path(entry["model"]).is_absolute() else []
+            roots = [*package_roots(self.root), home(self.root / "task.yaml"), MODELS, *beside]
+            prim.child = read_mjcf(file, roots)
         except BadModel as error:
             raise ConfigError([Problem(where, "", f"'{file}' is not a valid MJCF; correct it: {error}")]) from None
         prim.label = str(entry.get("model", file.name))
         prim.names = {"joints": entry.get("joints", {}), "bodies": entry.get("bodies", {})}
         self._rename_elements(prim, where)
 
+    def clone(self, source: Prim, path: str, pos: Any, quat: Any) -> None:
+        """Add a copy of a prim with its model and settings; a path that exists only gets the pose."""
+        if path != source.prim_path:
+            copy = self.define(
+                path, *(getattr(source, name) if name in source.given else None for name in ("pos", "quat"))
+            )
+            copy.child = None if source.child is None else source.child.copy()
+            copy.label, copy.shape, copy._settings = source.label, source.shape, dict(source.settings)
+        self.define(path, pos, quat)
+
     def attach(self, scene: Scene, joint_forces: bool) -> None:
         """Add every prim to the scene as an entity, with sensors of joint forces if a task reads them."""
+        joints = [prim for prim in self.prims.values() if prim.kind.endswith("Joint")]
+        has_drives = False
         # robots before shapes: the scene takes its options from its first model
         for prim in sorted(self.prims.values(), key=lambda prim: prim.shape):
+            if prim.kind == "Mesh":
+                add_terrain(scene, prim)
             if prim.child is None:
                 continue
-            _apply_settings(prim, prim.child)
+            has_drives |= apply_schemas(prim, scene.sim.dt)
+            apply_settings(prim, prim.child)
             if joint_forces:
-                _add_force_sensors(prim.child)
-            entity = EntityConfig(model=prim.label, pos=prim.pos, quat=prim.quat)  # type: ignore[arg-type]
+                add_force_sensors(prim.child)
+            pose = {name: getattr(prim, name) for name in prim.given}
+            entity = EntityConfig(model=prim.label, **pose)
             scene.attach(prim.entity, entity, prim.child)
+        if has_drives:  # with Euler's method the armatures of drives make their steps implicit
+            scene.spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        for joint in joints:
+            joint.kind = ""
+            _add_joint(scene, joint)
+
+    def note_ignored(self, what: str, reason: str, lost: bool = False) -> None:
+        """Record a call of the task that has no effect in MuJoCo."""
+        (self.lost if lost else self.ignored).setdefault(what, f"{user_location()}{reason}")
 
     def _rename_elements(self, prim: Prim, where: str) -> None:
         """Give joints and bodies the names that the task uses."""
@@ -150,6 +332,48 @@ class Stage:
                     element.name = new_names[0]
 
 
+def _add_joint(scene: Scene, prim: Prim) -> None:
+    """Add a joint that a task has defined between a body and the world, as an equality constraint.
+
+    Raises:
+        TaskError: for any joint but one that locks all three translations of a body to a point of the world.
+    """
+    values = {name: attribute.value for (_, _, name), attribute in prim.attributes.items()}
+    limits = {
+        axis: (prim.attributes.get(("LimitAPI", axis, "Low")), prim.attributes.get(("LimitAPI", axis, "High")))
+        for axis in ("transX", "transY", "transZ")
+    }
+    locked = all(low is not None and high is not None and low.value > high.value for low, high in limits.values())
+    first, second = (values.get(name) or [] for name in ("Body0", "Body1"))
+    target = prim.stage.GetPrimAtPath(second[0]) if len(second) == 1 else None
+    world = len(first) == 1 and not prim.stage.GetPrimAtPath(first[0]).is_body()
+    if not locked or not world or target is None or not target.is_body():
+        raise TaskError(
+            f"{values.get('where', '')}the joint '{prim.prim_path}' has no counterpart: only a joint that locks the"
+            " three translations of a body to the ground has one",
+            hint="add the constraint to the MJCF, as <equality>",
+        )
+    environment = prim.stage.GetPrimAtPath("/".join(prim.prim_path.split("/")[:4]))
+    anchor = np.asarray(values.get("LocalPos0", (0.0, 0.0, 0.0))) - prim.stage.position(environment)
+    name = prim.prim_path.removeprefix(f"{BASE}/").partition("/")[2]
+    known = scene.spec.equality(name)
+    if known is not None:
+        site = scene.spec.site(f"{name}.anchor")
+        if not np.allclose(site.pos, anchor, atol=1e-4):
+            raise TaskError(f"the joint '{prim.prim_path}' is at another place than the one of the first environment")
+        return
+    body = scene.spec.body(f"{target.owner.entity}/{target.GetName()}")
+    body.add_site(name=f"{name}.point", pos=np.asarray(values.get("LocalPos1", (0.0, 0.0, 0.0))), group=5)
+    scene.spec.worldbody.add_site(name=f"{name}.anchor", pos=anchor, group=5)
+    scene.spec.add_equality(
+        name=name,
+        type=mujoco.mjtEq.mjEQ_CONNECT,
+        objtype=mujoco.mjtObj.mjOBJ_SITE,
+        name1=f"{name}.point",
+        name2=f"{name}.anchor",
+    )
+
+
 @contextlib.contextmanager
 def current_stage(stage: Stage) -> Iterator[Stage]:
     """Make a stage the current one, on which robots and shapes are created."""
@@ -160,25 +384,32 @@ def current_stage(stage: Stage) -> Iterator[Stage]:
         _CURRENT_STAGES.remove(stage)
 
 
-def get_current_stage() -> Stage:
+def get_current_stage(fabric: bool = False) -> Stage:
     """Return the stage of the task that is being built.
 
     Raises:
         TaskError: outside of `set_up_scene`.
     """
     if not _CURRENT_STAGES:
-        raise TaskError("the task has no stage yet", hint="create robots and shapes in the task's set_up_scene")
+        hint = "create robots and shapes in the task's set_up_scene"
+        raise TaskError(f"{user_location()}the task has no stage yet", hint=hint)
     return _CURRENT_STAGES[-1]
 
 
-def get_prim_at_path(prim_path: str) -> Prim:
+def note_ignored(what: str, reason: str, lost: bool = False) -> None:
+    """Record a call of the task that has no effect in MuJoCo, if a task is being built."""
+    if _CURRENT_STAGES:
+        _CURRENT_STAGES[-1].note_ignored(what, reason, lost)
+
+
+def get_prim_at_path(prim_path: str, fabric: bool = False) -> Prim:
     """Return the prim at a path, or the prim whose model contains the path."""
     return get_current_stage().find(prim_path)
 
 
-def is_prim_path_valid(prim_path: str) -> bool:
+def is_prim_path_valid(prim_path: str, fabric: bool = False) -> bool:
     """Return whether there is a prim at a path."""
-    return any(prim_path == path or prim_path.startswith(f"{path}/") for path in get_current_stage().prims)
+    return get_current_stage().GetPrimAtPath(prim_path).IsValid()
 
 
 def find_matching_prim_paths(prim_path_regex: str) -> list[str]:
@@ -189,261 +420,29 @@ def find_matching_prim_paths(prim_path_regex: str) -> list[str]:
 
 def define_prim(prim_path: str, prim_type: str = "Xform", **kwargs: Any) -> Prim:
     """Add a frame."""
-    return get_current_stage().define(prim_path, None, None)
+    return get_current_stage().DefinePrim(prim_path, prim_type)
 
 
-def add_reference_to_stage(usd_path: str, prim_path: str, prim_type: str = "Xform") -> None:
-    """Do nothing: the YAML's `mjcf:` names the model of each path."""
+def add_reference_to_stage(usd_path: str, prim_path: str, prim_type: str = "Xform") -> Prim:
+    """Record the USD file of a path. Its model is loaded when an object is created there."""
+    stage = get_current_stage()
+    stage.references[str(prim_path)] = str(usd_path)
+    return Prim(stage, str(prim_path))
 
 
-def get_assets_root_path() -> str:
+def get_assets_root_path(*args: Any, **kwargs: Any) -> str:
     """Return the start of USD paths. It is empty: nothing is downloaded."""
     return ""
 
 
-def path_pattern(expression: str) -> re.Pattern[str]:
-    """Compile a view's `prim_paths_expr`. `.*` and `*` match within one step of the path."""
-    steps = str(expression).rstrip("/").split("/")
-    steps = ["[^/]*" if step == "*" else step.replace(".*", "[^/]*") for step in steps]
-    try:
-        return re.compile("/".join(steps))
-    except re.error as error:
-        raise TaskError(
-            f"'{expression}' is not a valid regular expression of prim paths; correct it: {error}"
-        ) from None
-
-
-class XFormPrim:
-    """A frame."""
-
-    def __init__(
-        self,
-        prim_path: str,
-        name: str = "xform_prim",
-        position: Any = None,
-        translation: Any = None,
-        orientation: Any = None,
-        scale: Any = None,
-        visible: bool | None = None,
-        **kwargs: Any,
-    ) -> None:
-        self.prim_path = str(prim_path)
-        self.name = name
-        self.prim = get_current_stage().define(
-            self.prim_path, position if translation is None else translation, orientation
-        )
-        self._build(scale)
-
-    def _build(self, scale: Any) -> None:
-        """Fill the prim with a model."""
-
-    def set_collision_enabled(self, enabled: bool) -> None:
-        """Turn collisions on or off."""
-        self.prim.settings["collisions"] = bool(enabled)
-
-
-class Robot(XFormPrim):
-    """A robot. The YAML's `mjcf:` names its model; some classes have a built-in model."""
-
-    def _build(self, scale: Any) -> None:
-        self.prim.stage.load(self.prim, [kind.__name__ for kind in type(self).__mro__])
-
-
-class Cartpole(Robot):
-    """A cart on a rail with a pole."""
-
-
-class Ant(Robot):
-    """A robot with four legs."""
-
-
-class Humanoid(Robot):
-    """A humanoid robot."""
-
-
-class Crazyflie(Robot):
-    """A palm-sized quadcopter."""
-
-
-class Quadcopter(Robot):
-    """A quadcopter whose arms tilt."""
-
-
-class Ingenuity(Robot):
-    """A helicopter with two rotors, one above the other."""
-
-
-ROBOTS = ("Cartpole", "Ant", "Humanoid", "Crazyflie", "Quadcopter", "Ingenuity")
-"""Classes of robots with a built-in model."""
-
-
-class RigidPrim(XFormPrim):
-    """A frame whose model is loaded separately."""
-
-
-class _Shape(XFormPrim):
-    free, solid = True, True
-
-    def __init__(self, prim_path: str, name: str = "shape", radius: float | None = None, size: Any = None,
-                 height: float | None = None, color: Any = None, mass: float | None = None,
-                 density: float | None = None, **kwargs: Any) -> None:  # fmt: skip
-        self._radius, self._size, self._height = radius, size, height
-        self._color, self._mass, self._density = color, mass, density
-        super().__init__(prim_path, name, **kwargs)
-
-    def _geom(self, scale: np.ndarray) -> dict[str, Any]:
-        raise NotImplementedError
-
-    def _build(self, scale: Any) -> None:
-        child = mujoco.MjSpec()
-        body = child.worldbody.add_body(name=self.prim.GetName())
-        if self.free:
-            body.add_freejoint(name="root")
-        rgb = _to_floats(self._color, (0.5, 0.5, 0.5))
-        size = np.broadcast_to(np.asarray(_to_floats(scale, (1.0, 1.0, 1.0))), 3)
-        geom = body.add_geom(name="shape", rgba=[*rgb[:3], 1.0], **self._geom(size))
-        if self._mass is not None:
-            geom.mass = float(self._mass)
-        geom.density = float(self._density) if self._density is not None else 1000.0
-        self.prim.child, self.prim.label, self.prim.shape = child, type(self).__name__, True
-        self.prim.settings["collisions"] = self.solid
-
-
-class _Sphere(_Shape):
-    def _geom(self, scale: np.ndarray) -> dict[str, Any]:
-        radius = (1.0 if self._radius is None else float(self._radius)) * scale[0]
-        return {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0.0, 0.0]}
-
-
-class _Cuboid(_Shape):
-    def _geom(self, scale: np.ndarray) -> dict[str, Any]:
-        edges = np.broadcast_to(np.asarray(_to_floats(self._size, (1.0,))), 3) * scale
-        return {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": (0.5 * edges).tolist()}
-
-
-class _Cylinder(_Shape):
-    def _geom(self, scale: np.ndarray) -> dict[str, Any]:
-        radius, height = self._radius or 1.0, self._height or 1.0
-        return {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [radius * scale[0], 0.5 * height * scale[2], 0.0]}
-
-
-class DynamicSphere(_Sphere):
-    """A sphere that moves and collides."""
-
-
-class FixedSphere(_Sphere):
-    """A sphere that is fixed and collides."""
-
-    free = False
-
-
-class VisualSphere(_Sphere):
-    """A sphere without collisions."""
-
-    free, solid = False, False
-
-
-class DynamicCuboid(_Cuboid):
-    """A box that moves and collides."""
-
-
-class FixedCuboid(_Cuboid):
-    """A box that is fixed and collides."""
-
-    free = False
-
-
-class VisualCuboid(_Cuboid):
-    """A box without collisions."""
-
-    free, solid = False, False
-
-
-class DynamicCylinder(_Cylinder):
-    """A cylinder that moves and collides."""
-
-
-class FixedCylinder(_Cylinder):
-    """A cylinder that is fixed and collides."""
-
-    free = False
-
-
-class GroundPlane:
-    """The ground plane. `sim.add_ground_plane` of the YAML decides whether the scene has one."""
-
-    def __init__(self, prim_path: str = "/World/defaultGroundPlane", **kwargs: Any) -> None:
-        self.prim_path = prim_path
-
-
-def _apply_settings(prim: Prim, child: mujoco.MjSpec) -> None:
-    """Apply the settings of an actor to its model."""
-    settings = prim.settings
-    for geom in child.geoms:
-        if settings.get("collisions") is False:
-            geom.contype = geom.conaffinity = 0
-        if settings.get("density", -1) not in (-1, None):
-            geom.density, geom.mass = float(settings["density"]), np.nan  # NaN: MuJoCo computes the mass
-    if settings.get("make_kinematic") in (True, 1):
-        for body in child.worldbody.bodies:
-            for joint in [j for j in body.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]:
-                child.delete(joint)
-            body.mocap = True
-    if settings.get("disable_gravity") is True:
-        for body in child.bodies[1:]:
-            body.gravcomp = 1.0
-    if settings.get("enable_self_collisions") in (False, 0):
-        _disable_self_collisions(child)
-    if settings.get("mass", -1) not in (-1, None):
-        model = child.compile()
-        factor = float(settings["mass"]) / float(np.sum(model.body_mass))
-        for geom in child.geoms:
-            if np.isnan(geom.mass):
-                geom.density *= factor
-            else:
-                geom.mass *= factor
-        for body in child.bodies[1:]:
-            if body.explicitinertial:
-                body.mass *= factor
-                body.inertia = factor * np.asarray(body.inertia)
-
-
-def _disable_self_collisions(child: mujoco.MjSpec) -> None:
-    """Exclude contacts between all bodies of the model."""
-    for number, body in enumerate(child.bodies[1:]):
-        if not body.name:
-            body.name = f"body_{number}"  # the name that an entity gives to a body without one
-    bodies = [b for b in child.bodies[1:] if any(g.contype or g.conaffinity for g in b.geoms)]
-    for number, first in enumerate(bodies):
-        for second in bodies[number + 1 :]:
-            collide = any(
-                (a.contype & b.conaffinity) or (b.contype & a.conaffinity) for a in first.geoms for b in second.geoms
-            )
-            if collide:
-                child.add_exclude(bodyname1=first.name, bodyname2=second.name)
-
-
-def _add_force_sensors(child: mujoco.MjSpec) -> None:
-    """Add sensors of the force and torque between each body and its parent, in the body's frame."""
-    for number, body in enumerate(child.bodies[1:]):
-        if not body.name:
-            body.name = f"body_{number}"
-        body.add_site(name=f"{body.name}{FRAME}", pos=[0.0, 0.0, 0.0], size=[1e-3] * 3, group=5)
-    for body in child.bodies[1:]:
-        for kind, suffix in ((mujoco.mjtSensor.mjSENS_FORCE, FORCE), (mujoco.mjtSensor.mjSENS_TORQUE, TORQUE)):
-            child.add_sensor(
-                name=f"{body.name}{suffix}",
-                type=kind,
-                objtype=mujoco.mjtObj.mjOBJ_SITE,
-                objname=f"{body.name}{FRAME}",
-            )
-
-
-FRAME, FORCE, TORQUE = ".frame", ".joint_force", ".joint_torque"
-"""Suffixes of the sites and sensors that measure joint forces."""
-
-
-def _to_floats(value: Any, default: tuple[float, ...]) -> tuple[float, ...]:
+def to_floats(value: Any, default: tuple[float, ...]) -> tuple[float, ...]:
+    """Return a vector as a tuple of numbers; the default for None."""
     if value is None:
         return default
+    if "torch" in sys.modules and hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
     return tuple(float(x) for x in np.asarray(value, dtype=float).reshape(-1))
+
+
+BUILT_IN = ("Cartpole", "Ant", "Humanoid", "Crazyflie", "Quadcopter", "Ingenuity")
+"""Classes of robots with a built-in model."""

@@ -13,8 +13,12 @@ from torch import Tensor
 from rlcli.envs.direct import DirectTask
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli_oige.articulation_view import ArticulationView
+from rlcli_oige.cameras import Writer
+from rlcli_oige.prim_paths import BASE, ZERO
 from rlcli_oige.randomization import Randomizer
-from rlcli_oige.stage import BASE, ZERO, GroundPlane, Prim, Stage
+from rlcli_oige.shapes import GroundPlane
+from rlcli_oige.stage import Prim, Stage
+from rlcli_oige.user_code import Counterpart
 from rlcli_oige.views import RigidPrimView, XFormPrimView
 
 if TYPE_CHECKING:
@@ -34,7 +38,7 @@ ACTOR_DEFAULTS: Mapping[str, Any] = {
 }  # fmt: skip
 
 
-class SimConfig:
+class SimConfig(Counterpart):
     """The task's YAML, evaluated, with the methods that OmniIsaacGymEnvs' tasks call."""
 
     def __init__(self, config: dict[str, Any] | None = None) -> None:
@@ -115,7 +119,7 @@ class SimConfig:
         return self.parse_actor_config(name)[key] if value is None else value
 
 
-class SceneRegistry:
+class SceneRegistry(Counterpart):
     """Registry of views: the argument of `set_up_scene`."""
 
     def __init__(self) -> None:
@@ -179,7 +183,17 @@ class SceneRegistry:
     add_ground_plane = add_default_ground_plane
 
 
-class World:
+class SimulationContext(Counterpart):
+    """The simulation as a task steps it by itself, within `pre_physics_step`."""
+
+    _env: OigeEnv
+
+    def step(self, render: bool = True) -> None:
+        """Simulate one physics step."""
+        self._env.step_inside_action()
+
+
+class World(SimulationContext):
     """The simulation, with the methods that tasks call."""
 
     def __init__(self, env: OigeEnv) -> None:
@@ -233,7 +247,7 @@ class World:
         return self._env.common_step * self._env.config.decimation
 
 
-class EnvHandle:
+class EnvHandle(Counterpart):
     """The environment as tasks expect it in `self._env`."""
 
     def __init__(self, env: OigeEnv) -> None:
@@ -299,7 +313,10 @@ class RLTask(DirectTask):
         self._rand_seed = self._cfg.get("seed", 42)
         self.test = bool(self._cfg.get("test", False))
         self.is_extension = False
-        self.enable_cameras = False
+        self.enable_cameras = bool(self._task_cfg.get("sim", {}).get("enable_cameras", False))
+        if self.enable_cameras:
+            self.rep = env.runner.replicator
+            self.PytorchListener, self.PytorchWriter = self.rep.listener, Writer
         self.control_frequency_inv = env.runner.config.decimation
         bounds = env.runner.config
         self.clip_obs = np.inf if bounds.clip_observations is None else bounds.clip_observations
@@ -383,7 +400,8 @@ class RLTask(DirectTask):
         copy_from_source: bool = False,
     ) -> None:
         """Place the environments on the grid. A task's own method calls this after it created its robots."""
-        self._env_pos = self._env.runner.grid
+        runner = self._env.runner
+        self._env_pos = runner.place_environments(getattr(self, "_env_spacing", runner.config.scene.env_spacing))
 
     def initialize_views(self, scene: Any) -> None:
         """Set the positions of the environments. rlcli does not call this: `set_up_scene` creates the views."""

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
-from rlcli.config.layers import Origin, document_origins, read
+from rlcli.config.layers import Origin, read
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.errors import ConfigError, did_you_mean, listing
 from rlcli.formats import Status, Translation
 from rlcli_oige import agent_yaml, randomization_yaml
+from rlcli_oige.composition import compose
 from rlcli_oige.hydra import evaluate
 from rlcli_oige.task_class import class_constant
 from rlcli_oige.task_keys import (
@@ -43,7 +44,7 @@ def is_oige(data: Mapping[str, Any]) -> bool:
 def is_oige_file(file: FilePath) -> bool:
     """Return whether a file can be read and has OmniIsaacGymEnvs' format."""
     try:
-        return is_oige(read(file).data)
+        return is_oige(_composed_data(file))
     except ConfigError:
         return False
 
@@ -51,7 +52,7 @@ def is_oige_file(file: FilePath) -> bool:
 def task_name(file: FilePath) -> str | None:
     """Return the name of a task of OmniIsaacGymEnvs, imported or not; None for a file of another task."""
     try:
-        data = read(file).data
+        data = _composed_data(file)
     except ConfigError:
         return None
     imported = _mapping(data.get("oige"))
@@ -111,13 +112,12 @@ class _Translator(YamlTranslator):
         self.put(("oige",), block, ())
         self.put(("summary",), f"{task.get('name', 'A task')}, a task written for OmniIsaacGymEnvs", ("name",))
         self.data["scene"].setdefault("entities", {})
-        origin = document_origins(self.document, self.label, "task")
 
         def origin_of(path: Path) -> Origin:
             for length in range(len(path), -1, -1):
                 if path[:length] in self.sources:
-                    return origin(self.sources[path[:length]] + path[length:])
-            return origin(())
+                    return self.origin(self.sources[path[:length]] + path[length:])
+            return self.origin(())
 
         found = Translation(self.data, origin_of, self.notes)
         if agents is not None:
@@ -126,9 +126,7 @@ class _Translator(YamlTranslator):
 
     def _top(self, task: Mapping[str, Any]) -> None:
         for key in task:
-            if key == "defaults":
-                self.problem((key,), "Hydra's defaults lists are not supported", "write the task as one file")
-            elif key not in TOP_KEYS:
+            if key not in TOP_KEYS:
                 near = did_you_mean(key, TOP_KEYS) or f"keys: {listing(TOP_KEYS)}"
                 self.problem((key,), f"unknown key '{key}'", near)
         for key in ("rl", "ctrl", "randomize"):
@@ -282,6 +280,15 @@ def home(config: FilePath) -> FilePath:
     """Return the folder of a task's files: that of its YAML, or the package that contains its `cfg/task`."""
     inside = config.parent.parts[-2:] == ("cfg", "task")
     return config.parent.parent.parent if inside else config.parent
+
+
+def _composed_data(file: FilePath) -> dict[str, Any]:
+    """Return the data of a YAML file. A wrong `defaults:` list is not an error here: reading the task reports it."""
+    document = read(file)
+    try:
+        return compose(document, file, str(file)).data
+    except ConfigError:
+        return {"sim": {}, **document.data}
 
 
 def _mapping(value: Any) -> dict[str, Any]:

@@ -16,13 +16,15 @@ from torch import Tensor
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.sim.rotations import rotate, rotate_inverse
-from rlcli_oige.stage import ZERO, path_pattern
+from rlcli_oige.prim_paths import ZERO, path_pattern
+from rlcli_oige.stage import note_ignored
+from rlcli_oige.user_code import Counterpart
 
 if TYPE_CHECKING:
     from rlcli_oige.env import OigeEnv
 
 
-class XFormPrimView:
+class XFormPrimView(Counterpart):
     """Frames or bodies that a path expression matches, in every environment. Rows are ordered by environment.
 
     Args:
@@ -33,6 +35,9 @@ class XFormPrimView:
     def __init__(self, prim_paths_expr: str, name: str = "view", reset_xform_properties: bool = True, **kwargs: Any):
         self.prim_paths_expr = prim_paths_expr
         self.name = name
+        for option, value in kwargs.items():
+            if value is not None:
+                note_ignored(f"{type(self).__name__}({option}=...)", "set it with the view's methods", lost=True)
         self._non_root_link = False
         self._env: OigeEnv | None = None
 
@@ -161,17 +166,21 @@ class XFormPrimView:
                     self._write("qpos", rows, slice(entity.root_qpos + start, entity.root_qpos + start + size), new)
 
     def get_velocities(self, indices: Any = None, clone: bool = True) -> Tensor:
-        """Return linear [m/s] and angular [rad/s] velocities of the bodies' frames, world frame. (n, 6)"""
+        """Return velocities of the centres of mass (as PhysX) and angular ones, world frame. (n, 6) [m/s, rad/s]"""
         found = []
         for entity, body, root in zip(self._entities, self._bodies, self._roots, strict=True):
-            if root and entity.root_dof is not None:
-                found.append(torch.cat([entity.data.root_lin_vel_w, entity.data.root_ang_vel_w], dim=1))
+            if root and entity.root_dof is not None and entity.root_qpos is not None:
+                qvel = self.env.sim.qvel[:, entity.root_dof : entity.root_dof + 6]
+                quat = self.env.sim.qpos[:, entity.root_qpos + 3 : entity.root_qpos + 7]
+                angular = rotate(quat, qvel[:, 3:])
+                linear = qvel[:, :3] + torch.linalg.cross(angular, self._to_center(body, quat))
+                found.append(torch.cat([linear, angular], dim=1))
             else:
                 found.append(self._spatial(body))
         return select_rows(_interleave(found), self._index(indices))
 
     def get_linear_velocities(self, indices: Any = None, clone: bool = True) -> Tensor:
-        """Return linear velocities, world frame. (n, 3) [m/s]"""
+        """Return linear velocities of the centres of mass, world frame. (n, 3) [m/s]"""
         return self.get_velocities(indices)[:, :3]
 
     def get_angular_velocities(self, indices: Any = None, clone: bool = True) -> Tensor:
@@ -179,7 +188,7 @@ class XFormPrimView:
         return self.get_velocities(indices)[:, 3:]
 
     def set_velocities(self, velocities: Any, indices: Any = None) -> None:
-        """Set velocities of free bodies and robot roots, world frame. (n, 6) [m/s, rad/s]"""
+        """Set velocities of the centres of mass of free bodies and roots. (n, 6) [m/s, rad/s], world frame"""
         velocities = self._tensor(velocities).reshape(-1, 6)
         for which, (entity, root) in enumerate(zip(self._entities, self._roots, strict=True)):
             if not root or entity.root_qpos is None or entity.root_dof is None:
@@ -188,7 +197,9 @@ class XFormPrimView:
             new = velocities[selected]
             quat = self.env.sim.qpos[rows, entity.root_qpos + 3 : entity.root_qpos + 7]
             # qvel of a free joint: linear velocity in the world frame, angular velocity in the body frame
-            local = torch.cat([new[:, :3], rotate_inverse(quat, new[:, 3:])], dim=1)
+            arm = self._to_center(self._bodies[which], quat, rows)
+            linear = new[:, :3] - torch.linalg.cross(new[:, 3:], arm)
+            local = torch.cat([linear, rotate_inverse(quat, new[:, 3:])], dim=1)
             self._write("qvel", rows, slice(entity.root_dof, entity.root_dof + 6), local)
 
     def set_linear_velocities(self, velocities: Any, indices: Any = None) -> None:
@@ -211,12 +222,20 @@ class XFormPrimView:
     # --- helpers of the subclasses ---
 
     def _spatial(self, body: int) -> Tensor:
-        """Return linear and angular velocity of a body's frame, world frame. (num_envs, 6)"""
+        """Return the velocity of a body's centre of mass, and its angular velocity, world frame. (num_envs, 6)"""
         sim, model = self.env.sim, self.env.engine.model
         # MuJoCo's cvel is (angular, linear), and linear at the centre of mass of the whole kinematic tree
         angular, linear = sim.derived_field("cvel")[:, body].split(3, dim=1)
-        arm = sim.derived_field("xpos")[:, body] - sim.derived_field("subtree_com")[:, int(model.body_rootid[body])]
+        arm = sim.derived_field("xipos")[:, body] - sim.derived_field("subtree_com")[:, int(model.body_rootid[body])]
         return torch.cat([linear + torch.linalg.cross(angular, arm), angular], dim=1)
+
+    def _to_center(self, body: int, quat: Tensor, rows: Any = slice(None)) -> Tensor:
+        """Return the vector from a body's origin to its centre of mass, world frame. quat (n, 4) -> (n, 3) [m]"""
+        expanded = self.env.engine.expanded("body_ipos")
+        if expanded is not None:
+            return rotate(quat, expanded[rows, body].to(quat.dtype))
+        offset = torch.tensor(self.env.engine.model.body_ipos[body], dtype=quat.dtype, device=quat.device)
+        return rotate(quat, offset.expand(len(quat), 3))
 
     def _tensor(self, values: Any) -> Tensor:
         return torch.as_tensor(values, dtype=torch.float32, device=self.env.device)
@@ -254,8 +273,13 @@ class RigidPrimView(XFormPrimView):
         self, prim_paths_expr: str, name: str = "rigid_prim_view", reset_xform_properties: bool = True,
         track_contact_forces: bool = False, prepare_contact_sensors: bool = False, **kwargs: Any,
     ):  # fmt: skip
-        super().__init__(prim_paths_expr, name, reset_xform_properties)
+        self._initial_masses = kwargs.pop("masses", None)
+        super().__init__(prim_paths_expr, name, reset_xform_properties, **kwargs)
         self._track_contact_forces = track_contact_forces
+
+    def _bind(self) -> None:
+        if self._initial_masses is not None:
+            self.set_masses(self._initial_masses)
 
     def apply_forces(self, forces: Any, indices: Any = None, is_global: bool = True) -> None:
         """Apply forces at the centres of mass until the end of this step. (n, 3) [N], world or body frame"""

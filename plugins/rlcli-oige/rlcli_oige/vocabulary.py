@@ -4,11 +4,13 @@
 from rlcli_oige.articulation_view import ArticulationView
 from rlcli_oige.maths import *  # noqa: F403
 from rlcli_oige.maths import TENSOR_NAMES
+from rlcli_oige.randomization import Randomizer
 from rlcli_oige.rotations import *  # noqa: F403
 from rlcli_oige.rotations import ROTATION_NAMES
-from rlcli_oige.stage import (
+from rlcli_oige.shapes import (
     Ant,
     Cartpole,
+    Cloner,
     Crazyflie,
     DynamicCuboid,
     DynamicCylinder,
@@ -16,6 +18,7 @@ from rlcli_oige.stage import (
     FixedCuboid,
     FixedCylinder,
     FixedSphere,
+    GridCloner,
     GroundPlane,
     Humanoid,
     Ingenuity,
@@ -24,7 +27,10 @@ from rlcli_oige.stage import (
     Robot,
     VisualCuboid,
     VisualSphere,
+    WheeledRobot,
     XFormPrim,
+)
+from rlcli_oige.stage import (
     add_reference_to_stage,
     define_prim,
     find_matching_prim_paths,
@@ -33,18 +39,22 @@ from rlcli_oige.stage import (
     get_prim_at_path,
     is_prim_path_valid,
 )
-from rlcli_oige.task import RLTask, SimConfig, World
-from rlcli_oige.usd import ArticulationAction, Gf, PhysxSchema, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, carb, omni
+from rlcli_oige.task import RLTask, SimConfig, SimulationContext, World
+from rlcli_oige.usd import ArticulationAction, Gf, PhysxSchema, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, carb
 from rlcli_oige.views import RigidPrimView, XFormPrimView
 
+MATHS = [*TENSOR_NAMES, *ROTATION_NAMES]
+"""Names that `import *` of a module of Omniverse defines."""
+
 NAMES = [
-    *TENSOR_NAMES,
-    *ROTATION_NAMES,
-    "Ant", "ArticulationAction", "ArticulationView", "Cartpole", "Crazyflie", "DynamicCuboid", "DynamicCylinder",
-    "DynamicSphere", "FixedCuboid", "FixedCylinder", "FixedSphere", "Gf", "GroundPlane", "Humanoid", "Ingenuity",
-    "PhysxSchema", "Quadcopter", "RLTask", "RigidPrim", "RigidPrimView", "Robot", "Sdf", "SimConfig", "Usd", "UsdGeom",
-    "UsdLux", "UsdPhysics", "VisualCuboid", "VisualSphere", "World", "XFormPrim", "XFormPrimView",
-    "add_reference_to_stage", "carb", "define_prim", "find_matching_prim_paths", "get_assets_root_path",
-    "get_current_stage", "get_prim_at_path", "is_prim_path_valid", "omni", "torch_utils",
+    *MATHS,
+    "Ant", "ArticulationAction", "ArticulationView", "Cartpole", "Cloner", "Crazyflie", "DynamicCuboid",
+    "DynamicCylinder", "DynamicSphere", "FixedCuboid", "FixedCylinder", "FixedSphere", "Gf", "GridCloner",
+    "GroundPlane",
+    "Humanoid", "Ingenuity", "PhysxSchema", "Quadcopter", "RLTask", "Randomizer", "RigidPrim", "RigidPrimView", "Robot",
+    "Sdf", "SimConfig", "SimulationContext", "Usd", "UsdGeom", "UsdLux", "UsdPhysics", "UsdShade", "VisualCuboid",
+    "VisualSphere", "WheeledRobot", "World", "XFormPrim", "XFormPrimView", "add_reference_to_stage", "carb",
+    "define_prim", "find_matching_prim_paths", "get_assets_root_path", "get_current_stage", "get_prim_at_path",
+    "is_prim_path_valid", "torch_utils",
 ]  # fmt: skip
 """Names that `rlcli_oige` exports; `torch_utils` is the package itself."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from rlcli.config.layers import document_origins
+from rlcli.config.layers import Origin, document_origins
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.errors import Problem
 from rlcli.formats import Note, Status
+from rlcli_oige.composition import label_at
 
 
 @dataclass(slots=True)
@@ -35,7 +36,11 @@ class YamlTranslator:
 
     def where(self, path: Path) -> str:
         """Return `file:line:column` of a key."""
-        return document_origins(self.document, self.label, "task")(path).where
+        return self.origin(path).where
+
+    def origin(self, path: Path) -> Origin:
+        """Return the file and line of a key."""
+        return document_origins(self.document, label_at(self.document, path, self.label), "task")(path)
 
     def note(self, path: Path, status: Status, text: str = "") -> None:
         """Record how a key was translated."""

@@ -254,7 +254,7 @@ def test_restored_state_continues_bit_for_bit(env):
             "  /World/envs/.*/Arm: arm.xml",
             "  Leg: arm.xml",
             ConfigError,
-            "the robot at '/World/envs/env_0/Arm' has no model",
+            "'/World/envs/env_0/Arm' has no model",
         ),
         ("yaml", "arm.xml", "leg.xml", ConfigError, "no file"),
         ("yaml", "Arm: arm.xml", "Arm: {model: arm.xml, joints: {x: knee}}", ConfigError, "no 'knee' in arm.xml"),

@@ -2,6 +2,8 @@
 
 from types import SimpleNamespace
 
+import mujoco
+import numpy as np
 import pytest
 import torch
 import yaml as yaml_module
@@ -92,13 +94,14 @@ def test_linear_and_angular_velocities_are_set_separately(env):
     assert torch.allclose(boxes.get_angular_velocities([0]), torch.full((1, 3), -2.0), atol=1e-6)
 
 
-def test_link_velocity_equals_change_of_position(env):
+def test_link_velocity_is_that_of_center_of_mass(env):
     arms, links = env.task._arms, env.task._links
+    arms.set_joint_positions(torch.zeros(4, 3))
     arms.set_joint_velocities(torch.tensor([[0.0, 2.0, 0.0]]).repeat(4, 1))
     forward(env)
     speed = links.get_velocities().reshape(4, 2, 6)
     assert torch.allclose(speed[:, 1, 3:], torch.tensor([0.0, 2.0, 0.0]), atol=1e-5), "the right link turns about y"
-    assert torch.allclose(speed[:, 1, :3], torch.zeros(3), atol=1e-5), "and its frame lies on the joint"
+    assert torch.allclose(speed[:, 1, :3], torch.tensor([0.3, 0.0, 0.0]), atol=1e-5), "0.15 m above the joint"
     assert torch.allclose(speed[:, 0], torch.zeros(6), atol=1e-5)
 
 
@@ -357,3 +360,28 @@ def test_set_seed_seeds_all_three_generators():
         draws.append((random.random(), float(np.random.rand()), float(torch.rand(()))))
     assert draws[0] == draws[1]
     assert maths.set_seed(-1, torch_deterministic=True) == 42
+
+
+def test_root_velocity_is_that_of_center_of_mass(tmp_path):
+    offset = ARM.replace(
+        '<geom type="sphere" size="0.05" mass="1"',
+        '<freejoint/><geom type="sphere" size="0.05" pos="0.06 0 0" mass="99"',
+    )
+    folder = arm_folder(tmp_path / "arm")
+    (folder / "arm.xml").write_text(offset)
+    env = build(folder)
+    env.reset()
+    arms, generator = env.task._arms, torch.Generator().manual_seed(0)
+    quat = torch.nn.functional.normalize(torch.randn(4, 4, generator=generator), dim=1)
+    velocity = torch.randn(4, 6, generator=generator)
+    arms.set_world_poses(None, quat)
+    arms.set_velocities(velocity)
+    assert torch.allclose(arms.get_velocities(), velocity, atol=1e-5)
+    forward(env)
+    model, base = env.engine.model, env.task._arms.entity.root_body
+    for row in range(4):  # MuJoCo's own velocity of the body's inertial frame
+        _, data = env.world(row)
+        found = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, base, found, 0)
+        assert found[[3, 4, 5, 0, 1, 2]] == pytest.approx(velocity[row].numpy(), abs=1e-4)
+    assert np.linalg.norm(model.body_ipos[base]) > 0.05

@@ -38,7 +38,7 @@ SPACE = TRAIN[TRAIN.index("    space: {") : TRAIN.index("    mlp: {")]
             "expected a mapping; write mlp",
             None,
         ),
-        ("    separate: False", "    cnn: {}", "params.network.cnn", "unknown key 'cnn'", "keys: name, separate"),
+        ("    separate: False", "    cmn: {}", "params.network.cmn", "unknown key 'cmn'", "keys: name, separate"),
         (UNITS, "mlp: [32, 16]", "params.network.mlp", "expected a mapping", None),
         (
             "activation: elu",

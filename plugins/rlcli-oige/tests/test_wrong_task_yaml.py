@@ -20,7 +20,6 @@ def problem_of(place, yaml, message):
 @pytest.mark.parametrize(
     ("old", "new", "key", "message", "hint"),
     [
-        ("name: Arm\n", "name: Arm\ndefaults: [_self_]\n", "defaults", "defaults lists are not supported", "one file"),
         ("  physx:\n", "  physx: 3\n  other:\n", "sim.physx", "expected a mapping, found 3", None),
         ("  dt: 0.01", "  dt: 0.01\n  substep: 2", "sim.substep", "unknown key 'substep'", "did you mean 'substeps'"),
         ("mjcf:\n", "viewport: {camera_psition: [1, 1, 1]}\nmjcf:\n", "viewport.camera_psition", "unknown key", None),

@@ -77,6 +77,10 @@ def _set_verbosity(option: typer.CallbackParam, is_set: bool) -> bool:
     return is_set
 
 
+_MODEL = (
+    "MJCF file of a robot or object of a task in another framework's format, or a YAML file {NAME: FILE}; repeatable."
+)
+_Models = Annotated[list[str] | None, typer.Option("--model", metavar="NAME=FILE", help=_MODEL)]
 _COMMON: dict[str, Any] = {
     "json": typer.Option("--json", help="Print one JSON document on stdout."),
     "quiet": typer.Option("--quiet", "-q", callback=_set_verbosity, help="Print only results and errors."),
@@ -110,11 +114,20 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
         for option, info in _COMMON.items()
     ]
 
+    parameters = [*signature.parameters.values(), *common]
+    if "overrides" in signature.parameters:
+        model = inspect.Parameter("model", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=_Models)
+        parameters.insert(len(signature.parameters), model)
+
     @functools.wraps(function)
-    def run(**values: Any) -> None:
+    def run(*, model: list[str] | None = None, **values: Any) -> None:
+        if model:
+            from rlcli.config.given_models import MODELS, read_models
+
+            words = [f'{MODELS}."{name}"="{file}"' for name, file in read_models(model).items()]
+            values["overrides"] = [*(values["overrides"] or []), *words]
         function(**{option: value for option, value in values.items() if option not in _COMMON})
 
-    parameters = [*signature.parameters.values(), *common]
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     app.command(name, cls=HelpCommand, help=text, epilog=examples, **settings)(run)

@@ -46,6 +46,16 @@ class ManagerBasedEnvCfg:
     export_io_descriptors: bool = False
     log_dir: Any = None
 
+    def __rlcli_task__(self, root: Path) -> Any:
+        """Return this configuration as a task of rlcli."""
+        from rlcli.config.python_task import PythonTask
+        from rlcli_isaaclab.convert import task
+        from rlcli_isaaclab.settings import Report
+
+        report = Report()
+        data = task(to_dict(self), report, root, cfg=self)
+        return PythonTask(data, notes=report.user_notes())
+
 
 @configclass
 class ManagerBasedRLEnvCfg(ManagerBasedEnvCfg):
@@ -57,16 +67,6 @@ class ManagerBasedRLEnvCfg(ManagerBasedEnvCfg):
     terminations: Any = MISSING
     curriculum: Any = None
     commands: Any = None
-
-    def __rlcli_task__(self, root: Path) -> Any:
-        """Return this configuration as a task of rlcli."""
-        from rlcli.config.python_task import PythonTask
-        from rlcli_isaaclab.convert import task
-        from rlcli_isaaclab.settings import Report
-
-        report = Report()
-        data = task(to_dict(self), report, root)
-        return PythonTask(data, notes=report.user_notes())
 
 
 ManagerBasedEnv = ManagerBasedRLEnv

@@ -116,6 +116,139 @@ def copysign(mag: float, other: Tensor) -> Tensor:
     return torch.full_like(other, abs(mag)).copysign(other)
 
 
+def quat_from_angle_axis(angle: Tensor, axis: Tensor) -> Tensor:
+    """Return the rotation by an angle [rad] around an axis of any length. (n,), (n, 3) -> (n, 4)"""
+    unit = axis / axis.norm(p=2, dim=-1, keepdim=True).clamp(min=1e-9)
+    half = (0.5 * angle).unsqueeze(-1)
+    return torch.cat([half.cos(), unit * half.sin()], dim=-1)
+
+
+def axis_angle_from_quat(quat: Tensor, eps: float = 1.0e-6) -> Tensor:
+    """Return axis x angle [rad]. (..., 4) -> (..., 3)"""
+    quat = torch.where(quat[..., :1] < 0.0, -quat, quat)
+    length = quat[..., 1:].norm(p=2, dim=-1, keepdim=True)
+    angle = 2.0 * torch.atan2(length, quat[..., :1])
+    small = length < eps
+    return quat[..., 1:] * torch.where(small, 2.0 * torch.ones_like(angle), angle / torch.where(small, 1.0, length))
+
+
+def matrix_from_quat(quaternions: Tensor) -> Tensor:
+    """Return rotation matrices. (..., 4) -> (..., 3, 3)"""
+    w, x, y, z = quaternions.unbind(-1)
+    twice = 2.0 / (quaternions * quaternions).sum(-1)
+    rows = [
+        1.0 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w),
+        twice * (x * y + z * w), 1.0 - twice * (x * x + z * z), twice * (y * z - x * w),
+        twice * (x * z - y * w), twice * (y * z + x * w), 1.0 - twice * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape((*quaternions.shape[:-1], 3, 3))
+
+
+def quat_from_matrix(matrix: Tensor) -> Tensor:
+    """Return the quaternions (w >= 0) of rotation matrices. (..., 3, 3) -> (..., 4)"""
+    m = matrix.reshape(-1, 3, 3)
+    a, b, c = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
+    squares = torch.stack([1 + a + b + c, 1 + a - b - c, 1 - a + b - c, 1 - a - b + c], dim=1)
+    wx, wy, wz = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
+    xy, xz, yz = m[:, 1, 0] + m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 2, 1] + m[:, 1, 2]
+    rows = [
+        [squares[:, 0], wx, wy, wz],
+        [wx, squares[:, 1], xy, xz],
+        [wy, xy, squares[:, 2], yz],
+        [wz, xz, yz, squares[:, 3]],
+    ]
+    table = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+    best = table[torch.arange(len(m), device=m.device), squares.argmax(dim=1)]  # the largest divisor is the most exact
+    return quat_unique(normalize(best)).reshape((*matrix.shape[:-2], 4))
+
+
+def convert_quat(quat: Any, to: str = "xyzw") -> Any:
+    """Move the real part of quaternions to the end (`xyzw`) or to the start (`wxyz`). (..., 4)"""
+    order = [1, 2, 3, 0] if to == "xyzw" else [3, 0, 1, 2]
+    return quat[..., order]
+
+
+def quat_box_minus(q1: Tensor, q2: Tensor) -> Tensor:
+    """Return the rotation from q2 to q1 as axis x angle [rad]. (n, 4) each -> (n, 3)"""
+    return axis_angle_from_quat(multiply(q1, quat_conjugate(q2)))
+
+
+def quat_box_plus(q: Tensor, delta: Tensor, eps: float = 1.0e-6) -> Tensor:
+    """Return the rotation `delta` (axis x angle) after q. (n, 4), (n, 3) -> (n, 4)"""
+    return multiply(quat_from_angle_axis(delta.norm(p=2, dim=-1), delta), q)
+
+
+def compute_pose_error(
+    t01: Tensor, q01: Tensor, t02: Tensor, q02: Tensor, rot_error_type: str = "axis_angle"
+) -> tuple[Tensor, Tensor]:
+    """Return the error of position and rotation from pose 1 to pose 2. (n, 3), (n, 3 or 4)"""
+    turn = multiply(q02, quat_conjugate(q01))
+    return t02 - t01, turn if rot_error_type == "quat" else axis_angle_from_quat(turn)
+
+
+def apply_delta_pose(source_pos: Tensor, source_rot: Tensor, delta_pose: Tensor, eps: float = 1.0e-6) -> Any:
+    """Return a pose moved by a position [m] and a rotation vector [rad]. delta_pose (n, 6)"""
+    turn = quat_from_angle_axis(delta_pose[:, 3:6].norm(p=2, dim=-1), delta_pose[:, 3:6])
+    return source_pos + delta_pose[:, :3], multiply(turn, source_rot)
+
+
+def transform_points(points: Tensor, pos: Tensor | None = None, quat: Tensor | None = None) -> Tensor:
+    """Rotate, then move points. (..., p, 3)"""
+    if quat is not None:
+        wide = quat if quat.dim() == 1 else quat.unsqueeze(-2).expand((*points.shape[:-1], 4))
+        points = quat_apply(wide.expand((*points.shape[:-1], 4)), points)
+    if pos is None:
+        return points
+    return points + (pos if pos.dim() == 1 else pos.unsqueeze(-2))
+
+
+def skew_symmetric_matrix(vec: Tensor) -> Tensor:
+    """Return the matrix of the cross product with a vector. (..., 3) -> (..., 3, 3)"""
+    x, y, z = vec.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape((*vec.shape[:-1], 3, 3))
+
+
+def default_orientation(num: int, device: Any) -> Tensor:
+    """Return rotations by nothing. (num, 4)"""
+    return torch.eye(1, 4, device=device).repeat(num, 1)
+
+
+def random_yaw_orientation(num: int, device: Any) -> Tensor:
+    """Sample rotations around z uniformly. (num, 4)"""
+    yaw = torch.rand(num, device=device) * 2.0 * torch.pi
+    return from_euler(torch.zeros_like(yaw), torch.zeros_like(yaw), yaw)
+
+
+def sample_triangle(lower: float, upper: float, size: Any, device: Any) -> Tensor:
+    """Sample from a symmetric triangular distribution."""
+    shape = (size,) if isinstance(size, int) else tuple(size)
+    return (torch.rand(*shape, device=device) + torch.rand(*shape, device=device)) * 0.5 * (upper - lower) + lower
+
+
+def sample_cylinder(radius: float, h_range: Any, size: Any, device: Any) -> Tensor:
+    """Sample points in a cylinder around z. h_range is the range of heights, or the height from 0. (size, 3) [m]"""
+    shape = (size,) if isinstance(size, int) else tuple(size)
+    low, high = (0.0, float(h_range)) if isinstance(h_range, int | float) else h_range
+    distance = radius * torch.rand(*shape, device=device).sqrt()
+    angle = 2.0 * torch.pi * torch.rand(*shape, device=device)
+    return torch.stack(
+        [distance * angle.cos(), distance * angle.sin(), sample_uniform(low, high, shape, device)], dim=-1
+    )
+
+
+def orthogonalize_perspective_depth(depth: Tensor, intrinsics: Tensor) -> Tensor:
+    """Return the distance along the optical axis from the distance to the camera. (n, h, w[, 1]), (n or none, 3, 3)"""
+    flat = depth.squeeze(-1) if depth.shape[-1] == 1 else depth
+    height, width = flat.shape[-2:]
+    inverse = intrinsics.reshape(-1, 3, 3)
+    rows = torch.arange(height, device=depth.device).float()[:, None]
+    columns = torch.arange(width, device=depth.device).float()
+    x = (columns - inverse[:, 0, 2, None, None]) / inverse[:, 0, 0, None, None]
+    y = (rows - inverse[:, 1, 2, None, None]) / inverse[:, 1, 1, None, None]
+    return (flat / (1.0 + x.square() + y.square()).sqrt()).reshape(depth.shape)
+
+
 def sample_uniform(lower: Any, upper: Any, size: Any, device: Any) -> Tensor:
     """Sample uniformly from [lower, upper)."""
     shape = (size,) if isinstance(size, int) else tuple(size)

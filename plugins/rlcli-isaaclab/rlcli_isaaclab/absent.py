@@ -1,0 +1,216 @@
+"""Stand-ins for names of Isaac Lab and Isaac Sim that rlcli does not have. They raise an error when they are used."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from types import ModuleType
+from typing import Any
+
+from rlcli.errors import TaskError
+
+_REASONS = {
+    "pink": ("Pink inverse kinematics needs Pinocchio", "use DifferentialInverseKinematicsActionCfg"),
+    "pinocchio": ("it needs Pinocchio", "use DifferentialInverseKinematicsActionCfg"),
+    "rmp": ("RMPflow is a part of Isaac Sim", "use DifferentialInverseKinematicsActionCfg"),
+    "surface_gripper": ("a suction gripper has no counterpart in plain MuJoCo", "use a gripper with joints"),
+    "devices": ("devices for teleoperation belong to Isaac Sim", "rlcli trains policies: remove the use of the device"),
+    "recorder": ("recorders write files of Isaac Lab", "use `rlcli eval --record`"),
+    "operationalspace": ("rlcli has no operational space control", "use DifferentialInverseKinematicsActionCfg"),
+    "pretrainedpolicy": (
+        "it loads a TorchScript policy, and rlcli unpickles nothing",
+        "train the low-level policy, and write the task without it",
+    ),
+    "rigidobjectcollection": ("it holds assets that differ by environment", "use one RigidObjectCfg for each object"),
+    "multirotor": ("rlcli has no rotors", "write a DirectRLEnv that sets forces"),
+    "nonholonomic": ("rlcli has no action for wheeled bases", "use JointVelocityActionCfg"),
+    "surfacegripper": ("a suction gripper has no counterpart in plain MuJoCo", "use a gripper with joints"),
+    "image_features": ("its networks are downloads in TorchScript or pickles", "train a CNN on `mdp.image`"),
+    "thrust": ("rlcli has no action for thrusters", "write a DirectRLEnv that sets forces"),
+    "agile": (
+        "it loads a TorchScript policy, and rlcli unpickles nothing",
+        "train the low-level policy, and write the task without it",
+    ),
+    "torchvision": ("the library is not installed", "pip install torchvision"),
+    "trimesh": ("the library is not installed", "pip install trimesh"),
+    "nodal": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
+    "deformable": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
+    "omni": ("it belongs to Isaac Sim's USD stage", "change the model (MJCF) instead"),
+    "pxr": ("it belongs to Isaac Sim's USD stage", "change the model (MJCF) instead"),
+    "carb": ("it belongs to Isaac Sim", "remove its use"),
+    "isaacsim": ("it belongs to Isaac Sim", "remove its use"),
+    "marl": ("rlcli has no multi-agent tasks", "write a task with one agent"),
+}
+"""Part of a name -> the reason why rlcli does not have it, and what to do."""
+
+
+def reason_of(name: str) -> tuple[str, str]:
+    """Return why rlcli does not have a name of Isaac Lab or Isaac Sim, and what to do."""
+    words = name.lower()
+    return next(
+        (texts for part, texts in _REASONS.items() if part in words),
+        ("plain MuJoCo and rlcli have no counterpart", "docs/guides/isaac-lab.md lists what can be used"),
+    )
+
+
+def absence(name: str) -> TaskError:
+    """Return the error that a name of Isaac Lab or Isaac Sim cannot be used."""
+    reason, hint = reason_of(name)
+    return TaskError(f"{_user_place()}{name} cannot be used: {reason}", hint=hint)
+
+
+def _user_place() -> str:
+    """Return `file:line: ` of the task's code that runs; empty if none does."""
+    from rlcli.registry import is_framework
+
+    frame = sys._getframe(2)
+    while frame is not None:
+        file, module = frame.f_code.co_filename, str(frame.f_globals.get("__name__", ""))
+        if not is_framework(module) and not file.startswith("<") and not module.startswith(("importlib", "torch")):
+            return f"{file}:{frame.f_lineno}: "
+        frame = frame.f_back  # type: ignore[assignment]
+    return ""
+
+
+class _AbsentMeta(type):
+    """Class of classes that rlcli does not have: their members are names without a value."""
+
+    def __getattr__(cls, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return AbsentValue(f"{type.__getattribute__(cls, '__doc__')}.{name}")
+
+    def __call__(cls, *args: Any, **settings: Any) -> Any:
+        if "absent_name" not in vars(cls):  # a subclass of the user
+            raise absence(str(getattr(cls, "absent_name", cls.__name__)))
+        return AbsentValue(str(cls.__doc__))
+
+
+class AbsentValue:
+    """A constant or function that rlcli does not have. It can be copied, stored and passed on, but not called."""
+
+    def __init__(self, name: str) -> None:
+        self.__dict__["absent_name"] = name
+        self.__dict__["__name__"] = name.rpartition(".")[2]
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        if name in ("copy", "replace"):
+            return lambda **changes: self
+        return AbsentValue(f"{self.absent_name}.{name}")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Accept any setting: nothing reads it."""
+
+    def __getitem__(self, key: Any) -> Any:
+        return AbsentValue(f"{self.absent_name}[{key!r}]")
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        """Accept any setting: nothing reads it."""
+
+    def __deepcopy__(self, memo: Any) -> AbsentValue:
+        return self
+
+    def __or__(self, other: Any) -> Any:
+        return self
+
+    __ror__ = __add__ = __radd__ = __or__
+
+    def __call__(self, *args: Any, **settings: Any) -> Any:
+        """Raise the error that the name cannot be used."""
+        raise absence(self.absent_name)
+
+    def __repr__(self) -> str:
+        return f"<{self.absent_name}, not available in rlcli>"
+
+
+class AbsentModule(ModuleType):
+    """A module of Isaac Sim. Any name can be imported from it; its use raises an error."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        if self.__name__.endswith("settings") and name in ("get_settings", "acquire_settings_interface"):
+            return _NoSettings
+        if self.__name__ == "pxr" and name == "UsdGeom":
+            from rlcli_isaaclab.usd_stage import UsdGeom
+
+            return UsdGeom
+        if name[:1].isupper():
+            return absent_class(f"{self.__name__}.{name}")
+        if self.__name__ in ("carb", "omni.log") and name.startswith(("log", "info", "warn", "error", "verbose")):
+            return _log
+        from rlcli_isaaclab.namespace import module_of
+
+        return module_of(f"{self.__name__}.{name}", "")
+
+    def __call__(self, *args: Any, **settings: Any) -> Any:
+        """Raise the error that the name cannot be used."""
+        raise absence(self.__name__)
+
+
+@functools.cache
+def absent_module(name: str) -> AbsentModule:
+    """Return the stand-in of a module."""
+    module = AbsentModule(name)
+    module.__path__ = []
+    return module
+
+
+def absent_class(name: str) -> type:
+    """Return the stand-in of a class. It can be subclassed; an object of it is a stand-in, too."""
+    return _AbsentMeta(name.rpartition(".")[2], (), {"__doc__": name, "absent_name": name, "__module__": __name__})
+
+
+def absent_value(name: str) -> AbsentValue:
+    """Return the stand-in of a constant."""
+    return AbsentValue(name)
+
+
+def absent_function(name: str) -> AbsentValue:
+    """Return the stand-in of a function."""
+    return AbsentValue(name)
+
+
+class _NoSettings:
+    """Settings of Isaac Sim's application: none is set."""
+
+    def get(self, name: str) -> None:
+        """Return None."""
+
+    def set(self, name: str, value: Any) -> None:
+        """Do nothing."""
+
+    get_as_bool = get_as_string = get_as_int = get
+    set_bool = set_string = set_int = set
+
+
+class NoEffect:
+    """A USD prim, or a part of one, that only changes how a scene looks: every call does nothing."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return NoEffect(f"{self._name}.{name}")
+
+    def __call__(self, *args: Any, **settings: Any) -> Any:
+        """Report the first call, and do nothing."""
+        _report_once(self._name)
+        return self
+
+
+@functools.cache
+def _report_once(name: str) -> None:
+    import logging
+
+    logging.getLogger("rlcli.isaaclab").warning("%s has no effect: rlcli's lights and colours do not change", name)
+
+
+def _log(*texts: Any) -> None:
+    import logging
+
+    logging.getLogger("rlcli.isaaclab").info("%s", " ".join(map(str, texts)))

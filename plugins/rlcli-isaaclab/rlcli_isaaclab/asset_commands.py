@@ -1,0 +1,143 @@
+"""What a task writes to an asset besides its state: targets of joints, forces on bodies, and PhysX's view."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import TaskError, did_you_mean, listing
+from rlcli.scene.actuators import JointCommand
+from rlcli.scene.entity import Entity
+from rlcli.scene.jacobian import Jacobian
+from rlcli.sim.rotations import rotate
+
+
+class JointDrive:
+    """Targets of one kind (motor, position or velocity) of the joints that have such an actuator."""
+
+    def __init__(self, env: VecEnv, entity: Entity, kind: str) -> None:
+        count = len(entity.joint_names)
+        modelled = {joint for actuator in entity.actuators for joint in actuator.joints}
+        self._columns = [c for c in range(count) if c in modelled or c in dict(entity.actuators_of(kind))]
+        self._undriven = [c for c in range(count) if c not in self._columns] if kind != "position" else []
+        self._name, self._kind, self._joints = entity.name, kind, list(entity.joint_names)
+        self._command = JointCommand(entity, kind, self._columns) if self._columns else None
+        self.target = torch.zeros(env.num_envs, count, device=env.device)
+        if kind == "position":
+            self.target.copy_(entity.data.default_joint_pos)
+
+    def set(self, target: Tensor, joint_ids: Any, env_ids: Any) -> None:
+        """Set targets of joints. Joints without gains ignore position targets; other targets must be 0 there.
+
+        Raises:
+            TaskError: for a target that nothing drives.
+        """
+        rows = torch.arange(len(self.target)) if env_ids is None else torch.as_tensor(env_ids)
+        if joint_ids is None:
+            self.target[rows] = target
+        elif isinstance(joint_ids, slice):
+            self.target[rows, joint_ids] = target
+        else:
+            self.target[rows[:, None], torch.as_tensor(joint_ids)] = target
+        if self._undriven and bool(self.target[:, self._undriven].any()):
+            wrong = self.target[:, self._undriven].any(dim=0).nonzero()[:, 0].tolist()
+            raise TaskError(
+                f"the task sets a {self._kind} target of joints of '{self._name}' without such an actuator:"
+                f" {listing(self._joints[self._undriven[i]] for i in wrong)}",
+                hint="add actuators of this kind to the MJCF",
+            )
+        if self._command is not None:
+            self._command.write(self.target[:, self._columns])
+
+
+class BodyWrench:
+    """Forces and torques on bodies, in the frames of the bodies."""
+
+    def __init__(self, env: VecEnv, entity: Entity) -> None:
+        self._env, self._entity = env, entity
+        self._local: Tensor | None = None
+
+    def set_forces_and_torques(
+        self,
+        forces: Any = None,
+        torques: Any = None,
+        *,
+        body_ids: Any = None,
+        env_ids: Any = None,
+        is_global: bool = False,
+        **other: Any,
+    ) -> None:
+        """Replace forces [N] and torques [N m]. (rows, bodies, 3) each"""
+        count = len(self._entity.names["Bodies"])
+        if self._local is None:
+            self._local = torch.zeros(self._env.num_envs, count, 6, device=self._env.device)
+        rows = torch.arange(self._env.num_envs) if env_ids is None else torch.as_tensor(env_ids)
+        bodies = torch.arange(count) if body_ids is None or isinstance(body_ids, slice) else torch.as_tensor(body_ids)
+        for part, values in ((slice(0, 3), forces), (slice(3, 6), torques)):
+            if values is not None:
+                self._local[rows[:, None], bodies.reshape(1, -1), part] = values
+        self._is_global = is_global
+
+    def reset(self, env_ids: Any) -> None:
+        """Remove the forces of some environments."""
+        if self._local is not None:
+            self._local[slice(None) if env_ids is None else env_ids] = 0.0
+
+    def apply(self) -> None:
+        """Write the forces for the next physics step."""
+        if self._local is None:
+            return
+        world = self._local
+        if not self._is_global:
+            quat = self._entity.data.body_quat_w
+            world = torch.cat([rotate(quat, world[..., :3]), rotate(quat, world[..., 3:])], dim=-1)
+        self._env.engine.field("xfrc_applied")[:, self._entity.body_ids] = world.to(torch.float64)
+
+
+class PhysxView:
+    """The values of PhysX's view of an asset that have a counterpart in MuJoCo."""
+
+    def __init__(self, env: VecEnv, entity: Entity) -> None:
+        self._env, self._entity = env, entity
+        self._jacobians: list[Jacobian] | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        known = [n for n in dir(type(self)) if not n.startswith("_")]
+        hint = did_you_mean(name, known) or f"rlcli has {listing(known)}; for others use `data`"
+        raise TaskError(f"root_physx_view.{name} cannot be used: rlcli has no PhysX", hint=hint)
+
+    def _bodies(self, field: str) -> Tensor:
+        values = torch.as_tensor(getattr(self._env.engine.model, field)[self._entity.body_ids], dtype=torch.float32)
+        return values.expand(self._env.num_envs, *values.shape).clone()
+
+    def get_masses(self) -> Tensor:
+        """Return masses of the bodies. (num_envs, bodies) [kg]"""
+        return self._bodies("body_mass")
+
+    def get_dof_limits(self) -> Tensor:
+        """Return position limits of the joints. (num_envs, joints, 2) [m or rad]"""
+        limits = self._entity.data.joint_pos_limits
+        return limits.expand(self._env.num_envs, *limits.shape[-2:]).clone()
+
+    def get_jacobians(self) -> Tensor:
+        """Return the Jacobians of the bodies' origins, world frame: without the first body, which is fixed.
+
+        (num_envs, bodies - 1, 6, joints), linear before angular
+        """
+        if self._entity.is_floating:
+            raise TaskError("root_physx_view.get_jacobians cannot be used for a floating base", hint="fix the base")
+        count = len(self._entity.names["Bodies"])
+        if self._jacobians is None:
+            columns = list(range(len(self._entity.joint_names)))
+            self._jacobians = [Jacobian(self._entity, columns, body) for body in range(1, count)]
+        positions = self._entity.data.body_pos_w
+        return torch.stack([jacobian(positions[:, i + 1]) for i, jacobian in enumerate(self._jacobians)], dim=1)
+
+    def get_link_incoming_joint_force(self) -> Tensor:
+        """Return force and torque of each body's parent on the body, body frame. (num_envs, bodies, 6) [N, N m]"""
+        return self._entity.data.body_incoming_wrench_b

@@ -1,0 +1,142 @@
+"""Conversion of a direct task to a task of rlcli whose terms call the hooks of the task."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+from rlcli.config.python_task import PythonTask
+from rlcli.errors import ConfigError, Problem
+from rlcli_isaaclab import convert
+from rlcli_isaaclab.config_class import is_missing, to_dict
+from rlcli_isaaclab.direct_env import record, shape_of
+from rlcli_isaaclab.direct_terms import HookTerm
+from rlcli_isaaclab.scene_facade import Asset, TerrainImporter
+from rlcli_isaaclab.scene_reader import SceneReader
+from rlcli_isaaclab.settings import Node, Report
+from rlcli_isaaclab.term_reader import TermReader
+
+_KINDS = {"set_joint_effort_target": "effort", "set_joint_velocity_target": "velocity"}
+_BODY_FORCES = ("get_link_incoming_joint_force", "body_incoming_joint_wrench")
+
+
+def direct_task(cfg: Any, env_class: type, root: Path) -> PythonTask:
+    """Return the task of a configuration and its environment class.
+
+    Raises:
+        ConfigError: if the task cannot be expressed in rlcli.
+    """
+    report = Report()
+    _require_values(cfg)
+    actions = shape_of(cfg.action_space, "action_space")
+    observations = shape_of(cfg.observation_space, "observation_space")
+    setup, env = record(env_class, cfg)
+    names = _names(setup, env)
+    cfg.rlcli_names = names
+    scene_data: dict[str, Any] = {"num_envs": cfg.scene.num_envs, "env_spacing": cfg.scene.env_spacing}
+    for name, (_, settings) in zip(names, setup.created, strict=True):
+        scene_data[name] = to_dict(settings)
+    for index, (path, settings) in enumerate(setup.spawned):
+        scene_data[f"spawned_{index}"] = {"prim_path": path, "spawn": to_dict(settings)}
+    declared = to_dict(cfg.scene)
+    scene_data |= {key: value for key, value in declared.items() if key not in scene_data}
+    scene = SceneReader(Node(scene_data, ("scene",), report), root)
+    data = to_dict(cfg)
+    top = Node(data, (), report)
+    config: dict[str, Any] = {
+        "decimation": cfg.decimation,
+        "episode_length_s": float(cfg.episode_length_s),
+        "reward_dt_scaling": False,
+        "sim": convert._sim(top.node("sim")),
+        "scene": scene.read(),
+    }
+    source = _source_of(env_class)
+    kind = next((kind for method, kind in _KINDS.items() if method in source), "position")
+    assets = [name for name, (made, _) in zip(names, setup.created, strict=True) if isinstance(made, Asset)]
+    driven = {name: dict.fromkeys(scene.names(name, "joint") or [], kind) for name in assets}
+    scene.add_joint_settings(driven)
+    if kind == "effort":
+        _add_motors(scene, driven)
+    terms = TermReader(scene, report, cfg)
+    events = {name: term for member in top.node("events").nodes() for name, term in terms.read_terms("events", *member)}
+    hook = _Hooks(env_class, cfg, any(word in source for word in _BODY_FORCES))
+    config |= {
+        "actions": {"action": {"func": hook("action", actions)}},
+        "observations": {"policy": {"observation": {"func": hook("policy", observations)}}},
+        "rewards": {"reward": {"func": hook("reward"), "weight": 1.0}},
+        "terminations": {
+            "terminated": {"func": hook("terminated")},
+            "time_out": {"func": hook("time_out"), "time_out": True},
+        },
+        "events": {**events, "reset": {"func": hook("reset"), "mode": "reset"}},
+    }
+    if cfg.state_space:
+        states = hook("critic", shape_of(cfg.state_space, "state_space"))
+        config["observations"]["critic"] = {"state": {"func": states}}
+    if report.problems:
+        raise ConfigError(report.problems)
+    return PythonTask({key: v for key, v in config.items() if v is not None}, notes=report.user_notes())
+
+
+class _Hooks:
+    """Maker of the terms of one direct task."""
+
+    def __init__(self, env_class: type, cfg: Any, reads_body_forces: bool) -> None:
+        self._env_class, self._cfg, self._forces = env_class, cfg, reads_body_forces
+
+    def __call__(self, hook: str, shape: tuple[int, ...] = ()) -> HookTerm:
+        return HookTerm(hook, self._env_class, self._cfg, shape, self._forces)
+
+
+def _require_values(cfg: Any) -> None:
+    """Check that every setting without a default is set; older files have `num_actions` for `action_space`."""
+    for space, number in (
+        ("action_space", "num_actions"),
+        ("observation_space", "num_observations"),
+        ("state_space", "num_states"),
+    ):
+        if getattr(cfg, number, None) and (is_missing(getattr(cfg, space)) or getattr(cfg, space) is None):
+            setattr(cfg, space, getattr(cfg, number))
+    missing = [
+        name
+        for name in ("decimation", "episode_length_s", "scene", "action_space", "observation_space")
+        if is_missing(getattr(cfg, name))
+    ]
+    if missing:
+        raise ConfigError([Problem("configuration", name, "missing; give it a value") for name in missing])
+
+
+def _names(setup: Any, env: Any) -> list[str]:
+    """Return a name for each created object: its key in the scene, or the last part of its path."""
+    keys = {
+        id(made): key
+        for table in (env.scene.articulations, env.scene.rigid_objects, env.scene.sensors, env.scene.extras)
+        for key, made in table.items()
+    }
+    names: list[str] = []
+    for made, settings in setup.created:
+        name = keys.get(id(made)) or str(settings.prim_path).rstrip("/").rsplit("/", 1)[-1].lower()
+        if isinstance(made, TerrainImporter):
+            name = "terrain"
+        names.append(name if name not in names else f"{name}_{len(names)}")
+    return names
+
+
+def _source_of(env_class: type) -> str:
+    """Return the text of a class and of its bases that belong to the task."""
+    bases = [base for base in env_class.__mro__ if not base.__module__.startswith(("rlcli_isaaclab", "gymnasium"))]
+    return "\n".join(inspect.getsource(base) for base in bases if base is not object)
+
+
+def _add_motors(scene: SceneReader, driven: dict[str, dict[str, str]]) -> None:
+    """Give every joint of articulations a motor, so that the task can set any effort."""
+    for name, joints in driven.items():
+        entity = scene.entities.get(name)
+        if entity is None or not joints:
+            continue
+        settings = entity.setdefault("joints", {})
+        for values in settings.values():
+            values.setdefault("actuator", "motor")
+        if not settings:
+            settings[".*"] = {"actuator": "motor"}

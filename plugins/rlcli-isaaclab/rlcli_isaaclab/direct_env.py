@@ -1,0 +1,312 @@
+"""`DirectRLEnv`: direct tasks of Isaac Lab. Names as in `isaaclab.envs`.
+
+rlcli runs a direct task as a manager-based one with one action, one reward and so on, which call the hooks of the task
+(`direct_terms.py`).
+"""
+
+from __future__ import annotations
+
+import sys
+from contextvars import ContextVar
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from torch import Tensor
+
+from rlcli.errors import ConfigError, Problem, TaskError
+from rlcli_isaaclab.config_class import MISSING, configclass
+from rlcli_isaaclab.setup_scene import Setup, running
+from rlcli_isaaclab.sim import SimulationCfg
+
+MANAGED: ContextVar[Any] = ContextVar("managed")
+"""The environment of rlcli for which a `DirectRLEnv` is created."""
+
+
+class DirectRLEnv(gymnasium.Env):
+    """A direct task. rlcli creates the object; the hooks are Isaac Lab's."""
+
+    metadata = {"render_modes": [None]}  # noqa: RUF012  (gymnasium's)
+
+    def __init__(self, cfg: Any, render_mode: str | None = None, **kwargs: Any) -> None:
+        from rlcli_isaaclab.scene_facade import Scene
+
+        managed = MANAGED.get(None)
+        if managed is None:
+            raise TaskError("a DirectRLEnv cannot be created by itself", hint="use `rlcli train`, or rlcli.make_env")
+        self.cfg, self.managed, self.render_mode = cfg, managed, render_mode
+        self.sim = SimpleNamespace(
+            device=str(managed.device), cfg=cfg.sim, has_gui=lambda: False, has_rtx_sensors=lambda: False,
+            set_camera_view=lambda **view: None, get_physics_dt=lambda: managed.physics_dt,
+        )  # fmt: skip
+        self.scene = Scene(managed)
+        self.extras: dict[str, Any] = {}
+        n, device = managed.num_envs, managed.device
+        self.single_action_space = _space(cfg.action_space, "action_space")
+        self.single_observation_space = gymnasium.spaces.Dict(
+            {"policy": _space(cfg.observation_space, "observation_space")}
+        )
+        self.state_space = _space(cfg.state_space, "state_space") if cfg.state_space else None
+        self.actions = torch.zeros(n, gymnasium.spaces.flatdim(self.single_action_space), device=device)
+        self.reset_terminated, self.reset_time_outs, self.reset_buf = (
+            torch.zeros(n, dtype=torch.bool, device=device) for _ in range(3)
+        )
+        self.reward_buf = torch.zeros(n, device=device)
+        self.obs_buf: dict[str, Any] = {}
+        setup = Setup(self._bind)
+        with running(setup):
+            self._setup_scene()
+
+    def _bind(self, created: Any, index: int) -> None:
+        """Connect an object that `_setup_scene` has created with its part of the simulation."""
+        from rlcli_isaaclab.scene_facade import Asset, TerrainImporter
+
+        name = self.cfg.rlcli_names[index]
+        if isinstance(created, TerrainImporter):
+            created.bind(self.managed, self.managed.terrain)
+        elif isinstance(created, Asset):
+            created.bind(self.managed, self.managed.entities[name])
+            self.scene.articulations[name] = created
+        else:
+            created.bind(self.managed.sensors[name])
+
+    @property
+    def unwrapped(self) -> Any:
+        """The environment itself."""
+        return self
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments."""
+        return self.managed.num_envs
+
+    @property
+    def device(self) -> str:
+        """Device of the tensors."""
+        return str(self.managed.device)
+
+    @property
+    def physics_dt(self) -> float:
+        """Period of a physics step [s]."""
+        return self.managed.physics_dt
+
+    @property
+    def step_dt(self) -> float:
+        """Control period [s]."""
+        return self.managed.step_dt
+
+    @property
+    def max_episode_length(self) -> int:
+        """Maximum length of an episode [steps]."""
+        return self.managed.max_episode_length
+
+    @property
+    def max_episode_length_s(self) -> float:
+        """Maximum length of an episode [s]."""
+        return self.managed.config.episode_length_s
+
+    @property
+    def common_step_counter(self) -> int:
+        """Environment steps since the start."""
+        return self.managed.common_step
+
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """Steps of the running episodes. (num_envs,) int64"""
+        return self.managed.episode_length_buf
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: Tensor) -> None:
+        self.managed.episode_length_buf.copy_(value)
+
+    @property
+    def action_space(self) -> Any:  # type: ignore[override]  # gymnasium has an attribute
+        """Action space of all environments."""
+        return gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
+
+    @property
+    def observation_space(self) -> Any:  # type: ignore[override]  # gymnasium has an attribute
+        """Observation space of all environments."""
+        return gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
+
+    @property
+    def event_manager(self) -> Any:
+        """Event manager."""
+        return self.managed.event_manager
+
+    def set_debug_vis(self, debug_vis: bool) -> bool:
+        """Do nothing: rlcli does not draw the markers of direct tasks. Return False."""
+        return False
+
+    def _setup_scene(self) -> None:
+        """Create the assets and sensors of the scene."""
+
+    def _pre_physics_step(self, actions: Tensor) -> None:
+        """Store or process the actions, once per step."""
+        raise NotImplementedError(f"write {type(self).__name__}._pre_physics_step")
+
+    def _apply_action(self) -> None:
+        """Write targets to the assets, before each physics step."""
+        raise NotImplementedError(f"write {type(self).__name__}._apply_action")
+
+    def _get_observations(self) -> Any:
+        """Return the observations by group."""
+        raise NotImplementedError(f"write {type(self).__name__}._get_observations")
+
+    def _get_states(self) -> Any:
+        """Return the observations of the critic."""
+
+    def _get_rewards(self) -> Tensor:
+        """Return the reward. (num_envs,)"""
+        raise NotImplementedError(f"write {type(self).__name__}._get_rewards")
+
+    def _get_dones(self) -> tuple[Tensor, Tensor]:
+        """Return where the task ended the episode, and where it timed out. (num_envs,) bool each"""
+        raise NotImplementedError(f"write {type(self).__name__}._get_dones")
+
+    def _reset_idx(self, env_ids: Any) -> None:
+        """Remove forces on bodies. The environment resets everything else, and runs the reset events."""
+        for asset in self.scene.articulations.values():
+            asset.reset(env_ids)
+
+    def _set_debug_vis_impl(self, debug_vis: bool) -> None:
+        """Do nothing: rlcli does not draw the markers of direct tasks."""
+
+
+class DirectMARLEnv(gymnasium.Env):
+    """A task with several agents, which rlcli does not have."""
+
+    def __init__(self, cfg: Any, *args: Any, **kwargs: Any) -> None:
+        raise TaskError("rlcli has no multi-agent tasks", hint="write a DirectRLEnv with one agent")
+
+
+@configclass
+class DirectRLEnvCfg:
+    """A direct task."""
+
+    viewer: Any = None
+    sim: Any = SimulationCfg()
+    ui_window_class_type: Any = None
+    seed: Any = None
+    decimation: int = MISSING
+    is_finite_horizon: bool = False
+    episode_length_s: float = MISSING
+    scene: Any = MISSING
+    events: Any = None
+    observation_space: Any = MISSING
+    num_observations: Any = None
+    state_space: Any = None
+    num_states: Any = None
+    observation_noise_model: Any = None
+    action_space: Any = MISSING
+    num_actions: Any = None
+    action_noise_model: Any = None
+    rerender_on_reset: bool = False
+    num_rerenders_on_reset: int = 0
+    wait_for_textures: bool = True
+    xr: Any = None
+    log_dir: Any = None
+
+    def __rlcli_environment__(self, entry: Any) -> None:
+        """Store the class of the environment that a registration names."""
+        self.rlcli_class = entry
+
+    def __rlcli_task__(self, root: Path) -> Any:
+        """Return this configuration as a task of rlcli."""
+        from rlcli_isaaclab.direct_convert import direct_task
+
+        return direct_task(self, _environment_class(self), root)
+
+
+@configclass
+class DirectMARLEnvCfg:
+    """A task with several agents, which rlcli does not have."""
+
+    def __rlcli_task__(self, root: Path) -> Any:
+        """Raise the error that it cannot be used."""
+        raise ConfigError(
+            [
+                Problem(
+                    "configuration",
+                    "",
+                    "a DirectMARLEnv has several agents, and rlcli has no multi-agent tasks",
+                    "write a DirectRLEnv with one agent",
+                )
+            ]
+        )
+
+
+def _environment_class(cfg: Any) -> type[DirectRLEnv]:
+    """Return the environment class: that of the registration, or the only one in the module of the configuration."""
+    from rlcli.registry import load_object
+
+    entry = getattr(cfg, "rlcli_class", None)
+    if entry is not None:
+        found = load_object(entry) if isinstance(entry, str) else entry
+    else:
+        module = sys.modules[type(cfg).__module__]
+        kinds = [v for v in vars(module).values() if isinstance(v, type) and v.__module__ == module.__name__]
+        kinds = [kind for kind in kinds if issubclass(kind, DirectRLEnv)]
+        kinds = [kind for kind in kinds if not any(issubclass(k, kind) and k is not kind for k in kinds)]
+        if len(kinds) != 1:
+            what = f"the module of {type(cfg).__name__} has {len(kinds)} classes of a DirectRLEnv, expected 1"
+            raise ConfigError(
+                [Problem("configuration", "", what, "name the task that the package registers: FOLDER:ID")]
+            )
+        found = kinds[0]
+    if not (isinstance(found, type) and issubclass(found, DirectRLEnv)):
+        raise ConfigError([Problem("configuration", "", f"{entry} is not a DirectRLEnv", "derive it from DirectRLEnv")])
+    return found
+
+
+def record(env_class: type[DirectRLEnv], cfg: Any) -> tuple[Setup, Any]:
+    """Call `_setup_scene` without a simulation. Return what it creates, and the environment that created it."""
+    env = env_class.__new__(env_class)
+    shell = _Shell(cfg)
+    for name, value in {"cfg": cfg, "sim": shell.sim, "scene": shell.scene, "managed": shell}.items():
+        env.__dict__[name] = value
+    setup = Setup()
+    with running(setup):
+        env._setup_scene()
+    return setup, env
+
+
+class _Shell:
+    """What `_setup_scene` may read before the simulation exists."""
+
+    def __init__(self, cfg: Any) -> None:
+        self.device, self.num_envs = "cpu", cfg.scene.num_envs
+        self.physics_dt, self.step_dt = cfg.sim.dt, cfg.sim.dt * cfg.decimation
+        self.sim = SimpleNamespace(device="cpu", cfg=cfg.sim, has_gui=lambda: False)
+        self.scene = SimpleNamespace(
+            cfg=cfg.scene, articulations={}, rigid_objects={}, sensors={}, extras={}, deformable_objects={},
+            clone_environments=lambda **options: None, filter_collisions=lambda **options: None,
+            num_envs=cfg.scene.num_envs, env_origins=torch.zeros(cfg.scene.num_envs, 3),
+            env_prim_paths=["/World/envs/env_0"],
+        )  # fmt: skip
+
+
+def _space(value: Any, name: str) -> Any:
+    """Return the space that a setting describes: a number of columns, a shape, or a Box.
+
+    Raises:
+        ConfigError: for another kind of space.
+    """
+    if isinstance(value, gymnasium.spaces.Box):
+        return value
+    if isinstance(value, int) and not isinstance(value, bool):
+        return gymnasium.spaces.Box(-np.inf, np.inf, (value,))
+    if isinstance(value, list | tuple) and value and all(isinstance(size, int) for size in value):
+        return gymnasium.spaces.Box(-np.inf, np.inf, tuple(value))
+    what = (
+        f"a space of type {type(value).__name__} has no counterpart in rlcli, which has continuous actions and arrays"
+    )
+    raise ConfigError([Problem("configuration", name, what, "write a number of columns, or the shape of an image")])
+
+
+def shape_of(value: Any, name: str) -> tuple[int, ...]:
+    """Return the shape of a space; see `_space` for errors."""
+    return tuple(_space(value, name).shape)

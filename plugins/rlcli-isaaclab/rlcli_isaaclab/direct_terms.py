@@ -1,0 +1,230 @@
+"""Terms that call the hooks of a `DirectRLEnv`, one object of which belongs to each environment of rlcli."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rlcli.config.term_signatures import Signature
+from rlcli.managers.attribute_state import TermState
+from rlcli.sim.selection import Selection
+from rlcli_isaaclab.direct_env import MANAGED, DirectRLEnv
+from rlcli_isaaclab.observation_noise import noise_model
+
+
+class HookTerm:
+    """A hook of a direct task as a term of one section."""
+
+    def __init__(self, hook: str, env_class: type, cfg: Any, shape: tuple[int, ...], reads_body_forces: bool) -> None:
+        self.hook, self.env_class, self.cfg, self.shape = hook, env_class, cfg, shape
+        self.__name__, self.__module__ = hook, env_class.__module__
+        self.target = functools.partial(_bind, self)
+        self.target.reads_body_forces = reads_body_forces  # type: ignore[attr-defined]
+
+    def __deepcopy__(self, memo: Any) -> HookTerm:
+        return self
+
+    def __call__(self, *args: Any) -> Any:
+        """Raise an error: only the bound term can be called."""
+        raise TypeError("bind the term first")
+
+    def __rlcli_term__(self, name: str) -> Signature:
+        """Return the signature of the term under a name."""
+        file = Path(inspect.getsourcefile(self.env_class) or "?")
+        return Signature(
+            name, self.__name__, True, file, 1, f"Hook of {self.env_class.__name__}.", (), target=self.target
+        )
+
+
+class DirectRunner:
+    """The user's environment inside of an environment of rlcli, and the order in which its hooks are called."""
+
+    def __init__(self, managed: Any, term: HookTerm) -> None:
+        self.managed = managed
+        cfg = copy.deepcopy(term.cfg)
+        cfg.scene.num_envs, cfg.sim.device = managed.num_envs, str(managed.device)
+        cfg.sim.dt, cfg.decimation = managed.physics_dt, managed.config.decimation
+        cfg.episode_length_s = managed.config.episode_length_s
+        self.cfg = cfg
+        self.phase = "build"
+        managed.actuators["direct task"] = self  # called before each physics step
+        token = MANAGED.set(managed)
+        try:
+            self.lab: DirectRLEnv = term.env_class(cfg)
+        finally:
+            MANAGED.reset(token)
+        self.action_noise = noise_model(cfg.action_noise_model, managed)
+        self.observation_noise = noise_model(cfg.observation_noise_model, managed)
+        self._memory = TermState(self.lab, excluded=("cfg", "managed", "sim", "scene"))
+        self._observed: dict[str, Tensor] = {}
+
+    def compute(self) -> None:
+        """Call `_apply_action` before a physics step."""
+        self.lab._apply_action()
+        for asset in self.lab.scene.articulations.values():
+            asset.apply_wrenches()
+
+    def reset(self, selection: Selection) -> None:
+        """Do nothing: the reset event calls `_reset_idx`."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of the task's tensors."""
+        return dict(self._memory.state_dict())
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore the tensors returned by `state_dict`."""
+        self._memory.load_state_dict(state)
+        self.phase = "reset"
+
+    def process(self, action: Tensor) -> None:
+        """Call `_pre_physics_step`."""
+        self.lab._pre_physics_step(self.action_noise(action.clone()))
+
+    def compute_dones(self) -> None:
+        """Call `_get_dones`, but not for the first value that managers compute before the first reset."""
+        if self.phase == "build":
+            return
+        lab = self.lab
+        terminated, time_outs = lab._get_dones()
+        lab.reset_terminated[:], lab.reset_time_outs[:] = terminated, time_outs
+        lab.reset_buf = lab.reset_terminated | lab.reset_time_outs
+        self.phase = "done"
+
+    def reset_envs(self, selection: Selection) -> None:
+        """Call `_reset_idx`."""
+        ids = selection.env_ids()
+        if len(ids):
+            self.lab._reset_idx(ids)
+            self.observation_noise.reset(ids)
+            self.action_noise.reset(ids)
+        self.phase = "reset"
+
+    def observe(self, group: str, shape: tuple[int, ...]) -> Tensor:
+        """Return the observations of a group. The hook runs once per step; `policy` is the first group.
+
+        rlcli also wants the last observations of episodes that end. For them the hook runs once more, and then the task
+        and torch's generator get back the state that they had before.
+        """
+        if self.phase == "build":
+            return torch.zeros(self.managed.num_envs, *_channels_first(shape), device=self.managed.device)
+        if group == "policy":
+            manager = self.managed.termination_manager
+            if self.phase == "done" and bool((manager.terminated | manager.time_outs).any()):
+                self._observed = self._without_effects(self._call_observations)
+            else:
+                self._observed = self._call_observations()
+                self.phase = "observed"
+        return self._observed[group]
+
+    def _call_observations(self) -> dict[str, Tensor]:
+        found = dict(self.lab._get_observations())
+        if self.cfg.state_space and "critic" not in found:
+            found["critic"] = self.lab._get_states()
+        found["policy"] = self.observation_noise(found["policy"])
+        return {name: _image_first(value).float().clone() for name, value in found.items() if isinstance(value, Tensor)}
+
+    def _without_effects(self, function: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+        attributes = dict(vars(self.lab))
+        tensors = [(value, value.clone()) for value in attributes.values() if isinstance(value, Tensor)]
+        generator = torch.get_rng_state()
+        found = function()
+        vars(self.lab).clear()
+        vars(self.lab).update(attributes)
+        for value, before in tensors:
+            if not torch.equal(value, before):
+                value.copy_(before)
+        torch.set_rng_state(generator)
+        return found
+
+
+def _channels_first(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return (shape[2], shape[0], shape[1]) if len(shape) == 3 else shape
+
+
+def _image_first(value: Tensor) -> Tensor:
+    """Return images with the channels first, and other tensors unchanged."""
+    return value.movedim(-1, 1).contiguous() if value.dim() == 4 else value
+
+
+def runner_of(managed: Any, term: HookTerm) -> DirectRunner:
+    """Return the runner of an environment; the same object for the same environment."""
+    if "_isaaclab_direct" not in vars(managed):
+        vars(managed)["_isaaclab_direct"] = DirectRunner(managed, term)
+    return vars(managed)["_isaaclab_direct"]
+
+
+class _Hook:
+    """A bound hook."""
+
+    def __init__(self, runner: DirectRunner, shape: tuple[int, ...]) -> None:
+        self._runner, self._shape = runner, shape
+
+
+class _Action(_Hook):
+    unit = ""
+
+    def __init__(self, runner: DirectRunner, shape: tuple[int, ...]) -> None:
+        super().__init__(runner, shape)
+        self.size = shape[0]
+        self.elements = tuple(f"action[{i}]" for i in range(self.size))
+        self.sinks = ("direct task",)
+
+    def process(self, action: Tensor) -> None:
+        """Call `_pre_physics_step`."""
+        self._runner.process(action)
+
+
+class _Terminated(_Hook):
+    def __call__(self) -> Tensor:
+        self._runner.compute_dones()
+        return self._runner.lab.reset_terminated.clone()
+
+
+class _TimeOut(_Hook):
+    def __call__(self) -> Tensor:
+        return self._runner.lab.reset_time_outs.clone()
+
+
+class _Reward(_Hook):
+    def __call__(self) -> Tensor:
+        if self._runner.phase == "build":
+            return torch.zeros(self._runner.managed.num_envs, device=self._runner.managed.device)
+        return self._runner.lab._get_rewards().float()
+
+
+class _Reset(_Hook):
+    def __call__(self, selection: Selection) -> None:
+        self._runner.reset_envs(selection)
+
+
+class _Policy(_Hook):
+    group = "policy"
+
+    def __call__(self) -> Tensor:
+        return self._runner.observe(self.group, self._shape)
+
+
+class _Critic(_Policy):
+    group = "critic"
+
+
+_HOOKS: dict[str, type[_Hook]] = {
+    "action": _Action,
+    "policy": _Policy,
+    "critic": _Critic,
+    "reward": _Reward,
+    "terminated": _Terminated,
+    "time_out": _TimeOut,
+    "reset": _Reset,
+}
+
+
+def _bind(term: HookTerm, env: Any) -> Any:
+    return _HOOKS[term.hook](runner_of(env, term), term.shape)

@@ -1,0 +1,22 @@
+"""Markers of a task's own. rlcli does not draw them. Names as in `isaaclab.markers`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class VisualizationMarkers:
+    """Markers that are not drawn."""
+
+    def __init__(self, cfg: Any) -> None:
+        self.cfg = cfg
+
+    def visualize(self, *poses: Any, **options: Any) -> None:
+        """Do nothing."""
+
+    def set_visibility(self, visible: bool) -> None:
+        """Do nothing."""
+
+    def is_visible(self) -> bool:
+        """Return False."""
+        return False

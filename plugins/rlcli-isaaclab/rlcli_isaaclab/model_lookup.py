@@ -1,0 +1,111 @@
+"""Lookup of the MJCF that replaces a USD or URDF file of a task."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rlcli.errors import TaskError, did_you_mean
+from rlcli.registry.models import MODELS
+
+MODEL_MAP = "models.yaml"
+"""File that maps entities, or ends of USD paths, to MJCF files beside it."""
+
+USD_TO_MJCF: dict[str, str] = {
+    "Robots/Classic/Cartpole/cartpole.usd": "cartpole:cartpole.xml",
+    "Robots/Cartpole/cartpole.usd": "cartpole:cartpole.xml",
+    "Robots/IsaacSim/Ant/ant_instanceable.usd": "ant-direct:ant.xml",
+    "Robots/Ant/ant_instanceable.usd": "ant-direct:ant.xml",
+}
+"""End of a USD path -> MJCF: a file relative to the task's folder, or `TASK:FILE` of an installed task."""
+
+
+def map_usd(usd: str, mjcf: str) -> None:
+    """Replace a USD file by an MJCF; the end of the USD's path is enough. Call it before creating the configuration."""
+    USD_TO_MJCF[usd] = mjcf
+
+
+@dataclass(slots=True)
+class GivenModels:
+    """Content of the files `models.yaml` of a task."""
+
+    files: dict[str, str] = field(default_factory=dict)
+    """Entity, or end of a USD path -> MJCF."""
+    gains: dict[str, Any] = field(default_factory=dict)
+    """Entity -> group of actuators -> stiffness and damping that replace an actuator network."""
+
+
+def given_models(root: Path) -> GivenModels:
+    """Return what every `models.yaml` of a task gives for entities, or for ends of paths.
+
+    The files are those in the task's folder, in the folders above it that belong to its package, and in the folders of
+    RLCLI_MODELS. Earlier files win.
+
+    Raises:
+        TaskError: if a file is not a mapping of text, or names a file that does not exist.
+    """
+    found = GivenModels()
+    for folder, prefix in _folders(root):
+        file = folder / MODEL_MAP
+        if not file.is_file():
+            continue
+        try:
+            content = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+        except yaml.YAMLError as error:
+            raise TaskError(f"{file}: not YAML: {' '.join(str(error).split())}", hint="write NAME: FILE.xml") from None
+        if not isinstance(content, Mapping):
+            raise TaskError(f"{file}: expected lines NAME: FILE", hint="for example robot: robot.xml")
+        for name, value in content.items():
+            model = value.get("model") if isinstance(value, Mapping) else value
+            if not isinstance(model, str):
+                raise TaskError(f"{file}: {name}: expected a file", hint="for example robot: robot.xml")
+            if isinstance(value, Mapping):
+                found.gains.setdefault(str(name), value.get("gains") or {})
+            if ":" not in model and not (folder / model).is_file():
+                raise TaskError(f"{file}: {name}: there is no file '{model}' in {folder}", hint="correct the path")
+            found.files.setdefault(str(name), model if ":" in model else f"{prefix}{model}")
+    return found
+
+
+def mjcf_of(usd: str, root: Path, given: Mapping[str, str], entity: str) -> str:
+    """Return the MJCF of an entity; an `.xml` file is returned unchanged.
+
+    Raises:
+        TaskError: if no MJCF is known for it.
+    """
+    path = usd.replace("\\", "/")
+    for end, mjcf in [(entity, given[entity])] if entity in given else given.items():
+        if end == entity or path.endswith(end):
+            return mjcf
+    if path.endswith(".xml"):
+        return usd
+    for end, mjcf in USD_TO_MJCF.items():
+        if path.endswith(end):
+            return mjcf
+    file = f"{Path(path).stem}.xml"
+    for folder, prefix in _folders(root):
+        if (folder / file).is_file():
+            return f"{prefix}{file}"
+    near = did_you_mean(Path(path).name, [Path(end).name for end in USD_TO_MJCF])
+    raise TaskError(
+        f"no MJCF model is known for '{path.rsplit('/', 1)[-1]}'",
+        hint=f"write the line {entity}: FILE.xml into {MODEL_MAP} in {root}, or put {file} there"
+        + (f"; {near}" if near else ""),
+    )
+
+
+def _folders(root: Path) -> Iterator[tuple[Path, str]]:
+    """Yield the folders of a task's models, each with the prefix that their files have in a configuration."""
+    yield root, ""
+    folder = root
+    while (folder / "__init__.py").is_file() and (folder.parent / "__init__.py").is_file():
+        folder = folder.parent
+        yield folder, f"{os.path.relpath(folder, root)}/"
+    for name in os.environ.get(MODELS, "").split(os.pathsep):
+        if name:
+            yield Path(name).expanduser(), "models:"

@@ -1,0 +1,227 @@
+"""Modules of Isaac Lab and Isaac Sim as task files import them.
+
+`names.json` lists the public names of each module of Isaac Lab; `tools/names.py` writes it. A name that this package
+defines is that object. Any other name of the table is a stand-in, which raises an error when it is used.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rlcli.errors import did_you_mean
+from rlcli.registry.task_imports import import_from
+from rlcli_isaaclab.absent import absent_class, absent_function, absent_module, absent_value
+from rlcli_isaaclab.config_class import configclass
+
+_OWN = "rlcli_isaaclab"
+_EXTRA = {
+    "isaaclab_rl": ("rsl_rl",),
+    "isaaclab_assets": ("assets",),
+    "isaaclab_tasks": ("mdp", "task_utils"),
+    "isaaclab.envs.mdp": ("mdp",),
+    "isaaclab.sim": ("usd_stage",),
+}
+"""Module of Isaac Lab -> modules of this package that define further names of it."""
+_TEXTS = ("isaaclab_tasks", "isaaclab_assets")
+"""Packages whose own files are imported where they are found: they only use other modules of Isaac Lab."""
+_LIBRARIES = ("toml", "torchvision", "trimesh")
+"""Libraries that come with Isaac Lab: an installed one is imported, a missing one raises an error when it is used."""
+_SIM = {"isaacsim.core.utils.torch": "isaacsim_torch", "isaacsim.core.utils.torch.rotations": "isaacsim_torch",
+        "isaacsim.core.utils.torch.maths": "isaacsim_torch",
+    "isaacsim.core.utils.torch.transformations": "isaacsim_torch"}  # fmt: skip
+"""Module of Isaac Sim -> module of this package with its functions."""
+
+
+class LabModule(ModuleType):
+    """A module of Isaac Lab: its names are found when they are first used."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "__all__":
+            return public_names(self.__name__)
+        if name.startswith("__"):
+            raise AttributeError(name)
+        value = _member(self.__name__, name)
+        setattr(self, name, value)
+        return value
+
+
+SOURCE = "RLCLI_ISAACLAB"
+"""Environment variable with Isaac Lab's folder `source`, for the files of `isaaclab_tasks` and `isaaclab_assets`."""
+
+
+def module_of(name: str, file: str) -> ModuleType | None:
+    """Return the module that replaces a module of Isaac Lab or Isaac Sim; None to import an installed one.
+
+    Modules of `isaaclab_tasks` and `isaaclab_assets` are those in a folder above the importing file, of the folder
+    RLCLI_ISAACLAB, or of an installed wheel of Isaac Lab, if there are any.
+    """
+    top, _, inner = name.partition(".")
+    if top in _TEXTS and not inner.startswith("utils"):
+        folder = _text_folder(top, Path(file).parent)
+        if folder is not None:
+            return import_from(folder, inner, run_start=top != "isaaclab_tasks")  # it imports every task
+    if top in _LIBRARIES and importlib.util.find_spec(top) is not None:
+        return None
+    if top == "toml":
+        return importlib.import_module(f"{_OWN}.toml_reader")
+    if name == "isaacsim.core.utils.stage":
+        return importlib.import_module(f"{_OWN}.usd_stage")
+    if name in _SIM:
+        return importlib.import_module(f"{_OWN}.{_SIM[name]}")
+    if not top.startswith("isaaclab"):
+        return absent_module(name)
+    if name not in _packages():
+        near = did_you_mean(name, sorted(_packages()))
+        what = f"Isaac Lab 2.3.2 has no module '{name}'"
+        raise ModuleNotFoundError(f"{what}; {near}" if near else what, name=name)
+    return _lab_module(name)
+
+
+@functools.cache
+def _text_folder(package: str, start: Path) -> Path | None:
+    """Return the folder of a package whose own files are used; None if there is none."""
+    places = [*start.resolve().parents]
+    if os.environ.get(SOURCE):
+        places.append(Path(os.environ[SOURCE]).expanduser())
+    installed = importlib.util.find_spec("isaaclab")
+    places += [Path(place) / "source" for place in (installed.submodule_search_locations or ())] if installed else []
+    for place in places:
+        for folder in (place / package, place / package / package, place / "source" / package / package):
+            if (folder / "__init__.py").is_file():
+                return folder
+    return None
+
+
+@functools.cache
+def _lab_module(name: str) -> LabModule:
+    module = LabModule(name, f"Names of `{name}`.")
+    module.__path__ = []
+    return module
+
+
+def _member(module: str, name: str) -> Any:
+    path = f"{module}.{name}"
+    if path not in _packages() and name not in _definitions():  # a package that its parent imports from further below
+        below = (
+            found for found in sorted(_packages()) if found.startswith(f"{module}.") and found.endswith(f".{name}")
+        )
+        path = next(below, path)
+    for candidate in _homes(module):
+        value = getattr(candidate, name, None)
+        if value is not None and not (isinstance(value, ModuleType) and path in _packages()):
+            return value
+    if path in _packages():
+        return _lab_module(path)
+    found = _definitions().get(name)
+    if found is None:
+        near = did_you_mean(name, public_names(module)) or did_you_mean(name, list(_definitions()))
+        raise AttributeError(f"Isaac Lab 2.3.2 has no '{name}' in '{module}'" + (f"; {near}" if near else ""))
+    return lab_name(name)
+
+
+@functools.cache
+def lab_name(name: str) -> Any:
+    """Return the object of a public name of Isaac Lab, wherever it is defined."""
+    from rlcli_isaaclab import vocabulary
+
+    if hasattr(vocabulary, name):
+        return getattr(vocabulary, name)
+    module, kind = _definitions()[name]
+    for candidate in _homes(module):
+        value = getattr(candidate, name, None)
+        if value is not None and not isinstance(value, ModuleType):
+            return value
+    if isinstance(kind, Mapping):
+        return _settings_class(name, kind, f"{module}.{name}")
+    make = {"class": absent_class, "function": absent_function}.get(kind, absent_value)
+    return make(f"{module}.{name}")
+
+
+def _settings_class(name: str, kind: Mapping[str, Any], full: str, qualified: str | None = None) -> Any:
+    """Return a configuration class of the table. What cannot be used is reported where the settings are read."""
+    bases = tuple(base for base in map(_base, kind["bases"]) if isinstance(base, type)) or (object,)
+    members: dict[str, Any] = {"__doc__": f"Settings of Isaac Lab's `{full}`.", "__module__": f"{_OWN}.namespace"}
+    qualified = full.rpartition(".")[2] if qualified is None else qualified
+    members["__qualname__"] = qualified
+    for inner, content in kind.get("nested", {}).items():
+        members[inner] = _settings_class(inner, content, f"{full}.{inner}", f"{qualified}.{inner}")
+    fields = dict(kind.get("fields", {}))
+    known = {field for base in bases for field in getattr(base, "__dataclass_fields__", {})}
+    fields = {key: value for key, value in fields.items() if not (value is None and key in known)}
+    if name.endswith("Cfg") and "class_type" not in fields and full.count(".") and not name[0].islower():
+        fields.setdefault("class_type", name.removesuffix("Cfg"))
+    fields = {key: _tuple(value) for key, value in fields.items()}
+    if fields.get("class_type", "") is None:
+        fields["class_type"] = name.removesuffix("Cfg")
+    if fields.get("func", "") is None:
+        fields["func"] = f"isaaclab:{name}"
+    return configclass(type(name, bases, {**members, "__annotations__": {}, **fields}))
+
+
+def _base(written: str) -> Any:
+    """Return a base class as the table has it: `Name`, `module.Name` or `Name.Nested`."""
+    parts = written.split(".")
+    while len(parts) > 1 and parts[0] not in _definitions():
+        parts = parts[1:]
+    found = lab_name(parts[0]) if parts[0] in _definitions() else None
+    for part in parts[1:]:
+        found = getattr(found, part, None)
+    return found
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) and value and not isinstance(value[0], str) else value
+
+
+@functools.cache
+def _homes(module: str) -> tuple[Any, ...]:
+    """Return the modules of this package whose names a module of Isaac Lab has."""
+    parts = module.split(".")
+    names = [extra for prefix, extras in _EXTRA.items() for extra in extras if f"{module}.".startswith(f"{prefix}.")]
+    if parts[0] == "isaaclab":
+        for length in range(len(parts), 1, -1):
+            path = ".".join(parts[1:length])
+            if (Path(__file__).parent / path.replace(".", "/")).with_suffix(".py").is_file() or (
+                Path(__file__).parent / path.replace(".", "/") / "__init__.py"
+            ).is_file():
+                names.append(path)
+    if ".mdp" in module:
+        names.append("mdp")
+    return tuple(importlib.import_module(f"{_OWN}.{name}") for name in dict.fromkeys(names))
+
+
+@functools.cache
+def _table() -> dict[str, dict[str, Any]]:
+    table: dict[str, dict[str, Any]] = json.loads((Path(__file__).parent / "names.json").read_text(encoding="utf-8"))
+    return table
+
+
+@functools.cache
+def _packages() -> frozenset[str]:
+    return frozenset(".".join(name.split(".")[:n]) for name in _table() for n in range(1, name.count(".") + 2))
+
+
+@functools.cache
+def _definitions() -> dict[str, tuple[str, Any]]:
+    """Return name -> module that defines it, and its kind. Names of isaaclab itself win over others."""
+    found: dict[str, tuple[str, Any]] = {}
+    for module, names in sorted(_table().items(), key=lambda item: item[0].split(".")[0] != "isaaclab"):
+        for name, kind in names.items():
+            if name != "logger":
+                found.setdefault(name, (module, kind))
+    return found
+
+
+@functools.cache
+def public_names(module: str) -> list[str]:
+    """Return the names that `from module import *` imports: those of the module and the modules below it."""
+    below = [names for name, names in _table().items() if f"{name}.".startswith(f"{module}.")]
+    return sorted({name for names in below for name in names if name != "logger"})

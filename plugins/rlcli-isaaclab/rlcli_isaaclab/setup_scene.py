@@ -1,0 +1,79 @@
+"""What a direct task creates in `_setup_scene`: recorded to build the scene, then bound to its entities."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from typing import Any
+
+from rlcli.errors import TaskError
+
+
+class Setup:
+    """Assets, sensors and spawned objects of one call of `_setup_scene`, in order.
+
+    Args:
+        bind: receives each object and its position among the objects; None: the call only records.
+    """
+
+    def __init__(self, bind: Callable[[Any, int], None] | None = None) -> None:
+        self._bind = bind
+        self.created: list[tuple[Any, Any]] = []
+        """Object and configuration of each asset, sensor and terrain."""
+        self.spawned: list[tuple[str, Any]] = []
+        """Path and configuration of what is spawned without an object."""
+
+    def add(self, created: Any, cfg: Any) -> None:
+        """Store an object; bind it to its entity if the scene exists."""
+        created.cfg = cfg
+        self.created.append((created, cfg))
+        if self._bind is not None:
+            self._bind(created, len(self.created) - 1)
+
+
+_CURRENT: ContextVar[Setup | None] = ContextVar("setup", default=None)
+
+
+def current_setup() -> Setup:
+    """Return the setup that runs.
+
+    Raises:
+        TaskError: outside of `_setup_scene`.
+    """
+    setup = _CURRENT.get()
+    if setup is None:
+        raise TaskError("an asset was created outside of _setup_scene", hint="create it in _setup_scene")
+    return setup
+
+
+@contextlib.contextmanager
+def running(setup: Setup) -> Iterator[None]:
+    """Make a setup the current one inside the `with` block."""
+    token = _CURRENT.set(setup)
+    try:
+        yield
+    finally:
+        _CURRENT.reset(token)
+
+
+class Spawn:
+    """A function of Isaac Lab that spawns something by its configuration."""
+
+    def __init__(self, name: str) -> None:
+        self.__name__ = self.__qualname__ = name
+
+    def __deepcopy__(self, memo: Any) -> Spawn:
+        return self
+
+    def __reduce__(self) -> Any:
+        return Spawn, (self.__name__,)
+
+    def __call__(
+        self, prim_path: str, cfg: Any, translation: Any = None, orientation: Any = None, **other: Any
+    ) -> None:
+        """Store what is spawned."""
+        current_setup().spawned.append((prim_path, cfg))
+
+
+spawn_ground_plane, spawn_light, spawn_from_usd = map(Spawn, ("spawn_ground_plane", "spawn_light", "spawn_from_usd"))

@@ -1,0 +1,24 @@
+"""Functions of `isaaclab_tasks.utils` that packages of tasks call when they are imported."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from typing import Any
+
+
+def import_packages(package_name: str, blacklist_pkgs: list[str] | None = None) -> None:
+    """Import a package and all packages below it, except those whose name contains a word of the blacklist."""
+    package = importlib.import_module(package_name)
+    for found in pkgutil.iter_modules(getattr(package, "__path__", []), f"{package_name}."):
+        if found.ispkg and not any(word in found.name for word in blacklist_pkgs or ()):
+            import_packages(found.name, blacklist_pkgs)
+
+
+def load_cfg_from_registry(task_name: str, entry_point_key: str) -> Any:
+    """Return a configuration that a registered task names."""
+    from rlcli.registry.task_imports import load_object, registrations
+
+    entry = registrations[task_name][entry_point_key]
+    found = load_object(entry) if isinstance(entry, str) else entry
+    return found() if isinstance(found, type) else found

@@ -1,0 +1,319 @@
+# ruff: noqa: E501
+"""Task files of Isaac Lab run without a changed line: imports, models beside the files, agents, and direct tasks."""
+
+import os
+import subprocess
+import sys
+import textwrap
+import uuid
+from pathlib import Path
+
+import pytest
+import torch
+from cartpole_files import write
+
+from rlcli.config.load import resolve
+from rlcli.envs.make import make_env
+from rlcli.errors import ConfigError, TaskError
+from rlcli.registry import find_task
+
+
+def original(text):
+    """Return a file as it is in Isaac Lab."""
+    text = text.replace("rlcli_isaaclab.rsl_rl", "isaaclab_rl.rsl_rl").replace(
+        "from rlcli_isaaclab import mdp", "import isaaclab.envs.mdp as mdp"
+    )
+    return text.replace("rlcli_isaaclab", "isaaclab")
+
+
+@pytest.fixture
+def unchanged(tmp_path):
+    folder = tmp_path / "balance_unchanged"
+    folder.mkdir()
+    write(folder)
+    for file in folder.rglob("*.py"):
+        file.write_text(original(file.read_text()))
+    return folder
+
+
+def test_package_with_isaac_lab_imports_steps_and_leaves_no_module(unchanged):
+    program = f"""
+        import sys, torch
+        from rlcli.registry import find_task
+        from rlcli.config.load import resolve
+        from rlcli.envs.make import make_env
+        resolved = resolve(find_task({str(unchanged)!r}))
+        env = make_env(resolved.with_num_envs(4), seed=0)
+        env.reset()
+        env.step(torch.zeros(4, 1))
+        print([name for name in sys.modules if name.partition(".")[0] in ("isaaclab", "isaaclab_rl", "omni")])
+        try:
+            import isaaclab
+        except ModuleNotFoundError:
+            print("not found")
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True)
+    assert done.stdout.splitlines() == ["[]", "not found"], done.stderr
+
+
+def test_import_inside_a_function_that_runs_later(unchanged):
+    file = next(file for file in unchanged.glob("*env_cfg.py"))
+    text = file.read_text()
+    marker = "@configclass"
+    late = "def upright_late(env):\n    from isaaclab.utils.math import wrap_to_pi\n    import isaaclab.utils.math as m\n    assert m.wrap_to_pi is wrap_to_pi\n    return wrap_to_pi(env.scene['robot'].data.joint_pos[:, 1])\n\n\n"
+    text = text.replace(marker, late + marker, 1)
+    text = text.replace("RewTerm(func=mdp.is_alive", "RewTerm(func=upright_late", 1)
+    assert "func=upright_late" in text
+    file.write_text(text)
+    env = make_env(resolve(find_task(str(unchanged))).with_num_envs(2), seed=0)
+    env.reset()
+    env.step(torch.zeros(2, 1))
+
+
+DIRECT = """
+import torch
+import isaaclab.sim as sim_utils
+from isaaclab.actuators import ImplicitActuatorCfg
+from isaaclab.assets import Articulation, ArticulationCfg
+from isaaclab.envs import DirectRLEnv, DirectRLEnvCfg
+from isaaclab.scene import InteractiveSceneCfg
+from isaaclab.sim import SimulationCfg
+from isaaclab.sim.spawners.from_files import GroundPlaneCfg, spawn_ground_plane
+from isaaclab.utils import configclass
+
+
+@configclass
+class PoleEnvCfg(DirectRLEnvCfg):
+    decimation = 2
+    episode_length_s = 0.2
+    action_space = 1
+    observation_space = 3
+    sim: SimulationCfg = SimulationCfg(dt=0.01)
+    robot_cfg: ArticulationCfg = ArticulationCfg(
+        prim_path="/World/envs/env_.*/Robot",
+        spawn=sim_utils.UsdFileCfg(usd_path="omniverse://somewhere/pole.usd"),
+        actuators={"cart": ImplicitActuatorCfg(joint_names_expr=["slider_to_cart"], stiffness=0.0, damping=0.0)},
+    )
+    scene: InteractiveSceneCfg = InteractiveSceneCfg(num_envs=4, env_spacing=4.0)
+    force = 5.0
+
+
+class PoleEnv(DirectRLEnv):
+    cfg: PoleEnvCfg
+
+    def __init__(self, cfg, render_mode=None, **kwargs):
+        super().__init__(cfg, render_mode, **kwargs)
+        self.cart, _ = self.robot.find_joints("slider_to_cart")
+        self.observed = torch.zeros(self.num_envs, device=self.device)
+        self.applied = 0
+
+    def _setup_scene(self):
+        self.robot = Articulation(self.cfg.robot_cfg)
+        spawn_ground_plane(prim_path="/World/ground", cfg=GroundPlaneCfg())
+        self.scene.clone_environments(copy_from_source=False)
+        self.scene.articulations["robot"] = self.robot
+        light = sim_utils.DomeLightCfg(intensity=2000.0)
+        light.func("/World/Light", light)
+
+    def _pre_physics_step(self, actions):
+        self.actions = actions.clone()
+
+    def _apply_action(self):
+        self.applied += 1
+        self.robot.set_joint_effort_target(self.cfg.force * self.actions, joint_ids=self.cart)
+
+    def _get_observations(self):
+        self.observed += 1
+        velocity = self.robot.data.joint_vel
+        return {"policy": torch.cat([velocity, self.observed[:, None]], dim=1)}
+
+    def _get_rewards(self):
+        return torch.ones(self.num_envs, device=self.device)
+
+    def _get_dones(self):
+        return self.robot.data.joint_pos[:, 0].abs() > 3.0, self.episode_length_buf >= self.max_episode_length - 1
+
+    def _reset_idx(self, env_ids):
+        super()._reset_idx(env_ids)
+        position = self.robot.data.default_joint_pos[env_ids]
+        self.robot.write_joint_state_to_sim(position, torch.zeros_like(position), None, env_ids)
+"""
+
+
+@pytest.fixture
+def direct(tmp_path):
+    folder = tmp_path / "pole"
+    folder.mkdir()
+    (folder / "pole_env.py").write_text(DIRECT)
+    (folder / "models.yaml").write_text("pole.usd: cartpole:cartpole.xml\n")
+    return folder / "pole_env.py"
+
+
+def test_direct_task_steps_and_observes_once_per_step(direct):
+    env = make_env(resolve(find_task(f"{direct}:PoleEnvCfg")), seed=0)
+    obs = env.reset()["policy"]
+    assert obs[:, 2].tolist() == [1.0] * 4
+    result = None
+    for step in range(8):
+        result = env.step(torch.ones(4, 1))
+        assert result.obs["policy"][:, 2].tolist() == [step + 2.0] * 4
+        assert result.reward.tolist() == [1.0] * 4
+    assert not result.truncated.any()
+    result = env.step(torch.ones(4, 1))
+    assert result.truncated.all()
+    assert not result.terminated.any()
+    assert (result.final_obs["policy"][:, 0] > 0.1).all()
+    assert (result.obs["policy"][:, 0] == 0.0).all()
+    assert result.obs["policy"][:, 2].tolist() == [10.0] * 4  # the last observation of the episode left no trace
+    lab = vars(env)["_isaaclab_direct"].lab
+    assert lab.applied == 18  # before every physics step
+
+
+def test_direct_task_saves_and_restores_its_tensors(direct):
+    resolved = resolve(find_task(f"{direct}:PoleEnvCfg"))
+    env, other = make_env(resolved, seed=0), make_env(resolved, seed=0)
+    env.reset()
+    other.reset()
+    for _ in range(3):
+        env.step(torch.ones(4, 1))
+    other.load_state_dict(env.state_dict())
+    action = torch.full((4, 1), 0.5)
+    assert torch.equal(env.step(action).obs["policy"][:, :2], other.step(action).obs["policy"][:, :2])
+
+
+def test_space_that_is_not_continuous_is_refused_with_place(direct):
+    direct.write_text(DIRECT.replace("action_space = 1", "action_space = {2}"))
+    with pytest.raises(ConfigError) as caught:
+        resolve(find_task(f"{direct}:PoleEnvCfg"))
+    (problem,) = caught.value.problems
+    assert problem.where.endswith("pole_env.py:13")
+    assert "set" in problem.message
+
+
+def test_missing_model_names_the_mapping_file(direct):
+    (direct.parent / "models.yaml").unlink()
+    with pytest.raises(ConfigError) as caught:
+        resolve(find_task(f"{direct}:PoleEnvCfg"))
+    assert "no MJCF model is known for 'pole.usd'" in caught.value.problems[0].message
+    assert "robot: FILE.xml" in caught.value.problems[0].hint
+    assert "models.yaml" in caught.value.problems[0].hint
+
+
+def test_mapping_file_with_a_file_that_does_not_exist(direct):
+    (direct.parent / "models.yaml").write_text("robot: gone.xml\n")
+    with pytest.raises(TaskError, match=r"models\.yaml: robot: there is no file 'gone\.xml'"):
+        resolve(find_task(f"{direct}:PoleEnvCfg"))
+
+
+def test_actuator_network_needs_gains_of_the_mapping_file(direct):
+    network = 'ActuatorNetLSTMCfg(joint_names_expr=["slider_to_cart"], network_file="net.jit", saturation_effort=9.0, velocity_limit=3.0, effort_limit=8.0)'
+    text = DIRECT.replace(
+        'ImplicitActuatorCfg(joint_names_expr=["slider_to_cart"], stiffness=0.0, damping=0.0)', network
+    )
+    direct.write_text(
+        text.replace("import ImplicitActuatorCfg", "import ActuatorNetLSTMCfg").replace(
+            "effort_target", "position_target"
+        )
+    )
+    with pytest.raises(ConfigError) as caught:
+        resolve(find_task(f"{direct}:PoleEnvCfg"))
+    assert "gains: {cart: {stiffness: S, damping: D}}" in caught.value.problems[0].hint
+    gains = "robot: {model: 'cartpole:cartpole.xml', gains: {cart: {stiffness: 40.0, damping: 2.0}}}\n"
+    (direct.parent / "models.yaml").write_text(gains)
+    actuator = resolve(find_task(f"{direct}:PoleEnvCfg")).task.scene.entities["robot"].actuators["cart"]
+    assert (actuator.kind, actuator.stiffness, actuator.saturation_effort) == ("dc_motor", 40.0, 9.0)
+
+
+AGENTS = {
+    "rl_games.yaml": """
+params:
+  algo: {name: a2c_continuous}
+  model: {name: continuous_a2c_logstd}
+  network: {name: actor_critic, separate: False, mlp: {units: [16, 8], activation: relu},
+            space: {continuous: {fixed_sigma: True, sigma_init: {name: const_initializer, val: 0}}}}
+  config: {horizon_length: 24, max_epochs: 7, minibatch_size: 48, mini_epochs: 3, gamma: 0.98, tau: 0.9,
+           learning_rate: 1e-4, lr_schedule: adaptive, kl_threshold: 0.01, e_clip: 0.1, critic_coef: 4,
+           truncate_grads: True, grad_norm: 0.7, reward_shaper: {scale_value: 0.5}, surprise: 1}
+""",
+    "skrl.yaml": """
+models:
+  policy: {class: GaussianMixin, initial_log_std: 0.0, network: [{name: net, layers: [16, 8], activations: elu}]}
+  value: {class: DeterministicMixin, network: [{name: net, layers: [32], activations: elu}]}
+agent: {class: PPO, rollouts: 24, learning_epochs: 3, mini_batches: 2, discount_factor: 0.98, lambda: 0.9,
+        learning_rate: 1.0e-04, ratio_clip: 0.1, time_limit_bootstrap: False, rewards_shaper_scale: 0.5}
+trainer: {timesteps: 168}
+""",
+    "sb3.yaml": """
+n_timesteps: !!float 1e4
+policy: MlpPolicy
+n_steps: 24
+batch_size: 48
+n_epochs: 3
+gamma: 0.98
+policy_kwargs: {activation_fn: nn.ELU, net_arch: [16, 8]}
+""",
+}
+
+
+def registered(folder, libraries):
+    """Write the package of the direct task, which registers agents of some libraries."""
+    entries = "".join(f'"{name}_cfg_entry_point": f"{{__name__}}:{name}.yaml",' for name in libraries)
+    (folder / "__init__.py").write_text(
+        "import gymnasium as gym\n"
+        f'gym.register(id="Pole-{uuid.uuid4().hex}-v0", entry_point=f"{{__name__}}.pole_env:PoleEnv",\n'
+        f'             kwargs={{"env_cfg_entry_point": f"{{__name__}}.pole_env:PoleEnvCfg", {entries}}})\n'
+    )
+    for name in libraries:
+        (folder / f"{name}.yaml").write_text(AGENTS[f"{name}.yaml"])
+
+
+@pytest.mark.parametrize("library", ["rl_games", "skrl", "sb3"])
+def test_agent_file_of_each_library_is_read(direct, library):
+    registered(direct.parent, [library])
+    resolved = resolve(find_task(str(direct.parent)))
+    agent = resolved.agent
+    assert resolved.agent_name == library.replace("_", "-")
+    assert (agent.num_steps, agent.num_epochs, agent.gamma) == (24, 3, 0.98)
+    assert agent.actor.hidden == (16, 8)
+    if library != "sb3":
+        assert agent.max_iterations == 7
+        assert agent.learning_rate == 1e-4
+        assert agent.reward_scale == 0.5
+    if library == "rl_games":
+        assert any("surprise" in note.key for note in resolved.notes if note.status == "ignored")
+
+
+def test_registration_chooses_agent_and_file_reference_uses_the_same(direct):
+    registered(direct.parent, ["sb3", "skrl", "rl_games"])
+    assert resolve(find_task(str(direct.parent))).agent_name == "rl-games"
+    assert resolve(find_task(f"{direct}:PoleEnvCfg")).agent_name == "rl-games"
+    assert resolve(find_task(f"{direct}:PoleEnvCfg"), agent="skrl").agent.critic.hidden == (32,)
+
+
+def test_several_runners_beside_a_file_need_a_choice(unchanged):
+    (unchanged / "__init__.py").write_text("")
+    inner = next(file for file in unchanged.rglob("*.py") if "RslRlOnPolicyRunnerCfg" in file.read_text())
+    runner = unchanged / "runners.py"
+    runner.write_text(inner.read_text())
+    inner.unlink()
+    name = next(line for line in runner.read_text().splitlines() if line.startswith("class ")).split("(")[0].split()[1]
+    text = (
+        runner.read_text()
+        + f"\n\n@configclass\nclass Other(RslRlOnPolicyRunnerCfg):\n    policy = {name}().policy\n    algorithm = {name}().algorithm\n    num_steps_per_env = 8\n    max_iterations = 2\n    save_interval = 2\n    experiment_name = 'x'\n"
+    )
+    runner.write_text(text)
+    file = next(unchanged.glob("*env_cfg.py"))
+    resolved = resolve(find_task(f"{file}:CartpoleEnvCfg"))
+    assert resolved.agent is None
+    with pytest.raises(ConfigError, match="no default among the agents"):
+        resolved.require_agent()
+    assert resolve(find_task(f"{file}:CartpoleEnvCfg"), agent="Other").agent.num_steps == 8
+
+
+@pytest.mark.slow
+def test_whole_task_package_of_isaac_lab():
+    if "ISAACLAB_SOURCE" not in os.environ:
+        pytest.skip("set ISAACLAB_SOURCE to the folder `source` of Isaac Lab 2.3.2 or of its unpacked wheel")
+    command = [sys.executable, "corpus.py", "--stage", "steps", "--only", "^Isaac-(Cartpole|Velocity-Flat-G1|Ant)"]
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
+    assert all(line[0] == "3" for line in done.stdout.splitlines() if "Velocity-Flat-G1" in line), done.stdout

@@ -1,0 +1,120 @@
+"""Modules that the unchanged import lines of task files get: `omni.*`, `pxr`, `carb`, `gym`, `omniisaacgymenvs.*`.
+
+Names that rlcli has are those of the flat vocabulary, whatever the module is. Names whose calls have no effect in
+MuJoCo are recorded when they are called; all others can be imported and raise an error when they are used.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rlcli.errors import TaskError
+from rlcli_oige import neighbours
+from rlcli_oige.usd import Ignored, UsdContext, missing
+
+_REMOVED = re.compile(r"\b(?:np|numpy)\.(?:Inf|Infinity|NaN|float_)\b")
+_modules: dict[str, ModuleType] = {}
+
+_IGNORED = {
+    "enable_extension": "rlcli has no extensions",
+    "add_update_semantics": "there are no semantic labels",
+    "PreviewSurface": "the model has the materials",
+    "VisualMaterial": "the model has the materials",
+    "OmniPBR": "the model has the materials",
+    "OmniGlass": "the model has the materials",
+    "DifferentialController": "tasks set the speeds of wheels themselves",
+}
+"""Name -> why its calls have no effect."""
+_REASONS = {
+    "omni.isaac.core.prims.soft": "PhysX simulates deformable bodies on its GPU; rlcli simulates rigid bodies",
+    "omni.isaac.core.materials.deformable_material": "PhysX simulates deformable bodies on its GPU",
+    "omni.isaac.core.utils.deformable_mesh_utils": "PhysX simulates deformable bodies on its GPU",
+    "omni.physx": "it edits the meshes of a USD file; give an MJCF with --model",
+    "omni.replicator": "rlcli has no replicator; cameras are sensors of the scene",
+    "omni.isaac.sensor": "cameras are sensors of the scene",
+    "omni.isaac.core.utils.warp": "tasks with Warp arrays are not supported; use the task's torch version",
+    "warp": "tasks with Warp arrays are not supported; use the task's torch version",
+}
+"""Module -> why names below it have no counterpart."""
+_REFUSED = {
+    "omniisaacgymenvs.tasks.factory": "nut and bolt touch through signed distance fields of their meshes, which a rigid"
+    " body of MJCF has not; there is no counterpart of Factory's tasks",
+    "omniisaacgymenvs.tasks.franka_deformable": "PhysX simulates deformable bodies on its GPU; rlcli simulates rigid"
+    " bodies",
+    "omniisaacgymenvs.tasks.target_following": "its reward reads images of instance segmentation, which rlcli's cameras"
+    " do not render",
+    "omniisaacgymenvs.tasks.warp": "tasks with Warp arrays are not supported; use the task's torch version",
+}
+"""Module of the user's package -> why a task that imports it cannot run."""
+
+
+def find(name: str, file: str = "") -> ModuleType:
+    """Return the module that an import line in a task's file gets.
+
+    Raises:
+        TaskError: for a module that no task of rlcli can use.
+    """
+    if name not in _modules:
+        module = _modules[name] = (_Neighbours if name.split(".")[0] == "omniisaacgymenvs" else _Module)(name)
+        parent, _, last = name.rpartition(".")
+        if parent:
+            setattr(find(parent), last, module)
+    return _modules[name]
+
+
+def find_numpy(name: str, file: str = "") -> ModuleType | None:
+    """Return numpy with the names that NumPy 2 has removed, for a file that uses one of them; None for other files."""
+    if name != "numpy" or not file or not _REMOVED.search(Path(file).read_text(encoding="utf-8", errors="replace")):
+        return None
+    if name not in _modules:
+        numpy = importlib.import_module(name)
+        module = _modules[name] = ModuleType(name)
+        vars(module).update(
+            {**vars(numpy), "Inf": numpy.inf, "Infinity": numpy.inf, "NaN": numpy.nan, "float_": numpy.float64}
+        )
+    return _modules[name]
+
+
+def refuse(name: str, where: str) -> None:
+    """Check that a module of the user's package can be imported.
+
+    Raises:
+        TaskError: with the reason.
+    """
+    reason = next((text for module, text in _REFUSED.items() if f"{name}.".startswith(f"{module}.")), None)
+    if reason is not None:
+        raise TaskError(f"{where}{name}: {reason}")
+
+
+class _Module(ModuleType):
+    """A module of Omniverse or USD."""
+
+    def __getattr__(self, name: str) -> Any:
+        vocabulary = importlib.import_module("rlcli_oige.vocabulary")
+        if name == "__all__":
+            return list(vocabulary.MATHS)
+        if name.startswith("__"):
+            raise AttributeError(name)
+        if name == "torch_utils" or name not in vocabulary.NAMES:
+            return self._without_counterpart(name)
+        return getattr(vocabulary, name)
+
+    def _without_counterpart(self, name: str) -> Any:
+        full = f"{self.__name__}.{name}"
+        if full == "omni.usd.get_context":
+            return UsdContext
+        if name in _IGNORED:
+            return Ignored(name, _IGNORED[name])
+        reason = next((text for module, text in _REASONS.items() if f"{full}.".startswith(f"{module}.")), None)
+        return missing(self.__name__, name, *(() if reason is None else (reason,)))
+
+
+class _Neighbours(_Module):
+    """A module of `omniisaacgymenvs`, for files outside of that package: its names are searched in the task's files."""
+
+    def _without_counterpart(self, name: str) -> Any:
+        return neighbours.find(name, importlib.import_module("rlcli_oige.vocabulary").NAMES)

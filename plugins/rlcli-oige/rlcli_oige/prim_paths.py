@@ -1,0 +1,22 @@
+"""Paths of prims, and the regular expressions of paths that views have."""
+
+from __future__ import annotations
+
+import re
+
+from rlcli.errors import TaskError
+
+BASE = "/World/envs"
+ZERO = f"{BASE}/env_0"
+
+
+def path_pattern(expression: str) -> re.Pattern[str]:
+    """Compile a view's `prim_paths_expr`. `.*` and `*` match within one step of the path."""
+    steps = str(expression).rstrip("/").split("/")
+    steps = ["[^/]*" if step == "*" else step.replace(".*", "[^/]*") for step in steps]
+    try:
+        return re.compile("/".join(steps))
+    except re.error as error:
+        raise TaskError(
+            f"'{expression}' is not a valid regular expression of prim paths; correct it: {error}"
+        ) from None

@@ -1,0 +1,53 @@
+"""Place of the user's code that calls into this package, and errors for what this package lacks."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from rlcli.errors import TaskError
+from rlcli.registry.module_aliases import TaskFileLoader
+
+
+def user_file() -> tuple[Path, int] | None:
+    """Return the file and line of the innermost running code of a task; None outside of it."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        if isinstance(frame.f_globals.get("__loader__"), TaskFileLoader):
+            return Path(frame.f_code.co_filename), frame.f_lineno
+        frame = frame.f_back  # type: ignore[assignment]
+    return None
+
+
+def user_location() -> str:
+    """Return `FILE:LINE: ` of the code of the task that is running; empty outside of it."""
+    found = user_file()
+    return "" if found is None else f"{found[0]}:{found[1]}: "
+
+
+def error_location(error: BaseException) -> str:
+    """Return `FILE:LINE` of the innermost code of a task in an error's traceback; empty if there is none."""
+    found, entry = "", error.__traceback__
+    while entry is not None:
+        if isinstance(entry.tb_frame.f_globals.get("__loader__"), TaskFileLoader):
+            found = f"{entry.tb_frame.f_code.co_filename}:{entry.tb_lineno}"
+        entry = entry.tb_next
+    return found
+
+
+class MissingAttributeError(TaskError, AttributeError):
+    """Use of an attribute that the original class has, or may have, and its counterpart has not."""
+
+
+class Counterpart:
+    """Base of classes that replace one of Isaac Sim: a missing attribute is reported as missing in rlcli."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
+        own = next(kind.__name__ for kind in type(self).__mro__ if kind.__module__.startswith("rlcli_oige."))
+        text = f"rlcli's {own} has no '{name}'"
+        if own != type(self).__name__:
+            text = f"{type(self).__name__} has no '{name}', and {text}"
+        raise MissingAttributeError(f"{user_location()}{text}")
