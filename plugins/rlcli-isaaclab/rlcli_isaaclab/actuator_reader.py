@@ -52,17 +52,18 @@ def read_actuators(
             item.report.problem(item.key, what, hint)
             continue
         elif kind in _EXPLICIT or kind in _NETWORKS:
+            effort_limit = item.get("effort_limit")
             if kind in _NETWORKS:
                 gains = dict(replaced[group])
                 item.note("approximated", "network_file", "replaced by the gains of models.yaml")
                 item.skip("pos_scale", "vel_scale", "torque_scale", "input_order", "input_idx")
                 kind = "DCMotor"
             elif kind == "RemotizedPDActuator":
-                limits = [row[2] for row in item.get("joint_parameter_lookup") or [[0, 0, 0]]]
-                effort_limit = max(limits) if item.get("effort_limit") is None else effort_limit
+                table = item.get("joint_parameter_lookup")
+                effort_limit = max(row[2] for row in table) if table and effort_limit is None else effort_limit
                 item.note("approximated", "joint_parameter_lookup", "the effort limit is the largest of the table")
                 kind = "DelayedPDActuator"
-            models[group] = _read_explicit_actuator(item, kind, order_joints(patterns, item), gains)
+            models[group] = _read_explicit_actuator(item, kind, order_joints(patterns, item), gains, effort_limit)
             speed = None if kind == "DCMotor" else _speed_limit(item)  # terms read that of a DC motor by themselves
             settings = {**passive, "velocity_limit": speed}
         else:
@@ -106,11 +107,13 @@ def _speed_limit(item: Node) -> Any:
     return of_solver if limit is None else limit
 
 
-def _read_explicit_actuator(item: Node, kind: str, joints: Any, gains: Mapping[str, Any]) -> dict[str, Any]:
+def _read_explicit_actuator(
+    item: Node, kind: str, joints: Any, gains: Mapping[str, Any], effort_limit: Any
+) -> dict[str, Any]:
     """Return an actuator model; rlcli computes its effort before each physics step."""
     config = {"joints": joints, "kind": "dc_motor" if kind == "DCMotor" else "pd"}
     config |= {key: value for key, value in gains.items() if value is not None}
-    effort_limit, of_solver = item.get("effort_limit"), item.get("effort_limit_sim")
+    of_solver = item.get("effort_limit_sim")
     for key, value in {**gains, "effort_limit": effort_limit}.items():
         if value is None:
             value = "no limit" if key == "effort_limit" else "0"

@@ -152,18 +152,6 @@ class Data:
         return torch.cat([self.body_link_lin_vel_w, self._data.body_ang_vel_w], dim=-1)
 
     @property
-    def body_vel_w(self) -> Tensor:
-        """Linear [m/s] and angular [rad/s] velocities of all bodies, world frame. (num_envs, bodies, 6)"""
-        return torch.cat([self._data.body_lin_vel_w, self._data.body_ang_vel_w], dim=-1)
-
-    @property
-    def body_pose_w(self) -> Tensor:
-        """Positions [m] and quaternions (w, x, y, z) of all bodies, world frame. (num_envs, bodies, 7)"""
-        return torch.cat([self._data.body_pos_w, self._data.body_quat_w], dim=-1)
-
-    body_link_pose_w, body_com_vel_w = body_pose_w, body_vel_w
-
-    @property
     def body_state_w(self) -> Tensor:
         """Poses of all bodies, and velocities of their centres of mass, world frame. (num_envs, bodies, 13)"""
         return torch.cat([self.body_pose_w, self.body_vel_w], dim=-1)
