@@ -260,8 +260,8 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         if _module_of(kwargs[CONFIGURATION]).startswith(module.__name__)
     }
     if wanted and wanted not in found:
-        hint = did_you_mean(wanted, found) or f"it registers {listing(found)}"
-        raise TaskError(f"{source.root} does not register '{wanted}'", hint=hint)
+        known = did_you_mean(wanted, found) or f"it registers {listing(found)}"
+        raise TaskError(f"{source.root} does not register '{wanted}'", hint=known)
     if not wanted and len(found) != 1:
         hint = f"name one: {listing(f'{source.root}:{name}' for name in found)}" if found else None
         raise TaskError(f"{source.root} registers {len(found)} tasks with {CONFIGURATION}, expected 1", hint=hint)
