@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Any
@@ -209,6 +209,16 @@ def override_place(text: str) -> str:
 def parse_address(text: str) -> tuple[str, ...]:
     """Return the keys of a dotted key such as `rewards.alive.weight`. A key that contains a dot is in quotes."""
     return tuple(quoted or plain for quoted, plain in _KEY.findall(text))
+
+
+def without(data: Any, paths: Iterable[Path]) -> Any:
+    """Return a copy of the data with null at these paths, for values that are validated separately."""
+    inner: dict[Any, list[Path]] = {}
+    for path in paths:
+        if path == ():
+            return None
+        inner.setdefault(path[0], []).append(path[1:])
+    return {k: without(v, inner[k]) if k in inner else v for k, v in data.items()} if inner else data
 
 
 def _index(target: list[Any], step: str | int, taken: Path) -> int:

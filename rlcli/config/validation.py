@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from rlcli.config import messages, python_task
 from rlcli.config.foreign_keys import move_foreign_keys
 from rlcli.config.given_models import MODELS, model_path
-from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read
+from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read, without
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import (
@@ -302,7 +302,7 @@ class TaskCheck:
         entries = term_entries(data)
         # each term is validated with the model of its own function, then removed from the data for `TaskConfig`
         terms = {path: self._term(section, path, entry) for section, path, entry in entries}
-        task = self._validate(TaskConfig, _without(data, terms), ())
+        task = self._validate(TaskConfig, without(data, terms), ())
         params = self._params(data)
         if self.source.task is None:
             self._require_managed(data)
@@ -410,16 +410,6 @@ class TaskCheck:
                 self.problem(
                     (section,), f"a direct task has no {section} terms; its class implements them: delete this section"
                 )
-
-
-def _without(data: Any, paths: Iterable[Path]) -> Any:
-    """Return a copy of the data with null at these paths, for values that are validated separately."""
-    inner: dict[Any, list[Path]] = {}
-    for path in paths:
-        if path == ():
-            return None
-        inner.setdefault(path[0], []).append(path[1:])
-    return {k: _without(v, inner[k]) if k in inner else v for k, v in data.items()} if inner else data
 
 
 def _filled(task: TaskConfig, terms: Mapping[Path, TermConfig | None], params: dict[str, Any] | None) -> TaskConfig:
