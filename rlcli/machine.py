@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
-from rlcli.errors import DependencyError, DeviceError, UsageError
+from rlcli.errors import DependencyError, DeviceError, UsageError, pip_install
 
 _GROUPS, _OWN_GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _NO_LIMIT = 1 << 60
@@ -190,7 +190,7 @@ def choose_device(wanted: str) -> str:
         raise UsageError(f"no device '{wanted}'", hint="use auto, cpu, cuda or cuda:N")
     require_device(wanted)
     if find_spec("mujoco_warp") is None:
-        raise DependencyError("the GPU engine needs mujoco-warp", hint='pip install "rlcli[gpu]"')
+        raise DependencyError("the GPU engine needs mujoco-warp", hint=pip_install("rlcli[gpu]"))
     return wanted
 
 

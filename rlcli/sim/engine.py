@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rlcli.config.schema import SimConfig
-from rlcli.errors import ConfigError, DependencyError, Problem
+from rlcli.errors import ConfigError, DependencyError, Problem, pip_install
 from rlcli.machine import require_device
 from rlcli.sim.divergence_report import HISTORY_MEMORY, Call, Divergence, StateHistory, StateLayout
 from rlcli.sim.selection import Field, Groups, Selection
@@ -232,7 +232,7 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
     try:
         from rlcli.sim.warp import WarpEngine
     except ImportError as error:
-        raise DependencyError(f"the GPU engine needs mujoco-warp: {error}", hint='pip install "rlcli[gpu]"') from None
+        raise DependencyError(f"the GPU engine needs mujoco-warp: {error}", hint=pip_install("rlcli[gpu]")) from None
     return WarpEngine(model, num_envs, config, device)
 
 
