@@ -74,6 +74,8 @@ def test_pins_resolve_for_python(version, tmp_path):
     marker = default_environment() | {"python_version": version.rpartition(".")[0], "python_full_version": version}
     unpinned, conflicts = set(), set()
     for each in found:
+        if each["name"] in ("rl_games", "rsl-rl-lib"):
+            continue  # `make setup` installs them without their dependencies
         for requirement in map(Requirement, each.get("requires_dist", [])):
             if requirement.marker is None or requirement.marker.evaluate(marker | {"extra": ""}):
                 name, other = canonicalize_name(each["name"]), canonicalize_name(requirement.name)
@@ -82,4 +84,4 @@ def test_pins_resolve_for_python(version, tmp_path):
                 elif not requirement.specifier.contains(pins[other]):
                     conflicts.add((name, other))
     assert conflicts == {("trackio", "pillow")}  # named in pyproject.toml
-    assert unpinned <= {"mlflow-skinny", "trackio", "wandb", "rl-games", "rsl-rl-lib"}, "what they bring is not tested"
+    assert unpinned <= {"mlflow-skinny", "trackio", "wandb"}, "what they bring is not tested"
