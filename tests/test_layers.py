@@ -15,7 +15,7 @@ import rlcli
 PACKAGE = Path(rlcli.__file__).parent
 REPOSITORY = PACKAGE.parent
 LAYERS = """
-    errors task trainers formats random machine settings safe_text
+    errors task trainers formats random machine settings safe_text progress
     registry  config  sim  scene  managers  envs  mdp  rl  runs  replay  evaluation  deploy  viewer  reporting  testing
     training  adapters  tuning  doctor  scaffold  api  cli  gym  pytest_plugin
 """

@@ -20,6 +20,7 @@ from rlcli.evaluation.limits import Limit
 from rlcli.evaluation.perturbations import Perturbations
 from rlcli.evaluation.session import MAX_ENVS, PolicyInTask, make_actor, one_each
 from rlcli.evaluation.stress_sweeps import Point, Sweep, by_name, describe_point, grid
+from rlcli.progress import tracked
 from rlcli.random import derive
 from rlcli.rl.acting import Act
 from rlcli.rl.rng import seed_generators
@@ -168,7 +169,7 @@ def run_points(
     size = resolved.task.scene.num_envs
     at_once = max(1, MAX_ENVS // size)
     results: list[Evaluation] = []
-    for start in range(0, len(points), at_once):
+    for start in tracked(range(0, len(points), at_once), "batches of variants", -(-len(points) // at_once)):
         batch = points[start : start + at_once]
         seed_generators(derive(seed, "task"))  # some tasks draw from torch's, numpy's or Python's generator
         batched, env_seed = resolved.with_num_envs(size * len(batch)), derive(seed, "evaluation")

@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 
 from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
+from rlcli.progress import tracked
 from rlcli.testing import episode_checks, portability_checks, step_and_file_checks
 from rlcli.testing.findings import Finding, NotRunError, error_text
 from rlcli.testing.task_under_test import TaskUnderTest, open_task
@@ -94,7 +95,7 @@ def check_task(
             for name in dict.fromkeys((*(f.check for f in broken), *selected)):
                 on_check(name, [f for f in broken if f.check == name] or None)
             return broken
-        for name in selected:
+        for name in tracked(selected, "checks", len(selected)):
             try:
                 findings = list(_run(name, subject, found))
             except NotRunError as reason:

@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 
 from rlcli.errors import ConfigError, MachineError, UsageError, require_known
+from rlcli.progress import tracked
 from rlcli.testing.findings import error_text
 from rlcli.testing.fixed_policy_rollouts import RolloutEvidence
 from rlcli.testing.lint_rules import RULES, Remark
@@ -62,7 +63,7 @@ def lint_task(
     evidence = RolloutEvidence(open_task(task, agent, overrides, config), seconds)
     found: list[Remark] = []
     with torch.random.fork_rng(devices=[]):
-        for name in RULES:
+        for name in tracked(RULES, "rules", len(RULES)):
             if (only and name not in only) or name in ignore:
                 continue
             remarks = list(_apply_rule(name, evidence))

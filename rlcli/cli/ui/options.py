@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from rlcli import progress
 from rlcli.cli.ui.completion import agents, checkpoints, runs, tasks, words
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.help_text import HelpCommand, read_docstring
@@ -112,7 +113,12 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
 
     @functools.wraps(function)
     def run(**values: Any) -> None:
-        function(**{option: value for option, value in values.items() if option not in _COMMON})
+        from rlcli.cli.ui.progress_view import WorkView
+
+        progress.view = WorkView
+        given = {option: value for option, value in values.items() if option not in _COMMON}
+        with progress.track(f"rlcli {name}"):
+            function(**given)
 
     parameters = [*signature.parameters.values(), *common]
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
