@@ -14,7 +14,6 @@ from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import choice
 from rlcli.errors import Stopped, UsageError
 from rlcli.formats import log_notes
-from rlcli.progress import track
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
@@ -91,8 +90,7 @@ def command(
             resolved, process = request.resolve()
         log_notes(resolved.notes)
     if gpus is not None and gpus > 1 and not distributed.launched():
-        with track("processes", has_own_view=True):
-            raise typer.Exit(distributed.launch(gpus, sys.argv[1:]))
+        raise typer.Exit(distributed.launch(gpus, sys.argv[1:]))
     if study is not None:
         _train_seeds(study, request, resolved, process, jobs or 1, stop)
     else:
