@@ -74,7 +74,7 @@ def test_pins_resolve_for_python(version, tmp_path):
     marker = default_environment() | {"python_version": version.rpartition(".")[0], "python_full_version": version}
     unpinned, conflicts = set(), set()
     for each in found:
-        if each["name"] in ("rl_games", "rsl-rl-lib"):
+        if canonicalize_name(each["name"]) in ("rl-games", "rsl-rl-lib"):
             continue  # `make setup` installs them without their dependencies
         for requirement in map(Requirement, each.get("requires_dist", [])):
             if requirement.marker is None or requirement.marker.evaluate(marker | {"extra": ""}):
