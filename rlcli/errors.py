@@ -6,8 +6,12 @@ import difflib
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from rlcli.safe_text import message_line
+
+_UNPINNED = ("rlcli[trackio]",)
+"""Extras that do not fit the tested versions; trackio needs pillow < 13."""
 
 
 class RlcliError(Exception):
@@ -141,6 +145,19 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str | None:
     known = dict.fromkeys(itertools.islice(candidates, 1000))
     close = difflib.get_close_matches(name[:200], known, n=3, cutoff=0.6)
     return f"did you mean {' or '.join(repr(match) for match in close)}?" if close else None
+
+
+def pip_install(package: str) -> str:
+    """Return the command that installs a package, or an extra such as `rlcli[plot]`, in the tested versions.
+
+    A plugin of the repository is installed from its folder if rlcli itself runs from a checkout.
+    """
+    root = Path(__file__).parents[1]
+    lists = (Path(__file__).with_name("constraints.txt"), root / "constraints.txt")  # of a wheel, of a checkout
+    pins = [str(file) for file in lists if file.is_file() and package not in _UNPINNED]
+    source = root / "plugins" / package
+    words = [*(["-c", pins[0]] if pins else []), *([str(source)] if source.is_dir() else package.split())]
+    return " ".join(["pip install", *(f'"{word}"' if set(word) & set(" []<>=*") else word for word in words)])
 
 
 def one_line(error: BaseException, limit: int | None = None) -> str:

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
-from rlcli.errors import DependencyError, DeviceError, MachineError, UsageError, one_line
+from rlcli.errors import DependencyError, DeviceError, MachineError, UsageError, one_line, pip_install
 
 _GROUPS, _OWN_GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _NO_LIMIT = 1 << 60
@@ -228,7 +228,7 @@ def choose_device(wanted: str) -> str:
         raise UsageError(f"no device '{wanted}'", hint="use auto, cpu, cuda or cuda:N")
     require_device(wanted)
     if find_spec("mujoco_warp") is None:
-        raise DependencyError("the GPU engine needs mujoco-warp", hint='pip install "rlcli[gpu]"')
+        raise DependencyError("the GPU engine needs mujoco-warp", hint=pip_install("rlcli[gpu]"))
     return wanted
 
 
@@ -262,3 +262,20 @@ def has_onednn() -> bool:
     import torch
 
     return bool(torch.backends.mkldnn.is_available())  # type: ignore[no-untyped-call]  # torch has no type here
+
+
+@contextlib.contextmanager
+def native_stderr_discarded() -> Iterator[None]:
+    """Discard what libraries write to file descriptor 2 without Python, such as messages of their initialisation."""
+    with contextlib.ExitStack() as stack:
+        try:
+            kept = os.dup(2)
+        except OSError:  # it is closed
+            kept = -1
+        if kept >= 0:
+            stack.callback(os.close, kept)
+            stack.callback(os.dup2, kept, 2)
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, 2)
+            os.close(nowhere)
+        yield

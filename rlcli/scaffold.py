@@ -14,12 +14,17 @@ import re
 import shutil
 import sys
 import tempfile
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rlcli import __version__
 from rlcli.errors import MachineError, UsageError, listing, require_known
 from rlcli.registry import TASKS, catalog, folder_task
+
+if TYPE_CHECKING:
+    from rlcli.scaffold_robot import RobotTask
 
 FLAVOURS = ("yaml", "direct")
 MAX_LENGTH = 64
@@ -28,8 +33,10 @@ _DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt"
 """File names that Windows reserves for devices."""
 
 
-def create(name: str, flavour: str, folder: Path | None = None) -> tuple[Path, list[str]]:
-    """Write the package of a new task, completely or not at all.
+def create(
+    name: str, flavour: str, folder: Path | None = None, robot: RobotTask | None = None
+) -> tuple[Path, list[str]]:
+    """Write the package of a new task, completely or not at all; `robot` is the task of a robot's MJCF.
 
     Returns:
         The folder of the package, and its files relative to that folder.
@@ -38,16 +45,24 @@ def create(name: str, flavour: str, folder: Path | None = None) -> tuple[Path, l
         UsageError: if the name is not valid for a task, a distribution and a package, or if the folder is not empty.
         MachineError: if the files cannot be written.
     """
-    require_known(flavour, FLAVOURS, "flavour", "flavours")
+    if robot is None:
+        require_known(flavour, FLAVOURS, "flavour", "flavours")
     check_name(name)
     folder = Path(name) if folder is None else folder
     _check_folder(folder)
-    files = render(name, flavour)
+    from rlcli.config.dump import to_yaml
+
+    package = name.replace("-", "_")
+    assets: dict[str, Path] = {}
+    files = render(name, flavour if robot is None else "robot", "" if robot is None else robot.task["summary"])
+    if robot is not None:
+        files |= {f"{package}/model.xml": robot.model, f"{package}/task.yaml": to_yaml(robot.task)}
+        assets = {f"{package}/{place}": origin for place, origin in robot.assets.items()}
     try:
-        _write(folder, files, name.replace("-", "_"))
+        _write(folder, files, package, assets)
     except OSError as error:
         raise MachineError(f"cannot write {folder}: {error.strerror or error}", hint="give --output FOLDER") from error
-    return folder, sorted([*files, _SCHEMA])
+    return folder, sorted([*files, *assets, _SCHEMA])
 
 
 def check_name(name: str) -> None:
@@ -83,13 +98,13 @@ def check_name(name: str) -> None:
     raise UsageError(message, hint=f"use {name}-2, for example")
 
 
-def render(name: str, flavour: str) -> dict[str, str]:
+def render(name: str, flavour: str, summary: str = "") -> dict[str, str]:
     """Return the files of a new task: path within its folder -> text."""
     import jinja2
 
     package = name.replace("-", "_")
     version = ".".join(__version__.split(".")[:2])
-    values = {"name": name, "package": package, "version": version, "flavour": flavour}
+    values = {"name": name, "package": package, "version": version, "flavour": flavour, "summary": summary}
     # No escaping: the texts are Python, TOML, XML and Markdown, and `check_name` has checked the values.
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
     names = {"package": package, "suite": "tests", "gitignore": ".gitignore"}
@@ -105,7 +120,7 @@ def render(name: str, flavour: str) -> dict[str, str]:
 _SCHEMA = "task.schema.json"
 
 
-def _write(folder: Path, files: dict[str, str], package: str) -> None:
+def _write(folder: Path, files: dict[str, str], package: str, assets: Mapping[str, Path]) -> None:
     """Write all files to a temporary folder beside the target folder, then move them when they are complete."""
     from rlcli.config.dump import json_schema
     from rlcli.config.load import extensions
@@ -117,6 +132,9 @@ def _write(folder: Path, files: dict[str, str], package: str) -> None:
         for path, text in files.items():
             (made / path).parent.mkdir(parents=True, exist_ok=True)
             (made / path).write_text(text, encoding="utf-8", newline="\n")
+        for path, origin in assets.items():
+            (made / path).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(origin, made / path)
         schema = json_schema(*extensions(folder_task(made / package)))
         (made / _SCHEMA).write_text(json.dumps(schema), encoding="utf-8")
         for cache in made.rglob("__pycache__"):

@@ -159,7 +159,7 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
     if isinstance(error, RlcliError):
         return error
     if isinstance(error, ClickException):
-        failure = UsageError(error.format_message(), hint=_usage_hint(error, arguments))
+        failure = UsageError(_usage_message(error), hint=_usage_hint(error, arguments))
         failure.exit_code = error.exit_code
         return failure
     if isinstance(error, KeyboardInterrupt | typer.Abort):
@@ -199,6 +199,16 @@ def _user_settings(arguments: list[str]) -> dict[str, Any]:
     if settings:
         console.detail(f"settings: {settings_file()}")
     return settings
+
+
+def _usage_message(error: ClickException) -> str:
+    """Return the message of a wrong command line, in the same words as that of a wrong setting."""
+    cause, message = error.__cause__, error.format_message()
+    if cause is None or not hasattr(cause, "errors"):  # only pydantic's ValidationError has it
+        return message
+    from rlcli.config.messages import expected_and_found
+
+    return f"{message.partition(': ')[0]}: {expected_and_found(cause.errors(include_url=False))}"
 
 
 def _usage_hint(error: ClickException, arguments: list[str]) -> str | None:

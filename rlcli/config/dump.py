@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+from pathlib import PurePath
 from typing import Any
 
 import yaml
@@ -13,7 +16,10 @@ from rlcli.config.load import Resolved
 from rlcli.config.schema import ObservationGroupConfig, TaskConfig
 from rlcli.config.strict_yaml import Path
 from rlcli.config.term_signatures import SECTIONS, SignatureError, Vocabulary, params_model
+from rlcli.errors import UsageError, did_you_mean, listing
 
+_ORIGIN_FILE = re.compile(r"  # (?:\w+: )?(\S*/\S*?):[0-9]+(?::[0-9]+)?$")
+"""The file in the comment that names the origin of a value."""
 _TAGS = {type(None): "null", bool: "bool", int: "int", float: "float", str: "str"}
 
 
@@ -73,16 +79,51 @@ def to_yaml(data: dict[str, Any]) -> str:
     return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, width=110, allow_unicode=True))
 
 
-def to_yaml_with_origins(resolved: Resolved) -> str:
-    """Return the configuration as YAML with the origin of every value as a comment."""
+def select(data: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    """Return the parts of a configuration at some dotted keys; all of it without keys.
+
+    Raises:
+        UsageError: for a key that it does not have.
+    """
+    found: dict[str, Any] = {} if keys else data
+    for key in keys:
+        value, target, steps = data, found, key.split(".")
+        for number, step in enumerate(steps):
+            if not isinstance(value, dict) or step not in value:
+                known = listing(value, 40) if isinstance(value, dict) else None
+                where = f" in {'.'.join(steps[:number])}" if number else ""
+                hint = did_you_mean(step, value if known else ()) or (f"keys{where}: {known}" if known else None)
+                raise UsageError(f"the configuration has no key '{key}'", hint=hint)
+            value = value[step]
+            if number < len(steps) - 1:
+                target = target.setdefault(step, {})
+        target[steps[-1]] = value
+    return found
+
+
+def to_yaml_with_origins(resolved: Resolved, data: dict[str, Any] | None = None) -> str:
+    """Return a part of the configuration as YAML with the origin of every value as a comment, and a list of the files.
+
+    In a comment a file has its name only, with as many folders as it takes to tell it from the others.
+    """
     lines: list[str] = []
-    _annotate(to_data(resolved), (), resolved, lines)
-    return "\n".join(lines) + "\n"
+    _annotate(to_data(resolved) if data is None else data, (), resolved, lines)
+    files = {PurePath(match[1]) for line in lines if (match := _ORIGIN_FILE.search(line))}
+    depth = 1
+    while len({file.parts[-depth:] for file in files}) < len(files):
+        depth += 1
+    short = {str(file): "/".join(file.parts[-depth:]) for file in sorted(files)}
+    for file, name in short.items():
+        lines = [line.replace(f"{file}:", f"{name}:") for line in lines]
+    return "\n".join([*(f"# {name}: {file}" for file, name in short.items()), *lines]) + "\n"
 
 
-def origins(resolved: Resolved) -> dict[str, str]:
-    """Return the origin of every value, by dotted key."""
-    return {messages.dotted(path): _origin(resolved, path) for path, _ in leaves(to_data(resolved))}
+def origins(resolved: Resolved, data: dict[str, Any] | None = None) -> dict[str, str]:
+    """Return the origin of every value of a part of the configuration, by dotted key."""
+    return {
+        messages.dotted(path): _origin(resolved, path)
+        for path, _ in leaves(to_data(resolved) if data is None else data)
+    }
 
 
 def explicit_values(resolved: Resolved) -> dict[str, str]:

@@ -6,7 +6,7 @@ import functools
 import json
 import operator
 import types
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
@@ -103,8 +103,9 @@ def _message(
         tag, expected = items[0]["ctx"]["tag"], items[0]["ctx"]["expected_tags"].replace(", ", " or ")
         similar = did_you_mean(tag, _tags(model, path))
         return f"expected {expected}, found {format_value(tag)}", similar, (*path, "kind")
-    if kind == "value_error":
-        return str(items[0]["ctx"]["error"]), None, path
+    refused = [item for item in items if item["type"] == "value_error"]  # one alternative has the right type
+    if refused:
+        return str(refused[0]["ctx"]["error"]), None, path
     if kind == "missing" and isinstance(items[0]["loc"][-1], str):
         return f"missing key '{path[-1]}'", None, path[:-1]
     length = _length(model, path)
@@ -118,7 +119,13 @@ def _message(
     elif isinstance(found, dict) and found and all(key.isdecimal() for key in found):
         # an override of one item, such as `size.0=1`, created a mapping
         hint = "the default is not a list, so no single item can change; give the whole list"
-    return f"expected {' or '.join(dict.fromkeys(map(_expected, items)))}, found {format_value(found)}", hint, path
+    return expected_and_found(items), hint, path
+
+
+def expected_and_found(items: Sequence[Any]) -> str:
+    """Return the message for pydantic's errors of one value."""
+    wanted = " or ".join(dict.fromkeys(map(_expected, items)))
+    return f"expected {wanted}, found {format_value(items[0]['input'])}"
 
 
 _OTHER_PLACES = {
@@ -136,7 +143,7 @@ def _suggest_key(key: str, fields: Iterable[str], locations: KeyLocations) -> st
     if beside in fields:
         return instead
     similar = did_you_mean(key, fields)
-    elsewhere = locations.get(key, [])
+    elsewhere = [] if "func" in fields else locations.get(key, [])  # the keys of a term have their own meaning
     belongs = f"it belongs {' or '.join(map(_inside, elsewhere))}" if 0 < len(elsewhere) <= 3 else None
     if similar or belongs:
         return "; ".join(filter(None, (similar, belongs)))

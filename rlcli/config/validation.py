@@ -25,7 +25,7 @@ from rlcli.config.term_signatures import (
     read_params,
     term_entries,
 )
-from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing
+from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing, pip_install
 from rlcli.formats import Note
 from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, formats, load_entry
 from rlcli.registry.imports import load_spec
@@ -268,7 +268,7 @@ class TaskCheck:
         except TaskError as error:
             if name in formats.known_trainers() and name not in {entry.name for entry in catalog(TRAINERS)[0]}:
                 where = f"{self.layers.place((*at, 'trainer'))}: {messages.dotted((*at, 'trainer'))}"
-                install = f"pip install {formats.known_trainers()[name]}"
+                install = pip_install(formats.known_trainers()[name])
                 self.missing = DependencyError(f"{where}: trainer '{name}' is not installed", hint=install)
             else:
                 self.problem((*at, "trainer"), error.message, error.hint)

@@ -146,7 +146,7 @@ class ClosedLoopResult:
 
 
 def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | None) -> ReferenceEnv:
-    """Build the environment that a policy was trained for, without observation noise, bias and delay.
+    """Build the environment that a policy was trained for, without observation noise, bias and delays.
 
     Args:
         choice: the policy.
@@ -158,6 +158,7 @@ def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | N
     groups = resolved.task.observations.items()
     # corruption is random, so an exported file cannot reproduce it
     clean = [f"observations.{name}.enable_corruption=false" for name, group in groups if group.enable_corruption]
+    clean += [f"actions.{name}.delay=null" for name, term in resolved.task.actions.items() if term and term.delay]
     if clean:
         resolved = configure(overrides=clean)
     torch.set_num_threads(1)

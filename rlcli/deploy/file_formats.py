@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rlcli.deploy.graph import DeployedPolicy
 from rlcli.deploy.numpy_export import numpy_bytes, read_numpy
-from rlcli.errors import CheckpointError, DependencyError
+from rlcli.errors import CheckpointError, DependencyError, pip_install
 
 KEY = "rlcli"
 """Key of the metadata in a file: a property of the ONNX model, an extra file of the torch program."""
@@ -64,7 +64,7 @@ def require_packages(format_: str) -> None:
                 importlib.import_module(module)
     except ImportError as error:
         message = f"ONNX export needs onnx, onnxscript and onnxruntime: {error}"
-        raise DependencyError(message, hint='pip install "rlcli[export]"') from None
+        raise DependencyError(message, hint=pip_install("rlcli[export]")) from None
 
 
 def _example_inputs(graph: DeployedPolicy) -> tuple[Tensor, ...]:

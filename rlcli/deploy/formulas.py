@@ -298,9 +298,10 @@ def _ee_to_object(env: VecEnv, entity: Entity, sites: Columns, object: Entity) -
     return op("sub", _root_pos(object), _row_of("site_xpos", site, 3))
 
 
-def _generated_commands(env: VecEnv, command: CommandTerm) -> Formula:
+def _generated_commands(env: VecEnv, command: CommandTerm, columns: list[int] | None) -> Formula:
     terms = getattr(env, "command_manager").terms  # noqa: B009 (only manager-based environments have commands)
-    return given(next(f"command/{term.name}" for term in terms if term.instance is command))
+    whole = given(next(f"command/{term.name}" for term in terms if term.instance is command))
+    return whole if columns is None else op("take", whole, [float(column) for column in columns])
 
 
 _OBSERVATIONS: Mapping[str, Callable[..., Formula]] = {

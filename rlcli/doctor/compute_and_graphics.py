@@ -14,7 +14,7 @@ from typing import Any
 
 from rlcli.doctor.check import Check
 from rlcli.doctor.installation import TRIPLE, version
-from rlcli.errors import MachineError
+from rlcli.errors import MachineError, pip_install
 from rlcli.machine import available_cores, has_gpu_driver, python_command
 from rlcli.registry.imports import release_numbers
 from rlcli.registry.probe import signal_name
@@ -92,7 +92,7 @@ def gpu_checks(gpu: Answer | None) -> list[Check]:
         hint = "install a torch that is built for this GPU (https://pytorch.org)"
     elif warp_package is None or warp is None:
         text += f"; {'mujoco-warp' if warp_package is None else 'warp-lang'} is not installed"
-        hint = 'pip install "rlcli[gpu]"'
+        hint = pip_install("rlcli[gpu]")
     elif warp["error"] or not warp["devices"]:
         cause = f": {warp['error']}" if warp["error"] else ", its build may not fit the driver"
         text += f"; Warp {warp['version']} finds no GPU{cause}"

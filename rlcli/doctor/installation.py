@@ -11,6 +11,7 @@ from pathlib import Path
 
 import rlcli
 from rlcli.doctor.check import Check
+from rlcli.errors import pip_install
 from rlcli.registry import Entry, catalog, unreadable_distributions
 from rlcli.registry.imports import release_numbers
 from rlcli.registry.probe import probe
@@ -147,7 +148,7 @@ def _extras() -> list[Check]:
             wanted.setdefault(extra, []).append((name, bounds))
     checks = []
     for extra, packages in sorted(wanted.items()):
-        hint = f'pip install "rlcli[{extra}]"'
+        hint = pip_install(f"rlcli[{extra}]")
         versions = {name: version(name) for name, _ in packages}
         missing = [name for name, found in versions.items() if found is None]
         if not missing:

@@ -67,7 +67,9 @@ class ManagedEnv(VecEnv):
         self._all_envs = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         n, device, tunable, bound = self.num_envs, self.device, self._binder.tunable, self._bound
         self.command_manager = CommandManager(bound["commands"], n, self.step_dt, device, tunable)
-        self.action_manager = ActionManager(bound["actions"], n, device, self.engine.as_field)
+        self.action_manager = ActionManager(
+            bound["actions"], n, self.step_dt, device, self.engine.as_field, self._select_all_by_step
+        )
         self.termination_manager = TerminationManager(bound["terminations"], n, device)
         self.event_manager = EventManager(bound["events"], n, self.step_dt, device, self.engine.set_constants)
         if self.event_manager.derives:
@@ -113,6 +115,7 @@ class ManagedEnv(VecEnv):
                 drawn = config.noise is not None or config.bias is not None or config.delay is not None
                 if (drawn and self.config.observations[group].enable_corruption) or config.modifiers:
                     found.append(f"observations.{group}.{term.name}")
+        found += [f"actions.{name}" for name, term in self.config.actions.items() if term is not None and term.delay]
         for term in self._terms():
             if not type(term.instance).__module__.startswith(_STATELESS):
                 found.append(".".join(map(str, term.path)))

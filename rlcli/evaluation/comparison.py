@@ -106,7 +106,8 @@ def compare(names: Sequence[str], policies: Sequence[PolicyInTask], episodes: in
         policies: the policies, from `find_policies`.
         episodes: number of episodes of each policy.
     """
-    from rlcli.evaluation.stress import one_each, run_points
+    from rlcli.evaluation.session import one_each
+    from rlcli.evaluation.stress import run_points
 
     first = policies[0]
     task = one_each(first.resolved, episodes)

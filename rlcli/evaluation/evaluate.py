@@ -14,6 +14,7 @@ from rlcli.envs.environment import Environment
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.step import Episodes, StepRecord, StepResult
 from rlcli.managers.termination import DIVERGED
+from rlcli.progress import track
 from rlcli.replay.rerun_episode import require_end
 from rlcli.rl.acting import Act
 from rlcli.rl.confidence import mean, proportion
@@ -128,8 +129,10 @@ def evaluate(
     success = {name: config for name, config in env.config.success.items() if config is not None}
     result = Evaluation({name: each.model_dump(include=keys, exclude_none=True) for name, each in success.items()})
     before = env.causes
-    obs = env.reset(seed=env.seed)["policy"]
-    with torch.no_grad(), env.observers.added(_EpisodeMeans(env)) as means:
+    obs, steps = env.reset(seed=env.seed)["policy"], 0
+    longest = env.max_episode_length * -(-episodes // size)
+    observed, counted = env.observers.added(_EpisodeMeans(env)), track("episodes", episodes * groups)
+    with torch.no_grad(), observed as means, counted as work:
         while bool((quota > 0).any()):
             require_end(env, int(env.episode_length_buf.max()))
             step = env.step(act(obs))
@@ -137,6 +140,9 @@ def evaluate(
             on_step(step)
             if step.episodes is not None:
                 _add_episodes(result, step.episodes.ended(), quota, means)
+                work.done = len(result.returns)
+            steps += 1
+            work.share = steps / longest  # environments may finish their episodes together
         env.check()
     after = {cause: count - before.get(cause, 0) for cause, count in env.causes.items()}
     result.diverged_by = {cause: count for cause, count in after.items() if count}

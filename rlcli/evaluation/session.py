@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +25,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 POLICIES = ("trained", "zero", "random", "lqr")
+MAX_ENVS = 8192
+"""Largest number of environments that run at a time; more episodes run in batches."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +43,8 @@ class PolicyRequest:
     seed: int = 42
     config: Path | None = None
     runs_dir: Path | None = None
+    episodes: int | None = None
+    """Number of episodes to evaluate, for the number of environments; None: the task's own number."""
     min_envs: int = 1
     """Smallest number of environments."""
 
@@ -138,11 +141,14 @@ def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
 
     try:
         return named_task(task)
-    except TaskError:
-        with contextlib.suppress(CheckpointError):
+    except TaskError as error:
+        try:
             find_run(task.partition("@")[0], runs_dir or default_runs_dir())
-            raise TaskError(f"'{task}' is a run, not a task", hint=f"--checkpoint {task}") from None
-        raise
+        except CheckpointError as no_run:
+            if error.message == f"no task '{task}'":
+                raise TaskError(f"no task or run '{task}'", hint=f"{no_run.hint}; {error.hint}") from None
+            raise error from None
+        raise TaskError(f"'{task}' is a run, not a task", hint=f"--checkpoint {task}") from None
 
 
 def open_session(request: PolicyRequest, check: Callable[[Resolved], None] = lambda resolved: None) -> Session:
@@ -153,6 +159,8 @@ def open_session(request: PolicyRequest, check: Callable[[Resolved], None] = lam
         check: called with the configuration; it may raise an error.
     """
     policy = find_policy(request, check)
+    if request.episodes is not None:
+        policy = replace(policy, resolved=one_each(policy.resolved, request.episodes))
     from rlcli.envs.make import make_env
     from rlcli.random import derive
     from rlcli.replay.crash_dump import CrashDumper
@@ -166,6 +174,15 @@ def open_session(request: PolicyRequest, check: Callable[[Resolved], None] = lam
     home = request.runs_dir or default_runs_dir() if policy.run is None else policy.run.folder
     CrashDumper(env, home / "dumps")
     return session
+
+
+def one_each(resolved: Resolved, episodes: int) -> Resolved:
+    """Return the task with one environment for each episode, unless the user has set the number of environments."""
+    from rlcli.config.dump import explicit_values
+
+    return (
+        resolved if "scene.num_envs" in explicit_values(resolved) else resolved.with_num_envs(min(episodes, MAX_ENVS))
+    )
 
 
 def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:

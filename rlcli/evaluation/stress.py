@@ -12,23 +12,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from rlcli.config.dump import explicit_values
 from rlcli.config.load import Resolved
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.evaluation.evaluate import Evaluation, evaluate
 from rlcli.evaluation.limits import Limit
 from rlcli.evaluation.perturbations import Perturbations
-from rlcli.evaluation.session import PolicyInTask, make_actor
+from rlcli.evaluation.session import MAX_ENVS, PolicyInTask, make_actor, one_each
 from rlcli.evaluation.stress_sweeps import Point, Sweep, by_name, describe_point, grid
+from rlcli.progress import tracked
 from rlcli.random import derive
 from rlcli.rl.acting import Act
 from rlcli.rl.rng import seed_generators
 
 _log = logging.getLogger(__name__)
 
-MAX_ENVS = 8192
-"""Largest number of environments that run at a time; more are run in batches."""
 _NEAR = 0.25
 """Standard deviation of a local search, as a share of the box's edges."""
 
@@ -171,7 +169,7 @@ def run_points(
     size = resolved.task.scene.num_envs
     at_once = max(1, MAX_ENVS // size)
     results: list[Evaluation] = []
-    for start in range(0, len(points), at_once):
+    for start in tracked(range(0, len(points), at_once), "batches of variants", -(-len(points) // at_once)):
         batch = points[start : start + at_once]
         seed_generators(derive(seed, "task"))  # some tasks draw from torch's, numpy's or Python's generator
         batched, env_seed = resolved.with_num_envs(size * len(batch)), derive(seed, "evaluation")
@@ -199,10 +197,3 @@ def search(sweeps: Sequence[Sweep], center: Point, count: int, seed: int) -> lis
 def score(summary: Summary) -> tuple[float, float]:
     """Return the key that orders variants: success rate, then mean return."""
     return summary["success"]["rate"] if "success" in summary else 0.0, summary["return"]["mean"]
-
-
-def one_each(resolved: Resolved, episodes: int) -> Resolved:
-    """Return the task with one environment for each episode, unless the user has set the number of environments."""
-    if "scene.num_envs" in explicit_values(resolved):
-        return resolved
-    return resolved.with_num_envs(min(episodes, MAX_ENVS))

@@ -6,10 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rlcli.errors import ConfigError
+from rlcli.managers.observation_pipeline import Delay, make_delay
 from rlcli.managers.term import BoundTerm, resets
 from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Field, Selection, in_place
@@ -51,9 +53,16 @@ class ActionManager(TensorState):
     """Manager of the action terms, with the raw actions of the current and the previous step."""
 
     def __init__(
-        self, terms: list[BoundTerm], num_envs: int, device: torch.device, as_field: Callable[[Tensor], Field]
+        self,
+        terms: list[BoundTerm],
+        num_envs: int,
+        step_dt: float,
+        device: torch.device,
+        as_field: Callable[[Tensor], Field],
+        select_all: Callable[[], Selection],
     ) -> None:
         self.terms = terms
+        self._select_all = select_all
         _require_separate_actuators(terms)
         self.size = sum(term.instance.size for term in terms)
         self._term_resets = resets(terms)
@@ -65,27 +74,44 @@ class ActionManager(TensorState):
         """The action of the previous step; zero at the start of an episode. (num_envs, size)"""
         self._previous, self._current = in_place(self.prev_action), in_place(self.action)
         self._process = []
+        self._delays: dict[str, Delay] = {}
         start = 0
         for term in terms:
-            self._process.append((term.instance.process, self.action[:, start : start + term.instance.size]))
-            start += term.instance.size
+            size = term.instance.size
+            delay = make_delay(term, num_envs, size, step_dt, device)
+            if delay is not None:
+                self._delays[term.name] = delay
+            self._process.append((term.instance.process, self.action[:, start : start + size], delay))
+            start += size
 
     def process(self, action: Tensor) -> None:
         """Store the action of this step and let each term process its columns. action (num_envs, size)"""
         self._previous[...] = self._current  # first: the current action is overwritten next
         self.action.copy_(action)
-        for process, columns in self._process:
-            process(columns)
+        for process, columns, delay in self._process:
+            if delay is None:
+                process(columns)
+                continue
+            delayed = columns.clone()
+            delay(delayed, self._draws, None, True)
+            process(delayed)
 
     def reset(self, selection: Selection) -> None:
         """Set the actions of new episodes to zero, and reset the terms."""
         selection.write(self._both_by_env, 0.0)
         for reset in self._term_resets:
             reset(selection)
+        for delay in self._delays.values():
+            delay.empty(selection)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return both actions."""
-        return {"action": self.action, "prev_action": self.prev_action}
+        """Return both actions, and the memories of the delays."""
+        delays = self._delays.items()
+        memories = {f"{name}.{key}": tensor for name, delay in delays for key, tensor in delay.tensors().items()}
+        return {"action": self.action, "prev_action": self.prev_action, **memories}
+
+    def _draws(self, stream: np.uint64) -> Selection:
+        return self._select_all().stream(stream)
 
 
 def _require_separate_actuators(terms: list[BoundTerm]) -> None:

@@ -81,8 +81,8 @@ class Pipeline:
             self._stages.append(_Clip(self._setting("clip", config.clip)))
         if config.scale is not None:
             self._stages.append(_Constant("scale", self._columns("scale", config.scale)))
-        if group.enable_corruption and config.delay is not None and config.delay.steps[1]:
-            self._stages.append(_Delay(config.delay, term.stream, self._zeros(config.delay.steps[1] + 1, width)))
+        delay = make_delay(term, num_envs, width, step_dt, device) if group.enable_corruption else None
+        self._stages += [] if delay is None else [delay]
         self._frames = self._zeros(self.history * width) if self.history > 1 else None
         self._value = self._zeros(width) if self.history > 1 else None
 
@@ -278,16 +278,17 @@ class _Integrator(_Filter):
             self._past.copy_(torch.stack([value, raw], dim=1))
 
 
-class _Delay(Stage):
+class Delay(Stage):
     """Delay of a few steps. `frames`: the last values, the oldest first. (num_envs, n, k)"""
 
-    def __init__(self, config: schema.DelayConfig, stream: np.uint64, frames: Tensor) -> None:
-        self._low, high = config.steps
-        self._options, self._redraw, self._stream = high - self._low + 1, config.redraw, stream
+    def __init__(self, steps: tuple[int, int], redraw: float, stream: np.uint64, frames: Tensor) -> None:
+        self._low, high = steps
+        self._options, self._redraw, self._stream = high - self._low + 1, redraw, stream
         self._frames = frames
         self._lag = torch.full((len(frames),), self._low, dtype=torch.int64, device=frames.device)
 
     def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
+        """Replace the value by that of some steps ago."""
         frames = torch.cat([self._frames[:, 1:], value[:, None]], dim=1)
         if fresh is not None:
             fresh.write(frames, fresh.read_view(value)[:, None].expand(-1, frames.shape[1], -1))
@@ -304,7 +305,31 @@ class _Delay(Stage):
         return selection.choice(self._options) + self._low
 
     def reset(self, selection: Selection) -> None:
+        """Draw the delays of new episodes."""
         selection.write(self._lag, self._sample(selection.stream(self._stream ^ _LAG)))
 
+    def empty(self, selection: Selection) -> None:
+        """Start new episodes with values of 0 in the past."""
+        self.reset(selection)
+        selection.write(self._frames, 0.0)
+
     def tensors(self) -> dict[str, Tensor]:
+        """Return the past values and the delays."""
         return {"frames": self._frames, "lag": self._lag}
+
+
+def make_delay(term: BoundTerm, num_envs: int, width: int, step_dt: float, device: torch.device) -> Delay | None:
+    """Return the delay of an observation or action term; None if it has none.
+
+    Raises:
+        ShapeError: for a delay in seconds that is no multiple of the control period `step_dt` [s].
+    """
+    config: schema.DelayConfig | None = term.config.delay  # type: ignore[attr-defined]
+    if config is None:
+        return None
+    try:
+        steps = config.step_range(step_dt)
+    except ValueError as error:
+        raise term.error(str(error), "delay") from None
+    frames = torch.zeros(num_envs, steps[1] + 1, width, device=device)
+    return Delay(steps, config.redraw, term.stream, frames) if steps[1] else None

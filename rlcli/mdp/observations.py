@@ -186,9 +186,14 @@ def last_action(env: ManagedEnv) -> Tensor:
     return env.action_manager.action
 
 
-def generated_commands(env: ManagedEnv, *, command: Command) -> Tensor:
-    """Command of a term of `commands:`. (num_envs, k)"""
-    return command.command
+def generated_commands(env: ManagedEnv, *, command: Command, columns: list[int] | None = None) -> Tensor:
+    """Command of a term of `commands:`, or some of its columns. (num_envs, k)"""
+    value: Tensor = command.command
+    if columns is None:
+        return value
+    if not columns or not all(0 <= column < value.shape[1] for column in columns):
+        raise ValueError(f"columns is {columns}; give one or more of 0 to {value.shape[1] - 1}, or leave it out")
+    return torch.stack([value[:, column] for column in columns], dim=1)
 
 
 def current_time_s(env: ManagedEnv) -> Tensor:

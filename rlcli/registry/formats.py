@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rlcli.errors import DependencyError, TaskError
+from rlcli.errors import DependencyError, TaskError, pip_install
 from rlcli.formats import FormatSpec
 from rlcli.registry.entries import FORMATS, OWN, Entry, catalog, find_entry
 from rlcli.registry.imports import load_entry, load_spec
@@ -80,7 +80,7 @@ class KnownFormat:
     def missing(self, what: str = "") -> DependencyError:
         """Return the error that the plugin is not installed. `what` names the file or import that needs the plugin."""
         message = f"the plugin that reads {self.summary} is not installed"
-        return DependencyError(f"{what}: {message}" if what else message, hint=f"pip install {self.install}")
+        return DependencyError(f"{what}: {message}" if what else message, hint=pip_install(self.install))
 
 
 def load_format(name: str) -> Format:

@@ -76,11 +76,29 @@ def _inside(folder: Path, file: str, what: str) -> Path:
     return folder / file
 
 
+def _menagerie_models(robot: str) -> list[Path]:
+    """Return the folders of a robot that the package mujoco-menagerie has downloaded, the newest first."""
+    if not robot or set(robot) & set("*?[]"):
+        return []
+    import platformdirs
+
+    own = os.environ.get("MENAGERIE_ROOT")
+    cache = Path(os.environ.get("MENAGERIE_CACHE_DIR") or platformdirs.user_cache_path("mujoco_menagerie", False))
+    marks = [mark for mark in (cache / "models").glob(f"{robot}-*/.complete") if mark.parent.name[:-17] == robot]
+    newest = sorted(marks, key=lambda mark: mark.stat().st_mtime, reverse=True)
+    return [*([Path(own) / robot] if own else []), *(mark.parent for mark in newest)]
+
+
 def _file_of_user_models(file: str) -> Path:
-    """Return a file from one of the folders of RLCLI_MODELS."""
+    """Return a file from one of the folders of RLCLI_MODELS, else from the cache of the package mujoco-menagerie."""
     folders = [Path(folder).expanduser() for folder in os.environ.get(MODELS, "").split(os.pathsep) if folder]
     for folder in folders:
         found = _inside(folder, file, f"the folder {folder} of {MODELS}")
+        if found.is_file():
+            return found
+    robot, _, inner = file.partition("/")
+    for folder in _menagerie_models(robot):
+        found = _inside(folder, inner, f"the folder {folder}")
         if found.is_file():
             return found
     reason = f"no file '{file}' in {listing(map(str, folders))} of {MODELS}" if folders else f"{MODELS} is not set"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -22,7 +23,7 @@ from rlcli.config.layers import leaves
 from rlcli.config.messages import dotted
 from rlcli.errors import CheckpointError
 from rlcli.runs.metric_rows import is_number, read_rows
-from rlcli.runs.run import Run
+from rlcli.runs.run import STUDY, Run
 from rlcli.safe_text import shorten
 
 Array = NDArray[np.float64]
@@ -33,9 +34,13 @@ AXES = {"steps": "environment steps", "iterations": "iterations", "time": "train
 RESAMPLES = 2000
 _LEVEL = 95.0
 _TRIM = 0.25
+FEWEST_FOR_IQM = 4
+"""With fewer runs nothing is cut off, and the interquartile mean is the mean."""
 _MAX_POINTS = 1000
 """Most points of a curve over several runs."""
 _MAX_METRICS = 1000
+_NAMED = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-((?!\d+$).+)")
+"""Name of the folder of a run with a `--name`."""
 _MAX_DIFFERENCES = 3
 """Most settings in a label."""
 
@@ -250,14 +255,22 @@ def _labels(groups: Sequence[Curve]) -> list[str]:
     def differ(key: str, compared: Sequence[Curve]) -> bool:
         return len({json.dumps(group.settings.get(key, "-")) for group in compared}) > 1
 
+    chosen = [_chosen_name(group) for group in groups]
     names = []
-    for group in groups:
+    for group, own in zip(groups, chosen, strict=True):
+        if own and chosen.count(own) == 1:  # the user's names distinguish the runs
+            names.append(own)
+            continue
         parts = [str(group.settings[key]) for key in ("task", "agent") if differ(key, groups)]
         same_task = [g for g in groups if g.settings["task"] == group.settings["task"]]
         same_agent = [g for g in same_task if g.settings["agent"] == group.settings["agent"]]
         keys = dict.fromkeys(key for other in same_task for key in other.settings if key not in ("task", "agent"))
         differing = [key for key in keys if differ(key, same_agent if key.startswith("agents.") else same_task)]
-        parts += [f"{key}={_short(group.settings.get(key))}" for key in differing[:_MAX_DIFFERENCES]]
+        given = group.histories[0].run.record.get("given") or {}
+        differing.sort(key=lambda key: key not in given)  # first what the user has set for this run
+        parts += [
+            f"{_short_key(key, differing)}={_short(group.settings.get(key))}" for key in differing[:_MAX_DIFFERENCES]
+        ]
         if len(differing) > _MAX_DIFFERENCES:
             parts.append(f"and {len(differing) - _MAX_DIFFERENCES} more")
         names.append(", ".join(parts))
@@ -269,6 +282,20 @@ def _labels(groups: Sequence[Curve]) -> list[str]:
         folder = f" ({group.histories[-1].run.folder.name})" if names.count(name) > 1 else ""
         labels.append(name + folder + (f" ({count} seeds)" if count > 1 else ""))
     return labels
+
+
+def _chosen_name(group: Curve) -> str:
+    """Return the `--name` of a group's runs, with which their folders or those of their studies end; else ""."""
+    folders = (history.run.folder for history in group.histories)
+    homes = (folder.parent if (folder.parent / STUDY).is_file() else folder for folder in folders)
+    names = {match[1] if (match := _NAMED.fullmatch(home.name)) else "" for home in homes}
+    return names.pop() if len(names) == 1 else ""
+
+
+def _short_key(key: str, keys: Sequence[str]) -> str:
+    """Return the last two parts of a key, if they distinguish it from the other keys."""
+    end = ".".join(key.split(".")[-2:])
+    return end if sum(other == end or other.endswith(f".{end}") for other in keys) == 1 else key
 
 
 def _short(value: object) -> str:

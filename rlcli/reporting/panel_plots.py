@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rlcli.errors import DependencyError
+from rlcli.errors import DependencyError, pip_install
 from rlcli.reporting.panels import Item, Panel
 from rlcli.safe_text import UNSAFE, shorten
 
@@ -49,7 +49,7 @@ def check_drawing() -> None:
         DependencyError: if matplotlib is not installed.
     """
     if importlib.util.find_spec("matplotlib") is None:
-        raise DependencyError("matplotlib is not installed", hint='pip install "rlcli[plot]"')
+        raise DependencyError("matplotlib is not installed", hint=pip_install("rlcli[plot]"))
 
 
 def picture(panels: Sequence[Panel], x_label: str, kind: str, *, title: str = "", note: str = "") -> bytes:

@@ -19,7 +19,14 @@ from typing import Any
 from rlcli.config.layers import leaves
 from rlcli.config.load import Resolved
 from rlcli.config.messages import dotted
-from rlcli.config.schema import ObservationConfig, ObservationGroupConfig, TaskConfig, TermConfig, bound_text
+from rlcli.config.schema import (
+    DelayConfig,
+    ObservationConfig,
+    ObservationGroupConfig,
+    TaskConfig,
+    TermConfig,
+    bound_text,
+)
 from rlcli.config.term_signatures import SECTIONS, SELECTORS, SignatureError, Vocabulary, first_paragraph, read_params
 from rlcli.config.unimported_classes import ClassSearch
 from rlcli.registry import TaskSource
@@ -193,9 +200,15 @@ def _observation(
         noise_text(config.bias) if noisy else "",
         text_of(config.clip) if config.clip is not None else "",
         f"x {text_of(config.scale)}" if config.scale is not None else "",
-        f"{text_of(delay.steps)} steps" if delay is not None else "",
+        _delay(delay),
         f"{history} steps" if history > 1 else "",
     )
+
+
+def _delay(config: DelayConfig | None) -> str:
+    if config is None:
+        return ""
+    return f"{text_of(config.steps)} steps" if config.steps is not None else f"{text_of(config.seconds)} s"
 
 
 def _actions(task: TaskConfig, vocabulary: Vocabulary, layout: Mapping[str, Any]) -> Table:
@@ -207,10 +220,12 @@ def _actions(task: TaskConfig, vocabulary: Vocabulary, layout: Mapping[str, Any]
         meaning, unit = _meaning("actions", config, vocabulary)
         term = layouts.get(name, {})
         parameters = _parameters("actions", config, vocabulary)
-        rows.append((name, meaning, term.get("unit") or unit, parameters, *_compiled_action(term)))
+        rows.append(
+            (name, meaning, term.get("unit") or unit, parameters, *_compiled_action(term), _delay(config.delay))
+        )
     if not task.actions:
-        rows = [(name, "", term.get("unit", ""), "", *_compiled_action(term)) for name, term in layouts.items()]
-    columns = _columns("Term", "What", "Unit", "Parameters", "Size", "Drives", "Limits")
+        rows = [(name, "", term.get("unit", ""), "", *_compiled_action(term), "") for name, term in layouts.items()]
+    columns = _columns("Term", "What", "Unit", "Parameters", "Size", "Drives", "Limits", "Delay")
     return Table("Actions", "", columns, tuple(rows))
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import MachineError
 from rlcli.machine import python_command
+from rlcli.progress import track
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -160,8 +161,10 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # else the launcher warns; torch_threads sets the threads
     logging.getLogger("torch.distributed").setLevel(logging.CRITICAL)  # each process prints its own error already
     options = ["--standalone", f"--nproc-per-node={processes}"]
+    command = run.parse_args([*options, "--no-python", *python_command("-m", "rlcli", *arguments)])  # type: ignore[no-untyped-call]  # torch has no type here
     try:
-        run.run(run.parse_args([*options, "--no-python", *python_command("-m", "rlcli", *arguments)]))  # type: ignore[no-untyped-call]  # torch has no type here
+        with track("processes", has_own_view=True):
+            run.run(command)  # type: ignore[no-untyped-call]
     except ChildFailedError as error:
         return _exit_code([failure.exitcode for failure in error.failures.values()])
     except SignalException as error:

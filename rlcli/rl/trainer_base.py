@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.environment import Environment
-from rlcli.errors import ConfigError, DependencyError
+from rlcli.errors import ConfigError, DependencyError, pip_install
 from rlcli.rl.policy import Policy, PolicySpec
 from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.trainer import Report
@@ -104,4 +104,4 @@ def require_library(trainer: str, needed: str, at_least: tuple[int, int], below:
         fits, found = False, f"{distribution} is not"
     if not fits:
         message = f"trainer '{trainer}' needs {needed}, and {found} installed"
-        raise DependencyError(message, hint=f"pip install '{needed}'")
+        raise DependencyError(message, hint=pip_install(needed))

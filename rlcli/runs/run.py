@@ -186,6 +186,15 @@ def run_folders(runs_dir: Path) -> Iterator[Path]:
                 yield folder
 
 
+def runs_below(folder: Path, depth: int = 3) -> Iterator[Path]:
+    """Yield the runs in a folder of runs, of a task or of a study."""
+    for below in _subfolders(folder):
+        if (below / RECORD).is_file():
+            yield below
+        elif depth > 1:
+            yield from runs_below(below, depth - 1)
+
+
 def _subfolders(folder: Path) -> list[Path]:
     try:
         with os.scandir(folder) as entries:

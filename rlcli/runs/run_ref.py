@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import logging
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from rlcli.errors import CheckpointError, UsageError, did_you_mean, listing
-from rlcli.runs.run import RECORD, STUDY, Run, open_run, run_folders
+from rlcli.runs.run import RECORD, STUDY, Run, open_run, run_folders, runs_below
 from rlcli.settings import setting
 
 _log = logging.getLogger(__name__)
@@ -54,24 +56,28 @@ def find_runs(references: list[str], runs_dir: Path) -> list[Run]:
 
 def _runs_of_task(reference: str, runs_dir: Path) -> list[Run]:
     """Return the runs of a task or of a folder of runs; an empty list if the reference names one run."""
-    folder = Path(reference)
-    if (folder / RECORD).is_file() or reference == "latest":
+    if (Path(reference) / RECORD).is_file() or reference == "latest":
         return []
     found = list_runs(runs_dir, reference.rpartition(":")[2])
-    if not found and folder.is_dir():
-        there = list_runs(folder.resolve().parent, None)
-        found = [run for run in there if run.folder.parent.samefile(folder)]
+    studies = [] if os.sep in reference else sorted(runs_dir.glob(f"*/{glob.escape(reference)}"))
+    for folder in (Path(reference), runs_dir / reference, *studies):
+        if not found and os.path.isdir(folder) and not (folder / RECORD).is_file():
+            found = _opened(runs_below(folder))
     return found
 
 
 def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
     """Return the runs under a folder, the oldest first; other folders and broken runs are skipped."""
+    runs = _opened(run_folders(runs_dir))
+    return runs if task is None else [run for run in runs if run.record["task"]["name"] == task]
+
+
+def _opened(folders: Iterable[Path]) -> list[Run]:
+    """Return the runs in some folders, the oldest first."""
     runs = []
-    for folder in run_folders(runs_dir):
+    for folder in folders:
         with contextlib.suppress(CheckpointError):
             runs.append(open_run(folder))
-    if task is not None:
-        runs = [run for run in runs if run.record["task"]["name"] == task]
     return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from typing import Any, Protocol
 
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rlcli.config.schema import SimConfig
-from rlcli.errors import ConfigError, DependencyError, Problem
-from rlcli.machine import require_device
+from rlcli.errors import ConfigError, DependencyError, Problem, pip_install
+from rlcli.machine import native_stderr_discarded, require_device
 from rlcli.sim.divergence_report import HISTORY_MEMORY, Call, Divergence, StateHistory, StateLayout
 from rlcli.sim.selection import Field, Groups, Selection
 
@@ -230,9 +231,10 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
         return open_cpu_engine(model, num_envs, config)
     require_device(device)
     try:
-        from rlcli.sim.warp import WarpEngine
+        with native_stderr_discarded() if device == "cpu" else contextlib.nullcontext():
+            from rlcli.sim.warp import WarpEngine  # without a GPU, Warp's libraries warn that there is no driver
     except ImportError as error:
-        raise DependencyError(f"the GPU engine needs mujoco-warp: {error}", hint='pip install "rlcli[gpu]"') from None
+        raise DependencyError(f"the GPU engine needs mujoco-warp: {error}", hint=pip_install("rlcli[gpu]")) from None
     return WarpEngine(model, num_envs, config, device)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 
 from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
+from rlcli.progress import tracked
 from rlcli.testing import episode_checks, portability_checks, step_and_file_checks
 from rlcli.testing.findings import Finding, NotRunError, error_text
 from rlcli.testing.task_under_test import TaskUnderTest, open_task
@@ -59,6 +60,7 @@ def check_task(
     *,
     agent: str | None = None,
     overrides: Sequence[str] = (),
+    config: Path | None = None,
     only: Sequence[str] = (),
     on_check: OnCheck = lambda name, findings: None,
     on_note: OnNote = lambda name, text: None,
@@ -69,6 +71,7 @@ def check_task(
         task: a name from `list-tasks`, or a folder with a `task.yaml`.
         agent: the agent whose changes to the task and action bound are used; None: the default agent.
         overrides: `key.path=value`, as on the command line.
+        config: a further configuration file, as that of `--config`.
         only: names of checks to run; all if empty.
         on_check: called after each check with its name and findings; with None for a check that was not run.
         on_note: called after a check with its name and a note: why it was not run, or what it measured.
@@ -83,7 +86,7 @@ def check_task(
     """
     for name in only:
         require_known(name, list(CHECKS), "check", "checks")
-    subject = open_task(task, agent, overrides)
+    subject = open_task(task, agent, overrides, config)
     selected = [n for n in CHECKS if (not only or n in only) and (subject.is_direct or n not in _DIRECT_ONLY)]
     found: list[Finding] = []
     with torch.random.fork_rng(devices=[]):
@@ -92,7 +95,7 @@ def check_task(
             for name in dict.fromkeys((*(f.check for f in broken), *selected)):
                 on_check(name, [f for f in broken if f.check == name] or None)
             return broken
-        for name in selected:
+        for name in tracked(selected, "checks", len(selected)):
             try:
                 findings = list(_run(name, subject, found))
             except NotRunError as reason:
@@ -106,7 +109,9 @@ def check_task(
     return found
 
 
-def record_layout(task: str | Path, *, agent: str | None = None, overrides: Sequence[str] = ()) -> Path:
+def record_layout(
+    task: str | Path, *, agent: str | None = None, overrides: Sequence[str] = (), config: Path | None = None
+) -> Path:
     """Record the columns of a task's observations and actions beside its configuration, for the check `layout`.
 
     Returns:
@@ -116,7 +121,7 @@ def record_layout(task: str | Path, *, agent: str | None = None, overrides: Sequ
         ConfigError: if the task is not valid.
         TaskError: if there is no such task, or it cannot be imported.
     """
-    subject = open_task(task, agent, overrides)
+    subject = open_task(task, agent, overrides, config)
     record, file = subject.env().layout.record(), portability_checks.layout_file(subject)
     columns = {part: record[part] for part in ("observations", "actions")}
     file.write_text(json.dumps(columns, indent=1) + "\n", encoding="utf-8")

@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 
 from rlcli.errors import ConfigError, MachineError, UsageError, require_known
+from rlcli.progress import tracked
 from rlcli.testing.findings import error_text
 from rlcli.testing.fixed_policy_rollouts import RolloutEvidence
 from rlcli.testing.lint_rules import RULES, Remark
@@ -29,6 +30,7 @@ def lint_task(
     *,
     agent: str | None = None,
     overrides: Sequence[str] = (),
+    config: Path | None = None,
     seconds: float | None = None,
     only: Sequence[str] = (),
     ignore: Sequence[str] = (),
@@ -40,6 +42,7 @@ def lint_task(
         task: a name from `list-tasks`, or a folder with a `task.yaml`.
         agent: the agent whose changes to the task, action bound and discount are used; None: the default agent.
         overrides: `key.path=value`, as on the command line.
+        config: a further configuration file, as that of `--config`.
         seconds: simulated time of each rollout [s]; None: one episode, but at most 1000 steps.
         only: names of rules; all if empty.
         ignore: names of rules that are left out.
@@ -57,10 +60,10 @@ def lint_task(
         require_known(name, list(RULES), "rule", "rules")
     if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
         raise UsageError(f"--seconds {seconds:g} is not a duration", hint="give simulated seconds, above 0")
-    evidence = RolloutEvidence(open_task(task, agent, overrides), seconds)
+    evidence = RolloutEvidence(open_task(task, agent, overrides, config), seconds)
     found: list[Remark] = []
     with torch.random.fork_rng(devices=[]):
-        for name in RULES:
+        for name in tracked(RULES, "rules", len(RULES)):
             if (only and name not in only) or name in ignore:
                 continue
             remarks = list(_apply_rule(name, evidence))

@@ -20,7 +20,7 @@ from rlcli.envs.direct import DirectEnv, DirectTask
 from rlcli.envs.make import make_env
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import ConfigError, DeviceError, RlcliError
+from rlcli.errors import ConfigError, DeviceError, RlcliError, pip_install
 from rlcli.rl.rng import rng_state
 from rlcli.runs.bundle import open_bundle
 from rlcli.runs.restore import require_fit
@@ -300,7 +300,7 @@ def _warp_env(subject: TaskUnderTest) -> VecEnv:
     if subject.resolved.task.sim.engine == "batch":
         raise NotRunError("the task sets sim.engine: batch")
     if find_spec("mujoco_warp") is None:
-        raise NotRunError('MuJoCo Warp is not installed; pip install "rlcli[gpu]"')
+        raise NotRunError(f"MuJoCo Warp is not installed; {pip_install('rlcli[gpu]')}")
     try:
         return subject.env(episode_steps=EPISODE, flags={"scene.num_envs": FEW_WORLDS, "sim.engine": "warp"})
     except (ConfigError, DeviceError) as error:

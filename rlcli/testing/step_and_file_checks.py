@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -184,15 +185,35 @@ def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that every observation column varies between environments or steps; of a picture, at least one pixel."""
     recording = subject.recording()
     for group in recording.env.layout.observations:
+        fixed = _fixed_command_columns(recording.env, group)
         obs = torch.stack([obs[group] for obs in recording.obs])
         for where, columns in observation_parts(recording.env, group):
             values = obs[:, :, columns]
-            if bool((values == values[0, 0]).all()):
+            if bool((values == values[0, 0]).all()) and where not in fixed:
                 value = f"is {float(values[0, 0]):g}" if values.shape[2] == 1 else "is the same"
                 message = f"{value} in {NUM_ENVS} environments and {len(obs)} observations"
                 yield error_at(
                     where, message, "compute the column from the state, or leave it out: a policy cannot learn from it"
                 )
+
+
+def _fixed_command_columns(env: VecEnv, group: str) -> set[str]:
+    """Return the columns of a group that show a command which the task itself keeps fixed: a range [x, x]."""
+    found: set[str] = set()
+    if not isinstance(env, ManagedEnv):
+        return found
+    parts = iter(observation_parts(env, group))
+    for pipeline in env.observation_manager.pipelines(group):
+        config = pipeline.term.config
+        names = [name for name, _ in itertools.islice(parts, pipeline.size if len(pipeline.shape) == 1 else 1)]
+        if config.func != "generated_commands":
+            continue
+        command = env.command_manager.get_term(config.params["command"])
+        limits = list(getattr(command, "limits", ()))
+        columns = config.params.get("columns") or range(command.command.shape[1])
+        is_fixed = [column < len(limits) and limits[column][0] == limits[column][1] for column in columns]
+        found |= {name for name, fixed in zip(names, is_fixed * pipeline.history, strict=True) if fixed}
+    return found
 
 
 def aliasing(subject: TaskUnderTest) -> Iterator[Finding]:

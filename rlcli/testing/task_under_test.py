@@ -24,12 +24,14 @@ NUM_ENVS = 8
 class TaskUnderTest:
     """Task as in training, but with few environments and one engine thread."""
 
-    def __init__(self, source: TaskSource, agent: str | None = None, overrides: Sequence[str] = ()) -> None:
+    def __init__(
+        self, source: TaskSource, agent: str | None = None, overrides: Sequence[str] = (), config: Path | None = None
+    ) -> None:
         self.source = source
-        self._agent, self._overrides = agent, tuple(overrides)
+        self._agent, self._overrides, self._config = agent, tuple(overrides), config
         # the configuration must be valid without our flags, and for playing
-        resolve(source, agent=agent, overrides=overrides)
-        resolve(source, agent=agent, overrides=overrides, play=True)
+        resolve(source, agent=agent, config_file=config, overrides=overrides)
+        resolve(source, agent=agent, config_file=config, overrides=overrides, play=True)
         self.resolved = self._resolve({})
         self.notes: dict[str, str] = {}
         """Check -> further text that is printed with its result."""
@@ -82,18 +84,23 @@ class TaskUnderTest:
                 overrides = self._overrides
                 if name != self.resolved.agent_name:  # `agent.` overrides are for the selected agent
                     overrides = tuple(override for override in overrides if not override.startswith("agent."))
-                agents[name] = resolve(self.source, agent=name, overrides=overrides)
+                agents[name] = resolve(self.source, agent=name, config_file=self._config, overrides=overrides)
         return agents
 
     def _resolve(self, flags: dict[str, Any]) -> Resolved:
         small = {"scene.num_envs": NUM_ENVS, "sim.engine_threads": 1}
-        return resolve(self.source, agent=self._agent, overrides=self._overrides, flags={**small, **flags})
+        values = {**small, **flags}
+        return resolve(
+            self.source, agent=self._agent, config_file=self._config, overrides=self._overrides, flags=values
+        )
 
 
-def open_task(task: str | Path, agent: str | None, overrides: Sequence[str]) -> TaskUnderTest:
+def open_task(
+    task: str | Path, agent: str | None, overrides: Sequence[str], config: Path | None = None
+) -> TaskUnderTest:
     """Open a task by its name, or by the path of its folder."""
     name = str(task.resolve()) if isinstance(task, Path) else task
-    return TaskUnderTest(find_task(name), agent, overrides)
+    return TaskUnderTest(find_task(name), agent, overrides, config)
 
 
 def expire_episodes(env: VecEnv, rows: list[int]) -> None:

@@ -189,6 +189,7 @@ def resume_run(request: TrainingRequest) -> Job | TrainingResult:
     if run.record.get("state") == "finished" and not request.budget and folder is not None:
         _log.info("%s (%s) is finished; --max-iterations N continues it", run.folder, why)
         return TrainingResult(run.folder, folder, open_checkpoint(folder).step)
+    _require_larger_budget(request, run, folder)
     resolved = resolve_run(run, play=False, flags=request.budget, named=request.source)
     _require_parallel(resolved)
     loggers = check_loggers(request.loggers or run.record.get("loggers") or ["none"])
@@ -353,6 +354,29 @@ def _find_checkpoint(request: TrainingRequest) -> tuple[Run, Path | None, str]:
         if run is None or not run.checkpoints.is_dir() or steps(run.checkpoints) or "step" in run.record:
             raise
         return run, None, why
+
+
+def _require_larger_budget(request: TrainingRequest, run: Run, folder: Path | None) -> None:
+    """Check that a new budget, which counts from the start of the training, leaves something to train.
+
+    Raises:
+        UsageError: with the progress of the checkpoint.
+    """
+    from rlcli.runs.checkpoint_reader import open_checkpoint
+
+    if folder is None:
+        return
+    saved = open_checkpoint(folder)
+    done = {"iterations": saved.iteration, "steps": saved.step}
+    for unit, number in done.items():
+        wanted = request.budget.get(f"agent.max_{unit}")
+        if wanted is not None and wanted <= number:
+            message = (
+                f"{run.folder} has {number:,} {unit}, and --max-{unit} counts from its start: {wanted:,} end before"
+            )
+            raise UsageError(
+                message, hint=f"give more than {number}, or leave out --max-{unit} to keep the run's budget"
+            )
 
 
 def _overrides_in(given: object) -> Any:

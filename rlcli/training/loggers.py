@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlcli.errors import DependencyError, require_known
+from rlcli.errors import DependencyError, pip_install, require_known
 from rlcli.registry import load_object
 from rlcli.runs.atomic_io import disk_errors, write_atomic
 from rlcli.runs.metric_rows import LONGEST_LINE, parse_row
@@ -109,7 +109,7 @@ def check_loggers(names: Sequence[str] | None) -> list[str]:
     for name in wanted:
         require_known(name, [*LOGGERS, "none"], "logger", "loggers")
         if not _installed(name):
-            raise DependencyError(f"{LOGGERS[name].title} is not installed", hint=f'pip install "rlcli[{name}]"')
+            raise DependencyError(f"{LOGGERS[name].title} is not installed", hint=pip_install(f"rlcli[{name}]"))
     return wanted
 
 

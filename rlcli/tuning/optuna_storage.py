@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
-from rlcli.errors import CheckpointError, DependencyError, MachineError, UsageError
+from rlcli.errors import CheckpointError, DependencyError, MachineError, UsageError, pip_install
 from rlcli.runs.atomic_io import disk_errors
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def check_optuna() -> None:
         DependencyError: with the line that installs it.
     """
     if importlib.util.find_spec("optuna") is None:
-        raise DependencyError("a sweep needs Optuna", hint='pip install "rlcli[sweep]"')
+        raise DependencyError("a sweep needs Optuna", hint=pip_install("rlcli[sweep]"))
 
 
 def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *, create: bool) -> optuna.Study:
@@ -154,7 +154,7 @@ def _database(url: str) -> optuna.storages.BaseStorage:
         import sqlalchemy
         from optuna.storages import RDBStorage
     except ImportError:
-        raise DependencyError("a shared storage needs SQLAlchemy", hint='pip install "rlcli[sweep]"') from None
+        raise DependencyError("a shared storage needs SQLAlchemy", hint=pip_install("rlcli[sweep]")) from None
     try:
         no_pool = {"poolclass": sqlalchemy.pool.NullPool}  # connections time out during a trial
         for _ in range(_ATTEMPTS):

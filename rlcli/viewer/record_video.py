@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
+from rlcli.progress import tracked
 from rlcli.rl.acting import PATIENCE
 from rlcli.viewer.offscreen import Renderer
 from rlcli.viewer.video_writer import VideoWriter
@@ -37,7 +38,7 @@ def record_episode(
     steps = PATIENCE * env.max_episode_length if longest_s is None else max(1, round(longest_s / env.step_dt))
     with Renderer(env.engine.model, env.config.viewer) as renderer, VideoWriter(file, stride * env.step_dt) as writer:
         obs = env.reset(seed=env.seed)["policy"]
-        for number in range(steps):
+        for number in tracked(range(steps), "steps", min(steps, env.max_episode_length)):
             if number % stride == 0:
                 writer.add(renderer.picture(env))
             with torch.no_grad():

@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlcli.errors import DependencyError, MachineError, UsageError
+from rlcli.errors import DependencyError, MachineError, UsageError, pip_install
 from rlcli.runs.atomic_io import disk_errors
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def check_video(file: Path) -> None:
         raise UsageError(f"'{file}' is not a video file", hint=f"give FILE{' or FILE'.join(FORMATS)}")
     needed = ["imageio"] if file.suffix == ".gif" else ["imageio", "imageio_ffmpeg"]
     if any(importlib.util.find_spec(name) is None for name in needed):
-        raise DependencyError("imageio is not installed", hint='pip install "rlcli[video]"')
+        raise DependencyError("imageio is not installed", hint=pip_install("rlcli[video]"))
     if file.suffix == ".mp4":
         _require_ffmpeg()
 

@@ -4,7 +4,7 @@ import pytest
 from support.small_task import TASK
 
 from rlcli.config.load import check_all, resolve
-from rlcli.errors import ConfigError, DependencyError
+from rlcli.errors import ConfigError, DependencyError, pip_install
 
 TYPOS = [
     ("decimatoin=2", "decimatoin: unknown key 'decimatoin'", "did you mean 'decimation'?"),
@@ -145,7 +145,7 @@ def test_missing_trainer_plugin_gives_pip_command(task, monkeypatch):
     with pytest.raises(DependencyError) as caught:
         resolve(source, agent="two")
     assert "23:9" in caught.value.message
-    assert caught.value.hint == "pip install rlcli-rsl-rl"
+    assert caught.value.hint == pip_install("rlcli-rsl-rl")
     with pytest.raises(ConfigError, match="decimation"):
         resolve(source, agent="two", overrides=["decimation=0"])
 

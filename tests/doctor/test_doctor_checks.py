@@ -16,6 +16,7 @@ from rlcli.doctor.compute_and_graphics import (
 from rlcli.doctor.installation import installation_checks, violates_bounds
 from rlcli.doctor.machine import machine_checks, memory_check
 from rlcli.doctor.settings import harmful_variables, settings_checks
+from rlcli.errors import pip_install
 from rlcli.machine import memory_limit
 from rlcli.settings import settings_file
 
@@ -87,8 +88,8 @@ def test_states_of_extras(package):
     found = by_name(installation_checks())
     assert {name for name in found if name.startswith("extra ")} == {"extra one", "extra two", "extra three"}
     assert (found["extra one"].state, found["extra one"].hint) == ("ok", None)
-    assert (found["extra two"].state, found["extra two"].hint) == ("absent", 'pip install "rlcli[two]"')
-    assert (found["extra three"].state, found["extra three"].hint) == ("warning", 'pip install "rlcli[three]"')
+    assert (found["extra two"].state, found["extra two"].hint) == ("absent", pip_install("rlcli[two]"))
+    assert (found["extra three"].state, found["extra three"].hint) == ("warning", pip_install("rlcli[three]"))
     assert "missing: no-such-package" in found["extra three"].found
 
 
@@ -204,7 +205,7 @@ WARP = {"version": "1.19.0", "devices": ["H200"], "error": ""}
             "cannot compute on it: no kernel image",
             "built for this GPU",
         ),
-        ({"warp": None}, "warning", "warp-lang is not installed", 'pip install "rlcli[gpu]"'),
+        ({"warp": None}, "warning", "warp-lang is not installed", pip_install("rlcli[gpu]")),
         ({"warp": {**WARP, "devices": []}}, "warning", "Warp 1.19.0 finds no GPU", "warp-lang"),
         ({"warp": {**WARP, "error": "E: x"}}, "warning", "finds no GPU: E: x", "warp-lang"),
     ],

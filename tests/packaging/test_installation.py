@@ -19,7 +19,7 @@ from packaging.requirements import Requirement
 from support.fenced import REPOSITORY
 from test_wheels import build
 
-VERSIONS = ("3.11", "3.12", "3.13")
+VERSIONS = ("system", "3.11", "3.12", "3.13")
 PLUGINS = ("rlcli-example-acrobot", "rlcli-gymnasium", "rlcli-menagerie")
 TORCH = {"torch", "stable-baselines3"}
 """Packages that cannot be installed without torch."""
@@ -28,6 +28,11 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
 def interpreter(version):
     """Return a Python interpreter of this version that can create environments; skip the test without one."""
+    if version == "system":
+        asked = ["/usr/bin/python3", "-c", "import ensurepip, sys; assert sys.version_info >= (3, 11)"]
+        if not Path(asked[0]).exists() or subprocess.run(asked, capture_output=True).returncode:
+            pytest.skip("/usr/bin/python3 is older than 3.11, or cannot create environments")
+        return Path(asked[0])
     found = shutil.which(f"python{version}")
     versions = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     places = [Path(found)] if found else []
@@ -91,7 +96,7 @@ def installed(request, wheels, tmp_path_factory):
         place.run(*pip, *(str(wanted) for wanted in required(wheels[0]) if wanted.name not in TORCH))
         place.run(*pip, "--no-deps", *wheels)
     else:
-        place.run(*pip, *wheels)
+        place.run(*pip, "--find-links", wheels[0].parent, *PLUGINS)  # rlcli comes with them
     yield place
     shutil.rmtree(folder)  # gigabytes
 
@@ -143,7 +148,8 @@ def test_train_play_and_eval_work(installed):
     done = installed.rlcli("train", "cartpole", "--seeds", "0..1", *small, "--json")
     assert [run["state"] for run in json.loads(done.stdout)["runs"]] == ["finished"] * 2
     lacking = installed.rlcli("sweep", "cartpole", "--param", "agent.gamma=0.9:0.99", code=7)
-    assert 'pip install "rlcli[sweep]"' in lacking.stderr
+    pins = installed.run("-c", "import rlcli; print(rlcli.__path__[0])").stdout.strip() + "/constraints.txt"
+    assert f'pip install -c {pins} "rlcli[sweep]"' in lacking.stderr
 
 
 def test_simulation_runs(installed):

@@ -98,6 +98,8 @@ def test_rlcli_wheel_has_task_files_and_no_tests(wheels):
         files = {f.relative_to(root).as_posix() for f in (root / package).rglob("*") if f.is_file()}
         assert {f for f in files if "__pycache__" not in f} <= inside
     assert {"rlcli_tasks/index.json", "rlcli_tasks/cartpole/task.yaml", "rlcli_tasks/cartpole/cartpole.xml"} <= inside
+    with zipfile.ZipFile(wheels[0]) as archive:
+        assert archive.read("rlcli/constraints.txt") == (REPOSITORY / "constraints.txt").read_bytes()
     assert {name.split("/")[0] for name in inside} == {"rlcli", "rlcli_tasks", f"rlcli-{rlcli.__version__}.dist-info"}
 
 

@@ -8,6 +8,8 @@ import textwrap
 
 import pytest
 
+from rlcli.errors import pip_install
+
 END = "exit code:"
 HIDDEN = ("rlcli-oige", "rlcli-isaaclab")
 CORE = f"""
@@ -94,14 +96,14 @@ def test_task_of_missing_format_gives_pip_command(refused, command):
     error = json.loads(out)["error"]
     assert code == 7
     assert "is not installed" in error["message"]
-    assert error["hint"] == f"pip install {TARGETS[command[1]]}"
+    assert error["hint"] == pip_install(TARGETS[command[1]])
 
 
 def test_missing_importer_gives_pip_command(tmp_path):
     importing = ("import", "isaaclab", "env.yaml", "--model", "robot=robot.xml", "--json")
     (code, out), (_, text) = core(tmp_path, importing, ("import", "--help"))
     assert code == 7
-    assert "pip install rlcli-isaaclab" in out
+    assert pip_install("rlcli-isaaclab") in out
     assert "isaaclab" not in text
 
 

@@ -128,8 +128,8 @@ def test_runs_with_different_seeds_are_one_curve(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"overrides": ["rewards.cart_vel.weight=-0.5"]}, "rewards.cart_vel.weight=-0.5"),
-        ({"overrides": ["agent.gamma=0.5"]}, "agents.sb3-ppo.gamma=0.5"),
+        ({"overrides": ["rewards.cart_vel.weight=-0.5"]}, "cart_vel.weight=-0.5"),
+        ({"overrides": ["agent.gamma=0.5"]}, "sb3-ppo.gamma=0.5"),
         ({"agent": "sac"}, "sac"),
         ({"task": "cartpole-direct"}, "cartpole-direct"),
         ({"sources": {"task.py": "changed"}}, "source of task.py=changed"),

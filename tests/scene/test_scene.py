@@ -11,7 +11,8 @@ import pytest
 import torch
 from support.worlds import CRITTER, PENDULUM, PENDULUM_TASK, build, edited, write
 
-from rlcli.errors import ConfigError, TaskError
+from rlcli.errors import ConfigError, MissingModelError, TaskError
+from rlcli.registry.models import model_file
 
 ARM = """
 <mujoco model="arm">
@@ -438,3 +439,25 @@ def test_model_outside_packages_is_refused(tmp_path, reference, expected):
     with pytest.raises(ConfigError) as refused:
         model_of(tmp_path, robot={"model": reference})
     assert expected in str(refused.value)
+
+
+def test_models_in_the_cache_of_mujoco_menagerie(tmp_path, monkeypatch):
+    monkeypatch.delenv("RLCLI_MODELS", raising=False)
+    monkeypatch.delenv("MENAGERIE_ROOT", raising=False)
+    monkeypatch.setenv("MENAGERIE_CACHE_DIR", str(tmp_path))
+    for name, complete in (
+        ("arm-0123456789abcdef", True),
+        ("arm-fedcba9876543210", False),
+        ("arm-2-0123456789abcdef", True),
+    ):
+        folder = tmp_path / "models" / name
+        folder.mkdir(parents=True)
+        (folder / "arm.xml").write_text("<mujoco/>")
+        if complete:
+            (folder / ".complete").write_text("{}")
+    assert model_file(tmp_path, "models:arm/arm.xml") == tmp_path / "models" / "arm-0123456789abcdef" / "arm.xml"
+    for missing in ("models:arm/other.xml", "models:ar/arm.xml", "models:*/arm.xml"):
+        with pytest.raises(MissingModelError):
+            model_file(tmp_path, missing)
+    with pytest.raises(TaskError, match="outside"):
+        model_file(tmp_path, "models:arm/../../x.xml")

@@ -49,7 +49,7 @@ def test_missing_warp_raises_dependency_error_with_pip_line(tmp_path):
     done = python(WITHOUT + RUN.format(arguments=[*SMALL, "sim.engine=warp"]), tmp_path)
     code, loaded = json.loads(done.stdout.splitlines()[-1])
     assert code == 7, done.stderr
-    assert 'pip install "rlcli[gpu]"' in done.stderr
+    assert '"rlcli[gpu]"' in done.stderr
     assert "mujoco-warp" in done.stderr
     assert "Traceback" not in done.stderr
     assert "mujoco_warp" not in loaded

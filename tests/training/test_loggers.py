@@ -78,7 +78,7 @@ def test_check_loggers_accepts_installed_names(monkeypatch):
     assert check_loggers(None) == []
     with pytest.raises(DependencyError) as missing:
         check_loggers(["tensorboard"])
-    assert 'pip install "rlcli[tensorboard]"' in missing.value.hint
+    assert '"rlcli[tensorboard]"' in missing.value.hint
 
 
 def test_metrics_file_that_cannot_be_opened_is_a_machine_error(tmp_path):

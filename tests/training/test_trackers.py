@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from rlcli.cli.app import main
-from rlcli.errors import DependencyError
+from rlcli.errors import DependencyError, pip_install
 from rlcli.training import loggers
 from rlcli.training.loggers import LOGGERS, LoggerKind, check_loggers, read_metrics
 from rlcli.training.trackers import BackgroundTracker
@@ -203,7 +203,7 @@ def test_missing_logger_error_names_its_extra(name, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(DependencyError) as missing:
         check_loggers([name])
-    assert missing.value.hint == f'pip install "rlcli[{name}]"'
+    assert missing.value.hint == pip_install(f"rlcli[{name}]")
 
 
 def test_check_loggers_removes_duplicates_and_none(monkeypatch):

@@ -12,7 +12,7 @@ import pytest
 from rlcli.config.load import resolve
 from rlcli.config.schema import ViewerConfig
 from rlcli.envs.make import make_env
-from rlcli.errors import ConfigError, DependencyError, MachineError, UsageError
+from rlcli.errors import ConfigError, DependencyError, MachineError, UsageError, pip_install
 from rlcli.registry import find_task
 from rlcli.sim.gl import open_context
 from rlcli.viewer.offscreen import Renderer, free_camera
@@ -213,7 +213,7 @@ def test_missing_imageio_names_pip_command(monkeypatch, tmp_path):
     monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n.startswith("imageio") else real(n, *a))
     with pytest.raises(DependencyError) as caught:
         check_video(tmp_path / "x.mp4")
-    assert caught.value.hint == 'pip install "rlcli[video]"'
+    assert caught.value.hint == pip_install("rlcli[video]")
 
 
 def test_check_video_imports_nothing_heavy():

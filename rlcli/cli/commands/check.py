@@ -9,7 +9,7 @@ import typer
 
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.findings import report_findings
-from rlcli.cli.ui.options import Agent, Overrides, TaskName
+from rlcli.cli.ui.options import Agent, ConfigFile, Overrides, TaskName
 
 if TYPE_CHECKING:
     from rlcli.testing import Finding
@@ -21,6 +21,7 @@ def command(
     only: Annotated[list[str] | None, typer.Option(metavar="CHECK")] = None,
     record: Annotated[bool, typer.Option("--record-layout")] = False,
     agent: Agent = None,
+    config: ConfigFile = None,
 ) -> None:
     """Check that a task keeps the contract of rlcli: shapes, seeds, resets, rewards, devices.
 
@@ -43,13 +44,14 @@ def command(
 
     torch.set_num_threads(1)
     if record:
-        console.info(f"recorded {record_layout(task, agent=agent, overrides=overrides or ())}")
+        console.info(f"recorded {record_layout(task, agent=agent, overrides=overrides or (), config=config)}")
     checks: list[tuple[str, list[Finding] | None]] = []
     notes: dict[str, str] = {}
     findings = check_task(
         task,
         agent=agent,
         overrides=overrides or (),
+        config=config,
         only=only or (),
         on_check=lambda name, found: checks.append((name, found)),
         on_note=notes.__setitem__,

@@ -40,7 +40,8 @@ def command(
     Options:
         compare: Compare several runs in the same episodes: eval --compare RUN1 RUN2. Further policies: shipped,
             lqr, zero, random. Limits apply to the first.
-        episodes: Number of episodes; the first ones of each environment count.
+        episodes: Number of episodes, by default in one environment each; else the first ones of each environment
+            count.
         fail_under: Exit with code 9 if a mean is below X. Keys: success, return, length, reward_terms.NAME,
             terminations.NAME, a value of the task (speed); KEY.low is the lower end of the interval; repeatable.
         fail_over: Exit with code 9 if a mean is above X. The same keys; KEY.high is the upper end; repeatable.
@@ -56,7 +57,9 @@ def command(
     from rlcli.evaluation.limits import failures, read_limits, require_success
 
     limits, words = read_limits(fail_under, fail_over), overrides or []
-    request = sessions.PolicyRequest(task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir)
+    request = sessions.PolicyRequest(
+        task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir, episodes
+    )
     if compare:
         given = {"--checkpoint": checkpoint, "--policy": policy if policy != "trained" else None, "--record": record}
         for option in [option for option, value in given.items() if value is not None]:

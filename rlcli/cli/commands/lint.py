@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rlcli.cli.ui.findings import report_findings
-from rlcli.cli.ui.options import Agent, Overrides, TaskName
+from rlcli.cli.ui.options import Agent, ConfigFile, Overrides, TaskName
 
 if TYPE_CHECKING:
     from rlcli.testing import Remark
@@ -24,6 +24,7 @@ def command(
     only: Annotated[list[str] | None, typer.Option(metavar="RULE")] = None,
     ignore: Annotated[list[str] | None, typer.Option(metavar="RULE")] = None,
     agent: Agent = None,
+    config: ConfigFile = None,
 ) -> None:
     """Find what makes a task hard to learn: run simple fixed policies, and check their episodes.
 
@@ -54,6 +55,7 @@ def command(
         task,
         agent=agent,
         overrides=overrides or (),
+        config=config,
         seconds=seconds,
         only=only or (),
         ignore=ignore or (),

@@ -44,6 +44,8 @@ def command(
     rows = [(entry, details.get(entry.qualified, Details())) for entry in entries]
     if rows or not pattern:
         _show(rows, shared)
+        if any(known.status == "?" for _, known in rows):
+            console.info("? is not known until a task has been loaded: rlcli list-tasks --probe")
     else:
         near = did_you_mean(pattern.lower(), by_name)
         console.info(f"no task's name or summary contains '{pattern}'; {near or 'rlcli list-tasks shows all'}")

@@ -9,17 +9,21 @@ import typer
 
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import choice
+from rlcli.errors import UsageError, listing
 
 
 def command(
     name: Annotated[str, typer.Argument()],
     flavour: Annotated[str, choice("FLAVOUR", "yaml", "direct")] = "yaml",
+    robot: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FOLDER")] = None,
 ) -> None:
     """Write the package of a new task with model, configuration, code and tests.
 
     Options:
         name: Name of the task in lowercase letters, digits and hyphens, such as my-arm.
+        robot: MJCF of a robot. The task tracks velocities with a floating base, reaches goals with a fixed one, and
+            balances any other robot; its numbers are in the YAML.
         flavour: yaml (lists of terms), or direct (one class with the hooks of the direct workflow).
         output: Folder to write. [default: a new folder named after the task]
 
@@ -28,11 +32,25 @@ def command(
             Write a package with a YAML task into the folder my-arm.
         rlcli new my-arm --flavour direct -o packages/my-arm
             Write a package with a task class into another folder.
+        rlcli new my-dog --robot robots/dog.xml
+            Write a package with a task for a robot.
     """
     from rlcli.scaffold import create
 
-    folder, files = create(name, flavour, output)
+    design = None
+    if robot is not None:
+        from rlcli.scaffold_robot import read_robot
+
+        if flavour != "yaml":
+            raise UsageError(f"--robot and --flavour {flavour} contradict each other", hint="leave out --flavour")
+        design = read_robot(robot, name)
+        for what, names in design.found.items():
+            console.info(f"{len(names)} {what}: {listing([each or '(unnamed)' for each in names])}")
+        console.info(f"task: {design.kind}")
+    folder, files = create(name, flavour, output, design)
     for file in files:
         console.data(str(folder / file))
     console.info(f"next: cd {folder} && pip install -e . && rlcli train {name}")
-    console.document("new", task=name, flavour=flavour, folder=str(folder), files=files)
+    console.document(
+        "new", task=name, flavour=flavour if design is None else design.kind, folder=str(folder), files=files
+    )

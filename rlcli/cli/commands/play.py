@@ -75,7 +75,9 @@ def command(
     if env is not None or episode is not None:
         check_choice(env, episode, num_envs, record_mode, held)
     words, min_envs = overrides or [], (env or 0) + 1
-    request = PolicyRequest(task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir, min_envs)
+    request = PolicyRequest(
+        task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir, None, min_envs
+    )
     session = open_session(request)
     file = _default_video(session) if str(video) == options.CHOOSE else video
 

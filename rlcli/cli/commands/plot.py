@@ -120,9 +120,12 @@ def _title(curves: list[Curve]) -> str:
 
 
 def _note(curves: list[Curve]) -> str:
+    from rlcli.reporting.curves import FEWEST_FOR_IQM
+
     if all(len(curve.histories) == 1 for curve in curves):
         return ""
-    few = "fewer than 4 seeds: mean; " if any(1 < len(curve.histories) < 4 for curve in curves) else ""
+    count = FEWEST_FOR_IQM
+    few = f"fewer than {count} seeds: mean; " if any(1 < len(curve.histories) < count for curve in curves) else ""
     return (
         f"Lines: interquartile mean of the seeds ({few}terminations: mean). Bands: 95 % stratified bootstrap "
         "interval (Agarwal et al. 2021)."

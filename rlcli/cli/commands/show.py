@@ -21,7 +21,7 @@ def command(
     num_envs: NumEnvs = None,
     config: ConfigFile = None,
 ) -> None:
-    """Print a task's resolved configuration.
+    """Print a task's resolved configuration, or the parts of it whose keys follow the task.
 
     Options:
         origin: Show the origin of each value: file and line, override, flag or default.
@@ -31,10 +31,10 @@ def command(
     Examples:
         rlcli show cartpole --origin
             Print all settings with their origin.
-        rlcli show cartpole sim.dt=0.005 --agent ppo
-            Print the settings with an override and another agent.
+        rlcli show cartpole rewards sim.dt sim.dt=0.005 --agent ppo
+            Print the rewards and one setting, with an override and another agent.
     """
-    from rlcli.config.dump import json_schema, origins, to_data, to_yaml, to_yaml_with_origins
+    from rlcli.config.dump import json_schema, origins, select, to_data, to_yaml, to_yaml_with_origins
     from rlcli.config.layers import flags
     from rlcli.config.load import extensions, resolve
     from rlcli.registry import find_task
@@ -45,14 +45,10 @@ def command(
         console.data(json_module.dumps(content, indent=2))
         console.document("show", schema_document=content)
         return
-    resolved = resolve(
-        source,
-        agent=agent,
-        play=play,
-        config_file=config,
-        overrides=overrides or (),
-        flags=flags(scene__num_envs=num_envs),
-    )
-    data = to_data(resolved)
-    console.data((to_yaml_with_origins(resolved) if origin else to_yaml(data)).rstrip("\n"))
-    console.document("show", config=data, **({"origins": origins(resolved)} if origin else {}))
+    words = overrides or []
+    changes, keys = [word for word in words if "=" in word], [word for word in words if "=" not in word]
+    values = flags(scene__num_envs=num_envs)
+    resolved = resolve(source, agent=agent, play=play, config_file=config, overrides=changes, flags=values)
+    data = select(to_data(resolved), keys)
+    console.data((to_yaml_with_origins(resolved, data) if origin else to_yaml(data)).rstrip("\n"))
+    console.document("show", config=data, **({"origins": origins(resolved, data)} if origin else {}))

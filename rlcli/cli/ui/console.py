@@ -40,6 +40,8 @@ class Console:
     """Whether the process was started for this command and ends with it."""
     has_document: bool = False
     """Whether the JSON document is printed; an error after that, such as Ctrl-C, prints no second one."""
+    has_line: bool = False
+    """Whether the last line of the terminal shows the progress of some work; other output overwrites this line."""
     out: Any = None
     """Stream of the JSON document; None is stdout."""
 
@@ -55,6 +57,14 @@ class Console:
                 yield
         finally:
             self.out = None
+
+    def clear_line(self) -> None:
+        """Remove the line with the progress, if there is one."""
+        if self.has_line and sys.stderr is not None:
+            self.has_line = False
+            with contextlib.suppress(OSError, ValueError):  # the terminal may be closed
+                sys.stderr.write("\r\x1b[K")
+                sys.stderr.flush()
 
     def data(self, text: str) -> None:
         """Print the result as text; with --json print nothing."""
@@ -174,6 +184,7 @@ def _write(stream: Any, text: str) -> None:
     if stream is None:  # the parent process closed it
         return
     text = plain(text)
+    console.clear_line()
     try:
         print(text, file=stream, flush=True)
     except OSError as error:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from rlcli import progress
 from rlcli.cli.ui.completion import agents, checkpoints, runs, tasks, words
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.help_text import HelpCommand, read_docstring
@@ -121,12 +122,17 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
 
     @functools.wraps(function)
     def run(*, model: list[str] | None = None, **values: Any) -> None:
+        from rlcli.cli.ui.progress_view import WorkView
+
         if model:
             from rlcli.config.given_models import MODELS, read_models
 
             words = [f'{MODELS}."{name}"="{file}"' for name, file in read_models(model).items()]
             values["overrides"] = [*(values["overrides"] or []), *words]
-        function(**{option: value for option, value in values.items() if option not in _COMMON})
+        progress.view = WorkView
+        given = {option: value for option, value in values.items() if option not in _COMMON}
+        with progress.track(f"rlcli {name}"):
+            function(**given)
 
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

@@ -1,9 +1,10 @@
-"""Views of running trainings: a live table on a terminal, else a line every few seconds."""
+"""Views of running work: a live block on a terminal, else a line every few seconds."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from typing import Any, Self
@@ -11,9 +12,14 @@ from typing import Any, Self
 from rlcli.cli.ui.console import console, plain
 from rlcli.cli.ui.tables import flow
 from rlcli.cli.ui.terminal import is_terminal, screen
+from rlcli.progress import Work, track
 from rlcli.training.progress import PARTS, Progress
 
 LINE_EVERY_S = 5.0
+_WORK_LINE_EVERY_S = 10.0
+_WORK_AFTER_S = 2.0
+"""Shorter work is not shown on a terminal [s]."""
+_REDRAW_EVERY_S = 0.25
 _MAX_ROWS = 100
 """Rows of one table; an untrusted run may have any number of metrics."""
 _MAX_S = 1e10
@@ -31,8 +37,11 @@ class LiveView:
     def __init__(self, **options: Any) -> None:
         self._options = options
         self._live: Any = None
+        self._own = track("", has_own_view=True)
 
     def __enter__(self) -> Self:
+        self._own.__enter__()
+        console.clear_line()
         if is_terminal(sys.stderr) and not console.quiet:
             from rich.live import Live
 
@@ -41,6 +50,7 @@ class LiveView:
         return self
 
     def __exit__(self, *error: Any) -> None:
+        self._own.__exit__(*error)
         if self._live is not None:
             with contextlib.suppress(OSError):  # the terminal may be closed
                 self._live.__exit__(*error)
@@ -50,6 +60,64 @@ class LiveView:
         from rich.text import Text
 
         self._live.update(Text("\n".join(lines)), refresh=refresh)
+
+
+class WorkView:
+    """View of `rlcli.progress`: what, how far, time left. A line on a terminal, else a new line every ten seconds."""
+
+    def __init__(self, running: list[Work]) -> None:
+        self._running = running
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._show, daemon=True)
+
+    def __enter__(self) -> Self:
+        if not console.quiet and not console.muted:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _show(self) -> None:
+        if not is_terminal(sys.stderr):
+            while not self._ended.wait(_WORK_LINE_EVERY_S):
+                self._print_line()
+        elif not self._ended.wait(_WORK_AFTER_S):
+            with contextlib.suppress(OSError, ValueError):  # the terminal may be closed
+                self._redraw(sys.stderr)
+
+    def _print_line(self) -> None:
+        if not any(work.has_own_view for work in list(self._running)):
+            console.info(work_line(self._running))
+
+    def _redraw(self, stream: Any) -> None:
+        """Write the line again and again, over itself."""
+        while not self._ended.is_set():
+            if not any(work.has_own_view for work in list(self._running)):
+                console.clear_line()
+                stream.write(plain(work_line(self._running))[: screen(stream).width - 1])
+                stream.flush()
+                console.has_line = True
+            self._ended.wait(_REDRAW_EVERY_S)
+        console.clear_line()
+
+
+def work_line(running: Sequence[Work]) -> str:
+    """Return one line about nested work, the outermost first: what, how far, time left."""
+    works = list(running)
+    counts = [f"{work.what} {work.done:,}/{work.total:,}" for work in works if work.total]
+    counted = [work for work in works if work.total]
+    share = 0.0
+    for work in reversed(counted):  # the inner work is a part of one part of the outer one
+        share = max(work.fraction(), (work.done + share) / (work.total or 1))
+    elapsed = time.monotonic() - counted[0].begin if counted else 0.0
+    title = "" if not works or works[0].total else f"{works[0].what}: "
+    if share > 0.0:
+        return f"{title}{', '.join(counts)}, {share:.0%}, {clock(elapsed * (1.0 - share) / share)} left"
+    since = f"{clock(time.monotonic() - works[0].begin)} so far" if works else ""
+    return title + ", ".join([*counts, since])
 
 
 class TrainingView(LiveView):

@@ -11,6 +11,7 @@ from rlcli.cli.ui.console import console
 from rlcli.cli.ui.progress_view import LiveView
 from rlcli.cli.ui.tables import flow
 from rlcli.errors import Stopped
+from rlcli.reporting.curves import FEWEST_FOR_IQM
 from rlcli.runs.overview import Overview, overview
 from rlcli.tuning.train_seeds import METRICS, StudyResult
 
@@ -46,7 +47,9 @@ def _print_table(runs: Sequence[dict[str, Any]], together: dict[str, Any]) -> No
     for run in runs:
         numbers = [f"{run[name]:.4g}" if name in run else "-" for name in METRICS]
         rows.append([str(run["seed"]), run["state"], f"{run['step'] or 0:,}", *numbers])
-    for title, keys in (("IQM", ("iqm",)), ("95 %", ("low", "high"))):
+    count = sum(any(name in run for name in METRICS) for run in runs)
+    middle = "IQM" if count >= FEWEST_FOR_IQM else "mean"
+    for title, keys in ((middle, ("iqm",)), ("95 %", ("low", "high"))):
         cells = [_interval([together.get(name, {}).get(key) for key in keys]) for name in METRICS]
         rows.append([title, "", "", *cells])
     console.table(["SEED", "STATE", "STEPS", "RETURN", "SUCCESS"], rows)

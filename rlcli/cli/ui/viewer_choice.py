@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from rlcli.cli.ui.console import console
 from rlcli.errors import DependencyError, MachineError, UsageError, require_known
+from rlcli.progress import track
 from rlcli.settings import setting
 from rlcli.viewer.protocol import DEFAULT_PORT, VIEWERS, Viewer
 
@@ -114,7 +115,8 @@ def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn
             console.info(f"viewer: none ({reason})")
             return False
         try:
-            _open(session, name, reason, port, drawn)
+            with track("viewer", has_own_view=True):
+                _open(session, name, reason, port, drawn)
         except (MachineError, DependencyError) as error:
             if position + 1 == len(viewers):
                 raise

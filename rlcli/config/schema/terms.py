@@ -5,6 +5,7 @@ Each term has further keys, the keyword-only parameters of its function. `rlcli.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -171,12 +172,44 @@ ModifierConfig = Annotated[
 
 
 class DelayConfig(StrictModel):
-    """Delay of an observation. In the first steps of an episode the policy gets the first value."""
+    """Delay of an observation or of an action term, in environment steps or in seconds.
 
-    steps: StepRange
-    """[low, high] delay in environment steps, both included; drawn for each environment at the start of an episode."""
+    In the first steps of an episode the policy gets the first value of a delayed observation, and a delayed action is
+    0 (the raw output of the policy).
+    """
+
+    steps: Annotated[int, Field(ge=0, le=1000)] | StepRange | None = None
+    """Delay in environment steps: a number, or [low, high], both included, drawn for each environment at the start of
+    an episode."""
+    seconds: NotNegative | tuple[NotNegative, NotNegative] | None = None
+    """The same in seconds, in multiples of the control period (sim.dt x decimation)."""
     redraw: Share = 0.0
     """Probability that an environment draws a new delay in a step, in [0, 1]."""
+
+    @model_validator(mode="after")
+    def _one_unit(self) -> DelayConfig:
+        if (self.steps is None) == (self.seconds is None):
+            raise ValueError("give either steps or seconds")
+        return self
+
+    def step_range(self, step_dt: float) -> tuple[int, int]:
+        """Return the shortest and the longest delay in environment steps of `step_dt` seconds.
+
+        Raises:
+            ValueError: if a number of seconds is not a multiple of `step_dt`, or the longest delay is too long.
+        """
+        if self.steps is not None:
+            return self.steps if isinstance(self.steps, tuple) else (self.steps, self.steps)
+        assert self.seconds is not None
+        low, high = self.seconds if isinstance(self.seconds, tuple) else (self.seconds, self.seconds)
+        for value in (low, high):
+            if abs(value / step_dt - round(value / step_dt)) > 1e-3:
+                lower = math.floor(value / step_dt) * step_dt
+                near = f"{lower:g} or {lower + step_dt:g}"
+                raise ValueError(f"{value:g} s is no multiple of the control period of {step_dt:g} s; give {near}")
+        if low > high or high / step_dt > 1000:
+            raise ValueError(f"the range is {low:g} to {high:g} s; give [low, high] of at most 1000 control periods")
+        return round(low / step_dt), round(high / step_dt)
 
 
 class ObservationConfig(TermConfig):
@@ -218,6 +251,10 @@ class ObservationGroupConfig(StrictModel):
 
 class ActionConfig(TermConfig):
     """An action term. It applies its columns of the policy's output."""
+
+    delay: DelayConfig | None = None
+    """Delay with which the term gets its columns; null: none. The observation `last_action` and the rewards of actions
+    are not delayed."""
 
 
 class CommandConfig(TermConfig):

@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import torch
 
-from rlcli.mdp.randomization_base import Draw, DrawKeys, FieldRandomization, RangeKeys, require_supported, unset_simple
+from rlcli.mdp.randomization_base import (
+    Draw,
+    DrawingTerm,
+    DrawKeys,
+    FieldRandomization,
+    RangeKeys,
+    require_supported,
+    unset_simple,
+)
 from rlcli.mdp.term import ActuatorTerm, JointTerm
 from rlcli.mdp.term_helpers import column_numbers, on_host
 from rlcli.scene.joint_and_actuator_setup import model_actuator_kind
 from rlcli.scene.model_fields import FIELDS, ModelField
 from rlcli.scene.names import NameProblem
+from rlcli.sim.column_views import as_index
 from rlcli.sim.selection import Columns, Selection
 from rlcli.task import Entity
 
@@ -108,25 +117,94 @@ class RandomizePdGains(DrawKeys, JointTerm):
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeEffortLimit(RangeKeys, ActuatorTerm):
-    """Random effort limits of MuJoCo's own actuators, the same in both directions of the joint [N or N m]."""
+    """Random effort limits of actuators, the same in both directions of the joint [N or N m].
+
+    The limit of a joint with an actuator model (`kind: pd` or `dc_motor`) is that of the model.
+    """
 
     derives = False
 
     def __post_init__(self) -> None:
-        limited = self.env.engine.model.actuator_forcelimited[self.entity.actuator_ids].astype(bool).tolist()
+        entity, model = self.entity, self.env.engine.model
+        ids = entity.actuator_ids
+        driven = {id: joint for joint, id in entity.actuators_of("motor")}
+        places = {j: (each, column) for each in entity.actuators for column, j in enumerate(each.joints)}
+        modelled = [places.get(driven.get(int(id), -1)) for id in ids]
+        limited = [
+            bool(model.actuator_forcelimited[id] if place is None else place[0].effort_limit[0, place[1]].isfinite())
+            for id, place in zip(ids, modelled, strict=True)
+        ]
         hint = "give its joint an effort_limit"
-        require_supported(self.entity, "Actuators", self.actuators, limited, "has no effort limit", hint)
-        self._field = ModelField(self.entity, "actuator_forcerange", self.actuators)
-        gear = self.env.engine.model.actuator_gear[self.entity.actuator_ids, 0]
-        chosen = torch.as_tensor(gear).abs()[on_host(self.actuators)]
-        self._gear = torch.where(chosen > 0, chosen, 1.0)[:, None].to(self.env.device, self._field.original.dtype)
-        self._effort = self._field.original[:, 1:] * self._gear
-        self._draw = Draw(self, self.range, (self._field.shape[0], 1), lowest=0.0)
+        require_supported(entity, "Actuators", self.actuators, limited, "has no effort limit", hint)
+        chosen = column_numbers(self.actuators, len(ids))
+        own = [row for row, number in enumerate(chosen) if modelled[number] is None]
+        self._own = as_index(own, self.env.device)
+        self._field = ModelField(entity, "actuator_forcerange", as_index([chosen[row] for row in own]))
+        self._modelled = [(*place, row) for row, number in enumerate(chosen) if (place := modelled[number]) is not None]
+        gear = torch.as_tensor(model.actuator_gear[ids, 0]).abs()[[chosen[row] for row in own]]
+        self._gear = torch.where(gear > 0, gear, 1.0)[:, None].to(self.env.device, self._field.original.dtype)
+        self._effort = torch.zeros(len(chosen), 1, dtype=self._field.original.dtype, device=self.env.device)
+        self._effort[self._own] = self._field.original[:, 1:] * self._gear
+        for actuator, column, row in self._modelled:
+            self._effort[row] = actuator.effort_limit[0, column]
+        self._draw = Draw(self, self.range, (len(chosen), 1), lowest=0.0)
 
     def __call__(self, selection: Selection) -> None:
         """Draw new limits for the selected environments."""
-        force = self._draw(selection, self._effort) / self._gear
-        self._field.write(selection, torch.cat([-force, force], dim=2))
+        effort = self._draw(selection, self._effort)
+        if self._field.shape[0]:
+            force = effort[:, self._own] / self._gear
+            self._field.write(selection, torch.cat([-force, force], dim=2))
+        for actuator, column, row in self._modelled:
+            values = effort[:, row].to(actuator.effort_limit.dtype)
+            selection.write(actuator.effort_limit, values, slice(column, column + 1))
+
+
+@dataclass(kw_only=True, eq=False)
+class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
+    """Random strength of actuators: a factor on their whole effort, with its limits; 0.9 is a motor 10 % too weak.
+
+    Works for MuJoCo's own actuators of every kind whose force is linear, and for actuator models, whose
+    `applied_effort` stays the effort before the factor. No other event may change gains or limits of the same model.
+    """
+
+    derives = False
+
+    range: tuple[float, float]
+    distribution: Literal["uniform", "loguniform", "gaussian"] = "uniform"
+    shared: bool = False
+
+    def __post_init__(self) -> None:
+        model, ids = self.env.engine.model, self.entity.actuator_ids
+        gain, bias = model.actuator_gaintype[ids], model.actuator_biastype[ids]
+        linear = (gain <= int(mujoco.mjtGain.mjGAIN_AFFINE)) & (bias <= int(mujoco.mjtBias.mjBIAS_AFFINE))
+        require_supported(
+            self.entity, "Actuators", self.actuators, linear.tolist(), "is not linear", "leave out muscles"
+        )
+        events = getattr(self.env, "config").events.items()  # noqa: B009 (events exist in managed environments only)
+        others = [name for name, event in events if event is not None and _changes_actuators(event)]
+        if others:
+            raise NameProblem(f"it and events.{others[0]} change the same fields", "remove one of the two")
+        fields = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
+        self._fields = [ModelField(self.entity, name, self.actuators, _AXES.get(name)) for name in fields]
+        self._draw = Draw(self, self.range, (self._fields[0].shape[0], 1), lowest=0.0)
+
+    def __call__(self, selection: Selection) -> None:
+        """Draw new factors for the selected environments."""
+        one = torch.ones_like(self._fields[0].original[:, :1])
+        factor = self._draw(selection, one)
+        for field in self._fields:
+            field.write(selection, field.original * factor)
+
+
+_AXES = {"actuator_gainprm": [0, 1, 2], "actuator_biasprm": [0, 1, 2]}
+
+
+def _changes_actuators(event: Any) -> bool:
+    """Return whether an event changes a field that `randomize_actuator_strength` changes."""
+    if event.func == "randomize_model_field":
+        return str(event.params["field"]) in ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
+    return event.func in ("randomize_actuator_gains", "randomize_effort_limit")
 
 
 @dataclass(kw_only=True, eq=False)

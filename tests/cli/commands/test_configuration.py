@@ -127,7 +127,7 @@ def test_show_origin(in_process, small):
     lines = {line.split(":")[0].strip(): line.partition("# ")[2] for line in shown.splitlines()}
     assert lines["dt"] == "override 'sim.dt=0.02'"
     assert lines["num_envs"] == "--num-envs"
-    assert lines["decimation"] == "small/task.yaml:2:1"
+    assert lines["decimation"] == "task.yaml:2:1"
     assert lines["gravity"] == "default"
     origins = json.loads(in_process("show", task, "--origin", "--json")[1])["origins"]
     assert origins["rewards.alive.weight"] == "small/task.yaml:15:27"
@@ -251,3 +251,25 @@ def test_validate_deep_of_failing_import_is_task_error(in_process, small):
     code, _, err = in_process("validate", task, "--deep")
     assert code == 4
     assert "No module named 'no_such_module'" in err
+
+
+def test_show_prints_chosen_parts(rlcli):
+    done = rlcli("show", "cartpole", "rewards.alive", "sim.dt", "sim.dt=0.01", "--json")
+    config = json.loads(done.stdout)["config"]
+    assert (config["sim"], list(config), list(config["rewards"])) == ({"dt": 0.01}, ["rewards", "sim"], ["alive"])
+    wrong = rlcli("show", "cartpole", "rewards.alive.wieght")
+    assert (wrong.returncode, "did you mean 'weight'?" in wrong.stderr) == (2, True)
+
+
+def test_origins_name_each_file_once(rlcli):
+    lines = rlcli("show", "cartpole", "rewards", "--origin").stdout.splitlines()
+    assert lines[0].startswith("# task.yaml: /")
+    assert [line for line in lines[1:] if "/" in line] == []
+    assert lines[3].split("# ")[1].startswith("task.yaml:")
+
+
+def test_check_and_lint_read_a_configuration_file(here, rlcli):
+    (here / "more.yaml").write_text("rewards: {alive: {wieght: 2}}\n")
+    for command in ("check", "lint"):
+        done = rlcli(command, "cartpole", "--config", "more.yaml")
+        assert (done.returncode, "more.yaml:1:19" in done.stderr) == (3, True)

@@ -1,0 +1,52 @@
+"""Progress of long commands: the text of a line, lines in a pipe, and silence with --quiet."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from rlcli.cli.ui.progress_view import work_line
+from rlcli.progress import Work, _running, track
+
+SHORT_WAITS = """
+import sys
+from rlcli.cli.ui import progress_view
+progress_view._WORK_LINE_EVERY_S = 0.2
+from rlcli.cli.app import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_line_has_what_how_far_and_time_left():
+    now = time.monotonic()
+    command, batches, episodes = (
+        Work("rlcli stress", begin=now - 20.0),
+        Work("batches", 4, 1, begin=now - 15.0),
+        Work("episodes", 100, 20, share=0.5, begin=now - 5.0),
+    )
+    assert work_line([command]) == "rlcli stress: 0:20 so far"
+    # 1.5 of 4 batches in 15 s: 25 s are left
+    assert work_line([command, batches, episodes]) in (
+        f"rlcli stress: batches 1/4, episodes 20/100, 38%, 0:{left} left" for left in (24, 25)
+    )
+    assert work_line([]) == ""
+
+
+def test_work_ends_with_its_context():
+    with track("outer"), track("inner", 3) as work:
+        work.advance(2)
+    assert work.fraction() == pytest.approx(2 / 3)
+    assert _running == []
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_lines_in_a_pipe(tmp_path, quiet):
+    command = ["check", "cartpole", "--only", "same-seed", *(["-q"] if quiet else [])]
+    done = subprocess.run(
+        [sys.executable, "-c", SHORT_WAITS, *command], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    lines = [line for line in done.stderr.splitlines() if line.startswith("rlcli check: ")]
+    assert bool(lines) is not quiet
+    assert "same-seed" in done.stdout
+    assert "so far" not in done.stdout
