@@ -444,6 +444,7 @@ class Scene(Mapping[str, Any]):
         self.rigid_objects = {name: a for name, a in self.articulations.items() if not a.joint_names}
 
         self._frames: dict[str, FrameTransformer] = {}
+        self.user_cfg: Any = None
         self.looks: dict[str, Any] = {}
         """Lights and other assets that only change how a scene looks."""
 
@@ -470,8 +471,8 @@ class Scene(Mapping[str, Any]):
 
     @property
     def cfg(self) -> Any:
-        """Settings of the scene: num_envs and env_spacing."""
-        return self._env.config.scene
+        """Settings of the scene: the user's object, or rlcli's without one."""
+        return self._env.config.scene if self.user_cfg is None else self.user_cfg
 
     @property
     def num_envs(self) -> int:
@@ -488,7 +489,12 @@ class Scene(Mapping[str, Any]):
     def terrain(self) -> Any:
         """Terrain, or None."""
         terrain = getattr(self._env, "terrain", None)
-        return None if terrain is None else _bound(TerrainImporter, self._env, terrain)
+        if terrain is None:
+            return None
+        made = _bound(TerrainImporter, self._env, terrain)
+        if hasattr(self.user_cfg, "terrain"):
+            made.cfg = self.user_cfg.terrain
+        return made
 
     def __getitem__(self, name: str) -> Any:
         if name in self.articulations:
