@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any
@@ -37,6 +38,10 @@ _DATA_NAMES = {
 """Isaac Lab's name -> rlcli's name, where they differ."""
 
 
+_MOST_VELOCITY = math.radians(1e6)
+"""Speed limit of a joint without a limit in Isaac Sim [rad/s]. It is finite, because terms multiply it by 0."""
+
+
 class Data:
     """State of an asset under Isaac Lab's names. The names of `rlcli.scene.entity_data.EntityData` work too."""
 
@@ -65,7 +70,7 @@ class Data:
     @property
     def joint_vel_limits(self) -> Tensor:
         """Speed limits. (num_envs, joints) [m/s or rad/s]"""
-        limits = self._data.joint_vel_limits
+        limits = self._data.joint_vel_limits.clamp(max=_MOST_VELOCITY)
         return limits if limits.dim() == 2 else limits.expand(self._env.num_envs, -1)
 
     soft_joint_vel_limits = joint_vel_limits
@@ -462,7 +467,10 @@ class Scene(Mapping[str, Any]):
     def sensors(self) -> Mapping[str, Any]:
         """Sensors by name."""
         sensors = getattr(self._env, "sensors", {}).items()
-        return {name: camera_or_sensor(sensor) for name, sensor in sensors} | self._frames
+        found = {name: camera_or_sensor(sensor) for name, sensor in sensors} | self._frames
+        for name, made in found.items():
+            made.cfg = getattr(self.user_cfg, name, None)
+        return found
 
     def clone_environments(self, *args: Any, **options: Any) -> None:
         """Do nothing: every environment has its own simulation."""
