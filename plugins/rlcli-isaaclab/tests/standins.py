@@ -28,6 +28,11 @@ EXTRA_BODIES = {
 LEGS = [f"{side}_{part}" for part in ("HAA", "HFE", "KFE") for side in ("LF", "LH", "RF", "RH")]
 JOINTS: dict[str, list[str]] = {
     "anymal": LEGS,
+    "shadow_hand": [
+        f"robot0_{finger}J{number}"
+        for finger, count in (("WR", 2), ("FF", 4), ("MF", 4), ("RF", 4), ("LF", 5), ("TH", 5))
+        for number in reversed(range(count))
+    ],
     "ant_instanceable": [*(f"{p}_{s}_leg" for p in ("front", "back") for s in SIDES), "front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot"],
     "humanoid_instanceable": [
         "lower_waist:0", "lower_waist:1", "pelvis",
