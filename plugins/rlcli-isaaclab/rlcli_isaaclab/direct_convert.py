@@ -12,8 +12,9 @@ from rlcli_isaaclab import convert
 from rlcli_isaaclab.config_class import is_missing, to_dict
 from rlcli_isaaclab.direct_env import record, shape_of
 from rlcli_isaaclab.direct_terms import HookTerm
-from rlcli_isaaclab.scene_facade import Asset, TerrainImporter
+from rlcli_isaaclab.scene_facade import Asset
 from rlcli_isaaclab.scene_reader import SceneReader
+from rlcli_isaaclab.sensor_facade import TerrainImporter
 from rlcli_isaaclab.settings import Node, Report
 from rlcli_isaaclab.term_reader import TermReader
 

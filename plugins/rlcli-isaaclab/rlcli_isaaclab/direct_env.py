@@ -62,7 +62,8 @@ class DirectRLEnv(gymnasium.Env):
 
     def _bind(self, created: Any, index: int) -> None:
         """Connect an object that `_setup_scene` has created with its part of the simulation."""
-        from rlcli_isaaclab.scene_facade import Asset, TerrainImporter
+        from rlcli_isaaclab.scene_facade import Asset
+        from rlcli_isaaclab.sensor_facade import TerrainImporter
 
         name = self.cfg.rlcli_names[index]
         if isinstance(created, TerrainImporter):

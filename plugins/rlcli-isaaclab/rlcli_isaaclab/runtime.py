@@ -183,6 +183,9 @@ class ManagerBasedRLEnv(gymnasium.Env):
         if context.cfg is not None and self._context is not context:
             self._context, self.cfg = context, copy.deepcopy(context.cfg)
             self.cfg.scene.num_envs = self.managed.num_envs
+            self.scene.user_cfg = self.cfg.scene
+            for name, asset in self.scene.articulations.items():
+                asset.cfg = getattr(self.cfg.scene, name, asset.cfg)
 
     @property
     def unwrapped(self) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any
@@ -13,169 +12,13 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
-from rlcli.scene.names import NameProblem, match
-from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
-from rlcli.sim.selection import ALL
+from rlcli.scene.names import NameProblem
+from rlcli.sim.rotations import rotate_inverse
 from rlcli_isaaclab.absent import NoEffect
 from rlcli_isaaclab.asset_commands import BodyWrench, JointDrive, PhysxView
+from rlcli_isaaclab.asset_data import Data
+from rlcli_isaaclab.sensor_facade import FrameTransformer, TerrainImporter, bound, camera_or_sensor, find_elements
 from rlcli_isaaclab.setup_scene import current_setup
-
-_DATA_NAMES = {
-    "applied_torque": "applied_effort",
-    "root_link_heading_w": "heading_w",
-    "computed_torque": "computed_effort",
-    "root_link_pos_w": "root_pos_w",
-    "root_link_quat_w": "root_quat_w",
-    "root_link_lin_vel_w": "root_origin_lin_vel_w",
-    "root_link_ang_vel_w": "root_ang_vel_w",
-    "root_link_ang_vel_b": "root_ang_vel_b",
-    "root_com_ang_vel_w": "root_ang_vel_w",
-    "root_com_ang_vel_b": "root_ang_vel_b",
-    "root_lin_vel_w": "root_com_lin_vel_w",
-    "body_link_pos_w": "body_pos_w",
-    "body_link_quat_w": "body_quat_w",
-    "body_link_ang_vel_w": "body_ang_vel_w",
-    "body_com_ang_vel_w": "body_ang_vel_w",
-}
-"""Isaac Lab's name -> rlcli's name, where they differ. Isaac Lab's velocities without `link` are those of the centre of
-mass, whatever the entity's `velocity_point` is."""
-
-
-class Data:
-    """State of an asset under Isaac Lab's names. The names of `rlcli.scene.entity_data.EntityData` work too."""
-
-    def __init__(self, env: VecEnv, entity: Entity) -> None:
-        self._env, self._entity, self._data = env, entity, entity.data
-        self.joint_names, self.body_names = list(entity.joint_names), list(entity.names["Bodies"])
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        try:
-            return getattr(self._data, _DATA_NAMES.get(name, name))
-        except AttributeError:
-            known = [n for n in (*dir(type(self)), *dir(self._data), *_DATA_NAMES) if not n.startswith("_")]
-            hint = did_you_mean(name, known) or f"its attributes: {listing(known, 60)}"
-            raise AttributeError(f"data has no '{name}'; {hint}") from None
-
-    def _expand_to_envs(self, row: Tensor) -> Tensor:
-        return row if row.dim() == 3 else row.expand(self._env.num_envs, *row.shape)
-
-    @property
-    def joint_pos_limits(self) -> Tensor:
-        """Lower and upper position limits. (num_envs, joints, 2) [m or rad]"""
-        return self._expand_to_envs(self._data.joint_pos_limits)
-
-    @property
-    def joint_vel_limits(self) -> Tensor:
-        """Speed limits. (num_envs, joints) [m/s or rad/s]"""
-        limits = self._data.joint_vel_limits
-        return limits if limits.dim() == 2 else limits.expand(self._env.num_envs, -1)
-
-    soft_joint_vel_limits = joint_vel_limits
-
-    @property
-    def soft_joint_pos_limits(self) -> Tensor:
-        """Lower and upper soft limits. (num_envs, joints, 2) [m or rad]"""
-        return self._expand_to_envs(self._data.soft_joint_pos_limits)
-
-    @property
-    def root_pose_w(self) -> Tensor:
-        """Root position [m] and quaternion (w, x, y, z), world frame. (num_envs, 7)"""
-        return torch.cat([self._data.root_pos_w, self._data.root_quat_w], dim=1)
-
-    @property
-    def root_lin_vel_b(self) -> Tensor:
-        """Velocity of the root's centre of mass, root frame. (num_envs, 3) [m/s]"""
-        return rotate_inverse(self._data.root_quat_w, self._data.root_com_lin_vel_w)
-
-    root_com_lin_vel_b = root_lin_vel_b
-
-    @property
-    def root_link_lin_vel_b(self) -> Tensor:
-        """Velocity of the root's origin, root frame. (num_envs, 3) [m/s]"""
-        return rotate_inverse(self._data.root_quat_w, self._data.root_origin_lin_vel_w)
-
-    @property
-    def root_vel_w(self) -> Tensor:
-        """Velocity of the root's centre of mass [m/s] and angular velocity [rad/s], world frame. (num_envs, 6)"""
-        return torch.cat([self._data.root_com_lin_vel_w, self._data.root_ang_vel_w], dim=1)
-
-    root_com_vel_w = root_vel_w
-
-    @property
-    def root_link_vel_w(self) -> Tensor:
-        """Velocity of the root's origin [m/s] and angular velocity [rad/s], world frame. (num_envs, 6)"""
-        return torch.cat([self._data.root_origin_lin_vel_w, self._data.root_ang_vel_w], dim=1)
-
-    @property
-    def root_state_w(self) -> Tensor:
-        """Root pose, and velocity of its centre of mass, world frame. (num_envs, 13)"""
-        return torch.cat([self.root_pose_w, self.root_vel_w], dim=1)
-
-    @property
-    def root_link_state_w(self) -> Tensor:
-        """Root pose, and velocity of its origin, world frame. (num_envs, 13)"""
-        return torch.cat([self.root_pose_w, self.root_link_vel_w], dim=1)
-
-    root_link_pose_w = root_pose_w
-
-    @property
-    def body_lin_vel_w(self) -> Tensor:
-        """Velocities of the bodies' centres of mass, world frame. (num_envs, bodies, 3) [m/s]"""
-        return self._data.body_lin_vel_of(ALL, "com")
-
-    body_com_lin_vel_w = body_lin_vel_w
-
-    @property
-    def body_link_lin_vel_w(self) -> Tensor:
-        """Velocities of the bodies' origins, world frame. (num_envs, bodies, 3) [m/s]"""
-        return self._data.body_lin_vel_of(ALL, "origin")
-
-    @property
-    def body_pose_w(self) -> Tensor:
-        """Positions [m] and quaternions (w, x, y, z) of all bodies, world frame. (num_envs, bodies, 7)"""
-        return torch.cat([self._data.body_pos_w, self._data.body_quat_w], dim=-1)
-
-    body_link_pose_w = body_pose_w
-
-    @property
-    def body_vel_w(self) -> Tensor:
-        """Linear velocities of the centres of mass and angular velocities, world frame. (num_envs, bodies, 6)"""
-        return torch.cat([self.body_lin_vel_w, self._data.body_ang_vel_w], dim=-1)
-
-    body_com_vel_w = body_vel_w
-
-    @property
-    def body_link_vel_w(self) -> Tensor:
-        """Linear velocities of the origins and angular velocities, world frame. (num_envs, bodies, 6)"""
-        return torch.cat([self.body_link_lin_vel_w, self._data.body_ang_vel_w], dim=-1)
-
-    @property
-    def body_state_w(self) -> Tensor:
-        """Poses of all bodies, and velocities of their centres of mass, world frame. (num_envs, bodies, 13)"""
-        return torch.cat([self.body_pose_w, self.body_vel_w], dim=-1)
-
-    @property
-    def body_link_state_w(self) -> Tensor:
-        """Poses of all bodies, and velocities of their origins, world frame. (num_envs, bodies, 13)"""
-        return torch.cat([self.body_pose_w, self.body_link_vel_w], dim=-1)
-
-    @property
-    def GRAVITY_VEC_W(self) -> Tensor:  # noqa: N802
-        """Unit vector along gravity, world frame. (num_envs, 3)"""
-        return self._data._down
-
-    @property
-    def FORWARD_VEC_B(self) -> Tensor:  # noqa: N802
-        """Unit vector along the x axis. (num_envs, 3)"""
-        return torch.eye(3, device=self._env.device)[:1].expand(self._env.num_envs, 3)
-
-    @property
-    def heading_w(self) -> Tensor:
-        """Angle of the root's x axis around z, world frame [rad]. (num_envs,)"""
-        forward = rotate(self._data.root_quat_w, self.FORWARD_VEC_B)
-        return torch.atan2(forward[:, 1], forward[:, 0])
 
 
 class Asset:
@@ -262,11 +105,11 @@ class Asset:
 
     def find_joints(self, name_keys: Any, joint_subset: Any = None, preserve_order: bool = False) -> Any:
         """Return ids and names of the joints that names or regexes match."""
-        return _find_elements(name_keys, joint_subset or self.joint_names, self.joint_names, "joint", preserve_order)
+        return find_elements(name_keys, joint_subset or self.joint_names, self.joint_names, "joint", preserve_order)
 
     def find_bodies(self, name_keys: Any, preserve_order: bool = False) -> Any:
         """Return ids and names of the bodies that names or regexes match."""
-        return _find_elements(name_keys, self.body_names, self.body_names, "body", preserve_order)
+        return find_elements(name_keys, self.body_names, self.body_names, "body", preserve_order)
 
     def write_joint_state_to_sim(
         self, position: Tensor, velocity: Tensor, joint_ids: Any = None, env_ids: Any = None
@@ -352,162 +195,6 @@ class Asset:
         self._env.sim.refresh()
 
 
-class FrameTransformer:
-    """Poses of frames that are fixed to bodies, under Isaac Lab's names; `data` is the object itself."""
-
-    def __init__(self, assets: Mapping[str, Asset], settings: Mapping[str, Any]) -> None:
-        self.data = self
-        self._source = self._bodies(assets, settings["source"])[0]
-        self._targets: list[tuple[Asset, int, Mapping[str, Any]]] = []
-        self.target_frame_names: list[str] = []
-        for target in settings["targets"]:
-            found = self._bodies(assets, target)
-            self._targets += found
-            names = [asset.body_names[index] for asset, index, _ in found]
-            self.target_frame_names += [target["name"]] * len(found) if target["name"] else names
-        self.body_names = self.target_frame_names
-        self.joint_names: list[str] = []
-
-    @staticmethod
-    def _bodies(assets: Mapping[str, Asset], frame: Mapping[str, Any]) -> list[tuple[Asset, int, Mapping[str, Any]]]:
-        asset = assets[frame["entity"]]
-        wanted = frame["body"]
-        ids = [0] if wanted is None else asset.find_bodies(wanted)[0]
-        return [(asset, index, frame) for index in ids]
-
-    @staticmethod
-    def _pose(frame: tuple[Asset, int, Mapping[str, Any]]) -> tuple[Tensor, Tensor]:
-        asset, index, settings = frame
-        pos, quat = asset.data.body_pos_w[:, index], asset.data.body_quat_w[:, index]
-        offset = torch.tensor(settings["pos"], device=pos.device).expand_as(pos)
-        turn = torch.tensor(settings["rot"], device=pos.device).expand_as(quat)
-        return pos + rotate(quat, offset), multiply(quat, turn)
-
-    @property
-    def source_pos_w(self) -> Tensor:
-        """Position of the source frame, world frame. (num_envs, 3) [m]"""
-        return self._pose(self._source)[0]
-
-    @property
-    def source_quat_w(self) -> Tensor:
-        """Orientation of the source frame (w, x, y, z), world frame. (num_envs, 4)"""
-        return self._pose(self._source)[1]
-
-    @property
-    def target_pos_w(self) -> Tensor:
-        """Positions of the target frames, world frame. (num_envs, frames, 3) [m]"""
-        return torch.stack([self._pose(target)[0] for target in self._targets], dim=1)
-
-    @property
-    def target_quat_w(self) -> Tensor:
-        """Orientations of the target frames (w, x, y, z), world frame. (num_envs, frames, 4)"""
-        return torch.stack([self._pose(target)[1] for target in self._targets], dim=1)
-
-    @property
-    def target_pos_source(self) -> Tensor:
-        """Positions of the target frames in the source frame. (num_envs, frames, 3) [m]"""
-        pos, quat = self._pose(self._source)
-        return torch.stack([rotate_inverse(quat, self._pose(t)[0] - pos) for t in self._targets], dim=1)
-
-    @property
-    def target_quat_source(self) -> Tensor:
-        """Orientations of the target frames in the source frame. (num_envs, frames, 4)"""
-        back = conjugate(self._pose(self._source)[1])
-        return torch.stack([multiply(back, self._pose(t)[1]) for t in self._targets], dim=1)
-
-
-class CameraView:
-    """A camera under Isaac Lab's names; `data` is the object itself."""
-
-    def __init__(self, cfg: Any) -> None:
-        current_setup().add(self, cfg)
-
-    cfg: Any
-
-    def bind(self, sensor: Any) -> None:
-        """Connect the camera with a sensor of the simulation."""
-        self._sensor, self.data = sensor, self
-        self.body_names: list[str] = []
-        self.joint_names: list[str] = []
-
-    @property
-    def output(self) -> Mapping[str, Tensor]:
-        """Images by type of data, channels last. (num_envs, h, w, c)"""
-        kind, image = self._sensor.config.data, self._sensor.image
-        names = {"rgb": ("rgb",), "depth": ("depth", "distance_to_image_plane"), "distance": ("distance_to_camera",)}
-        return dict.fromkeys(names[kind], image)
-
-    @property
-    def image_shape(self) -> tuple[int, int]:
-        """Height and width [pixels]."""
-        return self._sensor.config.height, self._sensor.config.width
-
-
-class TerrainImporter:
-    """The terrain under Isaac Lab's names."""
-
-    def __init__(self, cfg: Any) -> None:
-        current_setup().add(self, cfg)
-
-    def bind(self, env: VecEnv, terrain: Any) -> None:
-        """Connect the object with the terrain of the simulation; None: a plane."""
-        self._env, self._terrain = env, terrain
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return getattr(self._terrain, name)
-
-    @functools.cached_property
-    def cfg(self) -> Any:
-        """Configuration of the terrain in Isaac Lab's form, as far as terms read it."""
-        config: Any = self._env.config.scene.terrain
-        return SimpleNamespace(terrain_type="generator", terrain_generator=SimpleNamespace(
-            size=tuple(config.patch), num_rows=self._terrain.rows, num_cols=self._terrain.origins.shape[1],
-            curriculum=config.curriculum,
-        ))  # fmt: skip
-
-    @property
-    def terrain_levels(self) -> Tensor:
-        """Level of each environment. (num_envs,) int64"""
-        return self._terrain.levels
-
-    @property
-    def terrain_types(self) -> Tensor:
-        """Column of each environment. (num_envs,) int64"""
-        return self._terrain.types
-
-    @property
-    def terrain_origins(self) -> Tensor:
-        """Start positions by level and column. (rows, columns, 3) [m]"""
-        return self._terrain.origins
-
-    @property
-    def env_origins(self) -> Tensor:
-        """Start position of each environment. (num_envs, 3) [m]"""
-        return self._env.origins
-
-    def update_env_origins(self, env_ids: Any, move_up: Tensor, move_down: Tensor) -> None:
-        """Move environments a level up or down. env_ids are those of the running curriculum term."""
-        from rlcli_isaaclab.runtime import facade_of
-
-        selection = facade_of(self._env).selection
-        self._terrain.move(selection, move_up.bool(), move_down.bool())
-
-
-def camera_or_sensor(sensor: Any) -> Any:
-    """Return the facade of a sensor."""
-    is_camera = getattr(getattr(sensor, "config", None), "kind", "") == "camera"
-    return _bound(CameraView if is_camera else Sensor, sensor)
-
-
-def _bound(kind: Any, *parts: Any) -> Any:
-    """Return an object of a class that is connected with parts of the simulation."""
-    made = kind.__new__(kind)
-    made.bind(*parts)
-    return made
-
-
 class Scene(Mapping[str, Any]):
     """Assets and sensors by name."""
 
@@ -517,6 +204,7 @@ class Scene(Mapping[str, Any]):
         self.rigid_objects = {name: a for name, a in self.articulations.items() if not a.joint_names}
 
         self._frames: dict[str, FrameTransformer] = {}
+        self.user_cfg: Any = None
         self.looks: dict[str, Any] = {}
         """Lights and other assets that only change how a scene looks."""
 
@@ -534,7 +222,10 @@ class Scene(Mapping[str, Any]):
     def sensors(self) -> Mapping[str, Any]:
         """Sensors by name."""
         sensors = getattr(self._env, "sensors", {}).items()
-        return {name: camera_or_sensor(sensor) for name, sensor in sensors} | self._frames
+        found = {name: camera_or_sensor(sensor) for name, sensor in sensors} | self._frames
+        for name, made in found.items():
+            made.cfg = getattr(self.user_cfg, name, None)
+        return found
 
     def clone_environments(self, *args: Any, **options: Any) -> None:
         """Do nothing: every environment has its own simulation."""
@@ -543,8 +234,8 @@ class Scene(Mapping[str, Any]):
 
     @property
     def cfg(self) -> Any:
-        """Settings of the scene: num_envs and env_spacing."""
-        return self._env.config.scene
+        """Settings of the scene: the user's object, or rlcli's without one."""
+        return self._env.config.scene if self.user_cfg is None else self.user_cfg
 
     @property
     def num_envs(self) -> int:
@@ -561,7 +252,12 @@ class Scene(Mapping[str, Any]):
     def terrain(self) -> Any:
         """Terrain, or None."""
         terrain = getattr(self._env, "terrain", None)
-        return None if terrain is None else _bound(TerrainImporter, self._env, terrain)
+        if terrain is None:
+            return None
+        made = bound(TerrainImporter, self._env, terrain)
+        if hasattr(self.user_cfg, "terrain"):
+            made.cfg = self.user_cfg.terrain
+        return made
 
     def __getitem__(self, name: str) -> Any:
         if name in self.articulations:
@@ -596,58 +292,7 @@ class Scene(Mapping[str, Any]):
             if wanted is None:
                 continue
             names = getattr(element, f"{kind}_names")
-            ids, matched = _find_elements(wanted, names, names, kind, cfg.preserve_order)
+            ids, matched = find_elements(wanted, names, names, kind, cfg.preserve_order)
             all_selected = ids == list(range(len(names)))
             setattr(cfg, f"{kind}_names", matched)
             setattr(cfg, f"{kind}_ids", slice(None) if all_selected else torch.tensor(ids, device=self._env.device))
-
-
-class Sensor:
-    """A contact or ray sensor under Isaac Lab's names."""
-
-    _NAMES = {  # noqa: RUF012  (constant)
-        "net_forces_w": "force",
-        "net_forces_w_history": "force_history",
-        "current_air_time": "air_time",
-        "current_contact_time": "contact_time",
-        "ray_hits_w": "hits",
-        "pos_w": "position",
-    }
-
-    def __init__(self, cfg: Any) -> None:
-        current_setup().add(self, cfg)
-
-    cfg: Any
-
-    def bind(self, sensor: Any) -> None:
-        """Connect the object with a sensor of the simulation."""
-        self._sensor = sensor
-        self.data = self
-        self.body_names = list(getattr(sensor, "names", []))
-        self.joint_names: list[str] = []
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return getattr(self._sensor, self._NAMES.get(name, name))
-
-    def find_bodies(self, name_keys: Any, preserve_order: bool = False) -> Any:
-        """Return indices and names of the sensor's bodies that names or regexes match."""
-        return _find_elements(name_keys, self.body_names, self.body_names, "body", preserve_order)
-
-    def compute_first_contact(self, dt: float, abs_tol: float = 1e-8) -> Tensor:
-        """Return where contact began in this step. (num_envs, bodies) bool"""
-        return self._sensor.first_contact
-
-    def compute_first_air(self, dt: float, abs_tol: float = 1e-8) -> Tensor:
-        """Return where contact ended in this step. (num_envs, bodies) bool"""
-        return self._sensor.first_air
-
-
-def _find_elements(
-    wanted: Any, candidates: Any, names: list[str], kind: str, preserve_order: bool
-) -> tuple[list[int], list[str]]:
-    """Return indices into `names`, and the names, of the candidates that names or regexes match."""
-    indices = [names.index(candidates[i]) for i in match(wanted, list(candidates), kind)]
-    indices = indices if preserve_order else sorted(indices)
-    return indices, [names[i] for i in indices]

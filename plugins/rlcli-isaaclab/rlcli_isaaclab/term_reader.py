@@ -11,13 +11,14 @@ from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.lab_terms import LAB_TERMS
-from rlcli_isaaclab.managers import CommandTerm, SceneEntityCfg
+from rlcli_isaaclab.managers import CommandTerm
 from rlcli_isaaclab.mdp import MdpFunction
 from rlcli_isaaclab.observation_reader import read_processing
 from rlcli_isaaclab.randomization import EVENTS, translate_event
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, equals_default, kind_of, to_plain
 from rlcli_isaaclab.table import ACTIONS, COMMANDS, EFFORT_TERMS, HEIGHT_TERMS, TERMS, Entry, finite_times
+from rlcli_isaaclab.term_values import builtin_name, has_no_effect, is_entity, is_plain, triple
 
 _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
 """Prefixes of the modules whose functions are in `table.py`."""
@@ -86,7 +87,7 @@ class TermReader:
                 continue  # the term's default
             elif key in known:
                 config[key] = self._read_action_value(key, value, config.get("joints"))
-            elif _has_no_effect(key, value):
+            elif has_no_effect(key, value):
                 continue
             else:
                 node.note("ignored", key, f"'{name}' has no such setting")
@@ -135,8 +136,8 @@ class TermReader:
             for key in ("heading", "heading_stiffness", "rel_heading"):
                 config.pop(key, None)
         if kind == "NormalVelocityCommand":
-            config |= {"mean": _triple(ranges, "mean_vel"), "std": _triple(ranges, "std_vel")}
-            config["zero_prob"] = _triple(ranges, "zero_prob")
+            config |= {"mean": triple(ranges, "mean_vel"), "std": triple(ranges, "std_vel")}
+            config["zero_prob"] = triple(ranges, "zero_prob")
         return config
 
     def _read_user_command(self, kind: str, node: Node) -> dict[str, Any]:
@@ -149,7 +150,7 @@ class TermReader:
         node.skip("debug_vis")
         if isinstance(class_type, str) and not class_type.startswith(_ISAAC_LAB_MODULES) and ":" in class_type:
             named = {("entity" if key == "asset_name" else key): value for key, value in settings.items()}
-            params = {key: to_plain(value) for key, value in named.items() if _is_plain(value)}
+            params = {key: to_plain(value) for key, value in named.items() if is_plain(value)}
             self.stubs[kind] = ("commands", params)
             self.report.entries[(*node.key, "class_type")] = ("to do", f"write '{kind}' in terms.py")
             return {"func": snake_case(kind), **config, **params}
@@ -158,7 +159,7 @@ class TermReader:
             self.report.problem(node.key, f"the command '{kind}' has no counterpart in rlcli", near)
             return {"func": "null_command"}
         self._report_missing(node.data, node.key)
-        plain = {key: value for key, value in settings.items() if _is_plain(value)}
+        plain = {key: value for key, value in settings.items() if is_plain(value)}
         for key in settings.keys() - plain.keys():
             node.note("ignored", key, "only numbers, text, lists and mappings can be written to a file")
         command = UserCommand(class_type, node.key[-1], tuple(plain))
@@ -190,7 +191,7 @@ class TermReader:
 
     def read_terms(self, section: str, name: str, node: Node) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield the rlcli terms that replace one term of Isaac Lab, usually one; names of several get a suffix."""
-        function = _builtin_name(node.data.get("func"))
+        function = builtin_name(node.data.get("func"))
         if section == "events" and function in _LOOKS:
             self.report.entries[node.key] = ("ignored", "rlcli does not randomize colours and textures")
             return
@@ -216,7 +217,7 @@ class TermReader:
                 kind = type(function).__name__
                 self.report.problem((*node.key, "func"), f"expected a function, found a {kind}", hint)
             return {"func": "missing"}
-        name = _builtin_name(function)
+        name = builtin_name(function)
         if name == "modify_reward_weight":
             return self._read_reward_stage(params)
         if name in ("modify_env_param", "modify_term_cfg", "initial_final_interpolate_fn"):
@@ -369,7 +370,7 @@ class TermReader:
             self.report.problem((*node.key, "func"), f"no {section.rstrip('s')} term '{name}'", near)
             return {"func": str(name), **common}
         values = {key: params.get(key) for key in params.data}
-        objects = {key: value for key, value in values.items() if not is_entity(value) and not _is_plain(value)}
+        objects = {key: value for key, value in values.items() if not is_entity(value) and not is_plain(value)}
         if isinstance(function, str):
             stub = self._write_stub(section, function, values, node)
             return {"func": stub} | common | self.stubs[stub][1]
@@ -436,41 +437,7 @@ _LOOKS = ("randomize_visual_color", "randomize_visual_texture_material")
 _COMMAND_KEYS = ("class_type", "resampling_time_range", "debug_vis")
 
 
-def _is_plain(value: Any) -> bool:
-    """Return whether a setting can be written to a YAML file."""
-    if isinstance(value, Mapping):
-        return all(map(_is_plain, value.values()))
-    if isinstance(value, list | tuple):
-        return all(map(_is_plain, value))
-    return isinstance(value, str | float | int | None)
-
-
-def is_entity(value: Any) -> bool:
-    """Return whether a parameter is a `SceneEntityCfg`, or the dict of one."""
-    if isinstance(value, SceneEntityCfg):
-        return True
-    return isinstance(value, Mapping) and "name" in value and ("joint_names" in value or "body_names" in value)
-
-
-def _builtin_name(function: Any) -> str | None:
-    """Return the name of one of Isaac Lab's functions; None for the user's own function."""
-    if isinstance(function, MdpFunction):
-        return function.__name__
-    if isinstance(function, str):
-        return function.rpartition(":")[2]
-    return None
-
-
 def _find_signature(terms: Mapping[str, Signature], name: str) -> Signature:
     if name not in terms:
         raise ConfigError([Problem("configuration", "commands", f"no term '{name}'", f"terms: {listing(terms)}")])
     return terms[name]
-
-
-def _triple(ranges: Node, name: str) -> list[float]:
-    return [as_float(v) for v in ranges.get(name, (0.0, 0.0, 0.0))]
-
-
-def _has_no_effect(key: str, value: Any) -> bool:
-    """Return whether a setting without a counterpart has a value that changes nothing."""
-    return {"scale": 1.0, "offset": 0.0}.get(key) == value or value is False or value == "" or key == "use_zero_offset"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rlcli_isaaclab.config_class import MISSING, configclass, make_config_class
-from rlcli_isaaclab.scene_facade import TerrainImporter
+from rlcli_isaaclab.sensor_facade import TerrainImporter
 from rlcli_isaaclab.sim import RigidBodyMaterialCfg
 
 

@@ -46,11 +46,11 @@ from rlcli_isaaclab.runtime import ManagerBasedRLEnv
 from rlcli_isaaclab.scene import InteractiveSceneCfg
 from rlcli_isaaclab.scene_facade import Asset as Articulation
 from rlcli_isaaclab.scene_facade import Asset as RigidObject
-from rlcli_isaaclab.scene_facade import CameraView as Camera
-from rlcli_isaaclab.scene_facade import CameraView as TiledCamera
-from rlcli_isaaclab.scene_facade import FrameTransformer, TerrainImporter
-from rlcli_isaaclab.scene_facade import Sensor as ContactSensor
-from rlcli_isaaclab.scene_facade import Sensor as RayCaster
+from rlcli_isaaclab.sensor_facade import CameraView as Camera
+from rlcli_isaaclab.sensor_facade import CameraView as TiledCamera
+from rlcli_isaaclab.sensor_facade import FrameTransformer, TerrainImporter
+from rlcli_isaaclab.sensor_facade import Sensor as ContactSensor
+from rlcli_isaaclab.sensor_facade import Sensor as RayCaster
 from rlcli_isaaclab.sensors import ContactSensorCfg, RayCasterCfg, patterns
 from rlcli_isaaclab.sensors.patterns import GridPatternCfg
 from rlcli_isaaclab.setup_scene import spawn_from_usd, spawn_ground_plane, spawn_light

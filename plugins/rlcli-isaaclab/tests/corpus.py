@@ -160,6 +160,23 @@ def isolated(limit_s: float, function: Any, *arguments: Any) -> Any:
     return json.loads(text) if text else (0, f"died with status {status} after {time.time() - start:.0f} s", {})
 
 
+def write_page(rows: dict[str, Any], page: Path) -> None:
+    """Write the table of the documentation from the results."""
+    text = page.read_text(encoding="utf-8")
+    start, end = "<!-- table -->\n", "<!-- end of table -->"
+    lines = ["| task | imports | validates | steps | trains | why it stops |", "| --- | --- | --- | --- | --- | --- |"]
+    for name, row in sorted(rows.items()):
+        marks = ["yes" if row["stage"] > i else "no" for i in range(len(STAGES))]
+        if row["stage"] == row["last"] < len(STAGES):
+            marks[row["last"] :] = ["not run"] * (len(STAGES) - row["last"])
+        if not row["agent"]:
+            marks[-1] = "no agent"
+        reason = re.sub(r"/\S*/", "", row["reason"]).replace("|", ";")[:200] if row["stage"] < row["last"] else ""
+        lines.append(f"| `{name}` | {' | '.join(marks)} | {reason} |")
+    before, after = text.partition(start)[0], text.partition(end)[2]
+    page.write_text(before + start + "\n".join(lines) + "\n" + end + after, encoding="utf-8")
+
+
 def main_() -> None:
     """Print one line per task, and the counts."""
     parser = argparse.ArgumentParser()
@@ -168,6 +185,7 @@ def main_() -> None:
     parser.add_argument("--stage", choices=STAGES, default="trains")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--steps", type=int, default=STEPS, help="steps of the stage `steps`")
+    parser.add_argument("--page", type=Path, help="page whose table is written from the results")
     parser.add_argument("--part", default="0/1", help="i/n: every n-th task")
     options = parser.parse_args()
     source = Path(os.environ[SOURCE])
@@ -192,10 +210,19 @@ def main_() -> None:
                 key.endswith("_cfg_entry_point") and key not in ("env_cfg_entry_point",) and "robomimic" not in key
                 for key in found[name]
             )
-            rows[name] = {"direct": direct, "stage": stage, "reason": reason, "agent": with_agent, **facts}
+            rows[name] = {
+                "direct": direct,
+                "stage": stage,
+                "reason": reason,
+                "agent": with_agent,
+                "last": STAGES.index(options.stage) + 1,
+                **facts,
+            }
             print(f"{stage} {name}: {reason[:400]}", flush=True)
             if options.out:
                 options.out.write_text(json.dumps(rows, indent=1))
+    if options.page:
+        write_page(rows, options.page)
     for direct in (False, True):
         kind = [row for row in rows.values() if row["direct"] == direct]
         counts = {stage: sum(row["stage"] > i for row in kind) for i, stage in enumerate(STAGES)}

@@ -28,6 +28,11 @@ EXTRA_BODIES = {
 LEGS = [f"{side}_{part}" for part in ("HAA", "HFE", "KFE") for side in ("LF", "LH", "RF", "RH")]
 JOINTS: dict[str, list[str]] = {
     "anymal": LEGS,
+    "shadow_hand": [
+        f"robot0_{finger}J{number}"
+        for finger, count in (("WR", 2), ("FF", 4), ("MF", 4), ("RF", 4), ("LF", 5), ("TH", 5))
+        for number in reversed(range(count))
+    ],
     "ant_instanceable": [*(f"{p}_{s}_leg" for p in ("front", "back") for s in SIDES), "front_left_foot", "front_right_foot", "left_back_foot", "right_back_foot"],
     "humanoid_instanceable": [
         "lower_waist:0", "lower_waist:1", "pelvis",
@@ -232,8 +237,8 @@ def mjcf(name: str, path: str, joints: list[str], bodies: list[str], articulated
             limits = "-4 4"
         axis = "0 1 0" if number % 2 else "0 0 1"
         place = f"{0.1 * (number % 5 - 2)} {0.1 * (number // 5 % 5 - 2)} 0" if floating else "0.05 0 0.1"
-        start = f'<body name="{owned[joint]}" pos="{place}"><joint name="{joint}" type="{kind}" axis="{axis}" range="{limits}" damping="0.5" armature="0.01"/>'
-        start += '<geom size="0.03" pos="0 0 -0.05" mass="0.2"/>'
+        start = f'<body name="{owned[joint]}" pos="{place}"><joint name="{joint}" type="{kind}" axis="{axis}" range="{limits}" damping="1" armature="0.5"/>'
+        start += '<geom size="0.06" pos="0 0 -0.1" mass="1"/>'
         inner = inner + start + "</body>" if floating else f"{start}{inner}</body>"
     drives = "".join(f'<position name="{joint}" joint="{joint}" kp="30" kv="1"/>' for joint in joints if driven)
     motors = f"<actuator>{drives}</actuator>" if driven else ""
@@ -242,7 +247,7 @@ def mjcf(name: str, path: str, joints: list[str], bodies: list[str], articulated
         motors += f'<tendon><fixed name="tendon"><joint joint="{joints[0]}" coef="1"/><joint joint="{joints[1]}" coef="-1"/></fixed></tendon>'
     return (
         f'<mujoco model="{name}"><compiler angle="radian"/><worldbody><body name="{root}">{free}'
-        f'<geom type="box" size=".15 .1 .05" mass="4"/>{inner}{fixed}</body></worldbody>{motors}</mujoco>'
+        f'<geom type="box" size=".15 .1 .05" mass="20"/>{inner}{fixed}</body></worldbody>{motors}</mujoco>'
     )
 
 

@@ -359,3 +359,27 @@ def test_invalid_params_error_lists_valid_names(source, section, name, params, m
 
     with pytest.raises(ConfigError, match=message):
         make_env(resolve(source(Wrong)))
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:DeprecationWarning")
+def test_rotations_agree_and_compile_to_torchscript():
+    import torch
+
+    from rlcli.sim.rotations import rotate, rotate_inverse
+    from rlcli_isaaclab.utils import math
+
+    generator = torch.Generator().manual_seed(3)
+    quat = math.normalize(torch.randn(64, 4, generator=generator))
+    vector = torch.randn(64, 3, generator=generator)
+    torch.testing.assert_close(math.quat_apply(quat, vector), rotate(quat, vector))
+    torch.testing.assert_close(math.quat_apply_inverse(quat, vector), rotate_inverse(quat, vector))
+    matrix = math.matrix_from_quat(quat)
+    torch.testing.assert_close((matrix @ vector[:, :, None])[:, :, 0], rotate(quat, vector))
+    torch.testing.assert_close(math.quat_from_matrix(matrix), math.quat_unique(quat))
+    turn = math.axis_angle_from_quat(quat)
+    again = math.quat_from_angle_axis(turn.norm(dim=-1), turn)
+    torch.testing.assert_close(again, math.quat_unique(quat), atol=1e-5, rtol=1e-5)
+    skew = math.skew_symmetric_matrix(vector)
+    torch.testing.assert_close((skew @ turn[:, :, None])[:, :, 0], torch.linalg.cross(vector, turn))
+    for name in ("quat_apply", "quat_mul", "quat_from_angle_axis", "matrix_from_quat", "normalize", "yaw_quat"):
+        torch.jit.script(getattr(math, name))

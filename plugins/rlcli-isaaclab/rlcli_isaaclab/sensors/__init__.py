@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from rlcli_isaaclab.config_class import MISSING, configclass
-from rlcli_isaaclab.scene_facade import Sensor as ContactSensor
-from rlcli_isaaclab.scene_facade import Sensor as RayCaster
+from rlcli_isaaclab.sensor_facade import Sensor as ContactSensor
+from rlcli_isaaclab.sensor_facade import Sensor as RayCaster
 from rlcli_isaaclab.sensors import patterns
 
 

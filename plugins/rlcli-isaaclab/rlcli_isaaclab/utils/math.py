@@ -12,25 +12,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.sim.rotations import from_euler, multiply, rotate, rotate_inverse
+from rlcli.sim.rotations import from_euler, multiply
 from rlcli.sim.rotations import wrap_to_pi as wrap_to_pi
 
 quat_from_euler_xyz, quat_mul = from_euler, multiply
 
 
-def _rows(function: Any, quat: Tensor, vector: Tensor) -> Tensor:
-    quat = quat.expand(*vector.shape[:-1], 4) if quat.dim() <= vector.dim() else quat
-    return function(quat.reshape(-1, 4), vector.reshape(-1, 3)).reshape(vector.shape)
-
-
 def quat_apply(quat: Tensor, vec: Tensor) -> Tensor:
     """Rotate a vector. (..., 4), (..., 3) -> (..., 3)"""
-    return _rows(rotate, quat, vec)
+    axis = quat[..., 1:]
+    twice = 2.0 * torch.linalg.cross(axis, vec, dim=-1)
+    return vec + quat[..., :1] * twice + torch.linalg.cross(axis, twice, dim=-1)
 
 
 def quat_apply_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     """Rotate a vector by the inverse rotation. (..., 4), (..., 3) -> (..., 3)"""
-    return _rows(rotate_inverse, quat, vec)
+    axis = quat[..., 1:]
+    twice = 2.0 * torch.linalg.cross(axis, vec, dim=-1)
+    return vec - quat[..., :1] * twice + torch.linalg.cross(axis, twice, dim=-1)
 
 
 quat_rotate, quat_rotate_inverse = quat_apply, quat_apply_inverse
@@ -78,14 +77,18 @@ def quat_error_magnitude(q1: Tensor, q2: Tensor) -> Tensor:
     return 2.0 * torch.acos(cosine)
 
 
-def subtract_frame_transforms(t01: Tensor, q01: Tensor, t02: Tensor | None = None, q02: Tensor | None = None) -> Any:
+def subtract_frame_transforms(
+    t01: Tensor, q01: Tensor, t02: Tensor | None = None, q02: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Return the pose of frame 2 in frame 1. Both poses are given in frame 0."""
     back = quat_conjugate(q01)
     quat = back if q02 is None else multiply(back, q02)
     return quat_apply(back, -t01 if t02 is None else t02 - t01), quat
 
 
-def combine_frame_transforms(t01: Tensor, q01: Tensor, t12: Tensor | None = None, q12: Tensor | None = None) -> Any:
+def combine_frame_transforms(
+    t01: Tensor, q01: Tensor, t12: Tensor | None = None, q12: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Return the pose of frame 2 in frame 0, from frame 1 in frame 0 and frame 2 in frame 1."""
     quat = q01 if q12 is None else multiply(q01, q12)
     return t01 if t12 is None else t01 + quat_apply(q01, t12), quat
@@ -93,7 +96,7 @@ def combine_frame_transforms(t01: Tensor, q01: Tensor, t12: Tensor | None = None
 
 def normalize(x: Tensor, eps: float = 1e-9) -> Tensor:
     """Scale vectors to length 1. (..., n)"""
-    return x / x.norm(dim=-1, keepdim=True).clamp(min=eps)
+    return x / x.norm(p=2, dim=-1, keepdim=True).clamp(min=eps)
 
 
 def scale_transform(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
@@ -136,12 +139,10 @@ def matrix_from_quat(quaternions: Tensor) -> Tensor:
     """Return rotation matrices. (..., 4) -> (..., 3, 3)"""
     w, x, y, z = quaternions.unbind(-1)
     twice = 2.0 / (quaternions * quaternions).sum(-1)
-    rows = [
-        1.0 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w),
-        twice * (x * y + z * w), 1.0 - twice * (x * x + z * z), twice * (y * z - x * w),
-        twice * (x * z - y * w), twice * (y * z + x * w), 1.0 - twice * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).reshape((*quaternions.shape[:-1], 3, 3))
+    first = torch.stack([1.0 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w)], dim=-1)
+    second = torch.stack([twice * (x * y + z * w), 1.0 - twice * (x * x + z * z), twice * (y * z - x * w)], dim=-1)
+    third = torch.stack([twice * (x * z - y * w), twice * (y * z + x * w), 1.0 - twice * (x * x + y * y)], dim=-1)
+    return torch.stack([first, second, third], dim=-2)
 
 
 def quat_from_matrix(matrix: Tensor) -> Tensor:
@@ -206,7 +207,8 @@ def skew_symmetric_matrix(vec: Tensor) -> Tensor:
     """Return the matrix of the cross product with a vector. (..., 3) -> (..., 3, 3)"""
     x, y, z = vec.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape((*vec.shape[:-1], 3, 3))
+    first, second = torch.stack([zero, -z, y], dim=-1), torch.stack([z, zero, -x], dim=-1)
+    return torch.stack([first, second, torch.stack([-y, x, zero], dim=-1)], dim=-2)
 
 
 def default_orientation(num: int, device: Any) -> Tensor:

@@ -1,0 +1,223 @@
+"""Sensors and terrain as Isaac Lab's terms expect them: `env.scene["contact_forces"].data.net_forces_w`."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rlcli.envs.vec_env import VecEnv
+from rlcli.scene.names import match
+from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
+from rlcli_isaaclab.setup_scene import current_setup
+
+
+class FrameTransformer:
+    """Poses of frames that are fixed to bodies, under Isaac Lab's names; `data` is the object itself."""
+
+    def __init__(self, assets: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+        self.data = self
+        self._source = self._bodies(assets, settings["source"])[0]
+        self._targets: list[tuple[Any, int, Mapping[str, Any]]] = []
+        self.target_frame_names: list[str] = []
+        for target in settings["targets"]:
+            found = self._bodies(assets, target)
+            self._targets += found
+            names = [asset.body_names[index] for asset, index, _ in found]
+            self.target_frame_names += [target["name"]] * len(found) if target["name"] else names
+        self.body_names = self.target_frame_names
+        self.joint_names: list[str] = []
+
+    @staticmethod
+    def _bodies(assets: Mapping[str, Any], frame: Mapping[str, Any]) -> list[tuple[Any, int, Mapping[str, Any]]]:
+        asset = assets[frame["entity"]]
+        wanted = frame["body"]
+        ids = [0] if wanted is None else asset.find_bodies(wanted)[0]
+        return [(asset, index, frame) for index in ids]
+
+    @staticmethod
+    def _pose(frame: tuple[Any, int, Mapping[str, Any]]) -> tuple[Tensor, Tensor]:
+        asset, index, settings = frame
+        pos, quat = asset.data.body_pos_w[:, index], asset.data.body_quat_w[:, index]
+        offset = torch.tensor(settings["pos"], device=pos.device).expand_as(pos)
+        turn = torch.tensor(settings["rot"], device=pos.device).expand_as(quat)
+        return pos + rotate(quat, offset), multiply(quat, turn)
+
+    @property
+    def source_pos_w(self) -> Tensor:
+        """Position of the source frame, world frame. (num_envs, 3) [m]"""
+        return self._pose(self._source)[0]
+
+    @property
+    def source_quat_w(self) -> Tensor:
+        """Orientation of the source frame (w, x, y, z), world frame. (num_envs, 4)"""
+        return self._pose(self._source)[1]
+
+    @property
+    def target_pos_w(self) -> Tensor:
+        """Positions of the target frames, world frame. (num_envs, frames, 3) [m]"""
+        return torch.stack([self._pose(target)[0] for target in self._targets], dim=1)
+
+    @property
+    def target_quat_w(self) -> Tensor:
+        """Orientations of the target frames (w, x, y, z), world frame. (num_envs, frames, 4)"""
+        return torch.stack([self._pose(target)[1] for target in self._targets], dim=1)
+
+    @property
+    def target_pos_source(self) -> Tensor:
+        """Positions of the target frames in the source frame. (num_envs, frames, 3) [m]"""
+        pos, quat = self._pose(self._source)
+        return torch.stack([rotate_inverse(quat, self._pose(t)[0] - pos) for t in self._targets], dim=1)
+
+    @property
+    def target_quat_source(self) -> Tensor:
+        """Orientations of the target frames in the source frame. (num_envs, frames, 4)"""
+        back = conjugate(self._pose(self._source)[1])
+        return torch.stack([multiply(back, self._pose(t)[1]) for t in self._targets], dim=1)
+
+
+class CameraView:
+    """A camera under Isaac Lab's names; `data` is the object itself."""
+
+    def __init__(self, cfg: Any) -> None:
+        current_setup().add(self, cfg)
+
+    cfg: Any
+
+    def bind(self, sensor: Any) -> None:
+        """Connect the camera with a sensor of the simulation."""
+        self._sensor, self.data = sensor, self
+        self.body_names: list[str] = []
+        self.joint_names: list[str] = []
+
+    @property
+    def output(self) -> Mapping[str, Tensor]:
+        """Images by type of data, channels last. (num_envs, h, w, c)"""
+        kind, image = self._sensor.config.data, self._sensor.image
+        names = {"rgb": ("rgb",), "depth": ("depth", "distance_to_image_plane"), "distance": ("distance_to_camera",)}
+        return dict.fromkeys(names[kind], image)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Height and width [pixels]."""
+        return self._sensor.config.height, self._sensor.config.width
+
+
+class TerrainImporter:
+    """The terrain under Isaac Lab's names."""
+
+    def __init__(self, cfg: Any) -> None:
+        current_setup().add(self, cfg)
+
+    def bind(self, env: VecEnv, terrain: Any) -> None:
+        """Connect the object with the terrain of the simulation; None: a plane."""
+        self._env, self._terrain = env, terrain
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._terrain, name)
+
+    @functools.cached_property
+    def cfg(self) -> Any:
+        """Configuration of the terrain in Isaac Lab's form, as far as terms read it."""
+        config: Any = self._env.config.scene.terrain
+        return SimpleNamespace(terrain_type="generator", terrain_generator=SimpleNamespace(
+            size=tuple(config.patch), num_rows=self._terrain.rows, num_cols=self._terrain.origins.shape[1],
+            curriculum=config.curriculum,
+        ))  # fmt: skip
+
+    @property
+    def terrain_levels(self) -> Tensor:
+        """Level of each environment. (num_envs,) int64"""
+        return self._terrain.levels
+
+    @property
+    def terrain_types(self) -> Tensor:
+        """Column of each environment. (num_envs,) int64"""
+        return self._terrain.types
+
+    @property
+    def terrain_origins(self) -> Tensor:
+        """Start positions by level and column. (rows, columns, 3) [m]"""
+        return self._terrain.origins
+
+    @property
+    def env_origins(self) -> Tensor:
+        """Start position of each environment. (num_envs, 3) [m]"""
+        return self._env.origins
+
+    def update_env_origins(self, env_ids: Any, move_up: Tensor, move_down: Tensor) -> None:
+        """Move environments a level up or down. env_ids are those of the running curriculum term."""
+        from rlcli_isaaclab.runtime import facade_of
+
+        selection = facade_of(self._env).selection
+        self._terrain.move(selection, move_up.bool(), move_down.bool())
+
+
+def camera_or_sensor(sensor: Any) -> Any:
+    """Return the facade of a sensor."""
+    is_camera = getattr(getattr(sensor, "config", None), "kind", "") == "camera"
+    return bound(CameraView if is_camera else Sensor, sensor)
+
+
+def bound(kind: Any, *parts: Any) -> Any:
+    """Return an object of a class that is connected with parts of the simulation."""
+    made = kind.__new__(kind)
+    made.bind(*parts)
+    return made
+
+
+class Sensor:
+    """A contact or ray sensor under Isaac Lab's names."""
+
+    _NAMES = {  # noqa: RUF012  (constant)
+        "net_forces_w": "force",
+        "net_forces_w_history": "force_history",
+        "current_air_time": "air_time",
+        "current_contact_time": "contact_time",
+        "ray_hits_w": "hits",
+        "pos_w": "position",
+    }
+
+    def __init__(self, cfg: Any) -> None:
+        current_setup().add(self, cfg)
+
+    cfg: Any
+
+    def bind(self, sensor: Any) -> None:
+        """Connect the object with a sensor of the simulation."""
+        self._sensor = sensor
+        self.data = self
+        self.body_names = list(getattr(sensor, "names", []))
+        self.joint_names: list[str] = []
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._sensor, self._NAMES.get(name, name))
+
+    def find_bodies(self, name_keys: Any, preserve_order: bool = False) -> Any:
+        """Return indices and names of the sensor's bodies that names or regexes match."""
+        return find_elements(name_keys, self.body_names, self.body_names, "body", preserve_order)
+
+    def compute_first_contact(self, dt: float, abs_tol: float = 1e-8) -> Tensor:
+        """Return where contact began in this step. (num_envs, bodies) bool"""
+        return self._sensor.first_contact
+
+    def compute_first_air(self, dt: float, abs_tol: float = 1e-8) -> Tensor:
+        """Return where contact ended in this step. (num_envs, bodies) bool"""
+        return self._sensor.first_air
+
+
+def find_elements(
+    wanted: Any, candidates: Any, names: list[str], kind: str, preserve_order: bool
+) -> tuple[list[int], list[str]]:
+    """Return indices into `names`, and the names, of the candidates that names or regexes match."""
+    indices = [names.index(candidates[i]) for i in match(wanted, list(candidates), kind)]
+    indices = indices if preserve_order else sorted(indices)
+    return indices, [names[i] for i in indices]
