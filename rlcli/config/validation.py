@@ -14,6 +14,7 @@ from rlcli.config import messages, python_task
 from rlcli.config.foreign_keys import move_foreign_keys
 from rlcli.config.given_models import MODELS, model_path
 from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read, without
+from rlcli.config.older_success import upgraded
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import (
@@ -80,12 +81,12 @@ class TaskCheck:
     def document(self) -> Document:
         """Return the content of the task's file. For a configuration in Python, also store its functions and notes."""
         if self.source.python is None and self.source.value is None:
-            return read(self.source.config, self.source.label)
+            return upgraded(read(self.source.config, self.source.label), self.source.config)
         task = python_task.load(self.source)
         self.functions, self.notes, self.format, self.place = task.terms, task.notes, task.format, task.place
         if self.source.config.suffix == ".py":
             return Document(task.data)
-        return read(self.source.config, self.source.label)  # the record of a run, which is YAML
+        return upgraded(read(self.source.config, self.source.label), self.source.config)  # the record of a run
 
     def add(self, *problems: Problem) -> None:
         """Add problems.
