@@ -40,7 +40,15 @@ class SuccessCondition:
 
     def holds(self) -> Field:
         """Return where the condition holds in the current state, and keep the value. (num_envs,) bool"""
-        self.value = value = self._as_field(self.term.call())
+        self.value = self._as_field(self.term.call())
+        return self._within(self.value)
+
+    def holds_for_tensors(self) -> Tensor:
+        """Return where the condition holds in the current state. (num_envs,) bool"""
+        held: Tensor = self._within(self.term.call())
+        return held
+
+    def _within(self, value: Any) -> Any:
         if self._low is None:
             return value if self._high is None else value <= self._high
         return value >= self._low if self._high is None else (value >= self._low) & (value <= self._high)

@@ -284,7 +284,7 @@ class VecEnv(Workflow):
 
     def compute_success(self) -> Tensor | None:
         """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""
-        held = [torch.as_tensor(condition.holds()) for condition in self._counters.conditions]
+        held = [condition.holds_for_tensors() for condition in self._counters.conditions]
         return functools.reduce(torch.logical_and, held) if held else None
 
     def check(self) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 import subprocess
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -83,7 +84,9 @@ def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False, com
         quiet_mujoco()
         spec = mujoco.MjSpec.from_file(str(file))
         if compiled or spec.compiler.settotalmass > 0:  # `write_masses` compiles it
-            spec.compile()
+            with warnings.catch_warnings():  # a deprecated attribute of the file
+                warnings.simplefilter("ignore")
+                spec.compile()
     except MUJOCO_ERRORS as error:
         if too_little := memory_error(error):
             raise too_little from None

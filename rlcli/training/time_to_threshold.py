@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from rlcli.errors import UsageError
-from rlcli.rl.confidence import NORMAL
 from rlcli.safe_text import float_or_nan
 
 _METRICS = {"success": "Eval/success_rate", "return": "Eval/mean_reward", "length": "Eval/mean_episode_length"}
@@ -43,6 +42,8 @@ class Threshold:
         if self.value == 1.0:
             hint = "as in --until success=0.97"
             raise UsageError("no number of episodes shows a success rate of 1 with 95 % confidence", hint=hint)
+        from rlcli.rl.confidence import NORMAL  # it imports numpy
+
         # Wilson's lower end with n of n successes is n / (n + z^2); twice as many episodes leave room for failures
         return max(least, 2 * math.ceil(NORMAL * NORMAL * self.value / (1.0 - self.value)))
 

@@ -247,7 +247,7 @@ def test_terms_read_kinematics_of_returned_state(tmp_path, engine):
     """Rewards, terminations and success read body positions of the final joint positions."""
     task = full_task(rewards={"log": {"func": "log", "weight": 1.0, "name": "reward"}},
                  terminations={"log": {"func": "log_end", "name": "termination"}})  # fmt: skip
-    task["success"] = {"func": "log_end", "name": "success"}
+    task["success"] = {"logged": {"func": "log_end", "name": "success"}}
     env = make(tmp_path, 3, task, f"sim.engine={engine}", "episode_length_s=0.1")
     env.reset()
     data, near = mujoco.MjData(env.engine.model), 1e-12 if engine == "batch" else 2e-6

@@ -86,7 +86,8 @@ def test_read_file_refuses_an_invalid_name(tmp_path):
     for name, output in (("x" * 300, "File name too long"), ("a\0b", "embedded null byte")):
         with pytest.raises(CheckpointError) as caught:
             read_file(tmp_path / name, 10)
-        assert caught.value.message.endswith(f"{name} cannot be read: {output}")
+        shown = name.replace("\0", "\\x00")
+        assert caught.value.message.endswith(f"{shown[-40:]} cannot be read: {output}")
 
 
 def test_json_limit_is_4_mib(tmp_path):

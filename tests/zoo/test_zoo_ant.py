@@ -271,7 +271,7 @@ def test_hooks_run_few_operations_without_host_sync(env):
 
 @pytest.mark.parametrize(("speed", "succeeds"), [(4.0, True), (0.5, False)])
 def test_success_requires_speed_at_end(speed, succeeds):
-    env = build("ant-direct", 2, "episode_length_s=1.0", "success.hold_s=0.5")
+    env = build("ant-direct", 2, "episode_length_s=1.0", "success.velocity.hold_s=0.5")
     env.reset()
     for _ in range(60):
         env.engine.field("qvel")[:, 0] = speed

@@ -251,7 +251,7 @@ def test_initial_balls_fall_inwards():
 
 @pytest.mark.parametrize(("place", "succeeds"), [(0.05, True), (0.2, False)])
 def test_success_is_ball_in_middle(place, succeeds):
-    env = build(TASK, 1, "episode_length_s=0.6", "success.hold_s=0.3")
+    env = build(TASK, 1, "episode_length_s=0.6", "success.position.hold_s=0.3")
     env.reset()
     while True:
         put_ball(env, 0, (place, 0.0, 0.67))

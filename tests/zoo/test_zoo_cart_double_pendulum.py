@@ -128,7 +128,7 @@ def test_time_out_after_five_seconds(env):
 
 @pytest.mark.parametrize(("pendulum", "succeeds"), [(0.05, True), (0.2, False)])
 def test_success_requires_upright_links(pendulum, succeeds):
-    env = build(TASK, 1, "episode_length_s=1.0", "success.hold_s=0.5")
+    env = build(TASK, 1, "episode_length_s=1.0", "success.pole.hold_s=0.5", "success.pendulum.hold_s=0.5")
     env.reset()
     while True:
         put(env, positions=(0.0, 0.0, pendulum))

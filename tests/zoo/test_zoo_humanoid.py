@@ -189,7 +189,7 @@ def test_initial_states_are_within_limits():
 @pytest.mark.parametrize("task", ["humanoid", "humanoid-direct"])
 @pytest.mark.parametrize(("speed", "pitch", "succeeds"), [(2.0, 0.0, True), (0.9, 0.0, False), (2.0, 1.0, False)])
 def test_success_requires_upright_and_speed_at_end(task, speed, pitch, succeeds):
-    env = build(task, 2, "episode_length_s=0.5", "success.hold_s=0.3")
+    env = build(task, 2, "episode_length_s=0.5", "success.velocity.hold_s=0.3", "success.upright.hold_s=0.3")
     env.reset()
     tilted = torch.tensor([math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0]).double()
     for _ in range(30):

@@ -191,7 +191,9 @@ def test_trunk_contact_terminates():
 
 def test_success_requires_tracking_whole_episode():
     """Check that a robot at rest succeeds with a zero command and fails with a velocity command."""
-    env = quadruped("quadruped-flat", 2, "episode_length_s=2.0", "success.hold_s=0.5")
+    env = quadruped(
+        "quadruped-flat", 2, "episode_length_s=2.0", "success.velocity.hold_s=0.5", "success.yaw_rate.hold_s=0.5"
+    )
     for _ in range(100):
         env.command_manager.get_command("velocity")[:] = torch.tensor([[0.0, 0.0, 0.0], [0.8, 0.0, 0.0]])
         result = env.step(torch.zeros(2, 12))

@@ -30,8 +30,6 @@ def command(
     Examples:
         rlcli new my-arm
             Write a package with a YAML task into the folder my-arm.
-        rlcli new my-arm --flavour direct -o packages/my-arm
-            Write a package with a task class into another folder.
         rlcli new my-dog --robot robots/dog.xml
             Write a package with a task for a robot.
     """

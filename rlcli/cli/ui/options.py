@@ -121,10 +121,10 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
         parameters.insert(len(signature.parameters), model)
 
     @functools.wraps(function)
-    def run(*, model: list[str] | None = None, **values: Any) -> None:
+    def run(**values: Any) -> None:
         from rlcli.cli.ui.progress_view import WorkView
 
-        if model:
+        if "overrides" in values and (model := values.pop("model")):
             from rlcli.config.given_models import MODELS, read_models
 
             words = [f'{MODELS}."{name}"="{file}"' for name, file in read_models(model).items()]

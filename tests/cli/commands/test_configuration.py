@@ -60,7 +60,7 @@ def column(env, *, entity: Entity = "robot"):
     [
         ("  alive: {func: is_alive, weight: 1.0}", "  bad:\n    weight: 1.0\n    func: column", "15:3: rewards.bad"),
         ("rewards:", "terminations: {bad: {func: column}}\nrewards:", "14:16: terminations.bad"),
-        ("rewards:", "success:\n  func: column\nrewards:", "14:1: success"),
+        ("rewards:", "success:\n  centred: {func: column}\nrewards:", "15:3: success.centred"),
     ],
 )
 def test_wrong_shape_of_term_is_reported_once(in_process, small, old, new, place):

@@ -118,7 +118,7 @@ def test_resume_of_earlier_step_drops_later_steps(cli, only_run):
     run = only_run()
     whole = files_of(run, 512)
     (run / "checkpoints/000000000512/policy.safetensors").write_bytes(b"damaged")
-    refused = cli("train", "--resume", f"{run.name}@step:512", "--max-iterations", 4)
+    refused = cli("train", "--resume", f"{run.name}@step:512", "--max-iterations", 5)
     assert refused.code == 5
     assert "policy.safetensors" in refused.err
     assert "@step:N" in refused.err
