@@ -146,7 +146,8 @@ def test_low_or_tilted_torso_terminates(height, roll, cause):
 def test_success_requires_commanded_velocity(speed, succeeds):
     env = biped(2, "episode_length_s=0.4", "success.velocity.hold_s=0.2", "success.yaw_rate.hold_s=0.2",
                 "commands.walk.lin_vel_x=[0.5,0.5]", "commands.walk.lin_vel_y=[0.0,0.0]",
-                "commands.walk.ang_vel_z=[0.0,0.0]", "events.base.yaw=[0.0,0.0]", "sim.gravity=[0.0,0.0,0.0]")  # fmt: skip
+                "commands.walk.ang_vel_z=[0.0,0.0]", "events.base.yaw=[0.0,0.0]",
+                "sim.gravity=[0.0,0.0,0.0]")  # fmt: skip
     for _ in range(20):
         for row in range(2):
             put(env, row, height=1.5, linear=(speed, 0.0, 0.0))
