@@ -10,6 +10,7 @@ from rlcli.errors import CheckpointError
 from rlcli.runs import safe_io
 from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.safe_io import parse_json, read_file, read_tail, refuse_links
+from rlcli.safe_text import message_line
 
 
 @pytest.fixture
@@ -86,8 +87,9 @@ def test_read_file_refuses_an_invalid_name(tmp_path):
     for name, output in (("x" * 300, "File name too long"), ("a\0b", "embedded null byte")):
         with pytest.raises(CheckpointError) as caught:
             read_file(tmp_path / name, 10)
-        shown = name.replace("\0", "\\x00")
-        assert caught.value.message.endswith(f"{shown[-40:]} cannot be read: {output}")
+        # a long name is cut in the middle, and a control character is escaped
+        assert caught.value.message == message_line(f"{tmp_path / name} cannot be read: {output}")
+        assert caught.value.message.endswith(f" cannot be read: {output}")
 
 
 def test_json_limit_is_4_mib(tmp_path):

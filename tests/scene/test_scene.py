@@ -337,7 +337,10 @@ def test_scene_reports_all_problems_at_once(tmp_path):
 
 def test_compile_error_raises_config_error(tmp_path):
     xml = ARM.replace('<geom size="0.03" mass="0.2"', '<geom size="0.03" mass="0"').replace('mass="0.5"', 'mass="0"')
-    with pytest.raises(ConfigError, match=r"mass and inertia of moving bodies must be larger"):
+    with pytest.raises(
+        ConfigError,
+        match=r"'arm.xml' is not a valid MJCF: .*arm.xml: .*mass and inertia of moving bodies must be larger",
+    ):
         build(arm(tmp_path, xml=xml))
 
 

@@ -1,4 +1,4 @@
-"""What a task writes to an asset besides its state: targets of joints, forces on bodies, and PhysX's view."""
+"""Commands of a task to an asset, besides its state: targets of joints, forces on bodies, and PhysX's view."""
 
 from __future__ import annotations
 

@@ -276,7 +276,7 @@ def record(env_class: type[DirectRLEnv], cfg: Any) -> tuple[Setup, Any]:
 
 
 class _Shell:
-    """What `_setup_scene` may read before the simulation exists."""
+    """Values that `_setup_scene` may read before the simulation exists."""
 
     def __init__(self, cfg: Any) -> None:
         self.device, self.num_envs = "cpu", cfg.scene.num_envs

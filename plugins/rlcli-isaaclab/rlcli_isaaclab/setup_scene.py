@@ -1,4 +1,7 @@
-"""What a direct task creates in `_setup_scene`: recorded to build the scene, then bound to its entities."""
+"""Assets and sensors that a direct task creates in `_setup_scene`.
+
+They are recorded to build the scene, and then bound to its entities.
+"""
 
 from __future__ import annotations
 

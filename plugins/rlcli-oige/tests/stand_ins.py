@@ -1,7 +1,7 @@
 """MJCF stand-ins for the robots and objects of OmniIsaacGymEnvs that have no built-in model.
 
-They have the joint and body names that the tasks use, and simple shapes: tasks run with them, and nobody should draw
-conclusions from what they learn.
+They have the joint and body names that the tasks use, and simple shapes. A task runs with them, but what it learns says
+nothing about the original robot.
 """
 
 from pathlib import Path

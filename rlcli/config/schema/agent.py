@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from rlcli.config.schema.base import Count, Positive, StrictModel, Threads, _FractionString
 
@@ -18,6 +19,19 @@ class AutopsyConfig(StrictModel):
     """Number of recordings to keep: the newest ones, with some of every kind of termination."""
     memory_mib: Annotated[int, Field(ge=1, le=1_000_000)] = 256
     """Memory for the last seconds of all environments [MiB]. If it is too small, fewer seconds are recorded."""
+
+
+def _check_bar(text: str) -> str:
+    key, _, number = text.partition("=")
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if key not in ("success", "return", "length") or not math.isfinite(value):
+        raise ValueError(f"'{text}' is not a bar; write success=0.97, return=200 or length=250")
+    if key == "success" and not 0.0 < value < 1.0:
+        raise ValueError(f"no evaluation can show a success rate of {value:g}; give a number between 0 and 1")
+    return text
 
 
 class AgentConfig(StrictModel):
@@ -45,7 +59,7 @@ class AgentConfig(StrictModel):
     the checkpoint with the best evaluation."""
     eval_episodes: Count = 100
     """Number of episodes of each of these evaluations."""
-    until: Annotated[str, Field(pattern=r"^(success=0?\.\d+|(return|length)=-?[0-9.e+-]+)$")] | None = None
+    until: Annotated[str, AfterValidator(_check_bar)] | None = None
     """Bar at which training ends before its budget: success=X, return=X or length=X. It is reached when the lower end
     of an evaluation's 95 % interval is at least X. The bar sets `eval_interval` to a twentieth of the budget if it is
     null, and raises `eval_episodes` to the number that the interval of a success rate needs."""
