@@ -280,9 +280,14 @@ REWARDS = [
     (r.distance_to_goal_exp, {**ROBOT, "command": "place", "std": 2.0}, lambda s:
      np.exp(-((s.place[:3] + s.origin - s.pos) ** 2).sum() / 4)),
     (r.object_is_lifted, {**THING, "minimal_height": 0.2}, lambda s: s.thing[2] - s.origin[2] > 0.2),
+    (r.object_is_lifted, {**GRIP, **THING, "minimal_height": 0.2, "held_within": 1.2}, lambda s:
+     (s.thing[2] - s.origin[2] > 0.2) * (norm(s.thing - s.grip) <= 1.2)),
     (r.object_ee_distance, {**GRIP, **THING, "std": 0.5}, lambda s: 1 - np.tanh(norm(s.thing - s.grip) / 0.5)),
     (r.object_goal_distance, {**ARM, **THING, "command": "pose", "std": 0.5, "minimal_height": 0.2}, lambda s:
      (1 - np.tanh(norm(s.thing - s.goal) / 0.5)) * (s.thing[2] - s.origin[2] > 0.2)),
+    (r.object_goal_distance,
+     {**GRIP, **THING, "command": "pose", "std": 0.5, "minimal_height": 0.2, "held_within": 1.2}, lambda s:
+     (1 - np.tanh(norm(s.thing - s.goal) / 0.5)) * (s.thing[2] - s.origin[2] > 0.2) * (norm(s.thing - s.grip) <= 1.2)),
     (r.success_bonus, {**GOAL, "threshold": 1.7}, lambda s:
      angle_of(product(inverse(s.thing_quat), s.goal_quat)) <= 1.7),
     (r.track_pos_l2, GOAL, lambda s: norm(s.goal + s.origin - s.thing)),

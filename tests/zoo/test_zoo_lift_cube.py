@@ -101,20 +101,23 @@ def test_cube_on_table_stays(env):
 # --- rewards ---
 
 
-def test_only_lifted_cube_is_rewarded(env):
+def test_only_a_held_cube_is_rewarded(env):
     env.reset()
-    set_cube(env, [0.5, 0.0, 0.039])
-    assert reward_terms(env)["lifting"].tolist() == [0.0] * 4
-    assert reward_terms(env)["goal"].tolist() == [0.0] * 4
-    set_cube(env, [0.5, 0.0, 0.041])
-    assert reward_terms(env)["lifting"].tolist() == pytest.approx([15.0 * 0.02] * 4)
+    grasp = env.entities["robot"].data.site_pos_w[0, 0].double()
+    for off, lifted in ((0.0, 1.0), (0.029, 1.0), (0.031, 0.0)):
+        set_cube(env, (grasp + torch.tensor([0.0, off, 0.0])).tolist())
+        paid = reward_terms(env)
+        assert paid["lifting"].tolist() == pytest.approx([15.0 * 0.02 * lifted] * 4), off
+        assert (paid["goal"] > 0).tolist() == [bool(lifted)] * 4, off
 
 
 def test_goal_distance_reward(env):
     env.reset()
-    goal = env.command_manager.get_term("object_pose").command[:, :3].double()
+    grasp = env.entities["robot"].data.site_pos_w[0, 0].double()
+    set_cube(env, grasp.tolist())
+    command = env.command_manager.get_term("object_pose").command
     for row, off in enumerate((0.0, 0.03, 0.1, 0.3)):
-        set_cube(env, (goal[row] + torch.tensor([0.0, 0.0, off])).tolist(), row)
+        command[row, :3] = grasp + torch.tensor([0.0, 0.0, off])
     paid = reward_terms(env)
     wide = [16.0 * 0.02 * (1.0 - math.tanh(off / 0.3)) for off in (0.0, 0.03, 0.1, 0.3)]
     fine = [5.0 * 0.02 * (1.0 - math.tanh(off / 0.05)) for off in (0.0, 0.03, 0.1, 0.3)]

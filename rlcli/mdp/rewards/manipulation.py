@@ -50,16 +50,30 @@ def goal_distance_tanh(env: ManagedEnv, *, command: Command, std: float) -> Tens
 # --- objects and handles ---
 
 
-def object_is_lifted(env: ManagedEnv, *, object: Entity = "object", minimal_height: float) -> Tensor:
-    """1 where an object is higher than `minimal_height` [m] above its environment's origin. (num_envs,)"""
-    return object.data.root_pos_w[:, 2] - env.origins[:, 2] > minimal_height
+def object_is_lifted(
+    env: ManagedEnv,
+    *,
+    entity: Entity = "robot",
+    object: Entity = "object",
+    minimal_height: float,
+    sites: Sites | None = None,
+    held_within: float | None = None,
+) -> Tensor:
+    """1 where an object is higher than `minimal_height` [m] above its environment's origin. (num_envs,)
+
+    held_within: 0 where the object is farther than this [m] from the site of `entity`, so that a throw earns nothing.
+    """
+    lifted = object.data.root_pos_w[:, 2] - env.origins[:, 2] > minimal_height
+    if held_within is None:
+        return lifted
+    return lifted & (_distance_to_object(entity, sites, object) <= held_within)
 
 
 def object_ee_distance(
     env: ManagedEnv, *, entity: Entity = "robot", sites: Sites, object: Entity = "object", std: float
 ) -> Tensor:
     """1 - tanh(distance / std), the distance from a site of `entity` to an object; std [m]. (num_envs,)"""
-    return _near(length(object.data.root_pos_w - single(entity.data.site_pos_w[:, sites], "site")), std)
+    return _near(_distance_to_object(entity, sites, object), std)
 
 
 def object_goal_distance(
@@ -70,13 +84,17 @@ def object_goal_distance(
     command: Command,
     std: float,
     minimal_height: float,
+    sites: Sites | None = None,
+    held_within: float | None = None,
 ) -> Tensor:
     """1 - tanh(distance / std), the distance from an object to the goal of a pose command; std [m]. (num_envs,)
 
-    0 unless the object is higher than `minimal_height` [m] above its environment's origin.
+    0 where `object_is_lifted`, with the same parameters, is 0.
     """
     distance = length(goal_in_world(entity, command) - object.data.root_pos_w)
-    return _near(distance, std) * (object.data.root_pos_w[:, 2] - env.origins[:, 2] > minimal_height)
+    return _near(distance, std) * object_is_lifted(
+        env, entity=entity, object=object, minimal_height=minimal_height, sites=sites, held_within=held_within
+    )
 
 
 def success_bonus(env: ManagedEnv, *, object: Entity = "object", command: Command, threshold: float = 0.1) -> Tensor:
@@ -166,3 +184,14 @@ def multi_stage_open_drawer(env: ManagedEnv, *, entity: Entity = "cabinet", join
 
 def _near(distance: Tensor, std: float) -> Tensor:
     return 1.0 - torch.tanh(distance / std)
+
+
+def _distance_to_object(entity: Entity, sites: Sites | None, object: Entity) -> Tensor:
+    """Return the distance from the one selected site of `entity` to an object [m]. (num_envs,)
+
+    Raises:
+        ValueError: if not exactly one site is selected.
+    """
+    if sites is None:
+        raise ValueError("'held_within' needs 'sites': the site of the gripper from which the distance is measured")
+    return length(object.data.root_pos_w - single(entity.data.site_pos_w[:, sites], "site"))
