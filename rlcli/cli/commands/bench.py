@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +20,10 @@ from rlcli.formats import log_notes
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
     from rlcli.tuning.bench import Bench, Findings, Stepped, Trained
+    from rlcli.tuning.step_profile import Cost
 
+_PROFILED = 5.0
+"""Length of a profile [s]."""
 _MAX_LOAD = 0.5
 """Load per core before the measurements [processes] above which a warning is printed."""
 
@@ -33,6 +37,7 @@ def command(
     save_preset: Annotated[str | None, typer.Option(metavar="FILE|NAME")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite")] = False,
     quick: Annotated[bool, typer.Option("--quick")] = False,
+    profile: Annotated[bool, typer.Option("--profile")] = False,
 ) -> None:
     """Measure the speed of a task on this machine, and recommend sizes and threads for its training.
 
@@ -40,12 +45,15 @@ def command(
         save_preset: Write the recommended settings to FILE.yaml, or to NAME.yaml here, for train --config.
         overwrite: Allow --save-preset to replace a file.
         quick: Measure shortly and once, for a first impression.
+        profile: Instead show where the time of an environment step goes: by stage, term and reset.
 
     Examples:
         rlcli bench cartpole --quick
             Get a first impression of the speed.
         rlcli bench cartpole --save-preset fast.yaml
             Write the recommended settings, for: rlcli train --config fast.yaml
+        rlcli bench quadruped-flat --profile --num-envs 1024
+            See which terms take the time of a step.
     """
     from rlcli.config.layers import flags
     from rlcli.config.load import resolve
@@ -61,6 +69,10 @@ def command(
         return resolve(source, agent=agent, config_file=config, overrides=overrides or [], flags=settings)
 
     present = resolved({})
+    if profile:
+        if file is not None:
+            raise UsageError("--profile measures no sizes, so there is no preset to save", hint="leave one of them out")
+        return _profile(present, _PROFILED / 5 if quick else _PROFILED)
     present.require_agent()
     log_notes(present.notes)
 
@@ -77,6 +89,25 @@ def command(
     _report(bench, present, machine, file, f"rlcli train {task}", names_agent=agent is not None, stopped=stopped)
     if stopped:
         raise Stopped("stopped; the measurements until now are shown, and no preset was written", exit_code=130)
+
+
+def _profile(resolved: Resolved, seconds: float) -> None:
+    """Print where the time of an environment step goes."""
+    import torch
+
+    from rlcli.tuning.step_profile import profile_step
+
+    machine = _machine(resolved)
+    torch.set_num_threads(1)  # small tensors: waking threads would take longer than the work
+    costs = profile_step(resolved, seconds)
+    rows = [[cost.section if cost.term is None else f"  {cost.term}", *_cost_cells(cost)] for cost in costs]
+    console.table(["PART OF THE STEP", "MS", "SHARE"], rows, f"environment step, {resolved.task.scene.num_envs:,} envs")
+    document = [dataclasses.asdict(cost) for cost in costs]
+    console.document("bench", task=resolved.source.name, machine=machine, profile=document)
+
+
+def _cost_cells(cost: Cost) -> list[str]:
+    return [cell(cost.milliseconds, ".3f"), cell(cost.share, ".1%")]
 
 
 def _report(

@@ -41,7 +41,8 @@ def number_of_workers(resolved: Resolved, device: str) -> int:
             return 1
         if ONE_WORKER in os.environ:
             return 1
-        count = min(cores, scene.num_envs // ENVS_PER_WORKER, available_memory() // FREE_MEMORY_PER_WORKER)
+        most = max(cores // 2, FEWEST_WORKERS)  # two hardware threads share a core; a process for each is slower
+        count = min(most, scene.num_envs // ENVS_PER_WORKER, available_memory() // FREE_MEMORY_PER_WORKER)
         return count if count >= FEWEST_WORKERS else 1
     if reason is None and scene.num_envs < 2 * scene.workers:
         reason = f"{scene.num_envs} environments are too few; each worker needs two"
