@@ -52,7 +52,7 @@ warning_at = partial(Remark, "", "warning")
 """(where, message, hint, numbers) -> warning of the running rule; the linter adds the name of the rule."""
 
 
-def runs_without_error(evidence: RolloutEvidence) -> Iterator[Remark]:
+def stops(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that the task raises no error under any fixed policy."""
     seen = set()
     for rollout in evidence.rollouts:
@@ -75,19 +75,16 @@ def early_resets(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that few episodes end in their first steps, at least under one fixed policy."""
     shares = {}
     for rollout in evidence.rollouts:
-        complete = [e for e in rollout.episodes if e.ended or e.steps > EARLY]
-        early = [e for e in complete if e.steps <= EARLY < rollout.env.max_episode_length]
-        shares[rollout.policy] = (len(early) / len(complete) if complete else 0.0, early)
+        early = [e for e in rollout.episodes if e.length <= EARLY < rollout.env.max_episode_length]
+        count = len(rollout.episodes) + sum(length > EARLY for length in rollout.unfinished)
+        shares[rollout.policy] = (len(early) / count if count else 0.0, early)
     share, early = min(shares.values(), key=lambda found: found[0])
     if share >= 0.1:
         causes = Counter(cause for episode in early for cause in episode.causes)
         names = ", ".join(name for name, _ in causes.most_common(2)) or "a reset"
-        yield error_at(
-            f"terminations: {names}",
-            f"{share:.0%} of the episodes end within {EARLY} steps, under every fixed policy",
-            "choose start states that the termination allows (narrower reset ranges), or widen its limits",
-            {"share": share, "steps": EARLY},
-        )
+        message = f"{share:.0%} of the episodes end within {EARLY} steps, under every fixed policy"
+        hint = "choose start states that the termination allows (narrower reset ranges), or widen its limits"
+        yield error_at(f"terminations: {names}", message, hint, {"share": share, "steps": EARLY})
 
 
 def _weighted_terms(evidence: RolloutEvidence) -> list[str]:
@@ -100,7 +97,7 @@ def _weighted_terms(evidence: RolloutEvidence) -> list[str]:
     return [name for name, config in rewards.items() if config is not None and config.weight != 0.0]
 
 
-def silent_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
+def silent_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that every reward term with a weight is not always 0 under all fixed policies."""
     if evidence.steps < min(evidence.subject.resolved.task.max_episode_length, MAX_STEPS):
         return  # a term may be other than 0 only at the end of an episode, which a shorter rollout does not reach
@@ -108,18 +105,15 @@ def silent_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
     for name in _weighted_terms(evidence):
         values = [rollout.terms[name] for rollout in evidence.rollouts if name in rollout.terms]
         if values and not any(bool(v.any()) for v in values):
-            yield warning_at(
-                f"rewards.{name}",
-                f"is 0 in all {steps} steps of {len(evidence.rollouts)} fixed policies",
-                "check its thresholds, joints and sensors, give it a softer slope, or remove it",
-                {"steps": steps},
-            )
+            message = f"is 0 in all {steps} steps of {len(evidence.rollouts)} fixed policies"
+            hint = "check its thresholds, joints and sensors, give it a softer slope, or remove it"
+            yield warning_at(f"rewards.{name}", message, hint, {"steps": steps})
 
 
 DOMINANT = 0.99
 
 
-def dominant_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
+def dominant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Report a reward term that is so large, with every kind of action, that the other terms have no effect."""
     active = _weighted_terms(evidence)
     shares: dict[str, list[float]] = {name: [] for name in active}
@@ -175,7 +169,7 @@ def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
     last = float(terminal.median())
     if good * horizon >= last:
         return
-    finished = [e for rollout in evidence.rollouts for e in rollout.episodes if e.ended]
+    finished = [e for rollout in evidence.rollouts for e in rollout.episodes]
     timed_out = [e.total for e in finished if not e.terminated]
     return_terminated = _mean([e.total for e in finished if e.terminated])
     numbers = {"good_step": good, "last_step": last, "horizon": horizon, "return_terminated": return_terminated}
@@ -199,7 +193,7 @@ LARGE, SMALL = 100.0, 0.01
 """Limits of the usual size. `cart-double-pendulum` has a column above 75 in 1 % of the steps, and learns well."""
 
 
-def constant_observations(evidence: RolloutEvidence) -> Iterator[Remark]:
+def constant_observation(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that every observation column varies under the fixed policies; of a picture, at least one pixel."""
     for where, values in _columns(evidence):
         if bool((values == values[:, :1]).all()):
@@ -255,7 +249,7 @@ def saturated_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
 DEAD = 1e-6
 
 
-def dead_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
+def dead_action(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that every column of the action changes the state."""
     env = evidence.env(8)
     env.reset(seed=0)
@@ -378,20 +372,11 @@ def discount_of(agent: AgentConfig | None) -> float | None:
     return next((float(value) for value in discounts if isinstance(value, int | float)), None)
 
 
-RULES: dict[str, Callable[[RolloutEvidence], Iterable[Remark]]] = {
-    "stops": runs_without_error,
-    "early-resets": early_resets,
-    "silent-reward": silent_rewards,
-    "dominant-reward": dominant_rewards,
-    "constant-reward": constant_reward,
-    "dying-pays": dying_pays,
-    "constant-observation": constant_observations,
-    "observation-scale": observation_scale,
-    "saturated-actions": saturated_actions,
-    "dead-action": dead_actions,
-    "timestep": timestep,
-    "horizon": horizon,
-}
+_IN_ORDER: tuple[Callable[[RolloutEvidence], Iterable[Remark]], ...] = (
+    *(stops, early_resets, silent_reward, dominant_reward, constant_reward, dying_pays, constant_observation),
+    *(observation_scale, saturated_actions, dead_action, timestep, horizon),
+)
+RULES = {rule.__name__.replace("_", "-"): rule for rule in _IN_ORDER}
 """Name -> rule, in the order in which they run. The first line of a rule's docstring is the rule."""
 
 

@@ -21,8 +21,9 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DivergedError, listing
 from rlcli.registry import model_file
 from rlcli.scene.untrusted_mjcf import model_roots, read_mjcf
+from rlcli.testing import steps
 from rlcli.testing.findings import Finding, error_at, warning_at
-from rlcli.testing.steps import STEPS, extreme_actions, record, step_outputs
+from rlcli.testing.steps import STEPS, record, step_outputs
 from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, observation_parts, task_of
 
 
@@ -38,11 +39,9 @@ def names(subject: TaskUnderTest) -> Iterator[Finding]:
             unnamed = [element for element in elements if not element.name]
             if unnamed:
                 places = [f"on '{e.target}'" if word == "actuator" else f"in '{e.parent.name}'" for e in unnamed]
-                yield warning_at(
-                    f"scene.entities.{entity}: {config.model}",
-                    f"{word} without a name: {listing(places)}; a term can select it only by its index",
-                    f'name it in the MJCF: <{word} name="..."/>',
-                )
+                message = f"{word} without a name: {listing(places)}; a term can select it only by its index"
+                hint = f'name it in the MJCF: <{word} name="..."/>'
+                yield warning_at(f"scene.entities.{entity}: {config.model}", message, hint)
 
 
 def yaml_round_trip(subject: TaskUnderTest) -> Iterator[Finding]:
@@ -157,16 +156,16 @@ def _task_outputs(env: VecEnv) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]:
             yield f"{section}.{term.name}", term.call(), ()
 
 
-def random_actions_stay_stable(subject: TaskUnderTest) -> Iterator[Finding]:
+def random_actions(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that no simulation diverges in 200 steps of random actions within the action bound."""
     recording = subject.recording()
     yield from _check_divergence(subject, recording.env, len(recording.steps))
 
 
-def extreme_actions_stay_stable(subject: TaskUnderTest) -> Iterator[Finding]:
+def extreme_actions(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that no simulation diverges in 200 steps of actions at the bound with alternating signs."""
     env = subject.env()
-    recording = record(env, extreme_actions(env, subject.bound))
+    recording = record(env, steps.extreme_actions(env, subject.bound))
     yield from _check_divergence(subject, env, len(recording.steps))
     if recording.error is not None:
         raise recording.error
