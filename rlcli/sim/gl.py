@@ -73,10 +73,9 @@ def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[A
             continue
         return context, backend
     packages = " or ".join(_PACKAGES.get(backend, backend) for backend in candidates())
-    raise MachineError(
-        f"no OpenGL backend works on this machine; tried {', '.join(tried)}",
-        hint=f"install {packages} (Debian, Ubuntu: apt install libegl1 libosmesa6), or set MUJOCO_GL",
-    )
+    message = f"no OpenGL backend works on this machine; tried {', '.join(tried)}"
+    hint = f"install {packages} (Debian, Ubuntu: apt install libegl1 libosmesa6), or set MUJOCO_GL"
+    raise MachineError(message, hint=hint)
 
 
 def _has_window() -> bool:
