@@ -28,6 +28,11 @@ _RUNNING = [row for row in range(NUM_ENVS) if row not in _ENDING]
 _LIMITS = (6, 9)
 """Two episode lengths [steps]; an end that occurs at both follows the limit."""
 
+Trajectory = list[dict[str, Tensor]]
+"""Outputs of each step by name."""
+MakeFinding = Callable[[str, str, str], Finding]
+"""`error_at` or `warning_at`."""
+
 
 def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the same seed and actions give the same trajectory, in a new environment and after reset(seed)."""
@@ -44,11 +49,7 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 def compare_trajectories(
-    env: VecEnv,
-    trajectories: Sequence[list[dict[str, Tensor]]],
-    message: str,
-    hint: str,
-    make: Callable[[str, str, str], Finding] = error_at,
+    env: VecEnv, trajectories: Sequence[Trajectory], message: str, hint: str, make: MakeFinding = error_at
 ) -> Iterator[Finding]:
     """Report the first difference of two trajectories, if they are not equal bit for bit.
 
