@@ -143,11 +143,11 @@ def partial_reset(subject: TaskUnderTest) -> Iterator[Finding]:
             rows = [row for row in _RUNNING if not bitwise_equal(a[row], b[row])]
             if rows:
                 later = f", {number} steps later" if number else ""
-                yield error_at(
-                    "the simulation's state" if name == "state" else name,
-                    f"of environments {rows} changed when {_ENDING} were reset{later}; they must stay bit-identical",
-                    "write only the rows of the selection or of env_ids, and do not average over environments",
+                message = (
+                    f"of environments {rows} changed when {_ENDING} were reset{later}; they must stay bit-identical"
                 )
+                hint = "write only the rows of the selection or of env_ids, and do not average over environments"
+                yield error_at("the simulation's state" if name == "state" else name, message, hint)
                 return
 
 

@@ -126,12 +126,10 @@ def dominant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     for name, found in shares.items():
         if found and min(found) >= DOMINANT:
             others = ", ".join(other for other in active if other != name)
-            yield warning_at(
-                f"rewards.{name}",
-                f"is {min(found):.1%} or more of the reward's size under every fixed policy: {others} have no effect",
-                "lower its weight, or raise the weights of the others",
-                {"share": min(found)},
-            )
+            message = f"is {min(found):.1%} or more of the reward's size under every fixed policy"
+            message += f": {others} have no effect"
+            hint = "lower its weight, or raise the weights of the others"
+            yield warning_at(f"rewards.{name}", message, hint, {"share": min(found)})
 
 
 def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -143,12 +141,9 @@ def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     ends_early = any(bool(rollout.terminated.any()) for rollout in evidence.rollouts)
     if not ends_early or value == 0.0:  # with terminations, any other constant rewards long or short episodes
         reason = "" if ends_early else ", and no episode ends early"
-        yield error_at(
-            "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf",
-            f"is {value:g} in every step of all fixed policies{reason}: there is nothing to learn",
-            "compute the reward from the state or the action",
-            {"value": value},
-        )
+        where = "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf"
+        message = f"is {value:g} in every step of all fixed policies{reason}: there is nothing to learn"
+        yield error_at(where, message, "compute the reward from the state or the action", {"value": value})
 
 
 def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -236,14 +231,12 @@ SATURATED = 0.8
 def saturated_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that random actions within the bound mostly stay within the limits of the actuators."""
     (rollout,) = [rollout for rollout in evidence.rollouts if rollout.policy == "random"]
+    hint = "lower the action's scale (or the gain), or raise the limit: actions beyond it have the same effect"
     for name, share in rollout.limited.items():
         if share >= SATURATED:
-            yield warning_at(
-                name,
-                f"is at its limit in {share:.0%} of the steps under random actions within +-{evidence.subject.bound:g}",
-                "lower the action's scale (or the gain), or raise the limit: actions beyond it have the same effect",
-                {"share": share},
-            )
+            bound = evidence.subject.bound
+            message = f"is at its limit in {share:.0%} of the steps under random actions within +-{bound:g}"
+            yield warning_at(name, message, hint, {"share": share})
 
 
 DEAD = 1e-6
@@ -269,13 +262,10 @@ def dead_action(evidence: RolloutEvidence) -> Iterator[Remark]:
             if moved > DEAD:
                 break
         if moved <= DEAD:
-            yield error_at(
-                f"actions, column {column} ({name})",
-                f"moves nothing: after {steps} steps at +-{bound:g} the state differs by {moved:.1g}"
-                " from the state without this action",
-                "check its actuator, and that scale, gear and limit are not 0",
-                {"moved": moved, "steps": steps},
-            )
+            message = f"moves nothing: after {steps} steps at +-{bound:g} the state differs by {moved:.1g}"
+            message += " from the state without this action"
+            hint = "check its actuator, and that scale, gear and limit are not 0"
+            yield error_at(f"actions, column {column} ({name})", message, hint, {"moved": moved, "steps": steps})
 
 
 def _state_after(env: VecEnv, start: dict[str, Tensor], action: Tensor, steps: int) -> Tensor:
@@ -354,13 +344,11 @@ def horizon(evidence: RolloutEvidence) -> Iterator[Remark]:
         if NEAREST <= round(ahead / steps, 9) <= FARTHEST:  # rounded: 1 / (1 - 0.99) is a little less than 100
             continue
         fitting = 1.0 - 1.0 / max(2.0, 0.25 * steps)
-        yield warning_at(
-            f"agents.{name}.gamma = {gamma:g}",
-            f"gives a horizon of {ahead:.3g} steps ({ahead * resolved.task.step_dt:.2g} s), and an episode has {steps}"
-            f" ({resolved.task.episode_length_s:g} s)",
-            f"{fitting:.3g} gives a horizon of a quarter of the episode",
-            {"gamma": gamma, "horizon": ahead, "episode": steps},
-        )
+        message = f"gives a horizon of {ahead:.3g} steps ({ahead * resolved.task.step_dt:.2g} s)"
+        message += f", and an episode has {steps} ({resolved.task.episode_length_s:g} s)"
+        numbers = {"gamma": gamma, "horizon": ahead, "episode": steps}
+        hint = f"{fitting:.3g} gives a horizon of a quarter of the episode"
+        yield warning_at(f"agents.{name}.gamma = {gamma:g}", message, hint, numbers)
 
 
 def discount_of(agent: AgentConfig | None) -> float | None:

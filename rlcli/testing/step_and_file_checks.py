@@ -54,21 +54,16 @@ def yaml_round_trip(subject: TaskUnderTest) -> Iterator[Finding]:
             again = to_data(resolve(replace(subject.source, config=file)))
         except ConfigError as error:
             for problem in error.problems:
-                yield error_at(
-                    problem.path or subject.source.label,
-                    f"cannot be read back from YAML: {problem.message}",
-                    problem.hint or "use a value that YAML has (finite numbers, text, lists)",
-                )
+                message = f"cannot be read back from YAML: {problem.message}"
+                hint = problem.hint or "use a value that YAML has (finite numbers, text, lists)"
+                yield error_at(problem.path or subject.source.label, message, hint)
             return
     before, after = dict(leaves(data)), dict(leaves(again))
     for path in {**before, **after}:
         was, now = before.get(path), after.get(path)
         if was != now and not (isinstance(was, list | tuple) and list(was) == now):  # YAML has no tuples
-            yield error_at(
-                dotted(path),
-                f"is {was!r}, and {now!r} after writing and reading the configuration",
-                "a run stores its configuration as YAML: use a value that YAML has",
-            )
+            message = f"is {was!r}, and {now!r} after writing and reading the configuration"
+            yield error_at(dotted(path), message, "a run stores its configuration as YAML: use a value that YAML has")
 
 
 # --- results of a step ---
@@ -173,11 +168,10 @@ def extreme_actions(subject: TaskUnderTest) -> Iterator[Finding]:
 
 def _check_divergence(subject: TaskUnderTest, env: VecEnv, steps: int) -> Iterator[Finding]:
     if env.divergences:
-        yield error_at(
-            f"sim.dt = {env.physics_dt:g} s, {steps} of {STEPS} steps",
-            f"the simulation diverged {env.divergences} times with actions within +-{subject.bound:g}; it must never",
-            "take a smaller sim.dt, more damping or armature, lower gains, or an effort_limit",
-        )
+        where = f"sim.dt = {env.physics_dt:g} s, {steps} of {STEPS} steps"
+        message = f"the simulation diverged {env.divergences} times with actions within +-{subject.bound:g}"
+        hint = "take a smaller sim.dt, more damping or armature, lower gains, or an effort_limit"
+        yield error_at(where, f"{message}; it must never", hint)
 
 
 def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
