@@ -143,11 +143,10 @@ def partial_reset(subject: TaskUnderTest) -> Iterator[Finding]:
             rows = [row for row in _RUNNING if not bitwise_equal(a[row], b[row])]
             if rows:
                 later = f", {number} steps later" if number else ""
-                message = (
-                    f"of environments {rows} changed when {_ENDING} were reset{later}; they must stay bit-identical"
-                )
+                where = "the simulation's state" if name == "state" else name
+                message = f"of environments {rows} changed when {_ENDING} were reset{later}"
                 hint = "write only the rows of the selection or of env_ids, and do not average over environments"
-                yield error_at("the simulation's state" if name == "state" else name, message, hint)
+                yield error_at(where, f"{message}; they must stay bit-identical", hint)
                 return
 
 
