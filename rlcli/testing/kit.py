@@ -33,7 +33,9 @@ _IN_ORDER: tuple[Check, ...] = (
     *(_portability.num_envs, _portability.speed, _portability.engines, _portability.captured),
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in _IN_ORDER}
-"""Name -> check, in the order in which they run; `docs/tutorials/first-plugin.md` lists them. The first line of a check's docstring is its requirement."""
+"""Name -> check, in the order in which they run; `docs/tutorials/first-plugin.md` lists them.
+
+The first line of a check's docstring is its requirement."""
 
 _DIRECT_ONLY = ("observation-after-reset",)
 

@@ -365,7 +365,9 @@ _IN_ORDER: tuple[Callable[[RolloutEvidence], Iterable[Remark]], ...] = (
     *(observation_scale, saturated_actions, dead_action, timestep, horizon),
 )
 RULES = {rule.__name__.replace("_", "-"): rule for rule in _IN_ORDER}
-"""Name -> rule, in the order in which they run; `docs/guides/check-and-lint.md` lists them. The first line of a rule's docstring is the rule."""
+"""Name -> rule, in the order in which they run; `docs/guides/check-and-lint.md` lists them.
+
+The first line of a rule's docstring is the rule."""
 
 
 def _quantile(values: Tensor, share: float) -> float:
