@@ -273,9 +273,8 @@ class ManagedEnv(VecEnv):
             kind = getattr(self._binder.load(signature), "actuator", None)
             joints = next((p.name for p in signature.parameters if p.alias == SELECTORS[0]), None)
             if kind is not None and joints is not None:
-                needs.append(
-                    ActuatorNeed(config.params["entity"], config.params[joints], kind, ("actions", name, joints))
-                )
+                path = ("actions", name, joints)
+                needs.append(ActuatorNeed(config.params["entity"], config.params[joints], kind, path))
         return needs
 
 

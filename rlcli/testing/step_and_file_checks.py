@@ -185,9 +185,8 @@ def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
             if bool((values == values[0, 0]).all()) and where not in fixed:
                 value = f"is {float(values[0, 0]):g}" if values.shape[2] == 1 else "is the same"
                 message = f"{value} in {NUM_ENVS} environments and {len(obs)} observations"
-                yield error_at(
-                    where, message, "compute the column from the state, or leave it out: a policy cannot learn from it"
-                )
+                hint = "compute the column from the state, or leave it out: a policy cannot learn from it"
+                yield error_at(where, message, hint)
 
 
 def _fixed_command_columns(env: VecEnv, group: str) -> set[str]:
