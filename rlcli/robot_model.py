@@ -82,9 +82,8 @@ class Robot:
         if a is not None and model.actuator_forcelimited[a]:
             return float(np.abs(model.actuator_forcerange[a]).max() * abs(model.actuator_gear[a, 0]))
         if a is not None and model.actuator_ctrllimited[a] and not model.actuator_biasprm[a, 1]:
-            return float(
-                np.abs(model.actuator_ctrlrange[a]).max() * model.actuator_gainprm[a, 0] * model.actuator_gear[a, 0]
-            )
+            largest = np.abs(model.actuator_ctrlrange[a]).max()
+            return float(largest * model.actuator_gainprm[a, 0] * model.actuator_gear[a, 0])
         mass = float(model.body_subtreemass[model.jnt_bodyid[joint]])
         return max(0.05, 2.0 * 9.81 * mass * (1.0 if model.jnt_type[joint] == SCALAR[1] else 0.3))
 

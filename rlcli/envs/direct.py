@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -180,9 +180,8 @@ class DirectEnv(VecEnv):
         except RlcliError:
             raise
         except Exception as error:
-            raise TaskError(
-                f"task '{source.name}' is broken: {source.task}: {type(error).__name__}: {error}"
-            ) from error
+            message = f"task '{source.name}' is broken: {source.task}: {type(error).__name__}: {error}"
+            raise TaskError(message) from error
         if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
             raise TaskError(f"task '{source.name}' is broken: derive {source.task} from DirectTask")
         return task_class
@@ -242,15 +241,17 @@ class DirectEnv(VecEnv):
         """Return the task's `extras`, by name."""
         return self.task.extras
 
+    def _extra_tensors(self) -> Iterator[tuple[str, Tensor]]:
+        """Yield the numbers and the tensors of the task's `extras`, without empty ones."""
+        for name, value in self._extras().items():
+            if isinstance(value, int | float):
+                yield name, torch.tensor(float(value), dtype=torch.float64)
+            elif isinstance(value, Tensor) and value.numel():
+                yield name, value
+
     def metric_values(self) -> dict[str, Tensor]:
         """Return the task's `extras`: values and tensors."""
-        found = {}
-        for name, value in self._extras().items():
-            if isinstance(value, Tensor) and value.numel():
-                found[f"Task/{name}"] = value
-            elif isinstance(value, int | float):
-                found[f"Task/{name}"] = torch.tensor(float(value), dtype=torch.float64)
-        return found
+        return {f"Task/{name}": value for name, value in self._extra_tensors()}
 
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the task's `extras` with one row for each environment. (num_envs,) each
@@ -258,12 +259,9 @@ class DirectEnv(VecEnv):
         A tensor without such rows, or a number, gives the same value for all environments.
         """
         found = {}
-        for name, value in self._extras().items():
-            if isinstance(value, Tensor) and value.numel():
-                rows = value.float() if value.shape[:1] == (self.num_envs,) else value.float().mean().expand(1, 1)
-                found[name] = rows.reshape(len(rows), -1).mean(dim=1).expand(self.num_envs)
-            elif isinstance(value, int | float):
-                found[name] = torch.full((self.num_envs,), float(value), device=self.device)
+        for name, value in self._extra_tensors():
+            rows = value.float() if value.shape[:1] == (self.num_envs,) else value.float().mean().expand(1, 1)
+            found[name] = rows.reshape(len(rows), -1).mean(dim=1).expand(self.num_envs).to(self.device)
         return found
 
     def episode_dependencies(self) -> list[str]:

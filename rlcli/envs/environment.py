@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from rlcli.envs.vec_env import VecEnv
 
 
-class Environment(ABC):
+class Environment(Protocol):
     """`num_envs` copies of a task that are stepped together, in one process (`VecEnv`) or in several (`ShardedEnv`)."""
 
     resolved: Resolved
@@ -49,10 +48,9 @@ class Environment(ABC):
     default_state: dict[str, Tensor]
     """Joint state at the start of episodes, before reset events. qpos (nq,), qvel (nv,)"""
     engine: EngineView
-    _playing = True
+    _playing: bool = True
 
     @property
-    @abstractmethod
     def local(self) -> VecEnv:
         """The environments that this process steps, with their terms and managers.
 
@@ -64,7 +62,6 @@ class Environment(ABC):
         """Number of processes that step the environments."""
         return 1
 
-    @abstractmethod
     def reset(self, seed: int | None = None, *, episode: int = 0) -> dict[str, Tensor]:
         """Start a new episode everywhere, and return observations by group. (num_envs, d) float32
 
@@ -74,7 +71,6 @@ class Environment(ABC):
                 in the terms of `episode_dependencies` is missing then.
         """
 
-    @abstractmethod
     def step(self, action: Tensor, restart: Tensor | None = None) -> StepResult:
         """Apply one action for `decimation` physics steps.
 
@@ -88,21 +84,17 @@ class Environment(ABC):
                 it ends the episode of its environment.
         """
 
-    @abstractmethod
     def compute_success(self) -> Tensor | None:
         """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""
 
-    @abstractmethod
     def check(self) -> None:
         """Raise the `DivergedError` of the steps since the last call; a CPU raises it in the step."""
 
     @property
-    @abstractmethod
     def common_step(self) -> int:
         """Number of steps since the start, the same in all environments."""
 
     @property
-    @abstractmethod
     def causes(self) -> dict[str, int]:
         """Number of diverged simulations by cause: MuJoCo's warning (`BADQACC`), `FIELD not finite`, `engine error`."""
 
@@ -121,22 +113,18 @@ class Environment(ABC):
         """Names of the reward terms, in the order of `StepRecord.reward_terms`; empty for a task without terms."""
         return []
 
-    @abstractmethod
     def extras(self) -> dict[str, float]:
         """Return further values to log: the task's values of the last step, and new divergences by cause."""
 
-    @abstractmethod
     def step_metrics(self) -> dict[str, Tensor]:
         """Return one value per environment, for evaluation and for observers (`StepObserver.on_step`). (num_envs,) each
 
         They are of the state before resets. `Episodes.metrics` has the metrics of commands, as means over episodes.
         """
 
-    @abstractmethod
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of everything that the next steps depend on, at a step boundary."""
 
-    @abstractmethod
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Restore the state returned by `state_dict()`, and return the observations of that moment.
 
@@ -145,15 +133,12 @@ class Environment(ABC):
             ValueError: if a tensor has another shape or type, because it was saved from a different environment.
         """
 
-    @abstractmethod
     def unsaved_state(self) -> list[str]:
         """Return the state that `state_dict` cannot contain; empty: a resumed run continues exactly."""
 
-    @abstractmethod
     def stateful_objects(self) -> list[Any]:
         """Return the objects whose attributes a step may change: class terms, a direct task."""
 
-    @abstractmethod
     def episode_dependencies(self) -> list[str]:
         """Return the parts of the configuration that make an episode depend on earlier ones; empty: none is known."""
 
@@ -165,6 +150,5 @@ class Environment(ABC):
         """Pause, or continue with `paused=False`."""
         self._playing = not paused
 
-    @abstractmethod
     def close(self) -> None:
         """Close the engine, the sensors that render, and the worker processes."""

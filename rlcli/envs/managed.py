@@ -23,7 +23,7 @@ from rlcli.managers.event import EventManager
 from rlcli.managers.observation import ObservationManager
 from rlcli.managers.observation_pipeline import Pipeline
 from rlcli.managers.reward import RewardManager
-from rlcli.managers.term import BoundTerm
+from rlcli.managers.term import BoundTerm, EnvContext
 from rlcli.managers.termination import TerminationManager
 from rlcli.scene.joint_and_actuator_setup import ActuatorNeed
 from rlcli.scene.scene import Scene
@@ -65,26 +65,20 @@ class ManagedEnv(VecEnv):
     def _build_workflow(self) -> None:
         # in this order: the first value of a term may use a manager that is built before
         self._all_envs = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        n, device, tunable, bound = self.num_envs, self.device, self._binder.tunable, self._bound
-        self.command_manager = CommandManager(bound["commands"], n, self.step_dt, device, tunable)
-        self.action_manager = ActionManager(
-            bound["actions"], n, self.step_dt, device, self.engine.as_field, self._select_all_by_step
-        )
-        self.termination_manager = TerminationManager(bound["terminations"], n, device)
-        self.event_manager = EventManager(bound["events"], n, self.step_dt, device, self.engine.set_constants)
+        tunable, bound, task = self._binder.tunable, self._bound, self.config
+        select_all = self._select_all_by_step
+        context = EnvContext(self.num_envs, self.step_dt, self.device, self.engine, tunable, select_all)
+        self.command_manager = CommandManager(bound["commands"], context)
+        self.action_manager = ActionManager(bound["actions"], context)
+        self.termination_manager = TerminationManager(bound["terminations"], context)
+        self.event_manager = EventManager(bound["events"], context)
         if self.event_manager.derives:
             self.engine.set_constants()  # allocates per-environment constants, and derives all of them in the same way
         self.event_manager.startup(self._select_all())
-        reward_dt = self.step_dt if self.config.reward_dt_scaling else 1.0
-        self.reward_manager = RewardManager(
-            bound["rewards"], n, reward_dt, device, tunable, self.engine.as_field, self.config.divergence_reward
-        )
-        configs, select_all = self.config.observations, self._select_all_by_step
-        watch = self.engine.check_finite if self.engine.asynchronous else None
-        self.observation_manager = ObservationManager(
-            self._observations, configs, n, self.step_dt, device, select_all, tunable, watch
-        )
-        self.curriculum_manager = CurriculumManager(bound["curriculum"], n, tunable, device)
+        reward_dt = self.step_dt if task.reward_dt_scaling else 1.0
+        self.reward_manager = RewardManager(bound["rewards"], context, reward_dt, task.divergence_reward)
+        self.observation_manager = ObservationManager(self._observations, task.observations, context)
+        self.curriculum_manager = CurriculumManager(bound["curriculum"], context)
 
     def stateful_objects(self) -> list[Any]:
         """Return the class terms."""
@@ -279,9 +273,8 @@ class ManagedEnv(VecEnv):
             kind = getattr(self._binder.load(signature), "actuator", None)
             joints = next((p.name for p in signature.parameters if p.alias == SELECTORS[0]), None)
             if kind is not None and joints is not None:
-                needs.append(
-                    ActuatorNeed(config.params["entity"], config.params[joints], kind, ("actions", name, joints))
-                )
+                path = ("actions", name, joints)
+                needs.append(ActuatorNeed(config.params["entity"], config.params[joints], kind, path))
         return needs
 
 

@@ -208,7 +208,8 @@ class VecEnv(Workflow):
         if ended is None:
             return None, None, None
         self._read_finals = finished if self.final_obs_of == "finished" else timed_out
-        wanted = self.final_obs_of == "finished" or self._may_be_any(timed_out)
+        # on a GPU, the last operand would force a host sync
+        wanted = self.final_obs_of == "finished" or self.engine.asynchronous or len(timed_out.nonzero()[0]) > 0
         final_obs = self._compute_final_obs() if wanted else None
         returns, terms, causes = self._episode_returns_and_causes(ended)
         truncated_rows = ended.read_view(timed_out)
@@ -268,10 +269,6 @@ class VecEnv(Workflow):
         selection = self._select(torch.ones(self.num_envs, dtype=torch.bool, device=self.device))
         assert selection is not None
         return selection
-
-    def _may_be_any(self, mask: Field) -> bool:
-        """Return whether a mask holds anywhere; True on a GPU, where reading the mask would force a host sync."""
-        return self.engine.asynchronous or len(mask.nonzero()[0]) > 0
 
     @property
     def local(self) -> VecEnv:

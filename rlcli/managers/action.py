@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,9 +11,9 @@ from torch import Tensor
 
 from rlcli.errors import ConfigError
 from rlcli.managers.observation_pipeline import Delay, make_delay
-from rlcli.managers.term import BoundTerm, resets
+from rlcli.managers.term import BoundTerm, EnvContext, resets
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Field, Selection, in_place
+from rlcli.sim.selection import Selection, in_place
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,22 +51,14 @@ class ActionTerm(Protocol):
 class ActionManager(TensorState):
     """Manager of the action terms, with the raw actions of the current and the previous step."""
 
-    def __init__(
-        self,
-        terms: list[BoundTerm],
-        num_envs: int,
-        step_dt: float,
-        device: torch.device,
-        as_field: Callable[[Tensor], Field],
-        select_all: Callable[[], Selection],
-    ) -> None:
+    def __init__(self, terms: list[BoundTerm], context: EnvContext) -> None:
         self.terms = terms
-        self._select_all = select_all
+        self._select_all = context.select_all
         _require_separate_actuators(terms)
         self.size = sum(term.instance.size for term in terms)
         self._term_resets = resets(terms)
-        both = torch.zeros(2, num_envs, self.size, device=device)
-        self._both_by_env = as_field(both.transpose(0, 1))
+        both = torch.zeros(2, context.num_envs, self.size, device=context.device)
+        self._both_by_env = context.engine.as_field(both.transpose(0, 1))
         self.action = both[0]
         """The policy's action of this step. (num_envs, size)"""
         self.prev_action = both[1]
@@ -78,7 +69,7 @@ class ActionManager(TensorState):
         start = 0
         for term in terms:
             size = term.instance.size
-            delay = make_delay(term, num_envs, size, step_dt, device)
+            delay = make_delay(term, size, context)
             if delay is not None:
                 self._delays[term.name] = delay
             self._process.append((term.instance.process, self.action[:, start : start + size], delay))

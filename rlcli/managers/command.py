@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import UsageError, did_you_mean, listing
-from rlcli.managers.term import BoundTerm, resets
-from rlcli.managers.tunable import TunableValues
+from rlcli.managers.term import BoundTerm, EnvContext, resets
 from rlcli.sim.markers import Arrow, Frame, Marker, Sphere
 from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
@@ -63,27 +62,25 @@ class Knob:
 class CommandManager(TensorState):
     """Manager of the command terms, with their timers and the sums of their metrics over an episode."""
 
-    def __init__(
-        self, terms: list[BoundTerm], num_envs: int, step_dt: float, device: torch.device, tunable: TunableValues
-    ) -> None:
+    def __init__(self, terms: list[BoundTerm], context: EnvContext) -> None:
         self.terms = terms
         self._term_resets = [resets([term]) for term in terms]
         self._by_name = {term.name: term for term in terms}
-        self._step_dt = step_dt
+        self._step_dt = context.step_dt
         self._times = [
-            tunable.get((*term.path, "resampling_time_s"), term.config.resampling_time_s)  # type: ignore[attr-defined]
+            context.tunable.get((*term.path, "resampling_time_s"), term.config.resampling_time_s)  # type: ignore[attr-defined]
             for term in terms
         ]
         # whole steps: repeated subtraction of step_dt would accumulate rounding errors
-        self._steps_left = torch.zeros(len(terms), num_envs, dtype=torch.int64, device=device)
+        self._steps_left = torch.zeros(len(terms), context.num_envs, dtype=torch.int64, device=context.device)
         self._measured = [
             (f"{term.name}/{name}", term, name)
             for term in terms
             if hasattr(term.instance, "metrics")
             for name in term.instance.metrics()
         ]
-        self._sums = torch.zeros(num_envs, len(self._measured), device=device)
-        self._steps = torch.zeros(num_envs, device=device)
+        self._sums = context.zeros(len(self._measured))
+        self._steps = context.zeros()
         self.held: dict[str, float] = {}
         """Values that replace those of the terms in every environment, by the name of the knob."""
         self._held_knobs: dict[str, Knob] = {}

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm
-from rlcli.managers.tunable import TunableValues
+from rlcli.managers.term import BoundTerm, EnvContext
 from rlcli.sim.saved_tensors import TensorState, mean_of
 from rlcli.sim.selection import Selection
 
@@ -22,12 +21,12 @@ class CurriculumManager(TensorState):
     or (num_envs,); its mean is logged.
     """
 
-    def __init__(self, terms: list[BoundTerm], num_envs: int, tunable: TunableValues, device: torch.device) -> None:
+    def __init__(self, terms: list[BoundTerm], context: EnvContext) -> None:
         self.terms = terms
-        self._tunable = tunable
+        self._tunable = context.tunable
         self._scheduled = [term for term in terms if hasattr(term.instance, "advance")]
         self._per_episode = [term for term in terms if not hasattr(term.instance, "advance")]
-        self._values = {term.name: torch.full((num_envs,), torch.nan, device=device) for term in terms}
+        self._values = {term.name: torch.full((context.num_envs,), torch.nan, device=context.device) for term in terms}
 
     def advance(self, step: Tensor) -> None:
         """Advance the schedules to a step. step () int64"""

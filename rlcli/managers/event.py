@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, resets
+from rlcli.managers.term import BoundTerm, EnvContext, resets
 from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
 
@@ -28,17 +28,16 @@ class EventManager(TensorState):
             masses, inertias or the like.
     """
 
-    def __init__(
-        self, terms: list[BoundTerm], num_envs: int, step_dt: float, device: torch.device, set_constants: Callback
-    ) -> None:
+    def __init__(self, terms: list[BoundTerm], context: EnvContext) -> None:
+        num_envs, device = context.num_envs, context.device
         by_mode: dict[str, list[BoundTerm]] = {"startup": [], "reset": [], "interval": []}
         for term in terms:
             by_mode[term.config.mode].append(term)  # type: ignore[attr-defined]
         self.terms = terms
         self._startup, self._reset, self._interval = by_mode["startup"], by_mode["reset"], by_mode["interval"]
         self._updating = [term.instance for term in terms if hasattr(term.instance, "update")]
-        self._step_dt = step_dt
-        self._set_constants = set_constants
+        self._step_dt = context.step_dt
+        self._set_constants = context.engine.set_constants
         # whole steps: repeated subtraction of step_dt would accumulate rounding errors
         self._steps_left = torch.zeros(len(self._interval), num_envs, dtype=torch.int64, device=device)
         self._fired_at = torch.full((len(self._reset), num_envs), _NEVER, dtype=torch.int64, device=device)

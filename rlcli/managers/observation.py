@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +12,7 @@ from torch import Tensor
 
 from rlcli.config.schema import ObservationGroupConfig
 from rlcli.managers.observation_pipeline import Draws, Pipeline
-from rlcli.managers.term import BoundTerm, check_shape, first_value
-from rlcli.managers.tunable import TunableValues
+from rlcli.managers.term import BoundTerm, EnvContext, check_shape, first_value
 from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
 from rlcli.sim.state_cache import is_finite
@@ -27,9 +26,6 @@ class _Group:
     next: int = 0
 
 
-Watch = Callable[[Tensor, str], None]
-"""Callback that notes values that are not finite, without a host sync: (values, their name)."""
-
 _FINAL = np.uint64(0x46494E414C)
 """Stream of the last observation of an episode: the first one of the next episode has other noise."""
 
@@ -40,28 +36,14 @@ class ObservationManager(TensorState):
     Args:
         groups: the bound terms of each group.
         configs: the settings of the groups.
-        num_envs: number of environments.
-        step_dt: control period [s].
-        device: device of the buffers.
-        select_all: returns a selection of all environments; its random numbers depend on the current step.
-        tunable: the settings that a curriculum changes.
-        watch: notes values that are not finite; None: check them at once.
+        context: the environment. A GPU engine notes values that are not finite; else they are checked at once.
     """
 
     def __init__(
-        self,
-        groups: dict[str, list[BoundTerm]],
-        configs: Mapping[str, ObservationGroupConfig],
-        num_envs: int,
-        step_dt: float,
-        device: torch.device,
-        select_all: Callable[[], Selection],
-        tunable: TunableValues,
-        watch: Watch | None = None,
+        self, groups: dict[str, list[BoundTerm]], configs: Mapping[str, ObservationGroupConfig], context: EnvContext
     ) -> None:
-        self.num_envs = num_envs
-        self._device, self._step_dt, self._tunable = device, step_dt, tunable
-        self._select_all, self._watch = select_all, watch
+        self._context, engine = context, context.engine
+        self._watch = engine.check_finite if engine.asynchronous else None
         self.groups = {name: self._group(terms, configs[name]) for name, terms in groups.items()}
         self._final = {name: torch.zeros_like(group.buffers[0]) for name, group in self.groups.items()}
         self._final_views = {name: _split(self._final[name], group.pipelines) for name, group in self.groups.items()}
@@ -132,7 +114,7 @@ class ObservationManager(TensorState):
         self._fresh = None
 
     def _draws(self, salt: np.uint64) -> Draws:
-        all_envs = functools.cache(self._select_all)  # made when a step first needs random numbers
+        all_envs = functools.cache(self._context.select_all)  # made when a step first needs random numbers
         return lambda stream: all_envs().stream(stream ^ salt)
 
     def _fill(self, group: _Group, views: list[Tensor], draws: Draws, *, advance: bool) -> None:
@@ -145,10 +127,10 @@ class ObservationManager(TensorState):
             value = first_value(term)
             dims = value.dim() if isinstance(value, Tensor) else 0
             shape = tuple(value.shape[1:]) if dims in (2, 4) else (1,)  # columns, or an image
-            check_shape(term, value, (self.num_envs, *shape))
-            pipelines.append(Pipeline(term, shape, config, self.num_envs, self._step_dt, self._device, self._tunable))
+            check_shape(term, value, (self._context.num_envs, *shape))
+            pipelines.append(Pipeline(term, shape, config, self._context))
         size = sum(pipeline.size for pipeline in pipelines)
-        buffers = [torch.zeros(self.num_envs, size, device=self._device) for _ in range(3)]
+        buffers = [self._context.zeros(size) for _ in range(3)]
         return _Group(pipelines, buffers, [_split(buffer, pipelines) for buffer in buffers])
 
     def _require_finite(self, name: str, group: _Group, values: Tensor) -> None:

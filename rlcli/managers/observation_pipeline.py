@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from rlcli.config import schema
-from rlcli.managers.term import BoundTerm, resets
-from rlcli.managers.tunable import TunableValues
+from rlcli.managers.term import BoundTerm, EnvContext, resets
 from rlcli.sim.selection import Selection, in_place
 
 Draws = Callable[[np.uint64], Selection]
@@ -54,14 +53,7 @@ class Pipeline:
     """The stages of one term, and its columns in the group."""
 
     def __init__(
-        self,
-        term: BoundTerm,
-        shape: tuple[int, ...],
-        group: schema.ObservationGroupConfig,
-        num_envs: int,
-        step_dt: float,
-        device: torch.device,
-        tunable: TunableValues,
+        self, term: BoundTerm, shape: tuple[int, ...], group: schema.ObservationGroupConfig, context: EnvContext
     ) -> None:
         config = term.config
         assert isinstance(config, schema.ObservationConfig)
@@ -70,7 +62,7 @@ class Pipeline:
         """Shape of the term's value in one environment; the columns are its elements in row-major order."""
         self.width = width = math.prod(shape)
         self.history = group.history or config.history or 1
-        self._num_envs, self._step_dt, self._device, self._tunable = num_envs, step_dt, device, tunable
+        self._context, self._zeros = context, context.zeros
         self._stages = [self._modifier(number, modifier) for number, modifier in enumerate(config.modifiers)]
         if group.enable_corruption and config.noise is not None:
             self._stages.append(_Noise(self._sampler("noise", config.noise), config.noise.operation, term.stream))
@@ -81,7 +73,7 @@ class Pipeline:
             self._stages.append(_Clip(self._setting("clip", config.clip)))
         if config.scale is not None:
             self._stages.append(_Constant("scale", self._columns("scale", config.scale)))
-        delay = make_delay(term, num_envs, width, step_dt, device) if group.enable_corruption else None
+        delay = make_delay(term, width, context) if group.enable_corruption else None
         self._stages += [] if delay is None else [delay]
         self._frames = self._zeros(self.history * width) if self.history > 1 else None
         self._value = self._zeros(width) if self.history > 1 else None
@@ -142,18 +134,15 @@ class Pipeline:
         }
         return found if self._frames is None else {**found, "history": self._frames}
 
-    def _zeros(self, *shape: int) -> Tensor:
-        return torch.zeros(self._num_envs, *shape, device=self._device)
-
     def _setting(self, key: str, value: object) -> Any:
         """Return a setting, or its tensor if a curriculum changes it."""
-        return self._tunable.get((*self.term.path, *key.split(".")), value)
+        return self._context.tunable.get((*self.term.path, *key.split(".")), value)
 
     def _columns(self, key: str, value: float | list[float]) -> Tensor:
         """Return a setting with one value for all columns, or one for each. () or (width,)"""
         setting = self._setting(key, value)
         if not isinstance(setting, Tensor):
-            setting = torch.tensor(value, dtype=torch.float32, device=self._device)
+            setting = torch.tensor(value, dtype=torch.float32, device=self._context.device)
         if setting.dim() == 1 and len(setting) != self.width:
             raise self.term.error(f"has {len(setting)} values; give 1 or {self.width}", *key.split("."))
         return setting
@@ -163,7 +152,7 @@ class Pipeline:
         if isinstance(config, schema.ClipModifierConfig):
             return _Clip(config.bounds)
         if isinstance(config, schema.IntegratorModifierConfig):
-            return _Integrator(self._zeros(2, self.width), self._step_dt)
+            return _Integrator(self._zeros(2, self.width), self._context.step_dt)
         if isinstance(config, schema.DigitalFilterModifierConfig):
             return _DigitalFilter(self._zeros(len(config.a) + len(config.b) - 1, self.width), config)
         if config.kind == "scale":
@@ -318,7 +307,7 @@ class Delay(Stage):
         return {"frames": self._frames, "lag": self._lag}
 
 
-def make_delay(term: BoundTerm, num_envs: int, width: int, step_dt: float, device: torch.device) -> Delay | None:
+def make_delay(term: BoundTerm, width: int, context: EnvContext) -> Delay | None:
     """Return the delay of an observation or action term; None if it has none.
 
     Raises:
@@ -328,8 +317,8 @@ def make_delay(term: BoundTerm, num_envs: int, width: int, step_dt: float, devic
     if config is None:
         return None
     try:
-        steps = config.step_range(step_dt)
+        steps = config.step_range(context.step_dt)
     except ValueError as error:
         raise term.error(str(error), "delay") from None
-    frames = torch.zeros(num_envs, steps[1] + 1, width, device=device)
+    frames = context.zeros(steps[1] + 1, width)
     return Delay(steps, config.redraw, term.stream, frames) if steps[1] else None

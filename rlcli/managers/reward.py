@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, check_shape, first_value, resets
+from rlcli.managers.term import BoundTerm, EnvContext, check_shape, first_value, resets
 from rlcli.managers.termination import DIVERGED
-from rlcli.managers.tunable import TunableValues
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Field, Selection, in_place
+from rlcli.sim.selection import Selection, in_place
 
 
 class RewardManager(TensorState):
@@ -22,19 +19,13 @@ class RewardManager(TensorState):
     """
 
     def __init__(
-        self,
-        terms: list[BoundTerm],
-        num_envs: int,
-        dt: float,
-        device: torch.device,
-        tunable: TunableValues,
-        as_field: Callable[[Tensor], Field],
-        divergence_reward: float | None = None,
+        self, terms: list[BoundTerm], context: EnvContext, dt: float, divergence_reward: float | None = None
     ) -> None:
+        num_envs, device, as_field = context.num_envs, context.device, context.engine.as_field
         self.terms = terms
         self._term_resets = resets(terms)
         self._dt = dt
-        weights = [tunable.get((*term.path, "weight"), term.config.weight) for term in terms]  # type: ignore[attr-defined]
+        weights = [context.tunable.get((*term.path, "weight"), term.config.weight) for term in terms]  # type: ignore[attr-defined]
         # at least two columns: numpy sums a single column in another order than several
         table = torch.zeros(len(terms), max(num_envs, 2), device=device)
         self._values = table[:, :num_envs]

@@ -24,6 +24,8 @@ from rlcli.registry import is_framework, load_module
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem
 from rlcli.scene.sensors import Sensor
+from rlcli.sim.engine import Engine
+from rlcli.sim.selection import Selection
 
 SENSORS = {"ContactSensor": "contact", "RaySensor": "rays", "CameraSensor": "camera"}
 """Type alias of `rlcli.task` -> kind of its sensors in `scene.sensors`."""
@@ -81,6 +83,23 @@ class BoundTerm:
             self.call.load_state_dict(state)
         elif self.memory is not None:
             self.memory.load_state_dict(state)
+
+
+@dataclass(frozen=True, slots=True)
+class EnvContext:
+    """Parts of an environment that its managers use."""
+
+    num_envs: int
+    step_dt: float
+    device: torch.device
+    engine: Engine
+    tunable: TunableValues
+    select_all: Callable[[], Selection]
+    """Return a selection of all environments, whose random numbers depend on the training step."""
+
+    def zeros(self, *shape: int) -> Tensor:
+        """Return a tensor of zeros with a row for each environment. (num_envs, *shape)"""
+        return torch.zeros(self.num_envs, *shape, device=self.device)
 
 
 class TermEnv(Protocol):

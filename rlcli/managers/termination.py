@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, check_shape, first_value, resets
+from rlcli.managers.term import BoundTerm, EnvContext, check_shape, first_value, resets
 from rlcli.sim.selection import Selection
 
 DIVERGED = "diverged"
@@ -17,9 +17,9 @@ DIVERGED = "diverged"
 class TerminationManager:
     """Manager of the termination terms. A state may be both terminated and timed out."""
 
-    def __init__(self, terms: list[BoundTerm], num_envs: int, device: torch.device) -> None:
+    def __init__(self, terms: list[BoundTerm], context: EnvContext) -> None:
         self.terms = terms
-        self._none = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self._none = torch.zeros(context.num_envs, dtype=torch.bool, device=context.device)
         self.terminated = self._none.clone()
         """Where this step terminated the episode. (num_envs,) bool"""
         self.time_outs = self._none.clone()
@@ -29,7 +29,7 @@ class TerminationManager:
         self._term_resets = resets(terms)
         self._calls = [(term, bool(term.config.time_out)) for term in terms]  # type: ignore[attr-defined]
         for term in terms:
-            check_shape(term, first_value(term), (num_envs,))
+            check_shape(term, first_value(term), (context.num_envs,))
 
     def compute(self, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return where this step terminates episodes, and where they time out. (num_envs,) bool each"""

@@ -188,9 +188,8 @@ class JointPositionToLimits(_ScaledJointAction):
         finite = self.entity.data.soft_joint_pos_limits[self.joints].isfinite().all(dim=-1)
         if self.rescale_to_limits and not bool(finite.all()):
             unlimited = self.elements[int((~finite).nonzero()[0, 0])]
-            raise NameProblem(
-                f"joint '{unlimited}' has no limits to stretch over", "give it a range, or another action"
-            )
+            message = f"joint '{unlimited}' has no limits to stretch over"
+            raise NameProblem(message, "give it a range, or another action")
 
     def _compute_command(self, action: Tensor) -> None:
         self.command.copy_(self._limited(action))

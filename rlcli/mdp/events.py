@@ -11,9 +11,8 @@ from torch import Tensor
 
 from rlcli.errors import listing
 from rlcli.mdp.parameters import Entity, ManagedEnv
-from rlcli.mdp.randomization_base import element_names
+from rlcli.mdp.randomization_base import Pair, Ranges, element_names
 from rlcli.mdp.term import BodyTerm, JointTerm, Term
-from rlcli.mdp.tunable_ranges import Pair, Ranges
 from rlcli.scene.names import NameProblem
 from rlcli.sim.rotations import from_euler, multiply, random_quaternion
 from rlcli.sim.saved_tensors import TensorState

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import mujoco
 import torch
@@ -14,7 +15,6 @@ from rlcli.errors import listing
 from rlcli.mdp.parameters import Entity
 from rlcli.mdp.term import Term
 from rlcli.mdp.term_helpers import column_numbers
-from rlcli.mdp.tunable_ranges import Pair, Ranges
 from rlcli.scene.model_fields import ModelField
 from rlcli.scene.names import NameProblem, match
 from rlcli.sim.rotations import from_euler, multiply
@@ -22,6 +22,31 @@ from rlcli.sim.selection import Columns, Selection
 
 SMALLEST = 1e-9
 """Lower bound of quantities that must be positive."""
+Pair: TypeAlias = Sequence[float] | Tensor
+"""A range at run time: two numbers, or the tensor (2,) that a curriculum writes to."""
+
+
+class Ranges:
+    """Lower and upper ends of several ranges: fixed ones are made once, those of a curriculum are read each time."""
+
+    def __init__(self, device: torch.device, *pairs: Pair) -> None:
+        self._fixed = _table(device, *((0.0, 0.0) if isinstance(pair, Tensor) else tuple(pair) for pair in pairs))
+        self._tunable = [pair if isinstance(pair, Tensor) else None for pair in pairs]
+        self._any_tunable = any(pair is not None for pair in self._tunable)
+
+    def now(self) -> tuple[Tensor, Tensor]:
+        """Return the current ends. (ranges,) float32 each"""
+        ends = self._fixed
+        if self._any_tunable:
+            rows = zip(self._fixed, self._tunable, strict=True)
+            ends = torch.stack([row if tunable is None else tunable for row, tunable in rows])
+        return ends[:, 0], ends[:, 1]
+
+
+@functools.lru_cache(maxsize=1024)
+def _table(device: torch.device, *pairs: tuple[float, float]) -> Tensor:
+    """Return the range ends on the device; cached, as a captured step must not make new tensors. (ranges, 2)"""
+    return torch.tensor(pairs, dtype=torch.float32, device=device)
 
 
 class Draw:
@@ -198,9 +223,8 @@ def require_supported(
     bad = [name for name in element_names(entity, kind, index) if not able[name]]
     if bad:
         can = [name for name, fine in able.items() if fine]
-        raise NameProblem(
-            f"{listing(bad)} {problem}", f"{hint}; elements of '{entity.name}' that work: {listing(can) or 'none'}"
-        )
+        message = f"{listing(bad)} {problem}"
+        raise NameProblem(message, f"{hint}; elements of '{entity.name}' that work: {listing(can) or 'none'}")
 
 
 def _check(pairs: list[Pair], distribution: str) -> None:

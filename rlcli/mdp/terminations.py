@@ -74,12 +74,7 @@ def illegal_contact(env: ManagedEnv, *, sensor: ContactSensor, threshold: float 
 
 
 def out_of_bound(
-    env: ManagedEnv,
-    *,
-    entity: Entity = "robot",
-    x: Range | None = None,
-    y: Range | None = None,
-    z: Range | None = None,
+    env: ManagedEnv, *, entity: Entity = "robot", x: Range | None = None, y: Range | None = None, z: Range | None = None
 ) -> Tensor:
     """End the episode where the root is outside the ranges x, y, z from its environment's origin [m]. (num_envs,)
 

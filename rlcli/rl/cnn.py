@@ -76,9 +76,8 @@ class VisionSpec(BaseModel):
         for number, (channels, kernel, stride) in enumerate(layers):
             _, rows, columns = sizes[-1]
             if min(rows, columns) < kernel:
-                raise ValueError(
-                    f"layer {number} has a kernel of {kernel} x {kernel} for an input of {rows} x {columns} pixels"
-                )
+                sizes_text = f"a kernel of {kernel} x {kernel} for an input of {rows} x {columns} pixels"
+                raise ValueError(f"layer {number} has {sizes_text}")
             sizes.append((channels, (rows - kernel) // stride + 1, (columns - kernel) // stride + 1))
         return sizes
 

@@ -24,6 +24,7 @@ from rlcli.rl.mlp import FAST_ACTIVATIONS, affine, input_gradient, part_rows, we
 _PARTS = 2
 """Parts of a large minibatch. With two networks they occupy the default number of threads, four. More parts mean
 shorter operations, and a thread waits for Python's lock between two operations."""
+Layers = Iterable[nn.Module]
 OutputGradient = Callable[[slice, Tensor], tuple[Tensor, Tensor]]
 """Function of the rows of a part and of a network's outputs for them, (n, a). It returns the gradient of the loss with
 respect to the outputs, (n, a), and numbers that are summed over the parts: at most 3 + 2 a of the actor, one of the
@@ -40,13 +41,7 @@ class PartMemory:
         tensors: tensors of the shapes that `shapes` returns; None: new ones.
     """
 
-    def __init__(
-        self,
-        actor: Iterable[nn.Module],
-        critic: Iterable[nn.Module],
-        rows: int,
-        tensors: Mapping[str, Tensor] | None = None,
-    ) -> None:
+    def __init__(self, actor: Layers, critic: Layers, rows: int, tensors: Mapping[str, Tensor] | None = None) -> None:
         linears = [[layer for layer in layers if isinstance(layer, nn.Linear)] for layers in (actor, critic)]
         self._max_rows = part_rows([*linears[0], *linears[1]])
         # transposed, (inputs, outputs): products with few inputs are several times faster so
@@ -97,7 +92,7 @@ class PartGradients:
         memory: memory for the results.
     """
 
-    def __init__(self, actor: Iterable[nn.Module], critic: Iterable[nn.Module], memory: PartMemory) -> None:
+    def __init__(self, actor: Layers, critic: Layers, memory: PartMemory) -> None:
         self._memory, self._passes = memory, (_Passes(actor, memory.rows), _Passes(critic, memory.rows))
 
     def compute(self, task: tuple[int, int, slice], inputs: Sequence[Tensor], losses: Sequence[OutputGradient]) -> None:
@@ -120,14 +115,7 @@ class MlpGradients:
         threads: number of threads that share the work; torch itself must use one thread meanwhile.
     """
 
-    def __init__(
-        self,
-        actor: Iterable[nn.Module],
-        critic: Iterable[nn.Module],
-        gradients: Sequence[Tensor],
-        rows: int,
-        threads: int,
-    ) -> None:
+    def __init__(self, actor: Layers, critic: Layers, gradients: Sequence[Tensor], rows: int, threads: int) -> None:
         self._gradients, self._memory = gradients, PartMemory(actor, critic, rows)
         threads = min(threads, len(self._memory.tasks(rows)))
         self._threads = [PartGradients(actor, critic, self._memory) for _ in range(threads)]
@@ -160,7 +148,7 @@ class MlpGradients:
 class _Passes:
     """Forward and backward pass of one network, with preallocated memory."""
 
-    def __init__(self, layers: Iterable[nn.Module], rows: int) -> None:
+    def __init__(self, layers: Layers, rows: int) -> None:
         linears = [layer for layer in layers if isinstance(layer, nn.Linear)]
         self._weights = [(layer.weight.detach(), layer.bias.detach()) for layer in linears]
         (self._activation,) = {FAST_ACTIVATIONS[type(layer)] for layer in layers if not isinstance(layer, nn.Linear)}

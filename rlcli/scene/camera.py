@@ -212,10 +212,9 @@ class RendererPool:
             MachineError: after `close`, or in a process that was forked from the one that opened the contexts.
         """
         if os.getpid() != self._process:
-            raise MachineError(
-                "cameras render only in the process that made the environment; this process is a fork of it",
-                hint="make the environment in the new process, or start the process with 'spawn'",
-            )
+            message = "cameras render only in the process that made the environment; this process is a fork of it"
+            hint = "make the environment in the new process, or start the process with 'spawn'"
+            raise MachineError(message, hint=hint)
         if not self._end.alive:
             raise MachineError("the environment is closed, so its cameras cannot render; create a new environment")
         futures: list[Future[None]] = [Future() for _ in work]

@@ -265,9 +265,8 @@ class EntityData:
         if ranges is None:
             low, high = self._limits[soft]
             return low, high
-        low, high = self._once(
-            "joint_ranges", lambda: ranges.view(len(ranges), -1, 2)[:, self._joint_index].float()
-        ).unbind(dim=2)
+        own = self._once("joint_ranges", lambda: ranges.view(len(ranges), -1, 2)[:, self._joint_index].float())
+        low, high = own.unbind(dim=2)
         if soft:
             low, high = self._soft_limits(low, high)
         return torch.where(self._limited, low, self._infinite[0]), torch.where(self._limited, high, self._infinite[1])

@@ -80,9 +80,8 @@ class JointEfforts:
         largest = torch.where(self._force_limited, force.abs().amax(dim=-1), math.inf)
         control = (gain[..., None] * self._current("actuator_ctrlrange")).abs().amax(dim=-1)
         largest = torch.where(self._control_limited & self._is_motor, torch.minimum(largest, control), largest)
-        limits = torch.minimum(
-            torch.where(self._driven, self._sum_by_joint(self._gear.abs() * largest), math.inf), self._joint_limits
-        )
+        of_actuators = torch.where(self._driven, self._sum_by_joint(self._gear.abs() * largest), math.inf)
+        limits = torch.minimum(of_actuators, self._joint_limits)
         if self._entity.actuators:
             limits = limits.expand(self._entity.engine.num_envs, -1).clone()
         for model in self._entity.actuators:

@@ -32,12 +32,8 @@ def element_cost(name: str, attributes: dict[str, str]) -> float:
     if name == "size":
         return 1.0 + sum(number_of(attributes.get(key)) for key in attributes if key != "memory") / 100
     if name == "lengthrange":  # the compiler simulates so many steps for every muscle
-        return (
-            1.0
-            + number_of(attributes.get("inttotal", "10"))
-            / max(number_of(attributes.get("timestep", "0.01")), 1e-9)
-            / 10
-        )
+        total, timestep = attributes.get("inttotal", "10"), attributes.get("timestep", "0.01")
+        return 1.0 + number_of(total) / max(number_of(timestep), 1e-9) / 10
     if name == "config" and attributes.get("key") in ("size", "nchannel"):  # of the plugin touch_grid
         return 1.0 + math.prod(max(1.0, number_of(word)) for word in attributes.get("value", "").split()) / 10
     stored = product("num", "dim", "nsample", "actdim", "resolution", *(["size"] if name == "numeric" else []))

@@ -45,9 +45,8 @@ def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> lis
         found = [names.index(pattern)] if pattern in names else _search(pattern, names, what)
         for position in found:
             if position in positions:
-                raise NameProblem(
-                    f"{what} '{names[position]}' is matched twice; narrow the second pattern, '{pattern}'"
-                )
+                message = f"{what} '{names[position]}' is matched twice; narrow the second pattern, '{pattern}'"
+                raise NameProblem(message)
             positions.append(position)
     return positions
 

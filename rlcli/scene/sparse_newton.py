@@ -11,6 +11,8 @@ import logging
 import mujoco
 import numpy as np
 
+from rlcli.sim.skippable_work import colliding_pairs
+
 _log = logging.getLogger(__name__)
 
 _VERSION = "4.0.0"
@@ -69,17 +71,8 @@ def _contact_couples(model: mujoco.MjModel) -> bool:
     moves = _moves(model)
     if moves[model.geom_bodyid[model.pair_geom1]].dot(moves[model.geom_bodyid[model.pair_geom2]]):
         return True
-    types, affinities = model.body_contype * moves, model.body_conaffinity * moves
-    pairs = (types[:, None] & affinities) | (affinities[:, None] & types)
-    welded = model.body_weldid
-    pairs[welded[:, None] == welded] = 0
-    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
-        parents = welded[model.body_parentid[welded]]
-        pairs[parents[:, None] == welded] = 0
-        pairs[parents == welded[:, None]] = 0
-    first, second = model.exclude_signature >> 16, model.exclude_signature & 0xFFFF
-    pairs[first, second] = pairs[second, first] = 0
-    return bool(pairs.any())
+    bodies = (model.geom_bodyid[list(pair)] for pair in colliding_pairs(model))
+    return any(bool(moves[both].all()) for both in bodies)
 
 
 def _moves(model: mujoco.MjModel) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

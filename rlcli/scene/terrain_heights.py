@@ -18,12 +18,6 @@ class HeightTable:
         self._half = [0.5 * (n - 1) * ground.resolution for n in ground.heights.shape]
         self._border = ground.border
 
-    def distance(self, points: Tensor) -> Tensor:
-        """Return the distance from each point down to the ground; -1 if no ground is below. (..., 3) -> (...) [m]"""
-        px, py, pz = points.unbind(-1)
-        depth, on_ground = self.depth(px, py, pz)
-        return torch.where(on_ground & (depth >= 0.0), depth, -1.0)
-
     def depth(self, px: Tensor, py: Tensor, pz: Tensor) -> tuple[Tensor, Tensor]:
         """Return the height of points above the ground [m], and whether there is ground at their x and y. (...) each"""
         half_x, half_y = self._half

@@ -23,12 +23,8 @@ def computes_body_forces(model: mujoco.MjModel) -> bool:
 
 def add_body_forces(spec: mujoco.MjSpec) -> None:
     """Add a dummy sensor to the model, for which MuJoCo computes `cacc`, `cfrc_int` and `cfrc_ext`."""
-    spec.add_sensor(
-        name="body_forces",
-        type=mujoco.mjtSensor.mjSENS_FRAMEANGACC,
-        objtype=mujoco.mjtObj.mjOBJ_BODY,
-        objname="world",
-    )
+    kind, body = mujoco.mjtSensor.mjSENS_FRAMEANGACC, mujoco.mjtObj.mjOBJ_BODY
+    spec.add_sensor(name="body_forces", type=kind, objtype=body, objname="world")
 
 
 def force_sensors(model: mujoco.MjModel) -> list[int]:

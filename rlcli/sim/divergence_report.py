@@ -38,6 +38,9 @@ _INPUTS_FIRST = (
 )
 """Fields of the integration state: inputs of the simulation first, then its results."""
 
+States = NDArray[np.float64]
+"""Integration states, with a row for each environment; or one of them."""
+
 
 @dataclass(frozen=True, slots=True)
 class Divergence:
@@ -61,7 +64,7 @@ class Divergence:
 class Call:
     """One call of `Engine.step`, as one environment sees it."""
 
-    state: NDArray[np.float64]
+    state: States
     """Integration state before the call. (nstate,)"""
     nstep: int
     """Number of physics steps."""
@@ -82,14 +85,7 @@ class StateHistory:
     """
 
     def __init__(
-        self,
-        state: NDArray[np.float64],
-        width: int,
-        default: NDArray[np.float64],
-        calls: int,
-        *,
-        memory: int = HISTORY_MEMORY,
-        count: int = 0,
+        self, state: States, width: int, default: States, calls: int, *, memory: int = HISTORY_MEMORY, count: int = 0
     ) -> None:
         self._default = default
         self._source = state[:, :width]
@@ -121,7 +117,7 @@ class StateHistory:
         """Start new episodes of some environments; their earlier calls are dropped."""
         self._episode_start[envs] = self.count
 
-    def last_state(self, env: int) -> NDArray[np.float64]:
+    def last_state(self, env: int) -> States:
         """Return the state before the last call; the default state if the episode has no call yet."""
         if self._episode_start[env] == self.count:
             return self._default.copy()
@@ -137,7 +133,7 @@ class StateHistory:
         numbers = range(first, min(stop, self.count))
         return [Call(self._state(env, number), self._nstep[number % self.calls]) for number in numbers]
 
-    def _state(self, env: int, number: int) -> NDArray[np.float64]:
+    def _state(self, env: int, number: int) -> States:
         state = self._default.copy()
         state[: self.width] = self._ring[number % self.calls, env]
         return state
@@ -163,7 +159,7 @@ class StateLayout:
         """Return every field with its columns."""
         return list(self._columns.items())
 
-    def nonfinite_fields(self, state: NDArray[np.float64]) -> list[str]:
+    def nonfinite_fields(self, state: States) -> list[str]:
         """Return the fields of a state that are not finite, inputs of the simulation first."""
         names = [name for name in _INPUTS_FIRST if name in self._columns]
         return [name for name in names if not np.isfinite(state[self._columns[name]]).all()]
@@ -194,7 +190,7 @@ class DivergenceReporter:
     """
 
     layout: StateLayout
-    states: NDArray[np.float64]
+    states: States
     warnings: NDArray[Any]
     model_fields: Mapping[str, NDArray[Any]]
     max_velocity: float
@@ -203,7 +199,7 @@ class DivergenceReporter:
         """Return the first field that is not finite: a model field of the world, else a field of its state."""
         return [*self._nonfinite_model_fields(env), *self.layout.nonfinite_fields(self.states[env])][0]
 
-    def describe(self, env: int, cause: str, before: NDArray[np.float64], error: str) -> Divergence:
+    def describe(self, env: int, cause: str, before: States, error: str) -> Divergence:
         """Describe the divergence of a world.
 
         Args:

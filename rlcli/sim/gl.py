@@ -27,15 +27,11 @@ def opengl_import_error(error: BaseException) -> MachineError | None:
     if not chosen or not any(Path(file).parts[-2:] == ("classic", "gl_context.py") for file in raised_in):
         return None
     backend = chosen.lower()
-    if backend not in _PACKAGES:
-        return MachineError(
-            f"MUJOCO_GL={chosen}: MuJoCo has no such OpenGL backend",
-            hint="use egl, osmesa, glfw or disable, or unset MUJOCO_GL: rlcli then chooses one that works",
-        )
-    return MachineError(
-        f"MUJOCO_GL={chosen}: its library cannot be loaded ({one_line(error, 100)})",
-        hint=f"install {_PACKAGES[backend]}, or unset MUJOCO_GL: rlcli then chooses one that works",
-    )
+    reason, advice = "MuJoCo has no such OpenGL backend", "use egl, osmesa, glfw or disable"
+    if backend in _PACKAGES:
+        reason, advice = f"its library cannot be loaded ({one_line(error, 100)})", f"install {_PACKAGES[backend]}"
+    hint = f"{advice}, or unset MUJOCO_GL: rlcli then chooses one that works"
+    return MachineError(f"MUJOCO_GL={chosen}: {reason}", hint=hint)
 
 
 def has_display() -> bool:
@@ -73,10 +69,9 @@ def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[A
             continue
         return context, backend
     packages = " or ".join(_PACKAGES.get(backend, backend) for backend in candidates())
-    raise MachineError(
-        f"no OpenGL backend works on this machine; tried {', '.join(tried)}",
-        hint=f"install {packages} (Debian, Ubuntu: apt install libegl1 libosmesa6), or set MUJOCO_GL",
-    )
+    message = f"no OpenGL backend works on this machine; tried {', '.join(tried)}"
+    hint = f"install {packages} (Debian, Ubuntu: apt install libegl1 libosmesa6), or set MUJOCO_GL"
+    raise MachineError(message, hint=hint)
 
 
 def _has_window() -> bool:

@@ -23,11 +23,12 @@ from rlcli.sim.mask_selection import MaskSelection
 from rlcli.sim.selection import ALL, Field, Groups, Selection
 from rlcli.sim.warp_fields import FORCE, STATE
 from rlcli.sim.warp_memory import OVERFLOW_SETTINGS, overflow_error
-from rlcli.sim.warp_rays import RayCaster
-from rlcli.sim.warp_state import WarpState
+from rlcli.sim.warp_worlds import WarpWorlds
+
+_GroupFlags = wp.types.vector(length=mujoco.mjNGROUP, dtype=float)
 
 
-class WarpEngine(WarpState):
+class WarpEngine(WarpWorlds):
     """Engine that steps many worlds of one model on a GPU.
 
     Args:
@@ -55,7 +56,8 @@ class WarpEngine(WarpState):
         self._external_forces = config.external_forces
         self._max_velocity = config.max_velocity or STATE_LIMIT
         self._force_columns = as_index(force_sensors(model), self.device)
-        self._ray_caster = RayCaster(self._model, self._data, num_envs)
+        self._ray_buffers: dict[tuple[int, int], tuple[wp.array, wp.array, wp.array]] = {}
+        """Excluded body of each ray, and buffers for the geoms and normals at the hits; by number of rays and body."""
         self._checked: list[str] = []
         """Names of the values passed to `check_finite`; the index of a name is the index of its flag."""
         with self._setting_up():
@@ -157,8 +159,18 @@ class WarpEngine(WarpState):
     ) -> Tensor:
         """Return distances from points to the first geom along unit directions, -1 for none. (num_envs, rays) [m]"""
         self.field("geom_xpos")  # bind it, so that every step updates the geoms' positions
+        shape = (self.num_envs, points.shape[1])
+        distance = torch.empty(shape, device=points.device)
+        visible = _GroupFlags(*(-1.0 if groups is None else float(g in groups) for g in range(mujoco.mjNGROUP)))
+        pnt, vec = (wp.from_torch(v.expand(*shape, 3).contiguous(), dtype=wp.vec3) for v in (points, directions))
         with self._launching():
-            return self._ray_caster.cast(points, directions, groups, exclude)
+            if (shape[1], exclude) not in self._ray_buffers:
+                bodies, geoms = wp.full(shape[1], exclude, dtype=int), wp.empty(shape, dtype=int)
+                self._ray_buffers[shape[1], exclude] = bodies, geoms, wp.empty(shape, dtype=wp.vec3)
+            excluded, geom, normal = self._ray_buffers[shape[1], exclude]
+            out = wp.from_torch(distance)
+            mjw.rays(self._model, self._data, pnt, vec, visible, True, excluded, out, geom, normal)
+        return distance
 
     def check_finite(self, values: Tensor, what: str) -> None:
         """Launch a check of whether all values are finite; `report_nonfinite` returns its result."""

@@ -20,6 +20,9 @@ _TOO_LARGE = wp.constant(wp.float32(1e10))
 CAUSES = ("qpos not finite", "qpos out of bounds", "qvel not finite", "qvel out of bounds")
 """Causes of a divergence; `check_bounds` counts each by its index."""
 
+_Rows = wp.array2d(dtype=float)
+_Counters = wp.array(dtype=wp.int64)
+
 
 @wp.func
 def mix(x: wp.uint64) -> wp.uint64:
@@ -42,13 +45,13 @@ def unit(start: wp.uint64, counter: wp.int64, stream: wp.uint64, env: int, index
 @wp.kernel
 def draw_uniform(
     start: wp.uint64,
-    counters: wp.array(dtype=wp.int64),
+    counters: _Counters,
     stream: wp.uint64,
     index: int,
     num_streams: int,
     low: float,
     span: float,
-    out: wp.array2d(dtype=float),
+    out: _Rows,
 ):
     """Draw uniform numbers in [low, low + span). out (num_envs, count)"""
     env, column = wp.tid()
@@ -56,14 +59,7 @@ def draw_uniform(
 
 
 @wp.kernel
-def draw_normal(
-    start: wp.uint64,
-    counters: wp.array(dtype=wp.int64),
-    stream: wp.uint64,
-    index: int,
-    num_streams: int,
-    out: wp.array2d(dtype=float),
-):
+def draw_normal(start: wp.uint64, counters: _Counters, stream: wp.uint64, index: int, num_streams: int, out: _Rows):
     """Draw standard normal numbers with the Box-Muller transform. out (num_envs, count)"""
     env, column = wp.tid()
     count = out.shape[1]
@@ -74,17 +70,17 @@ def draw_normal(
 
 @wp.kernel
 def check_bounds(
-    qpos: wp.array2d(dtype=float),
-    qvel: wp.array2d(dtype=float),
-    warmstart: wp.array2d(dtype=float),
-    ctrl: wp.array2d(dtype=float),
-    act: wp.array2d(dtype=float),
+    qpos: _Rows,
+    qvel: _Rows,
+    warmstart: _Rows,
+    ctrl: _Rows,
+    act: _Rows,
     overflow: wp.array(dtype=wp.int32),
     max_velocity: wp.float32,
-    last_qpos: wp.array2d(dtype=float),
-    last_qvel: wp.array2d(dtype=float),
+    last_qpos: _Rows,
+    last_qvel: _Rows,
     diverged: wp.array(dtype=wp.bool),
-    counts: wp.array(dtype=wp.int64),
+    counts: _Counters,
     first: wp.array(dtype=wp.int32),
     overflowed: wp.array(dtype=wp.int32),
 ):
@@ -140,7 +136,7 @@ def check_bounds(
 
 
 @wp.kernel
-def restore_diverged(diverged: wp.array(dtype=wp.bool), now: wp.array2d(dtype=float), last: wp.array2d(dtype=float)):
+def restore_diverged(diverged: wp.array(dtype=wp.bool), now: _Rows, last: _Rows):
     """Restore the rows of diverged worlds from their last values; save the rows of the others."""
     world, column = wp.tid()
     if diverged[world]:
@@ -150,7 +146,7 @@ def restore_diverged(diverged: wp.array(dtype=wp.bool), now: wp.array2d(dtype=fl
 
 
 @wp.kernel
-def save_rows(mask: wp.array(dtype=wp.bool), now: wp.array2d(dtype=float), last: wp.array2d(dtype=float)):
+def save_rows(mask: wp.array(dtype=wp.bool), now: _Rows, last: _Rows):
     """Save the masked rows as their last values."""
     world, column = wp.tid()
     if mask[world]:
@@ -162,11 +158,11 @@ def reset_worlds(
     mask: wp.array(dtype=wp.bool),
     default_qpos: wp.array(dtype=float),
     default_qvel: wp.array(dtype=float),
-    qpos: wp.array2d(dtype=float),
-    qvel: wp.array2d(dtype=float),
-    warmstart: wp.array2d(dtype=float),
-    ctrl: wp.array2d(dtype=float),
-    act: wp.array2d(dtype=float),
+    qpos: _Rows,
+    qvel: _Rows,
+    warmstart: _Rows,
+    ctrl: _Rows,
+    act: _Rows,
     time: wp.array(dtype=float),
 ):
     """Put the masked worlds into the default state."""
@@ -185,7 +181,7 @@ def reset_worlds(
 
 
 @wp.kernel
-def flag_nonfinite(values: wp.array2d(dtype=float), flag: wp.array(dtype=wp.int32), index: int):
+def flag_nonfinite(values: _Rows, flag: wp.array(dtype=wp.int32), index: int):
     """Set a flag to 1 if a value is not finite."""
     row, column = wp.tid()
     if not wp.isfinite(values[row, column]):

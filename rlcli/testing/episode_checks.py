@@ -28,6 +28,11 @@ _RUNNING = [row for row in range(NUM_ENVS) if row not in _ENDING]
 _LIMITS = (6, 9)
 """Two episode lengths [steps]; an end that occurs at both follows the limit."""
 
+Trajectory = list[dict[str, Tensor]]
+"""Outputs of each step by name."""
+MakeFinding = Callable[[str, str, str], Finding]
+"""`error_at` or `warning_at`."""
+
 
 def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the same seed and actions give the same trajectory, in a new environment and after reset(seed)."""
@@ -44,11 +49,7 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 def compare_trajectories(
-    env: VecEnv,
-    trajectories: Sequence[list[dict[str, Tensor]]],
-    message: str,
-    hint: str,
-    make: Callable[[str, str, str], Finding] = error_at,
+    env: VecEnv, trajectories: Sequence[Trajectory], message: str, hint: str, make: MakeFinding = error_at
 ) -> Iterator[Finding]:
     """Report the first difference of two trajectories, if they are not equal bit for bit.
 
@@ -142,11 +143,10 @@ def partial_reset(subject: TaskUnderTest) -> Iterator[Finding]:
             rows = [row for row in _RUNNING if not bitwise_equal(a[row], b[row])]
             if rows:
                 later = f", {number} steps later" if number else ""
-                yield error_at(
-                    "the simulation's state" if name == "state" else name,
-                    f"of environments {rows} changed when {_ENDING} were reset{later}; they must stay bit-identical",
-                    "write only the rows of the selection or of env_ids, and do not average over environments",
-                )
+                where = "the simulation's state" if name == "state" else name
+                message = f"of environments {rows} changed when {_ENDING} were reset{later}"
+                hint = "write only the rows of the selection or of env_ids, and do not average over environments"
+                yield error_at(where, f"{message}; they must stay bit-identical", hint)
                 return
 
 
@@ -163,11 +163,9 @@ def final_observations(subject: TaskUnderTest) -> Iterator[Finding]:
     for group, values in result.final_obs.items():
         stale = [row for row in _ENDING if bitwise_equal(values[row], result.obs[group][row])]
         if stale:
-            yield error_at(
-                f"observations.{group}",
-                f"the first observation of the new episode equals the last one of the old in environments {stale}",
-                "compute observations from the state at every call, and let the reset change the state",
-            )
+            message = f"the first observation of the new episode equals the last one of the old in environments {stale}"
+            hint = "compute observations from the state at every call, and let the reset change the state"
+            yield error_at(f"observations.{group}", message, hint)
 
 
 def _episode_ends(subject: TaskUnderTest, limit: int) -> list[EndedEpisode]:
@@ -206,11 +204,9 @@ def back_fill(subject: TaskUnderTest) -> Iterator[Finding]:
         second[rows] = results[1].obs[group][rows]
         if not bitwise_equal(first, second):
             where, values = _difference(pair.kept, f"observation '{group}'", first, second, "at its start")
-            yield error_at(
-                where,
-                f"the first observation of an episode depends on the actions of the episode before: {values}",
-                "fill histories, delays and buffers of the reset environments in reset(selection) or reset_idx",
-            )
+            message = f"the first observation of an episode depends on the actions of the episode before: {values}"
+            hint = "fill histories, delays and buffers of the reset environments in reset(selection) or reset_idx"
+            yield error_at(where, message, hint)
 
 
 def truncation(subject: TaskUnderTest) -> Iterator[Finding]:
@@ -313,9 +309,6 @@ def observation_after_reset(subject: TaskUnderTest) -> Iterator[Finding]:
     for before, after in pairwise(observations):
         rows = [row for row in running if not bitwise_equal(before[row], after[row])]
         if rows:
-            yield error_at(
-                "obs_buf",
-                f"of running environments {rows} changes when {_ENDING} are reset",
-                "compute each row only from the state of its environment",
-            )
+            message = f"of running environments {rows} changes when {_ENDING} are reset"
+            yield error_at("obs_buf", message, "compute each row only from the state of its environment")
             return

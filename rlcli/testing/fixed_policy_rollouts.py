@@ -14,7 +14,7 @@ from torch import Tensor
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.vec_env import VecEnv
-from rlcli.testing.steps import ended_episodes
+from rlcli.testing.steps import EndedEpisode, ended_episodes
 from rlcli.testing.task_under_test import TaskUnderTest, element_names
 
 NUM_ENVS = 16
@@ -73,19 +73,6 @@ FIXED_POLICIES: dict[str, Callable[[VecEnv, float], FixedPolicy]] = {
 """Name -> factory of the policy, in the order in which they run."""
 
 
-@dataclass(frozen=True, slots=True)
-class Episode:
-    """Episode of a rollout; the end of the rollout may have cut it off."""
-
-    steps: int
-    total: float
-    """Undiscounted sum of rewards."""
-    terminated: bool
-    ended: bool
-    """Whether it ended before the rollout did."""
-    causes: tuple[str, ...] = ()
-
-
 @dataclass(slots=True)
 class Rollout:
     """Rollout of one fixed policy in a task. Tensors are (steps, num_envs, ...)."""
@@ -100,7 +87,10 @@ class Rollout:
     """Reward term -> its reward, weight included; empty for a direct task."""
     obs: dict[str, Tensor]
     """Group -> observations, beginning with those of the reset."""
-    episodes: list[Episode]
+    episodes: list[EndedEpisode]
+    """Episodes that ended before the rollout did."""
+    unfinished: list[int]
+    """Lengths of the episodes that the end of the rollout has cut off."""
     limited: dict[str, float]
     """Name of a limited quantity -> share of the steps in which it was at its limit; only under random actions."""
     speed: Tensor
@@ -115,7 +105,8 @@ def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollou
     steps_of: defaultdict[str, list[Tensor]] = defaultdict(list)
     terms: defaultdict[str, list[Tensor]] = defaultdict(list)
     obs: defaultdict[str, list[Tensor]] = defaultdict(list)
-    episodes, error, totals = [], None, torch.zeros(env.num_envs)
+    episodes: list[EndedEpisode] = []
+    error = None
     physics = _PhysicsObserver(env, limits=limits)
     with env.observers.added(physics):
         try:
@@ -130,15 +121,9 @@ def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollou
                 if limits:
                     physics.add_clipped_columns(action)
                 _append(obs, result.obs)
-                totals += result.reward
-                for end in ended_episodes(result):
-                    total = float(totals[end.env_id])
-                    episodes.append(Episode(end.length, total, end.terminated, True, end.causes))
-                    totals[end.env_id] = 0.0
+                episodes += ended_episodes(result)
         except Exception as raised:
             error = raised
-    running = zip(env.episode_length_buf.tolist(), totals.tolist(), strict=True)
-    episodes += [Episode(length, total, False, False) for length, total in running if length]
     count = max(1, physics.steps)
     return Rollout(
         policy,
@@ -149,6 +134,7 @@ def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollou
         terms={name: torch.stack(values) for name, values in terms.items()},
         obs={group: torch.stack(values) for group, values in obs.items()},
         episodes=episodes,
+        unfinished=[length for length in env.episode_length_buf.tolist() if length],
         limited={name: total / count for name, total in physics.shares.items()},
         speed=torch.zeros(0) if physics.squares is None else (physics.squares / count).sqrt(),
         diverged=env.divergences,

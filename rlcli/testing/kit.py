@@ -22,35 +22,20 @@ Check = Callable[[TaskUnderTest], Iterable[Finding]]
 OnCheck = Callable[[str, "list[Finding] | None"], None]
 OnNote = Callable[[str, str], None]
 
-CHECKS: dict[str, Check] = {
-    "names": step_and_file_checks.names,
-    "yaml-round-trip": step_and_file_checks.yaml_round_trip,
-    "finite": step_and_file_checks.finite,
-    "shapes": step_and_file_checks.shapes,
-    "dtypes": step_and_file_checks.dtypes,
-    "random-actions": step_and_file_checks.random_actions_stay_stable,
-    "extreme-actions": step_and_file_checks.extreme_actions_stay_stable,
-    "same-seed": episode_checks.same_seed,
-    "start-states": episode_checks.start_states,
-    "constant-columns": step_and_file_checks.constant_columns,
-    "aliasing": step_and_file_checks.aliasing,
-    "partial-reset": episode_checks.partial_reset,
-    "final-observations": episode_checks.final_observations,
-    "truncation": episode_checks.truncation,
-    "termination": episode_checks.termination,
-    "repeated-observation": episode_checks.repeated_observation,
-    "observation-after-reset": episode_checks.observation_after_reset,
-    "back-fill": episode_checks.back_fill,
-    "checkpoint": portability_checks.checkpoint,
-    "layout": portability_checks.layout,
-    "policy": portability_checks.policy,
-    "threads": portability_checks.threads,
-    "num-envs": portability_checks.num_envs,
-    "speed": portability_checks.speed,
-    "engines": portability_checks.engines,
-    "captured": portability_checks.captured,
-}
-"""Name -> check, in the order in which they run. The first line of a check's docstring is its requirement."""
+_files, _episodes, _portability = step_and_file_checks, episode_checks, portability_checks
+_IN_ORDER: tuple[Check, ...] = (
+    *(_files.names, _files.yaml_round_trip, _files.finite, _files.shapes, _files.dtypes),
+    *(_files.random_actions, _files.extreme_actions, _episodes.same_seed, _episodes.start_states),
+    *(_files.constant_columns, _files.aliasing, _episodes.partial_reset, _episodes.final_observations),
+    *(_episodes.truncation, _episodes.termination, _episodes.repeated_observation),
+    *(_episodes.observation_after_reset, _episodes.back_fill),
+    *(_portability.checkpoint, _portability.layout, _portability.policy, _portability.threads),
+    *(_portability.num_envs, _portability.speed, _portability.engines, _portability.captured),
+)
+CHECKS = {check.__name__.replace("_", "-"): check for check in _IN_ORDER}
+"""Name -> check, in the order in which they run; `docs/tutorials/first-plugin.md` lists them.
+
+The first line of a check's docstring is its requirement."""
 
 _DIRECT_ONLY = ("observation-after-reset",)
 

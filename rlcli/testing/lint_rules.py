@@ -52,7 +52,7 @@ warning_at = partial(Remark, "", "warning")
 """(where, message, hint, numbers) -> warning of the running rule; the linter adds the name of the rule."""
 
 
-def runs_without_error(evidence: RolloutEvidence) -> Iterator[Remark]:
+def stops(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that the task raises no error under any fixed policy."""
     seen = set()
     for rollout in evidence.rollouts:
@@ -75,19 +75,16 @@ def early_resets(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that few episodes end in their first steps, at least under one fixed policy."""
     shares = {}
     for rollout in evidence.rollouts:
-        complete = [e for e in rollout.episodes if e.ended or e.steps > EARLY]
-        early = [e for e in complete if e.steps <= EARLY < rollout.env.max_episode_length]
-        shares[rollout.policy] = (len(early) / len(complete) if complete else 0.0, early)
+        early = [e for e in rollout.episodes if e.length <= EARLY < rollout.env.max_episode_length]
+        count = len(rollout.episodes) + sum(length > EARLY for length in rollout.unfinished)
+        shares[rollout.policy] = (len(early) / count if count else 0.0, early)
     share, early = min(shares.values(), key=lambda found: found[0])
     if share >= 0.1:
         causes = Counter(cause for episode in early for cause in episode.causes)
         names = ", ".join(name for name, _ in causes.most_common(2)) or "a reset"
-        yield error_at(
-            f"terminations: {names}",
-            f"{share:.0%} of the episodes end within {EARLY} steps, under every fixed policy",
-            "choose start states that the termination allows (narrower reset ranges), or widen its limits",
-            {"share": share, "steps": EARLY},
-        )
+        message = f"{share:.0%} of the episodes end within {EARLY} steps, under every fixed policy"
+        hint = "choose start states that the termination allows (narrower reset ranges), or widen its limits"
+        yield error_at(f"terminations: {names}", message, hint, {"share": share, "steps": EARLY})
 
 
 def _weighted_terms(evidence: RolloutEvidence) -> list[str]:
@@ -100,7 +97,7 @@ def _weighted_terms(evidence: RolloutEvidence) -> list[str]:
     return [name for name, config in rewards.items() if config is not None and config.weight != 0.0]
 
 
-def silent_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
+def silent_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that every reward term with a weight is not always 0 under all fixed policies."""
     if evidence.steps < min(evidence.subject.resolved.task.max_episode_length, MAX_STEPS):
         return  # a term may be other than 0 only at the end of an episode, which a shorter rollout does not reach
@@ -108,18 +105,15 @@ def silent_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
     for name in _weighted_terms(evidence):
         values = [rollout.terms[name] for rollout in evidence.rollouts if name in rollout.terms]
         if values and not any(bool(v.any()) for v in values):
-            yield warning_at(
-                f"rewards.{name}",
-                f"is 0 in all {steps} steps of {len(evidence.rollouts)} fixed policies",
-                "check its thresholds, joints and sensors, give it a softer slope, or remove it",
-                {"steps": steps},
-            )
+            message = f"is 0 in all {steps} steps of {len(evidence.rollouts)} fixed policies"
+            hint = "check its thresholds, joints and sensors, give it a softer slope, or remove it"
+            yield warning_at(f"rewards.{name}", message, hint, {"steps": steps})
 
 
 DOMINANT = 0.99
 
 
-def dominant_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
+def dominant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Report a reward term that is so large, with every kind of action, that the other terms have no effect."""
     active = _weighted_terms(evidence)
     shares: dict[str, list[float]] = {name: [] for name in active}
@@ -132,12 +126,10 @@ def dominant_rewards(evidence: RolloutEvidence) -> Iterator[Remark]:
     for name, found in shares.items():
         if found and min(found) >= DOMINANT:
             others = ", ".join(other for other in active if other != name)
-            yield warning_at(
-                f"rewards.{name}",
-                f"is {min(found):.1%} or more of the reward's size under every fixed policy: {others} have no effect",
-                "lower its weight, or raise the weights of the others",
-                {"share": min(found)},
-            )
+            message = f"is {min(found):.1%} or more of the reward's size under every fixed policy"
+            message += f": {others} have no effect"
+            hint = "lower its weight, or raise the weights of the others"
+            yield warning_at(f"rewards.{name}", message, hint, {"share": min(found)})
 
 
 def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -149,12 +141,9 @@ def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     ends_early = any(bool(rollout.terminated.any()) for rollout in evidence.rollouts)
     if not ends_early or value == 0.0:  # with terminations, any other constant rewards long or short episodes
         reason = "" if ends_early else ", and no episode ends early"
-        yield error_at(
-            "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf",
-            f"is {value:g} in every step of all fixed policies{reason}: there is nothing to learn",
-            "compute the reward from the state or the action",
-            {"value": value},
-        )
+        where = "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf"
+        message = f"is {value:g} in every step of all fixed policies{reason}: there is nothing to learn"
+        yield error_at(where, message, "compute the reward from the state or the action", {"value": value})
 
 
 def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -175,7 +164,7 @@ def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
     last = float(terminal.median())
     if good * horizon >= last:
         return
-    finished = [e for rollout in evidence.rollouts for e in rollout.episodes if e.ended]
+    finished = [e for rollout in evidence.rollouts for e in rollout.episodes]
     timed_out = [e.total for e in finished if not e.terminated]
     return_terminated = _mean([e.total for e in finished if e.terminated])
     numbers = {"good_step": good, "last_step": last, "horizon": horizon, "return_terminated": return_terminated}
@@ -199,7 +188,7 @@ LARGE, SMALL = 100.0, 0.01
 """Limits of the usual size. `cart-double-pendulum` has a column above 75 in 1 % of the steps, and learns well."""
 
 
-def constant_observations(evidence: RolloutEvidence) -> Iterator[Remark]:
+def constant_observation(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that every observation column varies under the fixed policies; of a picture, at least one pixel."""
     for where, values in _columns(evidence):
         if bool((values == values[:, :1]).all()):
@@ -242,20 +231,18 @@ SATURATED = 0.8
 def saturated_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that random actions within the bound mostly stay within the limits of the actuators."""
     (rollout,) = [rollout for rollout in evidence.rollouts if rollout.policy == "random"]
+    hint = "lower the action's scale (or the gain), or raise the limit: actions beyond it have the same effect"
     for name, share in rollout.limited.items():
         if share >= SATURATED:
-            yield warning_at(
-                name,
-                f"is at its limit in {share:.0%} of the steps under random actions within +-{evidence.subject.bound:g}",
-                "lower the action's scale (or the gain), or raise the limit: actions beyond it have the same effect",
-                {"share": share},
-            )
+            bound = evidence.subject.bound
+            message = f"is at its limit in {share:.0%} of the steps under random actions within +-{bound:g}"
+            yield warning_at(name, message, hint, {"share": share})
 
 
 DEAD = 1e-6
 
 
-def dead_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
+def dead_action(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that every column of the action changes the state."""
     env = evidence.env(8)
     env.reset(seed=0)
@@ -275,13 +262,10 @@ def dead_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
             if moved > DEAD:
                 break
         if moved <= DEAD:
-            yield error_at(
-                f"actions, column {column} ({name})",
-                f"moves nothing: after {steps} steps at +-{bound:g} the state differs by {moved:.1g}"
-                " from the state without this action",
-                "check its actuator, and that scale, gear and limit are not 0",
-                {"moved": moved, "steps": steps},
-            )
+            message = f"moves nothing: after {steps} steps at +-{bound:g} the state differs by {moved:.1g}"
+            message += " from the state without this action"
+            hint = "check its actuator, and that scale, gear and limit are not 0"
+            yield error_at(f"actions, column {column} ({name})", message, hint, {"moved": moved, "steps": steps})
 
 
 def _state_after(env: VecEnv, start: dict[str, Tensor], action: Tensor, steps: int) -> Tensor:
@@ -360,13 +344,11 @@ def horizon(evidence: RolloutEvidence) -> Iterator[Remark]:
         if NEAREST <= round(ahead / steps, 9) <= FARTHEST:  # rounded: 1 / (1 - 0.99) is a little less than 100
             continue
         fitting = 1.0 - 1.0 / max(2.0, 0.25 * steps)
-        yield warning_at(
-            f"agents.{name}.gamma = {gamma:g}",
-            f"gives a horizon of {ahead:.3g} steps ({ahead * resolved.task.step_dt:.2g} s), and an episode has {steps}"
-            f" ({resolved.task.episode_length_s:g} s)",
-            f"{fitting:.3g} gives a horizon of a quarter of the episode",
-            {"gamma": gamma, "horizon": ahead, "episode": steps},
-        )
+        message = f"gives a horizon of {ahead:.3g} steps ({ahead * resolved.task.step_dt:.2g} s)"
+        message += f", and an episode has {steps} ({resolved.task.episode_length_s:g} s)"
+        numbers = {"gamma": gamma, "horizon": ahead, "episode": steps}
+        hint = f"{fitting:.3g} gives a horizon of a quarter of the episode"
+        yield warning_at(f"agents.{name}.gamma = {gamma:g}", message, hint, numbers)
 
 
 def discount_of(agent: AgentConfig | None) -> float | None:
@@ -378,21 +360,14 @@ def discount_of(agent: AgentConfig | None) -> float | None:
     return next((float(value) for value in discounts if isinstance(value, int | float)), None)
 
 
-RULES: dict[str, Callable[[RolloutEvidence], Iterable[Remark]]] = {
-    "stops": runs_without_error,
-    "early-resets": early_resets,
-    "silent-reward": silent_rewards,
-    "dominant-reward": dominant_rewards,
-    "constant-reward": constant_reward,
-    "dying-pays": dying_pays,
-    "constant-observation": constant_observations,
-    "observation-scale": observation_scale,
-    "saturated-actions": saturated_actions,
-    "dead-action": dead_actions,
-    "timestep": timestep,
-    "horizon": horizon,
-}
-"""Name -> rule, in the order in which they run. The first line of a rule's docstring is the rule."""
+_IN_ORDER: tuple[Callable[[RolloutEvidence], Iterable[Remark]], ...] = (
+    *(stops, early_resets, silent_reward, dominant_reward, constant_reward, dying_pays, constant_observation),
+    *(observation_scale, saturated_actions, dead_action, timestep, horizon),
+)
+RULES = {rule.__name__.replace("_", "-"): rule for rule in _IN_ORDER}
+"""Name -> rule, in the order in which they run; `docs/guides/check-and-lint.md` lists them.
+
+The first line of a rule's docstring is the rule."""
 
 
 def _quantile(values: Tensor, share: float) -> float:

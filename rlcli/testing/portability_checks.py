@@ -284,10 +284,8 @@ def captured(subject: TaskUnderTest) -> Iterator[Finding]:
             for _ in range(EPISODE + 1):
                 env.step(action)
     except HostSyncError as error:
-        hint = (
-            "compute with torch.where and masks over all rows: docs/tutorials/train-on-a-gpu.md; else a GPU is several"
-        )
-        hint += " times slower"
+        hint = "compute with torch.where and masks over all rows: docs/tutorials/train-on-a-gpu.md"
+        hint += "; else a GPU is several times slower"
         yield warning_at(subject.location(error), f"{error}, in a step", hint)
 
 

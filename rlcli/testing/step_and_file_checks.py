@@ -21,8 +21,9 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DivergedError, listing
 from rlcli.registry import model_file
 from rlcli.scene.untrusted_mjcf import model_roots, read_mjcf
+from rlcli.testing import steps
 from rlcli.testing.findings import Finding, error_at, warning_at
-from rlcli.testing.steps import STEPS, extreme_actions, record, step_outputs
+from rlcli.testing.steps import STEPS, record, step_outputs
 from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, observation_parts, task_of
 
 
@@ -38,11 +39,9 @@ def names(subject: TaskUnderTest) -> Iterator[Finding]:
             unnamed = [element for element in elements if not element.name]
             if unnamed:
                 places = [f"on '{e.target}'" if word == "actuator" else f"in '{e.parent.name}'" for e in unnamed]
-                yield warning_at(
-                    f"scene.entities.{entity}: {config.model}",
-                    f"{word} without a name: {listing(places)}; a term can select it only by its index",
-                    f'name it in the MJCF: <{word} name="..."/>',
-                )
+                message = f"{word} without a name: {listing(places)}; a term can select it only by its index"
+                hint = f'name it in the MJCF: <{word} name="..."/>'
+                yield warning_at(f"scene.entities.{entity}: {config.model}", message, hint)
 
 
 def yaml_round_trip(subject: TaskUnderTest) -> Iterator[Finding]:
@@ -55,21 +54,16 @@ def yaml_round_trip(subject: TaskUnderTest) -> Iterator[Finding]:
             again = to_data(resolve(replace(subject.source, config=file)))
         except ConfigError as error:
             for problem in error.problems:
-                yield error_at(
-                    problem.path or subject.source.label,
-                    f"cannot be read back from YAML: {problem.message}",
-                    problem.hint or "use a value that YAML has (finite numbers, text, lists)",
-                )
+                message = f"cannot be read back from YAML: {problem.message}"
+                hint = problem.hint or "use a value that YAML has (finite numbers, text, lists)"
+                yield error_at(problem.path or subject.source.label, message, hint)
             return
     before, after = dict(leaves(data)), dict(leaves(again))
     for path in {**before, **after}:
         was, now = before.get(path), after.get(path)
         if was != now and not (isinstance(was, list | tuple) and list(was) == now):  # YAML has no tuples
-            yield error_at(
-                dotted(path),
-                f"is {was!r}, and {now!r} after writing and reading the configuration",
-                "a run stores its configuration as YAML: use a value that YAML has",
-            )
+            message = f"is {was!r}, and {now!r} after writing and reading the configuration"
+            yield error_at(dotted(path), message, "a run stores its configuration as YAML: use a value that YAML has")
 
 
 # --- results of a step ---
@@ -157,16 +151,16 @@ def _task_outputs(env: VecEnv) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]:
             yield f"{section}.{term.name}", term.call(), ()
 
 
-def random_actions_stay_stable(subject: TaskUnderTest) -> Iterator[Finding]:
+def random_actions(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that no simulation diverges in 200 steps of random actions within the action bound."""
     recording = subject.recording()
     yield from _check_divergence(subject, recording.env, len(recording.steps))
 
 
-def extreme_actions_stay_stable(subject: TaskUnderTest) -> Iterator[Finding]:
+def extreme_actions(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that no simulation diverges in 200 steps of actions at the bound with alternating signs."""
     env = subject.env()
-    recording = record(env, extreme_actions(env, subject.bound))
+    recording = record(env, steps.extreme_actions(env, subject.bound))
     yield from _check_divergence(subject, env, len(recording.steps))
     if recording.error is not None:
         raise recording.error
@@ -174,11 +168,10 @@ def extreme_actions_stay_stable(subject: TaskUnderTest) -> Iterator[Finding]:
 
 def _check_divergence(subject: TaskUnderTest, env: VecEnv, steps: int) -> Iterator[Finding]:
     if env.divergences:
-        yield error_at(
-            f"sim.dt = {env.physics_dt:g} s, {steps} of {STEPS} steps",
-            f"the simulation diverged {env.divergences} times with actions within +-{subject.bound:g}; it must never",
-            "take a smaller sim.dt, more damping or armature, lower gains, or an effort_limit",
-        )
+        where = f"sim.dt = {env.physics_dt:g} s, {steps} of {STEPS} steps"
+        message = f"the simulation diverged {env.divergences} times with actions within +-{subject.bound:g}"
+        hint = "take a smaller sim.dt, more damping or armature, lower gains, or an effort_limit"
+        yield error_at(where, f"{message}; it must never", hint)
 
 
 def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
@@ -192,9 +185,8 @@ def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
             if bool((values == values[0, 0]).all()) and where not in fixed:
                 value = f"is {float(values[0, 0]):g}" if values.shape[2] == 1 else "is the same"
                 message = f"{value} in {NUM_ENVS} environments and {len(obs)} observations"
-                yield error_at(
-                    where, message, "compute the column from the state, or leave it out: a policy cannot learn from it"
-                )
+                hint = "compute the column from the state, or leave it out: a policy cannot learn from it"
+                yield error_at(where, message, hint)
 
 
 def _fixed_command_columns(env: VecEnv, group: str) -> set[str]:

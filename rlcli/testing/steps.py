@@ -42,6 +42,8 @@ class EndedEpisode:
     truncated: bool
     causes: tuple[str, ...]
     """Names of the termination terms that ended it."""
+    total: float = 0.0
+    """Undiscounted sum of its rewards."""
 
 
 def ended_episodes(result: StepResult) -> list[EndedEpisode]:
@@ -53,7 +55,7 @@ def ended_episodes(result: StepResult) -> list[EndedEpisode]:
     for row, env_id in enumerate(ended.ids.tolist()):
         flags = bool(result.terminated[env_id]), bool(result.truncated[env_id])
         causes = tuple(name for name, fired in ended.causes.items() if bool(fired[row]))
-        episodes.append(EndedEpisode(env_id, int(ended.lengths[row]), *flags, causes))
+        episodes.append(EndedEpisode(env_id, int(ended.lengths[row]), *flags, causes, float(ended.returns[row])))
     return episodes
 
 

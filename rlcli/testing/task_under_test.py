@@ -88,11 +88,9 @@ class TaskUnderTest:
         return agents
 
     def _resolve(self, flags: dict[str, Any]) -> Resolved:
-        small = {"scene.num_envs": NUM_ENVS, "sim.engine_threads": 1}
-        values = {**small, **flags}
-        return resolve(
-            self.source, agent=self._agent, config_file=self._config, overrides=self._overrides, flags=values
-        )
+        values = {"scene.num_envs": NUM_ENVS, "sim.engine_threads": 1, **flags}
+        agent, config = self._agent, self._config
+        return resolve(self.source, agent=agent, config_file=config, overrides=self._overrides, flags=values)
 
 
 def open_task(

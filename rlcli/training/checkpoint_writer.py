@@ -29,6 +29,9 @@ _SHARD_BYTES = 64 << 20
 _DEFAULT_LAST = 10
 """Number of newest checkpoints to keep by default if the time decides when to save."""
 
+_NewRows = list[tuple[int, int, dict[str, Tensor]]]
+"""Rows of a log that are in no file yet: (start, stop, columns) for each new file."""
+
 
 @dataclass(frozen=True, slots=True)
 class Keep:
@@ -121,7 +124,7 @@ class CheckpointWriter:
         if self._failure is not None:
             self.wait()
 
-    def _copy_new(self, name: str, rows: Rows) -> list[tuple[int, int, dict[str, Tensor]]]:
+    def _copy_new(self, name: str, rows: Rows) -> _NewRows:
         """Return copies of the rows that are in no file yet, one (start, stop, columns) for each new file."""
         start = max(rows.first, self._copied.get(name, 0))
         if start >= rows.stop:
@@ -133,12 +136,7 @@ class CheckpointWriter:
         return [(*part, rows.read(*part)) for part in parts]
 
     def _write(
-        self,
-        state: TrainerState,
-        fresh: Mapping[str, list[tuple[int, int, dict[str, Tensor]]]],
-        iteration: int,
-        step: int,
-        batch: FailureBatch | None,
+        self, state: TrainerState, fresh: Mapping[str, _NewRows], iteration: int, step: int, batch: FailureBatch | None
     ) -> None:
         try:
             if self.cases is not None and batch is not None:
@@ -153,7 +151,7 @@ class CheckpointWriter:
         except BaseException as error:
             self._failure = error
 
-    def _write_rows(self, name: str, rows: Rows, parts: list[tuple[int, int, dict[str, Tensor]]]) -> dict[str, Any]:
+    def _write_rows(self, name: str, rows: Rows, parts: _NewRows) -> dict[str, Any]:
         folder = self.checkpoints / LOG_FOLDER / name
         shards = self._shards.setdefault(name, [])
         for start, stop, columns in parts:

@@ -168,16 +168,14 @@ def no_reward(health: Health) -> Found:
         yield f"the return is {values[0]:g} in all {len(values)} iterations: {what}", "rlcli lint TASK, and the weights"
 
 
-def return_stands_still(health: Health) -> Found:
+def no_progress(health: Health) -> Found:
     """Check that the return, the length of episodes or a value of the task moves."""
     watched = [RETURN, LENGTH, *health.names("Episode_Reward/"), *health.names("Success_Value/")]
     if health.struggles(0.15) and all(abs(health.change(name)) < 1.0 for name in watched):
         value = statistics.fmean(health.last(RETURN)) if health.values(RETURN) else 0.0
         done = f"{health.progress:.0%} of the training"
-        yield (
-            f"return, reward terms and episode length have not moved in {done} (return {value:.4g})",
-            ("rlcli lint TASK (dead-action, silent-reward), a larger agent.learning_rate, or larger actions"),
-        )
+        message = f"return, reward terms and episode length have not moved in {done} (return {value:.4g})"
+        yield message, "rlcli lint TASK (dead-action, silent-reward), a larger agent.learning_rate, or larger actions"
 
 
 def one_termination(health: Health) -> Found:
@@ -189,20 +187,15 @@ def one_termination(health: Health) -> Found:
             continue
         if health.change(LENGTH) < 1.0 and not _approaches(health.values(RETURN)):
             length = statistics.fmean(health.last(LENGTH))
-            yield (
-                f"{share:.0%} of the episodes end by '{name}', after {length:.0f} steps, as at the beginning",
-                ("looser limits, an easier start of episodes, or a reward of each step alive"),
-            )
+            message = f"{share:.0%} of the episodes end by '{name}', after {length:.0f} steps, as at the beginning"
+            yield message, "looser limits, an easier start of episodes, or a reward of each step alive"
 
 
 def short_episodes(health: Health) -> Found:
     """Check that episodes have more than a few steps."""
     length, full = health.median(LENGTH), health.task.max_episode_length
     if length is not None and length <= min(3.0, full / 4):
-        yield (
-            f"episodes end after {length:.3g} of {full} steps",
-            "rlcli lint TASK (early-resets)",
-        )
+        yield f"episodes end after {length:.3g} of {full} steps", "rlcli lint TASK (early-resets)"
 
 
 def dying_pays(health: Health) -> Found:
@@ -210,10 +203,8 @@ def dying_pays(health: Health) -> Found:
     if health.struggles(0.1) and health.change(RETURN) > 1.0 and health.values(LENGTH):
         before, after = (statistics.fmean(part) for part in (health.first(LENGTH), health.last(LENGTH)))
         if after < 0.7 * before:
-            yield (
-                f"the return rises while episodes shrink from {before:.0f} to {after:.0f} steps: ending pays",
-                ("signs of the weights, a reward of each step alive, or a penalty for terminations"),
-            )
+            message = f"the return rises while episodes shrink from {before:.0f} to {after:.0f} steps: ending pays"
+            yield message, "signs of the weights, a reward of each step alive, or a penalty for terminations"
 
 
 def exploration(health: Health) -> Found:
@@ -226,10 +217,8 @@ def exploration(health: Health) -> Found:
         yield f"the standard deviation of actions has fallen from {start:.3g} to {std:.3g}", "a larger entropy_coef"
     if std > 3.0 * (bound or float("inf")) or (std > 1.25 * start and std > (bound or 1.0) and _rises(health)):
         limit = f", and the bound of actions is {bound:g}" if bound else ""
-        yield (
-            f"the standard deviation of actions is {std:.3g}, {std / start:.1f} times the first one{limit}",
-            ("a smaller entropy_coef or init_std, and rlcli lint TASK (dead-action)"),
-        )
+        message = f"the standard deviation of actions is {std:.3g}, {std / start:.1f} times the first one{limit}"
+        yield message, "a smaller entropy_coef or init_std, and rlcli lint TASK (dead-action)"
 
 
 def _rises(health: Health) -> bool:
@@ -243,10 +232,8 @@ def update_size(health: Health) -> Found:
     if kl is None or not health.struggles(0.1):
         return
     if kl > 4.0 * target:
-        yield (
-            f"the KL divergence of an update is {kl:.3g}, and {target:g} is the target",
-            ("a smaller agent.learning_rate, fewer epochs, or schedule adaptive with desired_kl"),
-        )
+        message = f"the KL divergence of an update is {kl:.3g}, and {target:g} is the target"
+        yield message, "a smaller agent.learning_rate, fewer epochs, or schedule adaptive with desired_kl"
     if abs(kl) < 1e-6:
         yield f"an update hardly changes the policy: its KL divergence is {kl:.1g}", "a larger agent.learning_rate"
 
@@ -256,10 +243,8 @@ def learning_rate_floor(health: Health) -> Found:
     rate, (floor, _) = health.median("Loss/learning_rate"), health.settings.get("learning_rate_range", (1e-5, 0.0))
     adaptive = health.settings.get("schedule") == "adaptive"
     if adaptive and rate is not None and rate <= 1.01 * floor and health.struggles(0.1):
-        yield (
-            f"the adaptive learning rate is at its floor, {rate:.1g}",
-            "a larger desired_kl, or normalised observations",
-        )
+        message = f"the adaptive learning rate is at its floor, {rate:.1g}"
+        yield message, "a larger desired_kl, or normalised observations"
 
 
 def value_function(health: Health) -> Found:
@@ -269,15 +254,11 @@ def value_function(health: Health) -> Found:
         return
     start = statistics.median(health.first("Loss/value"))
     if loss > 1000.0 * max(start, 1e-9) and explained < 0.1:
-        yield (
-            f"the value loss has grown from {start:.3g} to {loss:.3g}",
-            "a smaller agent.learning_rate or reward_scale",
-        )
+        message = f"the value loss has grown from {start:.3g} to {loss:.3g}"
+        yield message, "a smaller agent.learning_rate or reward_scale"
     elif explained < 0.02 and loss > 0.0 and not _approaches(health.values(RETURN)) and health.change(RETURN) < 1.0:
-        yield (
-            f"the critic explains {explained:.2f} of the variance of returns",
-            ("observations that show the state, normalize_observations, or another gamma"),
-        )
+        message = f"the critic explains {explained:.2f} of the variance of returns"
+        yield message, "observations that show the state, normalize_observations, or another gamma"
 
 
 def observations(health: Health) -> Found:
@@ -312,10 +293,8 @@ def blocked_success(health: Health) -> Found:
         if (never and not _approaches(_gaps(values, condition.model_dump()))) or alone:
             value = f", its value is {statistics.fmean(values[-3:]):.3g}, and the bound is" if values else ""
             bound = bound_text(condition.model_dump())
-            yield (
-                f"the condition '{name}' of success holds in {held:.1%} of the episodes{value} {bound}".rstrip(),
-                (f"a larger reward for it, or another bound of success.{name}"),
-            )
+            message = f"the condition '{name}' of success holds in {held:.1%} of the episodes{value} {bound}".rstrip()
+            yield message, f"a larger reward for it, or another bound of success.{name}"
 
 
 def _gaps(values: list[float], bounds: Mapping[str, Any]) -> list[float]:
@@ -335,18 +314,9 @@ def _approaches(values: list[float]) -> bool:
     return rise > max(0.05 * abs(statistics.fmean(before)), noise)
 
 
-CHECKS: dict[str, Callable[[Health], Found]] = {
-    "no-reward": no_reward,
-    "short-episodes": short_episodes,
-    "observations": observations,
-    "update-size": update_size,
-    "learning-rate-floor": learning_rate_floor,
-    "exploration": exploration,
-    "dying-pays": dying_pays,
-    "one-termination": one_termination,
-    "value-function": value_function,
-    "actions-at-bound": actions_at_bound,
-    "blocked-success": blocked_success,
-    "no-progress": return_stands_still,
-}
+_IN_ORDER: tuple[Callable[[Health], Found], ...] = (
+    *(no_reward, short_episodes, observations, update_size, learning_rate_floor, exploration, dying_pays),
+    *(one_termination, value_function, actions_at_bound, blocked_success, no_progress),
+)
+CHECKS = {check.__name__.replace("_", "-"): check for check in _IN_ORDER}
 """Name -> check, in the order in which findings are listed."""

@@ -371,12 +371,10 @@ def _require_larger_budget(request: TrainingRequest, run: Run, folder: Path | No
     for unit, number in done.items():
         wanted = request.budget.get(f"agent.max_{unit}")
         if wanted is not None and wanted <= number:
-            message = (
-                f"{run.folder} has {number:,} {unit}, and --max-{unit} counts from its start: {wanted:,} end before"
-            )
-            raise UsageError(
-                message, hint=f"give more than {number}, or leave out --max-{unit} to keep the run's budget"
-            )
+            option = f"--max-{unit}"
+            message = f"{run.folder} has {number:,} {unit}, and {option} counts from its start: {wanted:,} end before"
+            hint = f"give more than {number}, or leave out {option} to keep the run's budget"
+            raise UsageError(message, hint=hint)
 
 
 def _overrides_in(given: object) -> Any:

@@ -120,12 +120,7 @@ def stop_with_parent() -> None:
 
 
 def train_all(
-    runs: Iterable[Path],
-    device: str,
-    jobs: int,
-    options: Sequence[str],
-    stop: StopRequest,
-    poll: Callable[[], None],
+    runs: Iterable[Path], device: str, jobs: int, options: Sequence[str], stop: StopRequest, poll: Callable[[], None]
 ) -> list[TrainingProcess]:
     """Train runs in subprocesses until all have ended. After a signal stop all of them and start no more.
 

@@ -129,11 +129,7 @@ class BackgroundTracker:
 
 
 def open_tracker(
-    name: str,
-    kind: Callable[..., Tracker],
-    run: Run,
-    config: Mapping[str, Any],
-    resume: tuple[int, int] | None,
+    name: str, kind: Callable[..., Tracker], run: Run, config: Mapping[str, Any], resume: tuple[int, int] | None
 ) -> FailSafeLogger:
     """Open a tracker of a run. A resumed run is continued in the tracker, without a step twice.
 

@@ -403,10 +403,12 @@ def test_height_lookup_equals_ray_casts(tmp_path, engine):
     assert ((table.distance != before).any(dim=1) == (torch.arange(12) == 3)).all()
 
 
-def test_height_lookup_below_ground_returns_no_hit():
+def test_height_lookup_tells_height_above_ground_and_where_ground_is():
     table = HeightTable(ground(sub_terrains={"flat": {"kind": "flat"}}), torch.device("cpu"))
-    found = table.distance(torch.tensor([[0.3, 0.2, 1.5], [0.3, 0.2, -0.1], [7.9, 0.0, 2.0], [8.1, 0.0, 2.0]]))
-    assert found.tolist() == [1.5, -1.0, 2.0, -1.0]
+    points = torch.tensor([[0.3, 0.2, 1.5], [0.3, 0.2, -0.1], [7.9, 0.0, 2.0], [8.1, 0.0, 2.0]])
+    height, on_ground = table.depth(*points.unbind(1))
+    torch.testing.assert_close(height, points[:, 2])
+    assert on_ground.tolist() == [True, True, True, False]
 
 
 def test_height_lookup_is_refused_for_boxes(tmp_path):

@@ -177,10 +177,9 @@ class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
     def __post_init__(self) -> None:
         model, ids = self.env.engine.model, self.entity.actuator_ids
         gain, bias = model.actuator_gaintype[ids], model.actuator_biastype[ids]
-        linear = (gain <= int(mujoco.mjtGain.mjGAIN_AFFINE)) & (bias <= int(mujoco.mjtBias.mjBIAS_AFFINE))
-        require_supported(
-            self.entity, "Actuators", self.actuators, linear.tolist(), "is not linear", "leave out muscles"
-        )
+        is_linear = (gain <= int(mujoco.mjtGain.mjGAIN_AFFINE)) & (bias <= int(mujoco.mjtBias.mjBIAS_AFFINE))
+        linear = is_linear.tolist()
+        require_supported(self.entity, "Actuators", self.actuators, linear, "is not linear", "leave out muscles")
         events = getattr(self.env, "config").events.items()  # noqa: B009 (events exist in managed environments only)
         others = [name for name, event in events if event is not None and _changes_actuators(event)]
         if others:

@@ -146,9 +146,8 @@ class FeetSwingHeight(EntityTerm, TensorState):
 
     def __call__(self) -> Tensor:
         """Return the sum. (num_envs,)"""
-        height = (
-            require_one_per_body(self.entity.data.site_pos_w[:, self.sites, 2], self.sensor) - self.env.origins[:, 2:3]
-        )
+        z = require_one_per_body(self.entity.data.site_pos_w[:, self.sites, 2], self.sensor)
+        height = z - self.env.origins[:, 2:3]
         torch.maximum(self._peak, height, out=self._peak)
         error = (self._peak / self.target_height - 1.0).square_() * self.sensor.first_contact
         self._peak *= ~self.sensor.found

@@ -55,14 +55,9 @@ class Collector:
         self.critic_normalizer = Normalizer(critic_size).to(device) if normalizes_critic_obs else None
         self.value_normalizer = ValueNormalizer().to(device) if config.normalize_value else None
 
-        self.rollout = RolloutBuffer(
-            config.num_steps,
-            env.num_envs,
-            (obs_size, 0 if self._critic_reads_actor_obs else critic_size, layout.action_size),
-            minibatch_sizes(env, config, config.num_steps * env.num_envs),
-            config.rnn is not None,
-            device,
-        )
+        sizes = (obs_size, 0 if self._critic_reads_actor_obs else critic_size, layout.action_size)
+        steps, minibatches = config.num_steps, minibatch_sizes(env, config, config.num_steps * env.num_envs)
+        self.rollout = RolloutBuffer(steps, env.num_envs, sizes, minibatches, config.rnn is not None, device)
         self.obs = {
             group: torch.zeros(env.num_envs, layout.size(group), device=device)
             for group in dict.fromkeys(("policy", *groups))

@@ -43,7 +43,11 @@ class LayerGradients(Protocol):
         """Write the gradients; return the sums that `Objective`'s functions return. Inputs (n, d), (n, c)"""
 
 
-def threaded_gradients(networks: ActorCritic, rows: int, threads: int) -> Callable[[Sequence[Tensor]], LayerGradients]:
+MakeLayerGradients = Callable[[Sequence[Tensor]], LayerGradients]
+"""Factory of a computation that writes to the given gradients of the parameters."""
+
+
+def threaded_gradients(networks: ActorCritic, rows: int, threads: int) -> MakeLayerGradients:
     """Return the computation of `LayerGradients` by threads of this process."""
 
     def make(gradients: Sequence[Tensor]) -> LayerGradients:
@@ -92,11 +96,7 @@ class ClosedFormGradient:
     """
 
     def __init__(
-        self,
-        networks: ActorCritic,
-        out: Tensor,
-        slices: Mapping[str, slice],
-        compute: Callable[[Sequence[Tensor]], LayerGradients],
+        self, networks: ActorCritic, out: Tensor, slices: Mapping[str, slice], compute: MakeLayerGradients
     ) -> None:
         self._networks, self._out = networks, out
         parameters = dict(networks.named_parameters())

@@ -7,7 +7,6 @@ CUDA graph and replay it. `metrics` reads one small tensor.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -18,7 +17,7 @@ from rlcli.rl.ppo.compile import compile_update, tf32_matmul
 from rlcli.rl.ppo.gradient import (
     AutogradGradient,
     ClosedFormGradient,
-    LayerGradients,
+    MakeLayerGradients,
     MinibatchGradient,
     has_closed_form,
     threaded_gradients,
@@ -75,7 +74,7 @@ class Learner:
         else:
             self.minibatch_gradient = AutogradGradient(self._networks, self.gradient_and_kl, self.functions.loss)
 
-    def _gradient_computation(self, threads: int) -> Callable[[Sequence[Tensor]], LayerGradients]:
+    def _gradient_computation(self, threads: int) -> MakeLayerGradients:
         """Return what computes the gradients of the layers: the processes of the environment, or threads."""
         env, rollout = self.collector.env, self.collector.rollout
         if env.workers > 1:

@@ -1,10 +1,11 @@
-"""Model of the CPU engine's worlds (one per environment), and the model fields that differ between worlds."""
+"""Worlds of the CPU engine (one per environment): model fields that differ between worlds, and integration states."""
 
 from __future__ import annotations
 
 import contextlib
+import copy
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import mujoco
@@ -16,9 +17,17 @@ from torch import Tensor
 
 from rlcli import machine
 from rlcli.errors import DeviceError, DivergedError, did_you_mean, listing, one_line
-from rlcli.sim.divergence_report import MORE_MEMORY
-from rlcli.sim.mujoco_private import expand_disable_flags, expanded_fields, make_batch, without_profiler
+from rlcli.sim.divergence_report import HISTORY_MEMORY, MORE_MEMORY, Call, StateHistory, StateLayout
+from rlcli.sim.mujoco_private import (
+    STATE_FIELDS,
+    expand_disable_flags,
+    expanded_fields,
+    make_batch,
+    state_columns,
+    without_profiler,
+)
 from rlcli.sim.quiet_mujoco import quiet_mujoco
+from rlcli.sim.saved_tensors import substate
 from rlcli.sim.selection import Selection, ids_of
 from rlcli.sim.skippable_work import skippable_flags
 
@@ -33,8 +42,8 @@ _MIN_STATES_PER_ENV = 3
 """Least memory of an environment, as a number of integration states; the built-in tasks need 3.3 to 16."""
 
 
-class BatchModel:
-    """Base of the CPU engine: its worlds (one per environment), and the model fields that differ between worlds.
+class BatchWorlds:
+    """Base of the CPU engine: its worlds (one per environment), their own model fields and their states.
 
     Raises:
         DeviceError: for more worlds than the machine's memory holds.
@@ -53,6 +62,17 @@ class BatchModel:
         self._expanded = expanded_fields(self._batch)
         self.own_constants = False
         """Whether `set_constants` has been called."""
+        columns = state_columns(self._batch)
+        self.state_layout = StateLayout(model, columns)
+        self._sizes = {name: size for name, (_, size) in columns.items()}
+        self._rows: NDArray[np.float64] = self._batch.state
+        self._state = torch.from_numpy(self._rows)
+        self._default = np.empty(self._batch.nstate)
+        mujoco.mj_getState(model, mujoco.MjData(model), self._default, INTEGRATION_STATE)
+        self.history = StateHistory(self._rows, self.state_layout.columns("ctrl").stop, self._default, 1)
+        self._fields: dict[str, Tensor] = {}
+        """Fields of MjData that are in use (requested with `field`)."""
+        self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
 
     def can_expand(self, name: str) -> bool:
         """Return whether a model field may differ between worlds."""
@@ -104,6 +124,85 @@ class BatchModel:
         self._batch.get_model(env, model)
         if "opt.disableflags" not in self._expanded:
             model.opt.disableflags = self._disable_flags
+
+    def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
+        """Record the last calls of `step`: `calls` of them, or as many as fit into `memory` bytes."""
+        self._new_history(self.history.width, calls, memory)
+
+    def recorded_calls(self, env: int) -> list[Call]:
+        """Return the recorded calls of a world in its present episode, the oldest first."""
+        return self.history.calls_of(env)
+
+    def state_row(self, env: int) -> NDArray[np.float64]:
+        """Return a copy of a world's integration state. (nstate,)"""
+        row: NDArray[np.float64] = self._rows[env].copy()
+        return row
+
+    def state_rows(self, envs: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return copies of the integration states of some worlds. (n, nstate)"""
+        return self._rows[envs]
+
+    def set_state_row(self, env: int, row: NDArray[np.float64]) -> None:
+        """Set the integration state of a world; derived fields keep their values."""
+        self._rows[env] = row
+        self._batch.warning[env] = 0
+
+    def copy_data(self, env: int, data: mujoco.MjData) -> None:
+        """Set the integration state and the derived fields of a world to those of an MjData."""
+        mujoco.mj_getState(self.model, data, self._rows[env], INTEGRATION_STATE)
+        for name, field in self._fields.items():
+            if name not in STATE_FIELDS and hasattr(data, name):
+                field[env] = torch.from_numpy(np.array(getattr(data, name))).reshape(field[env].shape)
+
+    def set_default_state(self, qpos: Tensor, qvel: Tensor) -> None:
+        """Set the joint state that `reset` restores."""
+        for name, values in (("qpos", qpos), ("qvel", qvel)):
+            self._default[self.state_layout.columns(name)] = values.numpy()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of the state rows, the warning counters and the model fields with a value for each world."""
+        return {
+            "state": self._state.clone(),
+            "warning": torch.from_numpy(np.array(self._batch.warning)),
+            "constants": torch.tensor(self.own_constants),
+            **{f"model.{name}": torch.from_numpy(np.array(values)) for name, values in self._expanded.items()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore the state returned by `state_dict()`.
+
+        Raises:
+            ValueError: for a model field that cannot differ between environments, or that has another shape.
+        """
+        self._state.copy_(state["state"])
+        width = self.history.width
+        if (self._rows[:, width:] != self._default[width:]).any():
+            self._record_all_columns()
+        self.history.clear()
+        self._batch.warning[:] = state["warning"].numpy()
+        for name, values in substate(state, "model.").items():
+            self.load_model_field(name, values)
+        if bool(state["constants"]):
+            self.set_constants()
+
+    def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Return the model and the data of a world after `mj_forward`; a later call for it updates the same objects."""
+        is_new = env not in self._worlds
+        if is_new:
+            self._worlds[env] = (copy.copy(self.model), self._batch.get_data(env))
+        model, data = self._worlds[env]
+        if is_new or self._expanded:
+            self.write_own_model(env, model)
+        self._batch.get_data(env, data)
+        mujoco.mj_forward(model, data)
+        return model, data
+
+    def _record_all_columns(self) -> None:
+        self._new_history(self._batch.nstate, self.history.requested_calls, self.history.memory)
+
+    def _new_history(self, width: int, calls: int, memory: int) -> None:
+        count = self.history.count
+        self.history = StateHistory(self._rows, width, self._default, calls, memory=memory, count=count)
 
     def _skip_nothing(self) -> None:
         """From now on, compute everything that the flags of the original model do not disable."""

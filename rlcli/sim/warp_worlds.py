@@ -1,10 +1,12 @@
-"""Fields of the GPU engine's worlds: in use, derived from the state, and saved in checkpoints."""
+"""Worlds of the GPU engine (one per environment): own model fields, fields of the data, and saved states."""
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -14,20 +16,45 @@ import warp as wp
 from torch import Tensor
 
 from rlcli.config.schema import SimConfig
-from rlcli.errors import did_you_mean
+from rlcli.errors import did_you_mean, listing
+from rlcli.sim.capacity import required_capacity
+from rlcli.sim.quiet_mujoco import quiet_mujoco
 from rlcli.sim.saved_tensors import require_matching_tensors, substate
+from rlcli.sim.selection import Selection
 from rlcli.sim.warp_fields import FORCE, INPUTS, KINEMATICS, STATE, VELOCITY, FieldStages
-from rlcli.sim.warp_model import WarpModel
+from rlcli.sim.warp_memory import put_on_device
 
+_CONSTANTS = (
+    *("body_subtreemass", "dof_invweight0", "body_invweight0", "tendon_invweight0", "tendon_length0"),
+    *("actuator_acc0", "eq_data"),
+)
+"""Model fields that `set_const` derives from others."""
+_BOUNDS = ("geom_aabb", "geom_rbound")
+"""Model fields that `set_const` derives from the sizes of geoms."""
 _HOLDING_EQUALITIES = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 """Types of equality constraints that hold bodies together."""
 
 
-class WarpState(WarpModel):
-    """Base of the GPU engine: its worlds on a device of Warp, and their fields."""
+class WarpWorlds:
+    """Base of the GPU engine: its worlds on a device of Warp, their own model fields and their states.
+
+    Raises:
+        ConfigError: for a model that MuJoCo Warp cannot run.
+        DeviceError: for more worlds than the device's memory holds.
+    """
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, config: SimConfig, device: str) -> None:
-        super().__init__(model, num_envs, config, device)
+        quiet_mujoco()
+        self.model = model
+        self.num_envs = num_envs
+        self.capacity = required_capacity(model, config.contacts_per_env, config.constraints_per_env)
+        self.device = torch.device(device)
+        if self.device.type == "cuda" and self.device.index is None:
+            self.device = torch.device("cuda", torch.cuda.current_device())
+        self._device = wp.device_from_torch(self.device)
+        self._graphs: dict[tuple[int, bool], Any] = {}
+        """CUDA graphs of `step`, by `nstep` and `derive`."""
+        self._expanded: dict[str, Tensor] = {}
         self._fields: dict[str, Tensor] = {}
         """Fields of the data that are in use (requested with `field`)."""
         self._start_inputs: dict[str, Tensor] = {}
@@ -44,9 +71,48 @@ class WarpState(WarpModel):
         self._holds_bodies = bool(np.isin(model.eq_type, _HOLDING_EQUALITIES).any())
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
         with self._setting_up():
+            self._model, self._data = put_on_device(model, num_envs, self.device, self.capacity)
             self._arrays = {name: getattr(self._data, name) for name in STATE}
             qpos, qvel, _ = (self.field(name) for name in ("qpos", "qvel", "qacc_warmstart"))
             self._last_qpos, self._last_qvel = qpos.clone(), qvel.clone()
+
+    def can_expand(self, name: str) -> bool:
+        """Return whether a model field may differ between worlds."""
+        owner, attribute = self._owner(name)
+        return attribute in _batched_fields(owner) and getattr(owner, attribute, None) is not None
+
+    def expand(self, name: str) -> Tensor:
+        """Return a model field with a value for every world."""
+        if name not in self._expanded:
+            owner, attribute = self._owner(name)
+            if not self.can_expand(name):
+                known = sorted(_batched_fields(owner))
+                hint = did_you_mean(attribute, known) or f"fields that can: {listing(known)}"
+                raise ValueError(f"'{name}' cannot differ between environments; {hint}")
+            array = getattr(owner, attribute)
+            values = np.repeat(array.numpy()[:1], self.num_envs, axis=0)
+            wide = wp.array(values, dtype=array.dtype, device=self._device)
+            setattr(owner, attribute, wide)
+            self._expanded[name] = wp.to_torch(wide)
+            self._graphs.clear()
+        return self._expanded[name]
+
+    def expanded(self, name: str) -> Tensor | None:
+        """Return a model field that has a value for each world; None if all worlds share the model's value."""
+        return self._expanded.get(name)
+
+    def expanded_fields(self) -> list[str]:
+        """Return the names of the model fields that have a value for each world."""
+        return list(self._expanded)
+
+    def set_constants(self, selection: Selection | None = None) -> None:
+        """Recompute the constants that MuJoCo derives from model fields, in all worlds."""
+        for name in (*_CONSTANTS, *(_BOUNDS if "geom_size" in self._expanded else ())):
+            array = getattr(self._model, name, None)
+            if array is not None and array.size:
+                self.expand(name)
+        with self._launching():
+            mjw.set_const(self._model, self._data)
 
     def field(self, name: str) -> Tensor:
         """Return a live view of an MjData field; from now on, `step` computes the stage of a derived field."""
@@ -172,3 +238,25 @@ class WarpState(WarpModel):
         """Return copies of the values of the last substep, which MuJoCo's mj_forward would overwrite."""
         names = [*self._of_substep(), "qacc_warmstart"]
         return {name: self._fields[name].clone() for name in names if name in self._fields}
+
+    def _owner(self, name: str) -> tuple[Any, str]:
+        """Return the structure of MuJoCo Warp that has a model field, and the field's name in it."""
+        return (self._model.opt, name[4:]) if name.startswith("opt.") else (self._model, name)
+
+    def _launching(self) -> wp.ScopedDevice:
+        """Return a context in which Warp launches on the engine's device."""
+        return wp.ScopedDevice(self._device)
+
+    @contextlib.contextmanager
+    def _setting_up(self) -> Iterator[None]:
+        """Launch on the engine's device and, on a GPU, on torch's stream."""
+        is_gpu = self.device.type == "cuda"
+        stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if is_gpu else None
+        with self._launching(), wp.ScopedStream(stream):
+            yield
+
+
+def _batched_fields(owner: Any) -> set[str]:
+    """Return the array fields of a dataclass of MuJoCo Warp that have a row for each world."""
+    shapes = {field.name: getattr(field.type, "shape", ()) for field in dataclasses.fields(owner)}
+    return {name for name, shape in shapes.items() if next(iter(shape), None) == "*"}
