@@ -16,17 +16,14 @@ _REASONS = {
     "surface_gripper": ("a suction gripper has no counterpart in plain MuJoCo", "use a gripper with joints"),
     "devices": ("devices for teleoperation belong to Isaac Sim", "rlcli trains policies: remove the use of the device"),
     "recorder": ("recorders write files of Isaac Lab", "use `rlcli eval --record`"),
-    "operationalspace": ("rlcli has no operational space control", "use DifferentialInverseKinematicsActionCfg"),
     "pretrainedpolicy": (
         "it loads a TorchScript policy, and rlcli unpickles nothing",
         "train the low-level policy, and write the task without it",
     ),
     "rigidobjectcollection": ("it holds assets that differ by environment", "use one RigidObjectCfg for each object"),
-    "multirotor": ("rlcli has no rotors", "write a DirectRLEnv that sets forces"),
     "nonholonomic": ("rlcli has no action for wheeled bases", "use JointVelocityActionCfg"),
     "surfacegripper": ("a suction gripper has no counterpart in plain MuJoCo", "use a gripper with joints"),
     "image_features": ("its networks are downloads in TorchScript or pickles", "train a CNN on `mdp.image`"),
-    "thrust": ("rlcli has no action for thrusters", "write a DirectRLEnv that sets forces"),
     "agile": (
         "it loads a TorchScript policy, and rlcli unpickles nothing",
         "train the low-level policy, and write the task without it",

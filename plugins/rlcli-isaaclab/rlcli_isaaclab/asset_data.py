@@ -11,8 +11,10 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
 from rlcli.scene.entity import Entity
+from rlcli.scene.entity_data import EntityData
 from rlcli.sim.rotations import rotate, rotate_inverse
 from rlcli.sim.selection import ALL
+from rlcli_isaaclab.substeps import update_state
 
 _DATA_NAMES = {
     "applied_torque": "applied_effort",
@@ -43,8 +45,14 @@ class Data:
     """State of an asset under Isaac Lab's names. The names of `rlcli.scene.entity_data.EntityData` work too."""
 
     def __init__(self, env: VecEnv, entity: Entity) -> None:
-        self._env, self._entity, self._data = env, entity, entity.data
+        self._env, self._entity = env, entity
         self.joint_names, self.body_names = list(entity.joint_names), list(entity.names["Bodies"])
+
+    @property
+    def _data(self) -> EntityData:
+        """State of the entity, of the physics step that comes next."""
+        update_state(self._env)
+        return self._entity.data
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rlcli_isaaclab.config_class import MISSING, configclass
+from rlcli_isaaclab.operational_space import OperationalSpaceController
 
 
 @configclass
@@ -16,3 +17,6 @@ class DifferentialIKControllerCfg:
     use_relative_mode: bool = False
     ik_method: str = "dls"
     ik_params: Any = None
+
+
+__all__ = ["DifferentialIKControllerCfg", "OperationalSpaceController"]

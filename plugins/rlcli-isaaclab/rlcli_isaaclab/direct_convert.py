@@ -18,7 +18,7 @@ from rlcli_isaaclab.sensor_facade import TerrainImporter
 from rlcli_isaaclab.settings import Node, Report
 from rlcli_isaaclab.term_reader import TermReader
 
-_KINDS = {"set_joint_effort_target": "effort", "set_joint_velocity_target": "velocity"}
+_KINDS = {"set_joint_effort_target": "motor", "set_joint_velocity_target": "velocity"}
 _BODY_FORCES = ("get_link_incoming_joint_force", "body_incoming_joint_wrench")
 
 
@@ -57,8 +57,6 @@ def direct_task(cfg: Any, env_class: type, root: Path) -> PythonTask:
     assets = [name for name, (made, _) in zip(names, setup.created, strict=True) if isinstance(made, Asset)]
     driven = {name: dict.fromkeys(scene.names(name, "joint") or [], kind) for name in assets}
     scene.add_joint_settings(driven)
-    if kind == "effort":
-        _add_motors(scene, driven)
     terms = TermReader(scene, report, cfg)
     events = {name: term for member in top.node("events").nodes() for name, term in terms.read_terms("events", *member)}
     hook = _Hooks(env_class, cfg, any(word in source for word in _BODY_FORCES))
@@ -128,16 +126,3 @@ def _source_of(env_class: type) -> str:
     """Return the text of a class and of its bases that belong to the task."""
     bases = [base for base in env_class.__mro__ if not base.__module__.startswith(("rlcli_isaaclab", "gymnasium"))]
     return "\n".join(inspect.getsource(base) for base in bases if base is not object)
-
-
-def _add_motors(scene: SceneReader, driven: dict[str, dict[str, str]]) -> None:
-    """Give every joint of articulations a motor, so that the task can set any effort."""
-    for name, joints in driven.items():
-        entity = scene.entities.get(name)
-        if entity is None or not joints:
-            continue
-        settings = entity.setdefault("joints", {})
-        for values in settings.values():
-            values.setdefault("actuator", "motor")
-        if not settings:
-            settings[".*"] = {"actuator": "motor"}

@@ -26,7 +26,8 @@ _EXTRA = {
     "isaaclab_rl": ("rsl_rl",),
     "isaaclab_assets": ("assets",),
     "isaaclab_tasks": ("mdp", "task_utils"),
-    "isaaclab.envs.mdp": ("mdp",),
+    "isaaclab_contrib": ("multirotor", "action_terms"),
+    "isaaclab.envs.mdp": ("mdp", "action_terms", "command_terms"),
     "isaaclab.sim": ("usd_stage",),
 }
 """Module of Isaac Lab -> modules of this package that define further names of it."""

@@ -24,7 +24,9 @@ from rlcli_isaaclab.manager_facade import (
     RewardManagerFacade,
     TerminationManagerFacade,
 )
+from rlcli_isaaclab.multirotor import Multirotor
 from rlcli_isaaclab.scene_facade import Scene
+from rlcli_isaaclab.settings import kind_of
 
 
 class ManagerBasedRLEnv(gymnasium.Env):
@@ -186,6 +188,10 @@ class ManagerBasedRLEnv(gymnasium.Env):
             self.scene.user_cfg = self.cfg.scene
             for name, asset in self.scene.articulations.items():
                 asset.cfg = getattr(self.cfg.scene, name, asset.cfg)
+                if kind_of(getattr(asset.cfg, "class_type", None)) == "Multirotor":
+                    made = self.scene.articulations[name] = Multirotor.of(self.managed, self.managed.entities[name])
+                    made.cfg = asset.cfg
+                    made.start()
 
     @property
     def unwrapped(self) -> Any:

@@ -86,6 +86,10 @@ class Asset:
     def write_data_to_sim(self) -> None:
         """Do nothing: targets are written when they are set."""
 
+    def state(self) -> dict[str, Tensor]:
+        """Return the tensors that a checkpoint contains; the simulation has the others."""
+        return {}
+
     def update(self, dt: float) -> None:
         """Do nothing: data are computed when they are read."""
 

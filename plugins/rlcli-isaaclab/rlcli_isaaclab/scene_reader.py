@@ -49,9 +49,9 @@ class SceneReader:
             kind = kind_of(item.data.get("class_type"))
             spawn = item.node("spawn") if "spawn" in item else None
             spawn_function = kind_of(spawn.data.get("func")) if spawn else ""
-            if kind in ("Articulation", "RigidObject"):
+            if kind in ("Articulation", "RigidObject", "Multirotor"):
                 self._read_entity(name, item, spawn)
-            elif kind in ("RigidObjectCollection", "DeformableObject", "SurfaceGripper", "Multirotor"):
+            elif kind in ("RigidObjectCollection", "DeformableObject", "SurfaceGripper"):
                 reason, hint = reason_of(kind)
                 self.report.problem(item.key, f"a {kind} cannot be used: {reason}", hint)
             elif kind == "TerrainImporter":
@@ -195,7 +195,8 @@ class SceneReader:
 
     def _read_entity(self, name: str, item: Node, spawn: Node | None) -> None:
         item.skip("class_type", "prim_path", "collision_group", "debug_vis", "articulation_root_prim_path")
-        item.skip("actuator_value_resolution_debug_print")
+        item.skip("actuator_value_resolution_debug_print", "allocation_matrix", "rotor_directions")
+        item.skip("thruster_force_direction")  # Isaac Lab does not use it
         prim = str(item.data.get("prim_path") or "")
         self.prims[name] = prim.rstrip("/").rsplit("/", 1)[-1]
         path = spawn.get("usd_path", spawn.get("asset_path")) if spawn else None
@@ -233,6 +234,7 @@ class SceneReader:
         factor = item.get("soft_joint_pos_limit_factor", 1.0)
         if factor != 1.0:
             entity["soft_joint_pos_limit_factor"] = as_float(factor)
+        init.skip("rps")  # of a Multirotor, which reads it and its actuators when it is created
         self._joint_settings[name], explicit = read_actuators(
             item.node("actuators"),
             lambda patterns, group: self.order_names(name, "joint", patterns, False, group.key),

@@ -9,6 +9,7 @@ from typing import Any
 from rlcli.config.term_signatures import Signature, SignatureError, builtin_terms, snake_case
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli_isaaclab.absent import AbsentValue, reason_of
+from rlcli_isaaclab.action_terms import driven_by, find_action
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.lab_terms import LAB_TERMS
 from rlcli_isaaclab.managers import CommandTerm
@@ -44,8 +45,9 @@ class TermReader:
             wanted = item.data.get("joint_names")
             entity = str(item.data.get("asset_name"))
             kind = kind_of(item.data.get("class_type"))
-            command = next((word for word in ("effort", "velocity") if word in kind.lower()), "position")
-            patterns = [wanted] if isinstance(wanted, str) else wanted
+            action = find_action(item.data.get("class_type"))
+            command = driven_by(action) or next((w for w in ("effort", "velocity") if w in kind.lower()), "position")
+            patterns = [".*"] if wanted is None and action else [wanted] if isinstance(wanted, str) else wanted
             for pattern in patterns if isinstance(patterns, list | tuple) else ():
                 for joint in self.scene.names(entity, "joint") or []:
                     if re.fullmatch(pattern, joint):
@@ -54,6 +56,9 @@ class TermReader:
     def read_action(self, node: Node) -> dict[str, Any]:
         """Return an action term."""
         kind = kind_of(node.get("class_type"))
+        action = find_action(node.data.get("class_type"))
+        if action is not None:
+            return self._read_user_object(action, node)
         name = ACTIONS.get(kind)
         signature = builtin_terms("actions").get(name or "")
         if name is None or signature is None:
@@ -112,9 +117,11 @@ class TermReader:
 
     def read_command(self, node: Node) -> dict[str, Any]:
         """Return a command term."""
-        kind = kind_of(node.get("class_type"))
+        class_type = node.get("class_type")
+        kind = kind_of(class_type)
         entry = COMMANDS.get(kind)
-        if entry is None or entry.name is None:
+        own = isinstance(class_type, type) and not class_type.__module__.startswith("rlcli_isaaclab")
+        if entry is None or entry.name is None or own:
             return self._read_user_command(kind, node)
         times = finite_times(node.require("resampling_time_range"))
         config: dict[str, Any] = {"func": entry.name, "resampling_time_s": times}
@@ -142,13 +149,11 @@ class TermReader:
 
     def _read_user_command(self, kind: str, node: Node) -> dict[str, Any]:
         """Return a command term for the user's own class. A YAML file has only its name: then write a stub."""
-        from rlcli_isaaclab.terms import UserCommand, key_of
-
         config: dict[str, Any] = {"resampling_time_s": finite_times(node.require("resampling_time_range"))}
         class_type = node.data.get("class_type")
-        settings = {key: node.get(key) for key in node.data if key not in _COMMAND_KEYS}
         node.skip("debug_vis")
         if isinstance(class_type, str) and not class_type.startswith(_ISAAC_LAB_MODULES) and ":" in class_type:
+            settings = {key: node.get(key) for key in node.data if key not in _OBJECT_KEYS}
             named = {("entity" if key == "asset_name" else key): value for key, value in settings.items()}
             params = {key: to_plain(value) for key, value in named.items() if is_plain(value)}
             self.stubs[kind] = ("commands", params)
@@ -158,12 +163,20 @@ class TermReader:
             near = did_you_mean(kind, COMMANDS) or f"use {listing(COMMANDS)}, or write your own CommandTerm"
             self.report.problem(node.key, f"the command '{kind}' has no counterpart in rlcli", near)
             return {"func": "null_command"}
+        return config | self._read_user_object(class_type, node)
+
+    def _read_user_object(self, class_type: type, node: Node) -> dict[str, Any]:
+        """Return the term of a class `Name(cfg, env)`: the user's, or one of this package."""
+        from rlcli_isaaclab.terms import UserObject, key_of
+
+        section, name = node.key
         self._report_missing(node.data, node.key)
+        settings = {key: node.get(key) for key in node.data if key not in _OBJECT_KEYS}
         plain = {key: value for key, value in settings.items() if is_plain(value)}
-        for key in settings.keys() - plain.keys():
+        for key in settings.keys() - plain.keys() if self.context.cfg is None else ():
             node.note("ignored", key, "only numbers, text, lists and mappings can be written to a file")
-        command = UserCommand(class_type, node.key[-1], tuple(plain))
-        return {"func": command, **config, **{key_of(key): to_plain(value) for key, value in plain.items()}}
+        term = UserObject(class_type, section, name, tuple(plain), self.context)
+        return {"func": term, **{key_of(key): to_plain(value) for key, value in plain.items()}}
 
     def _report_missing(self, value: Mapping[str, Any], key: Key) -> None:
         for name, item in value.items():
@@ -434,7 +447,7 @@ class TermReader:
 _LOOKS = ("randomize_visual_color", "randomize_visual_texture_material")
 """Events that only change how a scene looks."""
 
-_COMMAND_KEYS = ("class_type", "resampling_time_range", "debug_vis")
+_OBJECT_KEYS = ("class_type", "resampling_time_range", "debug_vis")
 
 
 def _find_signature(terms: Mapping[str, Signature], name: str) -> Signature:

@@ -18,7 +18,10 @@ from torch import Tensor
 from rlcli.config.schema import Names, Number, StrictModel
 from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, SignatureError
 from rlcli.sim.selection import Selection
+from rlcli_isaaclab.config_class import to_dict
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
+from rlcli_isaaclab.settings import to_plain
+from rlcli_isaaclab.substeps import Substeps
 
 _RESERVED = {name for model in SECTIONS.values() for name in model.model_fields} | {"params"}
 _PLAIN: dict[Any, Any] = {float: Number, int: int, bool: bool, str: str}
@@ -120,16 +123,26 @@ class UserTerm:
         return Parameter(key_of(p.name), kind, default, required, None)
 
 
-class UserCommand:
-    """The user's command class `Name(cfg, env)` as the command term of one name."""
+class UserObject:
+    """The user's class `Name(cfg, env)` of an action or a command, as the term of one name.
 
-    def __init__(self, function: Any, name: str, settings: tuple[str, ...]) -> None:
-        self.function, self.name = function, name
+    Args:
+        function: the user's class.
+        section: `actions` or `commands`.
+        name: name of the term.
+        settings: names of the settings that a file can hold; they are the parameters of the term.
+        context: the user's configuration, which has the settings that no file can hold.
+    """
+
+    def __init__(
+        self, function: Any, section: str, name: str, settings: tuple[str, ...], context: TermContext
+    ) -> None:
+        self.function, self.section, self.name, self.context = function, section, name, context
         self.__name__, self.__module__ = function.__name__, function.__module__
-        self.target = functools.partial(_bind_command, self)
+        self.target = functools.partial(_bind_object, self)
         self.original = {key_of(key): key for key in settings}
 
-    def __deepcopy__(self, memo: Any) -> UserCommand:
+    def __deepcopy__(self, memo: Any) -> UserObject:
         return self
 
     def __call__(self, *args: Any) -> Any:
@@ -142,6 +155,15 @@ class UserCommand:
         summary = (inspect.getdoc(self.function) or "").split("\n")[0]
         parameters = tuple(Parameter(key, Any, None, True, None) for key in self.original)
         return Signature(name, self.__name__, True, file, 1, summary, parameters, target=self.target)
+
+    def settings(self, params: Mapping[str, Any]) -> Any:
+        """Return the configuration object of the term, with the values of its parameters."""
+        values = {self.original[key]: value for key, value in params.items()}
+        cfg = copy.deepcopy(getattr(getattr(self.context.cfg, self.section, None), self.name, None))
+        if cfg is None:
+            return SimpleNamespace(class_type=self.function, **{k: _to_namespace(v) for k, v in values.items()})
+        _set_members(cfg, values)
+        return cfg
 
 
 def key_of(name: str) -> str:
@@ -241,13 +263,66 @@ class _BoundCommand(_BoundObject):
         self._has_command = True
 
 
-def _bind_command(term: UserCommand, env: Any, **params: Any) -> _BoundCommand:
+class _BoundAction(_BoundObject):
+    """The user's action, bound to an environment."""
+
+    unit = ""
+
+    def __init__(self, term: Any, managed: Any, name: str) -> None:
+        self.term = term
+        self.size = term.action_dim
+        self.elements = tuple(f"{name}[{i}]" for i in range(self.size))
+        self.sinks = (f"action {name}",)
+        self._substeps = Substeps(managed, f"action {name}", self)
+
+    def process(self, action: Tensor) -> None:
+        """Call `process_actions`."""
+        self.term.process_actions(action)
+        self._substeps.start()
+
+    def apply(self) -> None:
+        """Call `apply_actions` before a physics step."""
+        self.term.apply_actions()
+        self.term._asset.write_data_to_sim()
+        self.term._asset.apply_wrenches()
+
+    def reset(self, selection: Selection) -> None:
+        """Reset the action and its asset at the start of episodes."""
+        super().reset(selection)
+        self.term._asset.reset(selection.env_ids())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of the tensors of the action and of its asset."""
+        asset = {f"asset.{name}": value.clone() for name, value in self.term._asset.state().items()}
+        return {**super().state_dict(), **asset}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore the tensors returned by `state_dict`."""
+        for name, value in self.term._asset.state().items():
+            value.copy_(state[f"asset.{name}"])
+        super().load_state_dict({name: value for name, value in state.items() if not name.startswith("asset.")})
+
+
+def _bind_object(term: UserObject, env: Any, **params: Any) -> _BoundObject:
     from rlcli_isaaclab.runtime import facade_of
 
-    settings = {term.original[key]: _to_namespace(value) for key, value in params.items()}
-    times = list(env.config.commands[term.name].resampling_time_s)
-    cfg = SimpleNamespace(class_type=term.function, debug_vis=False, resampling_time_range=times, **settings)
-    return _BoundCommand(term.function(cfg, facade_of(env)))
+    cfg, facade = term.settings(params), facade_of(env)
+    cfg.debug_vis = False
+    facade.use(term.context)
+    if term.section == "actions":
+        return _BoundAction(term.function(cfg, facade), env, term.name)
+    cfg.resampling_time_range = tuple(env.config.commands[term.name].resampling_time_s)
+    return _BoundCommand(term.function(cfg, facade))
+
+
+def _set_members(target: Any, values: Mapping[str, Any]) -> None:
+    """Set members of a configuration object that differ from the values; a list replaces an equal tuple only then."""
+    for name, value in values.items():
+        now = getattr(target, name, None)
+        if isinstance(value, Mapping) and hasattr(now, "__dataclass_fields__"):
+            _set_members(now, value)
+        elif to_plain(to_dict(now)) != value:
+            setattr(target, name, tuple(value) if isinstance(now, tuple) and isinstance(value, list) else value)
 
 
 def _resolved(value: Any, scene: Any) -> Any:

@@ -170,6 +170,7 @@ def collect(data: Any) -> dict[str, dict[str, list[str]]]:
         for group in (actuators or {}).values() if isinstance(actuators, Mapping) else ():
             if isinstance(group, Mapping):
                 add(name, "joint", group.get("joint_names_expr"))
+                add(name, "body", group.get("thruster_names_expr"))
                 for value in group.values():
                     if isinstance(value, Mapping):
                         add(name, "joint", list(value))
