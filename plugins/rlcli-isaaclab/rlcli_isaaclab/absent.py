@@ -20,7 +20,6 @@ _REASONS = {
         "it loads a TorchScript policy, and rlcli unpickles nothing",
         "train the low-level policy, and write the task without it",
     ),
-    "rigidobjectcollection": ("it holds assets that differ by environment", "use one RigidObjectCfg for each object"),
     "nonholonomic": ("rlcli has no action for wheeled bases", "use JointVelocityActionCfg"),
     "surfacegripper": ("a suction gripper has no counterpart in plain MuJoCo", "use a gripper with joints"),
     "image_features": ("its networks are downloads in TorchScript or pickles", "train a CNN on `mdp.image`"),
@@ -50,10 +49,10 @@ def reason_of(name: str) -> tuple[str, str]:
     )
 
 
-def absence(name: str) -> TaskError:
+def absence(name: str, hint: str | None = None) -> TaskError:
     """Return the error that a name of Isaac Lab or Isaac Sim cannot be used."""
-    reason, hint = reason_of(name)
-    return TaskError(f"{_user_place()}{name} cannot be used: {reason}", hint=hint)
+    reason, usual = reason_of(name)
+    return TaskError(f"{_user_place()}{name} cannot be used: {reason}", hint=hint or usual)
 
 
 def _user_place() -> str:

@@ -57,6 +57,7 @@ def direct_task(cfg: Any, env_class: type, root: Path) -> PythonTask:
     assets = [name for name, (made, _) in zip(names, setup.created, strict=True) if isinstance(made, Asset)]
     driven = {name: dict.fromkeys(scene.names(name, "joint") or [], kind) for name in assets}
     scene.add_joint_settings(driven)
+    config["sim"] |= scene.integrator()
     terms = TermReader(scene, report, cfg)
     events = {name: term for member in top.node("events").nodes() for name, term in terms.read_terms("events", *member)}
     hook = _Hooks(env_class, cfg, any(word in source for word in _BODY_FORCES))

@@ -123,9 +123,17 @@ def _member(module: str, name: str) -> Any:
         return _lab_module(path)
     found = _definitions().get(name)
     if found is None:
-        near = did_you_mean(name, public_names(module)) or did_you_mean(name, list(_definitions()))
-        raise AttributeError(f"Isaac Lab 2.3.2 has no '{name}' in '{module}'" + (f"; {near}" if near else ""))
+        raise _UnknownNameError(name, module)
     return lab_name(name)
+
+
+class _UnknownNameError(AttributeError):
+    """A name that Isaac Lab lacks. The search for similar names takes milliseconds: only a message needs it."""
+
+    def __str__(self) -> str:
+        name, module = self.args
+        near = did_you_mean(name, public_names(module)) or did_you_mean(name, list(_definitions()))
+        return f"Isaac Lab 2.3.2 has no '{name}' in '{module}'" + (f"; {near}" if near else "")
 
 
 @functools.cache

@@ -9,6 +9,7 @@ from typing import Any
 
 from rlcli.errors import TaskError
 from rlcli_isaaclab.absent import reason_of
+from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
 from rlcli_isaaclab.model_lookup import given_models, mjcf_of
 from rlcli_isaaclab.sensor_reader import read_sensor
@@ -51,7 +52,10 @@ class SceneReader:
             spawn_function = kind_of(spawn.data.get("func")) if spawn else ""
             if kind in ("Articulation", "RigidObject", "Multirotor"):
                 self._read_entity(name, item, spawn)
-            elif kind in ("RigidObjectCollection", "DeformableObject", "SurfaceGripper"):
+            elif kind == "RigidObjectCollection":
+                for part, content in item.node("rigid_objects").nodes():
+                    self._read_entity(entity_name(name, part), content, content.node("spawn"))
+            elif kind in ("DeformableObject", "SurfaceGripper"):
                 reason, hint = reason_of(kind)
                 self.report.problem(item.key, f"a {kind} cannot be used: {reason}", hint)
             elif kind == "TerrainImporter":
@@ -98,6 +102,14 @@ class SceneReader:
             joints = merge_joint_settings(settings, model, driven.get(name, {}), name, self.report)
             if joints:
                 entity["joints"] = joints
+
+    def integrator(self) -> dict[str, str]:
+        """Return the `integrator` of joints with a drive: PhysX integrates their damping implicitly.
+
+        MuJoCo's method of Euler does so only with the damping of joints, and a drive's damping can diverge.
+        """
+        joints = [settings for entity in self.entities.values() for settings in entity.get("joints", {}).values()]
+        return {"integrator": "implicitfast"} if any(settings.get("kv") for settings in joints) else {}
 
     def names(self, entity: str, kind: str) -> list[str] | None:
         """Return the joints or bodies of an entity in its model's order; None if there is no model."""

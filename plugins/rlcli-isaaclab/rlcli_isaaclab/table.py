@@ -132,9 +132,6 @@ TERMS: dict[str, dict[str, Entry]] = {
     },
     "curriculum": {
         "modify_reward_weight": Entry("stages"),
-        "modify_env_param": Entry("stages"),
-        "modify_term_cfg": Entry("stages"),
-        "initial_final_interpolate_fn": Entry("interpolate"),
         "terrain_levels_vel": Entry("terrain_levels", fixed={"command": "base_velocity"}),
     },
 }

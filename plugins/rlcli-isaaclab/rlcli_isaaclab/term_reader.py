@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import re
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -11,6 +13,7 @@ from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.action_terms import driven_by, find_action
 from rlcli_isaaclab.config_class import is_missing
+from rlcli_isaaclab.curricula import ChangedSetting, modify_env_param
 from rlcli_isaaclab.lab_terms import LAB_TERMS
 from rlcli_isaaclab.managers import CommandTerm
 from rlcli_isaaclab.mdp import MdpFunction
@@ -28,10 +31,10 @@ _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
 class TermReader:
     """Reader of the terms of all sections."""
 
-    def __init__(self, scene: SceneReader, report: Report, cfg: Any = None) -> None:
+    def __init__(self, scene: SceneReader, report: Report, cfg: Any = None, data: Mapping[str, Any] = {}) -> None:  # noqa: B006
         from rlcli_isaaclab.terms import TermContext
 
-        self.scene, self.report = scene, report
+        self.scene, self.report, self.data = scene, report, data
         self.context = TermContext(cfg, scene.frames)
         self._user_terms: dict[Any, Any] = {}
         self.driven_joints: dict[str, dict[str, str]] = {}
@@ -233,11 +236,8 @@ class TermReader:
         name = builtin_name(function)
         if name == "modify_reward_weight":
             return self._read_reward_stage(params)
-        if name in ("modify_env_param", "modify_term_cfg", "initial_final_interpolate_fn"):
-            hint = "use the term 'stages' or 'interpolate', which change a value by its address"
-            what = f"'{name}' has no counterpart, because it calls a function that edits the configuration"
-            self.report.problem(node.key, what, hint)
-            return {"func": "stages", "address": "", "steps": [], "values": []}
+        if isinstance(function, type) and issubclass(function, modify_env_param):
+            return self._read_changed_setting(function, node, params)
         special = LAB_TERMS.get(name or "")
         if special is not None and special.needed(params.data):
             return self._read_user_term(section, special.function, None, node, params)
@@ -262,6 +262,38 @@ class TermReader:
         else:
             config = self._read_user_term(section, function, name, node, params)
         return config
+
+    def _read_changed_setting(self, function: type, node: Node, params: Node) -> dict[str, Any]:
+        """Return a curriculum term that changes a setting by a function of the user's."""
+        from rlcli_isaaclab.terms import SettingTerm
+
+        address = str(params.require("address"))
+        values = {key: params.get(key) for key in ("modify_fn", "modify_params")}
+        setting = None
+        with contextlib.suppress(KeyError, AttributeError, TypeError, IndexError, ValueError):
+            setting = ChangedSetting(self.data, address, self._read_again)
+        if setting is None or not (setting.addresses or setting.is_own):
+            hint = "use the address of a number: SECTION.TERM.params.KEY, rewards.TERM.weight, commands.TERM.ranges.KEY"
+            what = f"the address '{address}' names no setting that rlcli can change during training"
+            self.report.problem((*params.key, "address"), what, hint)
+            return {"func": "stages", "address": "", "steps": [], "values": []}
+        return {"func": SettingTerm(function, setting, values, self.context), **dict(setting.addresses)}
+
+    def _read_again(
+        self, section: str, term: list[str], settings: Mapping[str, Any]
+    ) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield the address and the settings of the terms that one term of Isaac Lab becomes with other settings."""
+        reader = copy.copy(self)
+        reader.report, reader.stubs = Report(), {}
+        node = Node(settings, (section, *term), reader.report)
+        if section in ("commands", "actions"):
+            read = reader.read_command if section == "commands" else reader.read_action
+            yield f"{section}.{term[0]}", read(node)
+        elif section == "observations":
+            yield ".".join((section, *term)), reader.read_term(section, node)
+        else:
+            for name, config in reader.read_terms(section, term[0], node):
+                yield f"{section}.{name}", config
 
     def _find_builtin(self, section: str, name: str | None) -> tuple[str | None, Entry]:
         """Return rlcli's name of one of Isaac Lab's terms (None if there is none), and its row of the table."""

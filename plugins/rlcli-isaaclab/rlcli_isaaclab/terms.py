@@ -166,6 +166,35 @@ class UserObject:
         return cfg
 
 
+class SettingTerm:
+    """Curriculum term that changes a setting by a function of the user's.
+
+    Args:
+        function: class of the term, `modify_env_param` or a subclass.
+        setting: the setting, a `ChangedSetting`.
+        params: parameters of the term that no file can hold.
+        context: the user's configuration.
+    """
+
+    def __init__(self, function: Any, setting: Any, params: dict[str, Any], context: TermContext) -> None:
+        self.function, self.setting, self.params, self.context = function, setting, params, context
+        self.__name__, self.__module__ = function.__name__, function.__module__
+        self.target = functools.partial(_bind_setting, self)
+
+    def __deepcopy__(self, memo: Any) -> SettingTerm:
+        return self
+
+    def __call__(self, *args: Any) -> Any:
+        """Create an object of the class."""
+        return self.function(*args)
+
+    def __rlcli_term__(self, name: str) -> Signature:
+        """Return the signature of the term under a name; its parameters are the addresses that it changes."""
+        file = Path(inspect.getsourcefile(self.function) or "?")
+        addresses = tuple(Parameter(key, str, None, True, "Address") for key, _ in self.setting.addresses)
+        return Signature(name, self.__name__, True, file, 1, "Changes a setting.", addresses, target=self.target)
+
+
 def key_of(name: str) -> str:
     """Return the YAML key of a parameter: its name, with `_` appended if a section has a setting of that name."""
     return f"{name}_" if name in _RESERVED else name
@@ -194,18 +223,29 @@ class _Bound:
     """The user's function, bound to an environment and parameters."""
 
     def __init__(self, function: Any, section: str, env: Any, params: dict[str, Any]) -> None:
-        self.term, self._section, self._env, self._params = function, section, env, params
+        self.term, self._section, self._env, self.params = function, section, env, params
+        self._reads_reset = section == "observations" and "hasattr(env" in _source(function)
 
     def __call__(self, selection: Selection | None = None) -> Any:
         if selection is not None:
             self._env.selection = selection
-            value = self.term(self._env, selection.env_ids(), **self._params)
+            value = self.term(self._env, selection.env_ids(), **self.params)
             # a curriculum term may return several values to log; rlcli logs one
             return next(iter(value.values()), None) if isinstance(value, dict) else value
-        value = self.term(self._env, **self._params)
+        if self._reads_reset:  # the first value has the shape of all values: let the reset make what the term reads
+            self._reads_reset = False
+            self._env.run_own_reset_events()
+        value = self.term(self._env, **self.params)
         if self._section == "observations" and value.dim() == 1:
             return value.unsqueeze(1).float()  # a group that is not concatenated may have such terms
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
+
+
+def _source(function: Any) -> str:
+    try:
+        return inspect.getsource(function)
+    except (OSError, TypeError):
+        return ""
 
 
 class _BoundObject:
@@ -313,6 +353,15 @@ def _bind_object(term: UserObject, env: Any, **params: Any) -> _BoundObject:
         return _BoundAction(term.function(cfg, facade), env, term.name)
     cfg.resampling_time_range = tuple(env.config.commands[term.name].resampling_time_s)
     return _BoundCommand(term.function(cfg, facade))
+
+
+def _bind_setting(term: SettingTerm, env: Any, **opened: Tensor) -> _BoundClass:
+    from rlcli_isaaclab.runtime import facade_of
+
+    facade = facade_of(env)
+    facade.use(term.context)
+    cfg = SimpleNamespace(func=term.function, params=term.params, setting=term.setting)
+    return _BoundClass(term.function(cfg, facade), "curriculum", facade, {**term.params, **opened})
 
 
 def _set_members(target: Any, values: Mapping[str, Any]) -> None:

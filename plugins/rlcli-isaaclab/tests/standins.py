@@ -255,6 +255,11 @@ def mjcf(name: str, path: str, joints: list[str], bodies: list[str], articulated
 def write(data: Any, folder: Path) -> None:
     """Write stand-in models of all entities that have a file, and `models.yaml`, which names them."""
     folder.mkdir(parents=True, exist_ok=True)
+    scene = dict(data["scene"])
+    for name, item in data["scene"].items():
+        for part, content in (item.get("rigid_objects") or {}).items() if isinstance(item, Mapping) else ():
+            scene[f"{name}_{part}"] = content
+    data = {**data, "scene": scene}
     lines = []
     for name, wanted in collect(data).items():
         item = data["scene"][name]
