@@ -28,7 +28,6 @@ _REASONS = {
         "train the low-level policy, and write the task without it",
     ),
     "torchvision": ("the library is not installed", "pip install torchvision"),
-    "trimesh": ("the library is not installed", "pip install trimesh"),
     "nodal": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
     "deformable": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
     "omni": ("it belongs to Isaac Sim's USD stage", "change the model (MJCF) instead"),
@@ -130,7 +129,7 @@ class AbsentModule(ModuleType):
         if self.__name__.endswith("settings") and name in ("get_settings", "acquire_settings_interface"):
             return _NoSettings
         if self.__name__ == "pxr" and name == "UsdGeom":
-            from rlcli_isaaclab.usd_stage import UsdGeom
+            from rlcli_isaaclab.usd_geometry import UsdGeom
 
             return UsdGeom
         if name[:1].isupper():

@@ -15,7 +15,7 @@ from torch import Tensor
 from rlcli.config.term_signatures import Signature
 from rlcli.managers.attribute_state import TermState
 from rlcli.sim.selection import Selection
-from rlcli_isaaclab.direct_env import MANAGED, DirectRLEnv
+from rlcli_isaaclab.direct_env import DirectRLEnv, building
 from rlcli_isaaclab.observation_noise import noise_model
 from rlcli_isaaclab.substeps import Substeps
 
@@ -56,11 +56,8 @@ class DirectRunner:
         self.cfg = cfg
         self.phase = "build"
         self._substeps = Substeps(managed, "direct task", self)
-        token = MANAGED.set(managed)
-        try:
+        with building(managed):
             self.lab: DirectRLEnv = term.env_class(cfg)
-        finally:
-            MANAGED.reset(token)
         self.action_noise = noise_model(cfg.action_noise_model, managed)
         self.observation_noise = noise_model(cfg.observation_noise_model, managed)
         self._memory = TermState(self.lab, excluded=("cfg", "managed", "sim", "scene"))

@@ -28,7 +28,7 @@ _EXTRA = {
     "isaaclab_tasks": ("mdp", "task_utils"),
     "isaaclab_contrib": ("multirotor", "action_terms"),
     "isaaclab.envs.mdp": ("mdp", "action_terms", "command_terms"),
-    "isaaclab.sim": ("usd_stage",),
+    "isaaclab.sim": ("usd_stage", "usd_geometry"),
 }
 """Module of Isaac Lab -> modules of this package that define further names of it."""
 _TEXTS = ("isaaclab_tasks", "isaaclab_assets")
@@ -71,8 +71,8 @@ def module_of(name: str, file: str) -> ModuleType | None:
             return import_from(folder, inner, run_start=top != "isaaclab_tasks")  # it imports every task
     if top in _LIBRARIES and importlib.util.find_spec(top) is not None:
         return None
-    if top == "toml":
-        return importlib.import_module(f"{_OWN}.toml_reader")
+    if top in ("toml", "trimesh"):
+        return importlib.import_module(f"{_OWN}.{top}_reader" if top == "toml" else f"{_OWN}.triangle_mesh")
     if name == "isaacsim.core.utils.stage":
         return importlib.import_module(f"{_OWN}.usd_stage")
     if name in _SIM:

@@ -198,6 +198,9 @@ class ManagerBasedRLEnv(gymnasium.Env):
             self._context, self.cfg = context, copy.deepcopy(context.cfg)
             self.cfg.scene.num_envs = self.managed.num_envs
             self.scene.user_cfg = self.cfg.scene
+            for settings in vars(self.cfg.scene).values():
+                if isinstance(getattr(settings, "prim_path", None), str):
+                    settings.prim_path = settings.prim_path.replace("{ENV_REGEX_NS}", "/World/envs/env_.*")
             self.scene.add_collections(self.cfg.scene)
             for name, asset in self.scene.articulations.items():
                 asset.cfg = getattr(self.cfg.scene, name, asset.cfg)

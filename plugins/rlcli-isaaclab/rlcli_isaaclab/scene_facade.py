@@ -18,6 +18,7 @@ from rlcli_isaaclab.absent import NoEffect, absence
 from rlcli_isaaclab.asset_commands import BodyWrench, JointDrive, PhysxView
 from rlcli_isaaclab.asset_data import Data
 from rlcli_isaaclab.sensor_facade import FrameTransformer, TerrainImporter, bound, camera_or_sensor, find_elements
+from rlcli_isaaclab.sensor_reader import filter_name
 from rlcli_isaaclab.setup_scene import current_setup
 
 
@@ -254,6 +255,9 @@ class Scene(Mapping[str, Any]):
         found = {name: camera_or_sensor(sensor) for name, sensor in sensors} | self._frames
         for name, made in found.items():
             made.cfg = getattr(self.user_cfg, name, None)
+            made.filters = []
+            while filter_name(name, len(made.filters)) in found:
+                made.filters.append(found[filter_name(name, len(made.filters))])
         return found
 
     def clone_environments(self, *args: Any, **options: Any) -> None:

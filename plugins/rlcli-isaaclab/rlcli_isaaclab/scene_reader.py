@@ -12,7 +12,7 @@ from rlcli_isaaclab.absent import reason_of
 from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
 from rlcli_isaaclab.model_lookup import given_models, mjcf_of
-from rlcli_isaaclab.sensor_reader import read_sensor
+from rlcli_isaaclab.sensor_reader import filter_name, read_filters, read_sensor
 from rlcli_isaaclab.settings import Key, Node, as_float, kind_of
 from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
 
@@ -76,6 +76,9 @@ class SceneReader:
             sensor = read_sensor(kind, item, self.prims, self.frames)
             if sensor is not None:
                 self.sensors[item.key[-1]] = sensor
+            if kind == "ContactSensor" and sensor is not None:
+                for index, part in enumerate(read_filters(item, sensor, self.prims)):
+                    self.sensors[filter_name(item.key[-1], index)] = part
         config["ground"] = ground
         config["lights"] = lights
         if not self.entities and not self.report.problems:
@@ -115,6 +118,10 @@ class SceneReader:
         """Return the joints or bodies of an entity in its model's order; None if there is no model."""
         model = self._models.get(entity)
         return None if model is None else model[kind]
+
+    def is_fixed(self, entity: str) -> bool:
+        """Return whether the model of an entity has a fixed base; False without a model."""
+        return bool(self._models.get(entity, {}).get("fixed"))
 
     def order_names(self, entity: str, kind: str, wanted: Any, preserve: bool, key: Key) -> Any:
         """Return names or regexes as Isaac Lab orders them: in the model's order, or as written if `preserve`."""
@@ -217,6 +224,13 @@ class SceneReader:
         if spawn and shape:
             self.entities[name] = self._read_shape(item, spawn, shape)
             return
+        several = spawn is not None and (bool(spawn.data.get("assets_cfg")) or isinstance(spawn.data.get("usd_path"), list))
+        if several and spawn and isinstance(path, str):
+            item.report.entries[(*spawn.key, "assets_cfg")] = ("approximated", "one model in all environments")
+        elif several:
+            what = "has assets that differ by environment, and MuJoCo has one model for all environments"
+            self.report.problem(item.key, what, f"give one model for all: --model {name}=FILE.xml")
+            return
         if not isinstance(path, str):
             source = kind_of(spawn.data.get("func")) if spawn else "nothing"
             message = f"has no model, but {source}; write spawn=UsdFileCfg(usd_path='{name}.xml')"
@@ -310,6 +324,7 @@ class SceneReader:
             "joint": names,
             "body": [compiled.body(b).name for b in range(1, compiled.nbody)],  # body 0 is the world
             "root": (compiled.body_pos[1].tolist(), compiled.body_quat[1].tolist()) if compiled.nbody > 1 else None,
+            "fixed": not any(compiled.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_FREE) for j in range(compiled.njnt)),
             "damping": dict(zip(names, compiled.dof_damping[dofs].tolist(), strict=True)),
             "armature": dict(zip(names, compiled.dof_armature[dofs].tolist(), strict=True)),
             "friction_loss": dict(zip(names, compiled.dof_frictionloss[dofs].tolist(), strict=True)),

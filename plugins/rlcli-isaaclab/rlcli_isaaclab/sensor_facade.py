@@ -188,6 +188,13 @@ class Sensor:
         current_setup().add(self, cfg)
 
     cfg: Any
+    filters: list[Sensor]
+    """Sensors of the contacts with each filtered body."""
+
+    @property
+    def force_matrix_w(self) -> Tensor | None:
+        """Contact force between each body and each filtered body, world frame. (num_envs, bodies, filters, 3) [N]"""
+        return torch.stack([part._sensor.force for part in self.filters], dim=2) if self.filters else None
 
     def bind(self, sensor: Any) -> None:
         """Connect the object with a sensor of the simulation."""

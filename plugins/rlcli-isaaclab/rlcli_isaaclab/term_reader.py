@@ -211,6 +211,9 @@ class TermReader:
         if section == "events" and function in _LOOKS:
             self.report.entries[node.key] = ("ignored", "rlcli does not randomize colours and textures")
             return
+        if section == "events" and function == "reset_root_state_uniform" and self._moves_nothing(node):
+            node.skip(*node.data)
+            return
         if section == "events" and function in EVENTS:
             node.get("func")
             parts = translate_event(function, node.node("params"), self.scene)
@@ -219,6 +222,14 @@ class TermReader:
             parts, common = {"": self.read_term(section, node)}, {}
         for suffix, config in parts.items():
             yield name if len(parts) == 1 else f"{name}_{suffix}", {"func": config["func"], **common, **config}
+
+    def _moves_nothing(self, node: Node) -> bool:
+        """Return whether a reset of the root has a fixed base and only ranges of zero."""
+        params = node.data.get("params") or {}
+        asset = params.get("asset_cfg") or {"name": "robot"}
+        name = asset["name"] if isinstance(asset, Mapping) else asset.name
+        ranges = [params.get(key) or {} for key in ("pose_range", "velocity_range")]
+        return self.scene.is_fixed(name) and not any(any(pair) for values in ranges for pair in values.values())
 
     def read_term(self, section: str, node: Node) -> dict[str, Any]:
         """Return a term with its function and parameters."""

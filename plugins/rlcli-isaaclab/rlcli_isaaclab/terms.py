@@ -19,6 +19,7 @@ from rlcli.config.schema import Names, Number, StrictModel
 from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, SignatureError
 from rlcli.sim.selection import Selection
 from rlcli_isaaclab.config_class import to_dict
+from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
 from rlcli_isaaclab.settings import to_plain
 from rlcli_isaaclab.substeps import Substeps
@@ -238,6 +239,8 @@ class _Bound:
         value = self.term(self._env, **self.params)
         if self._section == "observations" and value.dim() == 1:
             return value.unsqueeze(1).float()  # a group that is not concatenated may have such terms
+        if self._section == "observations" and value.dim() == 3:
+            return value.flatten(1)  # as Isaac Lab does for a term with a history
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
 
 
@@ -349,10 +352,11 @@ def _bind_object(term: UserObject, env: Any, **params: Any) -> _BoundObject:
     cfg, facade = term.settings(params), facade_of(env)
     cfg.debug_vis = False
     facade.use(term.context)
-    if term.section == "actions":
-        return _BoundAction(term.function(cfg, facade), env, term.name)
-    cfg.resampling_time_range = tuple(env.config.commands[term.name].resampling_time_s)
-    return _BoundCommand(term.function(cfg, facade))
+    if term.section == "commands":
+        cfg.resampling_time_range = tuple(env.config.commands[term.name].resampling_time_s)
+    with building(env):
+        made = term.function(cfg, facade)
+    return _BoundAction(made, env, term.name) if term.section == "actions" else _BoundCommand(made)
 
 
 def _bind_setting(term: SettingTerm, env: Any, **opened: Tensor) -> _BoundClass:
@@ -410,7 +414,8 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
         values[term.original[key]] = value
     if not term.is_class:
         return _Bound(term.function, term.section, facade, values)
-    instance = term.function(cfg=ManagerTermBaseCfg(func=term.function, params=values), env=facade)
+    with building(env):
+        instance = term.function(cfg=ManagerTermBaseCfg(func=term.function, params=values), env=facade)
     return _BoundClass(instance, term.section, facade, values)
 
 

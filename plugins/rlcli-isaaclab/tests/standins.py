@@ -264,7 +264,7 @@ def write(data: Any, folder: Path) -> None:
     for name, wanted in collect(data).items():
         item = data["scene"][name]
         spawn = item.get("spawn")
-        if not isinstance(spawn, Mapping) or not any(spawn.get(k) for k in ("usd_path", "asset_path")):
+        if not isinstance(spawn, Mapping) or not any(spawn.get(k) for k in ("usd_path", "asset_path", "assets_cfg")):
             continue
         path = str(spawn.get("usd_path") or spawn.get("asset_path"))
         extra = [b for word, names in EXTRA_BODIES.items() if word in path.lower() for b in names]
