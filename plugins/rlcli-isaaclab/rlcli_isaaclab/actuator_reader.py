@@ -51,14 +51,14 @@ def read_actuators(
         elif kind in _NETWORKS and group not in replaced:
             what = f"the actuator network of '{kind}' is a TorchScript file, which rlcli does not load"
             gains_key = f"{group}: {{stiffness: S, damping: D}}"
-            hint = f"give gains in models.yaml: {entity}: {{model: FILE.xml, gains: {{{gains_key}}}}}"
+            hint = f"give gains: --model models.yaml with the line {entity}: {{model: FILE.xml, gains: {{{gains_key}}}}}"
             item.report.problem(item.key, what, hint)
             continue
         elif kind in _EXPLICIT or kind in _NETWORKS:
             effort_limit = item.get("effort_limit")
             if kind in _NETWORKS:
-                gains = dict(replaced[group])
-                item.note("approximated", "network_file", "replaced by the gains of models.yaml")
+                gains = {key: replaced[group].get(key, 0.0) for key in gains}
+                item.note("approximated", "network_file", "replaced by the gains that are given with the model")
                 item.skip("pos_scale", "vel_scale", "torque_scale", "input_order", "input_idx")
                 kind = "DCMotor"
             elif kind == "RemotizedPDActuator":

@@ -20,7 +20,7 @@ def task(
     report: Report,
     root: Path,
     defaults: Any = None,
-    models: Mapping[str, str] | None = None,
+    models: Mapping[str, Any] | None = None,
     cfg: Any = None,
 ) -> dict[str, Any]:
     """Return the task that the settings of a `ManagerBasedRLEnvCfg` describe.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,8 @@ _KINDS = {"set_joint_effort_target": "motor", "set_joint_velocity_target": "velo
 _BODY_FORCES = ("get_link_incoming_joint_force", "body_incoming_joint_wrench")
 
 
-def direct_task(cfg: Any, env_class: type, root: Path) -> PythonTask:
-    """Return the task of a configuration and its environment class.
+def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]) -> PythonTask:
+    """Return the task of a configuration and its environment class, with the models that the user gives.
 
     Raises:
         ConfigError: if the task cannot be expressed in rlcli.
@@ -42,7 +43,7 @@ def direct_task(cfg: Any, env_class: type, root: Path) -> PythonTask:
         scene_data[f"spawned_{index}"] = {"prim_path": path, "spawn": to_dict(settings)}
     declared = to_dict(cfg.scene)
     scene_data |= {key: value for key, value in declared.items() if key not in scene_data}
-    scene = SceneReader(Node(scene_data, ("scene",), report), root)
+    scene = SceneReader(Node(scene_data, ("scene",), report), root, models)
     data = to_dict(cfg)
     top = Node(data, (), report)
     config: dict[str, Any] = {

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from types import SimpleNamespace
@@ -227,18 +227,18 @@ class DirectRLEnvCfg:
         """Store the class of the environment that a registration names."""
         self.rlcli_class = entry
 
-    def __rlcli_task__(self, root: Path) -> Any:
-        """Return this configuration as a task of rlcli."""
+    def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
+        """Return this configuration as a task of rlcli, with the models that the user gives."""
         from rlcli_isaaclab.direct_convert import direct_task
 
-        return direct_task(self, _environment_class(self), root)
+        return direct_task(self, _environment_class(self), root, models)
 
 
 @configclass
 class DirectMARLEnvCfg:
     """A task with several agents, which rlcli does not have."""
 
-    def __rlcli_task__(self, root: Path) -> Any:
+    def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
         """Raise the error that it cannot be used."""
         raise ConfigError(
             [

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rlcli.errors import TaskError
+from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli_isaaclab.absent import reason_of
 from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
-from rlcli_isaaclab.model_lookup import given_models, mjcf_of
+from rlcli_isaaclab.model_lookup import given_models, mjcf_of, model_hint
 from rlcli_isaaclab.sensor_reader import filter_name, read_filters, read_sensor
 from rlcli_isaaclab.settings import Key, Node, as_float, kind_of
 from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
@@ -20,11 +20,11 @@ from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terra
 class SceneReader:
     """Reader of assets, lights, ground and sensors. It compiles the models to find the names of their elements."""
 
-    def __init__(self, node: Node, root: Path, models: Mapping[str, str] | None = None) -> None:
+    def __init__(self, node: Node, root: Path, models: Mapping[str, Any] | None = None) -> None:
         self.node, self.root, self.report = node, root, node.report
-        self._asked = models
-        self._given = given_models(root)
-        self._given_models = {**self._given.files, **(models or {})}
+        self._asked = dict(models or {})
+        self._given = given_models(root, self._asked)
+        self._given_models = self._given.files
         self.entities: dict[str, dict[str, Any]] = {}
         self.prims: dict[str, str] = {}
         """Entity -> the last part of its prim path."""
@@ -86,6 +86,9 @@ class SceneReader:
                 node.key, "the scene has no robot or object; add an ArticulationCfg or a RigidObjectCfg"
             )
         config["entities"] = self.entities
+        for name in self._asked.keys() - self.entities.keys() if not self.report.problems else ():
+            near = did_you_mean(name, self.entities) or f"robots and objects: {listing(self.entities)}"
+            self.report.problem(node.key, f"--model {name}: the scene has no '{name}'", near)
         if self.sensors:
             config["sensors"] = self.sensors
         self.has_terrain = "terrain" in config
@@ -229,7 +232,7 @@ class SceneReader:
             item.report.entries[(*spawn.key, "assets_cfg")] = ("approximated", "one model in all environments")
         elif several:
             what = "has assets that differ by environment, and MuJoCo has one model for all environments"
-            self.report.problem(item.key, what, f"give one model for all: --model {name}=FILE.xml")
+            self.report.problem(item.key, what, model_hint(name))
             return
         if not isinstance(path, str):
             source = kind_of(spawn.data.get("func")) if spawn else "nothing"
@@ -240,8 +243,7 @@ class SceneReader:
         try:
             model = mjcf_of(path, self.root, self._given_models, name)
         except TaskError as error:
-            hint = error.hint if self._asked is None else f"give a model: --model {name}=FILE.xml"
-            self.report.problem((*spawn.key, "usd_path"), error.message, hint)
+            self.report.problem((*spawn.key, "usd_path"), error.message, error.hint)
             return
         spawn.skip("func", "visible", "copy_from_source", "activate_contact_sensors", "semantic_tags")
         spawn.skip("visual_material_path", "variants")

@@ -170,6 +170,9 @@ ACTIONS: dict[str, str] = {
 }
 """Isaac Lab's class -> action term."""
 
+ONCE_PER_STEP = {"RelativeJointPositionAction", "DifferentialInverseKinematicsAction"}
+"""Actions whose targets Isaac Lab computes again in each physics step."""
+
 COMMANDS: dict[str, Entry] = {
     "NullCommand": Entry("null_command"),
     "UniformVelocityCommand": Entry(

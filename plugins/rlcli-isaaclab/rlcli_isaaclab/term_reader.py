@@ -21,7 +21,7 @@ from rlcli_isaaclab.observation_reader import read_processing
 from rlcli_isaaclab.randomization import EVENTS, translate_event
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, equals_default, kind_of, to_plain
-from rlcli_isaaclab.table import ACTIONS, COMMANDS, EFFORT_TERMS, HEIGHT_TERMS, TERMS, Entry, finite_times
+from rlcli_isaaclab.table import ACTIONS, COMMANDS, ONCE_PER_STEP, EFFORT_TERMS, HEIGHT_TERMS, TERMS, Entry, finite_times
 from rlcli_isaaclab.term_values import builtin_name, has_no_effect, is_entity, is_plain, triple
 
 _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
@@ -60,9 +60,15 @@ class TermReader:
         """Return an action term."""
         kind = kind_of(node.get("class_type"))
         action = find_action(node.data.get("class_type"))
-        if action is not None:
-            return self._read_user_object(action, node)
         name = ACTIONS.get(kind)
+        if action is not None and self.context.cfg is None and name is None:
+            hint = "run the task's own files: rlcli train FILE.py:CLASS"
+            self.report.problem(node.key, f"the action '{kind}' is code, which task.yaml cannot hold", hint)
+            return {"func": "joint_effort"}
+        if action is not None and self.context.cfg is not None:
+            return self._read_user_object(action, node)
+        if kind in ONCE_PER_STEP:
+            node.note("approximated", "class_type", "targets are computed once per step, not in each physics step")
         signature = builtin_terms("actions").get(name or "")
         if name is None or signature is None:
             reason, hint = reason_of(kind)
@@ -250,7 +256,7 @@ class TermReader:
         if isinstance(function, type) and issubclass(function, modify_env_param):
             return self._read_changed_setting(function, node, params)
         special = LAB_TERMS.get(name or "")
-        if special is not None and special.needed(params.data):
+        if special is not None and not isinstance(function, str) and special.needed(params.data):
             return self._read_user_term(section, special.function, None, node, params)
         ours, entry = self._find_builtin(section, name)
         config: dict[str, Any]
