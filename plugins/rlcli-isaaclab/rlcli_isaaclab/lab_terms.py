@@ -44,7 +44,7 @@ class reset_joints_within_limits_range(ManagerTermBase):  # noqa: N801  (Isaac L
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
         params = cfg.params
-        self._asset = env.scene[params["asset_cfg"].name if "asset_cfg" in params else "robot"]
+        self._asset = env.scene[getattr(params.get("asset_cfg"), "name", "robot")]
         data, speed = self._asset.data, self._asset.data.soft_joint_vel_limits[0]
         self._limits = data.soft_joint_pos_limits[0]
         ends = {"position_range": self._limits, "velocity_range": torch.stack([-speed, speed], dim=1)}
