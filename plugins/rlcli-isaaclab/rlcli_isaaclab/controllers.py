@@ -19,4 +19,9 @@ class DifferentialIKControllerCfg:
     ik_params: Any = None
 
 
-__all__ = ["DifferentialIKControllerCfg", "OperationalSpaceController"]
+def convert_usd_to_urdf(usd_path: str, output_path: str, force_conversion: bool = True) -> tuple[str, str]:
+    """Return the files that Isaac Lab would write: only Pink reads them, and actions of Pink are refused."""
+    return f"{output_path}/urdf", f"{output_path}/meshes"
+
+
+__all__ = ["DifferentialIKControllerCfg", "OperationalSpaceController", "convert_usd_to_urdf"]

@@ -13,6 +13,7 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.scene.names import match
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
+from rlcli_isaaclab.absent import absence
 from rlcli_isaaclab.setup_scene import current_setup
 
 
@@ -99,12 +100,19 @@ class CameraView:
         """Images by type of data, channels last. (num_envs, h, w, c)"""
         kind, image = self._sensor.config.data, self._sensor.image
         names = {"rgb": ("rgb",), "depth": ("depth", "distance_to_image_plane"), "distance": ("distance_to_camera",)}
-        return dict.fromkeys(names[kind], image)
+        return _Images(dict.fromkeys(names[kind], image))
 
     @property
     def image_shape(self) -> tuple[int, int]:
         """Height and width [pixels]."""
         return self._sensor.config.height, self._sensor.config.width
+
+
+class _Images(dict[str, Tensor]):
+    """Images by type of data."""
+
+    def __missing__(self, name: str) -> Tensor:
+        raise absence(f"Camera.data.output[{name!r}]")
 
 
 class TerrainImporter:
