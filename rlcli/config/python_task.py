@@ -1,8 +1,8 @@
 """Conversion of a configuration in Python to the plain data that a YAML file would contain.
 
 The configuration is a `TaskConfig`, a mapping with its keys, or a function that returns one. Or it is a configuration
-of another framework with a method `__rlcli_task__(root, models) -> PythonTask`. Terms are names or functions. A function that
-is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
+of another framework with a method `__rlcli_task__(root, models) -> PythonTask`. Terms are names or functions. A
+function that is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
 """
 
 from __future__ import annotations

@@ -18,7 +18,8 @@ def model_file(root: Path, model: str) -> Path:
 
     `FILE` is in the task's own folder; `TASK:FILE` in the folder of an installed task; `package:PACKAGE/FILE` in an
     installed package, which is not imported; `models:FILE` in a folder of the environment variable RLCLI_MODELS;
-    `file:PATH` is any file, which only the user can name with `--model`. If ` | ` separates several alternatives, the first existing one is used.
+    `file:PATH` is any file, which only the user can name with `--model`. If ` | ` separates several alternatives, the
+    first existing one is used.
 
     Raises:
         MissingModelError: if a model that the user must provide is not found.

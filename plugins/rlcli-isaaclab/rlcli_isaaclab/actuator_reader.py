@@ -51,7 +51,9 @@ def read_actuators(
         elif kind in _NETWORKS and group not in replaced:
             what = f"the actuator network of '{kind}' is a TorchScript file, which rlcli does not load"
             gains_key = f"{group}: {{stiffness: S, damping: D}}"
-            hint = f"give gains: --model models.yaml with the line {entity}: {{model: FILE.xml, gains: {{{gains_key}}}}}"
+            hint = (
+                f"give gains: --model models.yaml with the line {entity}: {{model: FILE.xml, gains: {{{gains_key}}}}}"
+            )
             item.report.problem(item.key, what, hint)
             continue
         elif kind in _EXPLICIT or kind in _NETWORKS:

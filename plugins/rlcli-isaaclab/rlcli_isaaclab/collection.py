@@ -57,7 +57,7 @@ class RigidObjectCollection:
     def write_object_velocity_to_sim(
         self, object_velocity: Tensor, env_ids: Any = None, object_ids: Any = None
     ) -> None:
-        """Set velocities of the centres of mass [m/s] and angular velocities [rad/s], world frame. (rows, objects, 6)"""
+        """Set velocities of the centres of mass and angular velocities, world frame. (rows, objects, 6) [m/s, rad/s]"""
         for item, values in self._each(object_velocity, object_ids):
             item.write_root_velocity_to_sim(values, env_ids)
 

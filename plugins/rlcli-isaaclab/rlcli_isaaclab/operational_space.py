@@ -124,7 +124,10 @@ class OperationalSpaceController:
             inverse = torch.linalg.inv(_given(mass_matrix, "mass_matrix"))
             inertia = self._inertia(jacobian_b, inverse)
         if self.desired_ee_pose_b is not None:
-            pose, velocity = _given(current_ee_pose_b, "current_ee_pose_b"), _given(current_ee_vel_b, "current_ee_vel_b")
+            pose, velocity = (
+                _given(current_ee_pose_b, "current_ee_pose_b"),
+                _given(current_ee_vel_b, "current_ee_vel_b"),
+            )
             goal = self.desired_ee_pose_b
             error = torch.cat(compute_pose_error(pose[:, :3], pose[:, 3:], goal[:, :3], goal[:, 3:]), dim=1)
             damping = 2.0 * self._kp.sqrt() * self._ratio
@@ -212,7 +215,8 @@ class OperationalSpaceControllerAction(ActionTerm):
         )
         closed_loop = control.contact_wrench_stiffness_task is not None
         self._force_sensor = next(
-            (s for s in env.scene.sensors.values() if closed_loop and cfg.body_name in getattr(s, "body_names", [])), None
+            (s for s in env.scene.sensors.values() if closed_loop and cfg.body_name in getattr(s, "body_names", [])),
+            None,
         )
         if closed_loop and self._force_sensor is None:
             raise TaskError(f"no contact sensor measures '{cfg.body_name}'", hint="add a ContactSensorCfg for it")
@@ -294,7 +298,7 @@ class OperationalSpaceControllerAction(ActionTerm):
         self._asset.set_joint_effort_target(efforts, joint_ids=self._joint_ids)
 
     def _ee_pose(self) -> tuple[Tensor, Tensor]:
-        """Return the pose of the controlled frame, and the body's quaternion, root frame. (num_envs, 7), (num_envs, 4)"""
+        """Return the pose of the controlled frame, and the body's quaternion, root frame. (num_envs, 7), (n, 4)"""
         data = self._asset.data
         position, quat = subtract_frame_transforms(
             data.root_pos_w, data.root_quat_w, data.body_pos_w[:, self._body], data.body_quat_w[:, self._body]

@@ -9,8 +9,8 @@ from typing import Any
 
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli_isaaclab.absent import reason_of
-from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
+from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.model_lookup import given_models, mjcf_of, model_hint
 from rlcli_isaaclab.sensor_reader import filter_name, read_filters, read_sensor
 from rlcli_isaaclab.settings import Key, Node, as_float, kind_of
@@ -227,7 +227,9 @@ class SceneReader:
         if spawn and shape:
             self.entities[name] = self._read_shape(item, spawn, shape)
             return
-        several = spawn is not None and (bool(spawn.data.get("assets_cfg")) or isinstance(spawn.data.get("usd_path"), list))
+        several = spawn is not None and (
+            bool(spawn.data.get("assets_cfg")) or isinstance(spawn.data.get("usd_path"), list)
+        )
         if several and spawn and isinstance(path, str):
             item.report.entries[(*spawn.key, "assets_cfg")] = ("approximated", "one model in all environments")
         elif several:

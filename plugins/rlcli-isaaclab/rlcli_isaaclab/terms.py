@@ -135,9 +135,7 @@ class UserObject:
         context: the user's configuration, which has the settings that no file can hold.
     """
 
-    def __init__(
-        self, function: Any, section: str, name: str, settings: tuple[str, ...], context: TermContext
-    ) -> None:
+    def __init__(self, function: Any, section: str, name: str, settings: tuple[str, ...], context: TermContext) -> None:
         self.function, self.section, self.name, self.context = function, section, name, context
         self.__name__, self.__module__ = function.__name__, function.__module__
         self.target = functools.partial(_bind_object, self)

@@ -167,7 +167,10 @@ def write_page(rows: dict[str, Any], page: Path) -> None:
     """Write the table of the documentation from the results."""
     text = page.read_text(encoding="utf-8")
     start, end = "<!-- table -->\n", "<!-- end of table -->"
-    lines = ["| task | imports | validates | steps | trains | what is lost, or why it stops |", "| --- | --- | --- | --- | --- | --- |"]
+    lines = [
+        "| task | imports | validates | steps | trains | what is lost, or why it stops |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
     for name, row in sorted(rows.items()):
         marks = ["yes" if row["stage"] > i else "no" for i in range(len(STAGES))]
         if row["stage"] == row["last"] < len(STAGES):
@@ -191,7 +194,9 @@ def lost(notes: Sequence[str]) -> str:
     for note in notes:
         key, _, rest = re.sub(r"^/\S*?: ", "", note).partition(": ")
         status = rest.partition(":")[0]
-        if not any(word in key for word in USUAL) and not key.startswith(("agent", "params", "models", "policy_kwargs")):
+        if not any(word in key for word in USUAL) and not key.startswith(
+            ("agent", "params", "models", "policy_kwargs")
+        ):
             keys.append(f"{'~' if status == 'approximated' else ''}{key}")
     return ", ".join(f"`{key}`" for key in sorted(set(keys)))
 

@@ -1,3 +1,4 @@
+# ruff: noqa: E501
 """Actions in Isaac Lab's form, and curricula: values of independent formulas on random states of plain MuJoCo."""
 
 import math
@@ -135,7 +136,9 @@ def expected_efforts(model, data, action, decoupled):
     mujoco.mju_mulQuat(back, action[3:7], quat * [1, -1, -1, -1])
     back = -back if back[0] < 0 else back
     half = math.atan2(np.linalg.norm(back[1:]), back[0])
-    error = np.concatenate([action[:3] - root.T @ (data.xpos[tool] - data.xpos[base]), back[1:] * 2 * half / math.sin(half)])
+    error = np.concatenate(
+        [action[:3] - root.T @ (data.xpos[tool] - data.xpos[base]), back[1:] * 2 * half / math.sin(half)]
+    )
     gains = (50.0 * action[7:13]).clip(20.0, 200.0)
     force = gains * error - 2.0 * np.sqrt(gains) * velocity
     inverse = np.linalg.inv(inertia)
@@ -297,7 +300,9 @@ def test_drawn_joint_acceleration_penalty(tmp_path):
 
 
 def test_drawn_clamped_squares_of_the_action(tmp_path):
-    terms = {name: RewTerm(func=getattr(mdp, name), weight=1.0) for name in ("action_l2_clamped", "action_rate_l2_clamped")}
+    terms = {
+        name: RewTerm(func=getattr(mdp, name), weight=1.0) for name in ("action_l2_clamped", "action_rate_l2_clamped")
+    }
     action = mdp.JointEffortActionCfg(asset_name="robot", joint_names=["j.*"], scale=0.001)
     env = task(tmp_path, action, rewards=terms)
     first, second = torch.full((ENVS, JOINTS), 3.0), torch.full((ENVS, JOINTS), -20.0)
@@ -376,12 +381,21 @@ def test_thruster_equals_its_scalar_formula(scheme):
 
 
 PROPS = ["p1", "p2", "p3", "p4"]
-ALLOCATION = [[0.0] * 4, [0.0] * 4, [1.0] * 4, [-0.1, -0.1, 0.1, 0.1], [-0.1, 0.1, 0.1, -0.1], [-0.07, 0.07, -0.07, 0.07]]
+ALLOCATION = [
+    [0.0] * 4,
+    [0.0] * 4,
+    [1.0] * 4,
+    [-0.1, -0.1, 0.1, 0.1],
+    [-0.1, 0.1, 0.1, -0.1],
+    [-0.07, 0.07, -0.07, 0.07],
+]
 DRONE = "<mujoco><worldbody><body name='hull'><freejoint/><geom size='.1 .1 .02' type='box' mass='1'/>{}</body></worldbody></mujoco>"
 
 
 def test_multirotor_forces_act_in_the_frame_of_the_body(tmp_path):
-    parts = "".join(f"<body name='{name}' pos='{i} 0 0'><geom size='.01' mass='.01'/></body>" for i, name in enumerate(PROPS))
+    parts = "".join(
+        f"<body name='{name}' pos='{i} 0 0'><geom size='.01' mass='.01'/></body>" for i, name in enumerate(PROPS)
+    )
     (tmp_path / "drone.xml").write_text(DRONE.format(parts))
     kind = lab_name("MultirotorCfg")
     rotors = lab_name("ThrusterCfg")(thruster_names_expr=["p."], torque_to_thrust_ratio=0.07, **vars(rotor_settings()))

@@ -223,7 +223,9 @@ def test_model_for_a_name_that_the_scene_lacks(direct):
 @pytest.mark.slow
 def test_run_remembers_its_model(unchanged, monkeypatch):
     file = next(file for file in unchanged.glob("*env_cfg.py"))
-    text = file.read_text().replace("@configclass", 'CARTPOLE_CFG.spawn.usd_path = "nowhere/other.usd"\n\n\n@configclass', 1)
+    text = file.read_text().replace(
+        "@configclass", 'CARTPOLE_CFG.spawn.usd_path = "nowhere/other.usd"\n\n\n@configclass', 1
+    )
     file.write_text(text)
     monkeypatch.chdir(unchanged.parent)
     model = ["--model", "robot=cartpole:cartpole.xml"]
