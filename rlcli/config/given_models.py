@@ -2,49 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path as FilePath
+from typing import Any
 
 from rlcli.config.layers import read
 from rlcli.config.strict_yaml import Path
-from rlcli.errors import Problem, UsageError
+from rlcli.errors import Problem, TaskError, UsageError
 from rlcli.registry.formats import Format
+from rlcli.registry.models import model_file
 
 MODELS = "models"
 """First key of the overrides that `--model` becomes."""
 
 
-def read_models(words: Iterable[str]) -> dict[str, FilePath]:
-    """Return the MJCF file of each robot or object: of `NAME=FILE`, or of a YAML file `{NAME: FILE}`.
+def read_models(words: Iterable[str]) -> dict[str, Any]:
+    """Return the model of each robot or object: of `NAME=FILE`, or of a YAML file `{NAME: FILE}`.
 
-    The paths in a YAML file are relative to that file.
+    FILE is an MJCF, relative to the YAML file if it is in one, or `TASK:FILE`, a model of an installed task. In a YAML
+    file it may be `{model: FILE, gains: {GROUP: {stiffness: S, damping: D}}}`, with gains that replace a network.
 
     Raises:
         ConfigError: if a YAML file cannot be read, or is not such a mapping.
         UsageError: if a model file does not exist.
     """
-    found: dict[str, FilePath] = {}
+    found: dict[str, Any] = {}
     for word in words:
         name, equals, value = word.partition("=")
-        entries = {name: FilePath(value)} if equals else {}
-        if not equals:
-            entries = {key: FilePath(word).parent / str(file) for key, file in read(FilePath(word)).data.items()}
-        for key, file in entries.items():
+        folder = FilePath.cwd() if equals else FilePath(word).parent
+        entries = {name: value} if equals else read(FilePath(word)).data
+        for key, entry in entries.items():
+            settings = entry if isinstance(entry, Mapping) else {"model": entry}
+            try:
+                file = model_file(folder, str(settings.get("model")))
+            except TaskError as error:
+                raise UsageError(f"--model {word}: {error.message}", hint=error.hint) from None
             if not key or not file.is_file():
                 hint = "write --model NAME=FILE.xml, or --model FILE.yaml with a mapping {NAME: FILE.xml}"
-                raise UsageError(f"--model {word}: there is no file '{file}'", hint=hint)
-            found[key] = file.resolve()
+                raise UsageError(f"--model {word}: there is no file '{settings.get('model')}'", hint=hint)
+            path = str(file.resolve())
+            found[key] = {**settings, "model": path} if "gains" in settings else path
     return found
 
 
-def model_path(path: Path, form: Format | None, problems: list[Problem]) -> Path:
-    """Return the key of a task's data that an override `models.NAME` sets.
+def recorded_models(task: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the models and gains in the record of a run, in the form of `read_models`."""
+    entities = (task.get("scene") or {}).get("entities") or {}
+    return {
+        name: {"model": entity["model"], "gains": entity.get("actuators") or {}}
+        for name, entity in entities.items()
+        if isinstance(entity, Mapping) and entity.get("model")
+    }
 
-    If the task's format has no such key, add a problem and return an empty path.
+
+def model_path(path: Path, form: Format | None, problems: list[Problem]) -> Path:
+    """Return the key of a task's data that an override `models.NAME` sets; empty if a configuration has read it.
+
+    If the task is not in another framework's format, add a problem and return an empty path.
     """
     name = ".".join(map(str, path[1:]))
-    if form is None or not form.spec.models:
+    if form is None:
         hint = f"set scene.entities.{name}.model"
         problems.append(Problem(f"--model {name}", "", "this task names its models itself", hint))
-        return ()
-    return tuple(name if key == "{name}" else key for key in form.spec.models.split("."))
+    keys = form.spec.models.split(".") if form is not None and form.spec.models else ()
+    return tuple(name if key == "{name}" else key for key in keys)

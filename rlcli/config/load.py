@@ -100,10 +100,10 @@ def resolve(
         DependencyError: if there is no other problem, but the agent's trainer is not installed.
     """
     check = TaskCheck(source)
-    document = check.document()
+    changes = check.changes(overrides, flags or {})
+    document = check.document(changes)
     extra = read(config_file, pipe=True) if config_file else Document({})
     origin = document_origins(extra, str(config_file), "config")
-    changes = check.changes(overrides, flags or {})
 
     check.read_task(document)
     check.layers.merge({key: extra.data[key] for key in PATCHES if key in extra.data}, origin)
@@ -141,7 +141,7 @@ def check_all(source: TaskSource, *, config_file: FilePath | None = None, overri
         ConfigError: with the problems of all agents.
     """
     check = TaskCheck(source)
-    check.read_task(check.document())
+    check.read_task(check.document(check.changes(overrides, {})))
     names = agent_names(check.layers)
     if len(names) > MAX_AGENTS:
         message = f"{len(names)} agents; {MAX_AGENTS} are allowed"

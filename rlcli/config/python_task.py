@@ -1,8 +1,8 @@
 """Conversion of a configuration in Python to the plain data that a YAML file would contain.
 
 The configuration is a `TaskConfig`, a mapping with its keys, or a function that returns one. Or it is a configuration
-of another framework with a method `__rlcli_task__(root) -> PythonTask`. Terms are names or functions. A function that
-is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
+of another framework with a method `__rlcli_task__(root, models) -> PythonTask`. Terms are names or functions. A
+function that is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
 """
 
 from __future__ import annotations
@@ -57,21 +57,21 @@ def source_of(value: object, root: FilePath | None = None, name: str = "task") -
     return TaskSource(name, root, root / "task.py", value=value)
 
 
-def load(source: TaskSource) -> PythonTask:
-    """Return the configuration of a task in Python.
+def load(source: TaskSource, models: Mapping[str, Any] | None = None) -> PythonTask:
+    """Return the configuration of a task in Python, with the models that the user gives for names in it.
 
     Raises:
         TaskError: if the code of the task raises an error, or the object does not exist.
         ConfigError: if the object is not a configuration.
     """
     if source.value is not None:
-        return to_task(source.value, source.label, source.root)
+        return to_task(source.value, source.label, source.root, models)
     assert source.python is not None
     place = ""
     try:
         value, agents = _import_configuration(source)
         place = _place_of(value)
-        task = to_task(value, source.label, source.root)
+        task = to_task(value, source.label, source.root, models)
         task.place = place
         _add_agents(task, agents)
     except ValidationError as error:
@@ -91,7 +91,7 @@ def load(source: TaskSource) -> PythonTask:
     return task
 
 
-def to_task(value: Any, label: str, root: FilePath) -> PythonTask:
+def to_task(value: Any, label: str, root: FilePath, models: Mapping[str, Any] | None = None) -> PythonTask:
     """Return a configuration object as plain data.
 
     Raises:
@@ -99,12 +99,12 @@ def to_task(value: Any, label: str, root: FilePath) -> PythonTask:
     """
     if hasattr(value, "__rlcli_task__"):
         value = value() if isinstance(value, type) else value
-        made = value.__rlcli_task__(root)
+        made = value.__rlcli_task__(root, models or {})
         task = made if isinstance(made, PythonTask) else PythonTask(made)
         task.format = format_of_module(value.__rlcli_task__.__module__)
     else:
         if callable(value) and not isinstance(value, BaseModel):
-            return to_task(value(), label, root)
+            return to_task(value(), label, root, models)
         task = PythonTask(value)
     if not isinstance(task.data, TaskConfig | Mapping):
         found = f"expected a TaskConfig, found a value of type {type(task.data).__name__}"

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, python_task
 from rlcli.config.foreign_keys import move_foreign_keys
-from rlcli.config.given_models import MODELS, model_path
+from rlcli.config.given_models import MODELS, model_path, recorded_models
 from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read, without
 from rlcli.config.older_success import upgraded
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
@@ -78,15 +78,17 @@ class TaskCheck:
     place: str = ""
     """File and line of a configuration's class in another framework's form; empty for others."""
 
-    def document(self) -> Document:
-        """Return the content of the task's file. For a configuration in Python, also store its functions and notes."""
-        if self.source.python is None and self.source.value is None:
-            return upgraded(read(self.source.config, self.source.label), self.source.config)
-        task = python_task.load(self.source)
+    def document(self, changes: Iterable[Change] = ()) -> Document:
+        """Return the content of the task's file; a configuration in Python also gets the models among the changes."""
+        file = self.source.config  # YAML: a task, or the record of a run
+        recorded = upgraded(read(file, self.source.label), file) if file.suffix != ".py" else None
+        if recorded is not None and self.source.python is None and self.source.value is None:
+            return recorded
+        models = recorded_models(recorded.data) if recorded is not None else {}
+        models |= {str(path[-1]): value for path, value, _ in changes if path[0] == MODELS}
+        task = python_task.load(self.source, models)
         self.functions, self.notes, self.format, self.place = task.terms, task.notes, task.format, task.place
-        if self.source.config.suffix == ".py":
-            return Document(task.data)
-        return upgraded(read(self.source.config, self.source.label), self.source.config)  # the record of a run
+        return recorded or Document(task.data)
 
     def add(self, *problems: Problem) -> None:
         """Add problems.
@@ -230,7 +232,7 @@ class TaskCheck:
                     self._no_agent(origin.where)
                     continue
                 path = ("agents", name, *path[1:])
-            form = formats.format_of_key(self.layers.data) if path[0] == MODELS else None
+            form = self.format or formats.format_of_key(self.layers.data)
             if path[0] == MODELS and not (path := model_path(path, form, self.problems)):
                 continue
             if value is None and path[0] in SECTIONS and not isinstance(self.layers.get(path), dict):
@@ -316,7 +318,8 @@ class TaskCheck:
     def _validate(self, model: type[BaseModel], data: Any, at: Path) -> BaseModel | None:
         """Validate the data at a path with a model; add the problems and return None if it is not valid."""
         try:
-            context = {"open_scene": self.format is not None and self.format.spec.open_scene}
+            spec = None if self.format is None else self.format.spec
+            context = {"open_scene": spec and spec.open_scene, "given_models": spec and not spec.models}
             content = move_foreign_keys(data) if model is TaskConfig else data
             return model.model_validate_json(json.dumps(content), context=context)
         except ValidationError as error:

@@ -163,7 +163,6 @@ def reset_scene_to_default(env: ManagedEnv, selection: Selection) -> None:
         root = selection.read(data.default_root_state)
         if entity.is_floating or entity.mocap >= 0:
             entity.write_root_pose(selection, root[:, :3] + selection.read_view(env.origins), root[:, 3:7])
-        if entity.is_floating:
             entity.write_root_velocity(selection, root[:, 7:10], root[:, 10:])
 
 

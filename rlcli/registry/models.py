@@ -17,8 +17,9 @@ def model_file(root: Path, model: str) -> Path:
     """Return the file of a model for a task in `root`.
 
     `FILE` is in the task's own folder; `TASK:FILE` in the folder of an installed task; `package:PACKAGE/FILE` in an
-    installed package, which is not imported; `models:FILE` in a folder of the environment variable RLCLI_MODELS. If
-    ` | ` separates several alternatives, the first existing one is used.
+    installed package, which is not imported; `models:FILE` in a folder of the environment variable RLCLI_MODELS;
+    `file:PATH` is any file, which only the user can name with `--model`. If ` | ` separates several alternatives, the
+    first existing one is used.
 
     Raises:
         MissingModelError: if a model that the user must provide is not found.
@@ -62,6 +63,8 @@ def _model_file(root: Path, model: str) -> Path:
     task, _, file = model.rpartition(":")
     if not task:
         return root / model
+    if task == "file":
+        return Path(file)
     if task == "package":
         return _package_file(file)
     if task == "models":

@@ -124,13 +124,15 @@ class Entity:
         selection.write(self._qpos, torch.cat([position, quat], dim=1), slice(root, root + 7))
 
     def write_root_velocity(self, selection: Selection, linear_w: Tensor, angular_w: Tensor) -> None:
-        """Set the root's velocity, world frame; set the pose first.
+        """Set the root's velocity, world frame; set the pose first. A mocap root has no velocity.
 
         Args:
             selection: the environments.
             linear_w: linear velocity of its `velocity_point`. (rows, 3) [m/s]
             angular_w: angular velocity. (rows, 3) [rad/s]
         """
+        if self.mocap >= 0:
+            return
         root, dof = self.floating()
         quat = selection.read(self._qpos, slice(root + 3, root + 7)).float()
         local = rotate_inverse(quat, angular_w)  # a free joint's angular velocity is in the body's frame

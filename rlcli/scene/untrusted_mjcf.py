@@ -106,6 +106,8 @@ def model_roots(root: Path, model: str) -> list[Path]:
     if not task:
         return package_roots(root)
     home = model_file(root, model)
+    if task == "file":
+        return package_roots(home.parent)
     for _ in Path(inner.partition("/")[2] if task == "package" else inner).parts:
         home = home.parent
     return package_roots(home)

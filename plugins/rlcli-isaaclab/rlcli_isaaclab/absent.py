@@ -16,23 +16,20 @@ _REASONS = {
     "surface_gripper": ("a suction gripper has no counterpart in plain MuJoCo", "use a gripper with joints"),
     "devices": ("devices for teleoperation belong to Isaac Sim", "rlcli trains policies: remove the use of the device"),
     "recorder": ("recorders write files of Isaac Lab", "use `rlcli eval --record`"),
-    "operationalspace": ("rlcli has no operational space control", "use DifferentialInverseKinematicsActionCfg"),
     "pretrainedpolicy": (
         "it loads a TorchScript policy, and rlcli unpickles nothing",
         "train the low-level policy, and write the task without it",
     ),
-    "rigidobjectcollection": ("it holds assets that differ by environment", "use one RigidObjectCfg for each object"),
-    "multirotor": ("rlcli has no rotors", "write a DirectRLEnv that sets forces"),
     "nonholonomic": ("rlcli has no action for wheeled bases", "use JointVelocityActionCfg"),
     "surfacegripper": ("a suction gripper has no counterpart in plain MuJoCo", "use a gripper with joints"),
     "image_features": ("its networks are downloads in TorchScript or pickles", "train a CNN on `mdp.image`"),
-    "thrust": ("rlcli has no action for thrusters", "write a DirectRLEnv that sets forces"),
     "agile": (
         "it loads a TorchScript policy, and rlcli unpickles nothing",
         "train the low-level policy, and write the task without it",
     ),
+    "read_file": ("it reads files of NVIDIA's server, and rlcli downloads nothing", "open a local file in the task"),
+    "output[": ("rlcli's cameras have no such images", "use rgb, depth, distance_to_image_plane or distance_to_camera"),
     "torchvision": ("the library is not installed", "pip install torchvision"),
-    "trimesh": ("the library is not installed", "pip install trimesh"),
     "nodal": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
     "deformable": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
     "omni": ("it belongs to Isaac Sim's USD stage", "change the model (MJCF) instead"),
@@ -53,10 +50,10 @@ def reason_of(name: str) -> tuple[str, str]:
     )
 
 
-def absence(name: str) -> TaskError:
+def absence(name: str, hint: str | None = None) -> TaskError:
     """Return the error that a name of Isaac Lab or Isaac Sim cannot be used."""
-    reason, hint = reason_of(name)
-    return TaskError(f"{_user_place()}{name} cannot be used: {reason}", hint=hint)
+    reason, usual = reason_of(name)
+    return TaskError(f"{_user_place()}{name} cannot be used: {reason}", hint=hint or usual)
 
 
 def _user_place() -> str:
@@ -134,7 +131,7 @@ class AbsentModule(ModuleType):
         if self.__name__.endswith("settings") and name in ("get_settings", "acquire_settings_interface"):
             return _NoSettings
         if self.__name__ == "pxr" and name == "UsdGeom":
-            from rlcli_isaaclab.usd_stage import UsdGeom
+            from rlcli_isaaclab.usd_geometry import UsdGeom
 
             return UsdGeom
         if name[:1].isupper():

@@ -33,6 +33,9 @@ def read_actuators(
     models: dict[str, Any] = {}
     for group, item in actuators.nodes():
         kind = kind_of(item.get("class_type"))
+        if "thruster_names_expr" in item:
+            item.skip(*item.data)
+            continue
         patterns = item.require("joint_names_expr") or [".*"]
         patterns = [patterns] if isinstance(patterns, str) else list(patterns)
         passive = {
@@ -48,14 +51,16 @@ def read_actuators(
         elif kind in _NETWORKS and group not in replaced:
             what = f"the actuator network of '{kind}' is a TorchScript file, which rlcli does not load"
             gains_key = f"{group}: {{stiffness: S, damping: D}}"
-            hint = f"give gains in models.yaml: {entity}: {{model: FILE.xml, gains: {{{gains_key}}}}}"
+            hint = (
+                f"give gains: --model models.yaml with the line {entity}: {{model: FILE.xml, gains: {{{gains_key}}}}}"
+            )
             item.report.problem(item.key, what, hint)
             continue
         elif kind in _EXPLICIT or kind in _NETWORKS:
             effort_limit = item.get("effort_limit")
             if kind in _NETWORKS:
-                gains = dict(replaced[group])
-                item.note("approximated", "network_file", "replaced by the gains of models.yaml")
+                gains = {key: replaced[group].get(key, 0.0) for key in gains}
+                item.note("approximated", "network_file", "replaced by the gains that are given with the model")
                 item.skip("pos_scale", "vel_scale", "torque_scale", "input_order", "input_idx")
                 kind = "DCMotor"
             elif kind == "RemotizedPDActuator":
@@ -180,13 +185,14 @@ def _joint_config(
 
     Args:
         values: settings of its implicit actuator, or the passive ones of an explicit actuator.
-        command: what an action commands: effort, velocity, position or, without an action, nothing.
+        command: what an action commands: effort, motor (an effort by the task's own code), velocity, position or,
+            without an action, nothing.
         has_actuator: whether an action or an actuator of the MJCF drives the joint.
         key: key of the joint in the report.
         report: receives what is approximated.
     """
     stiffness, viscous = values.pop("stiffness", 0.0), values.pop("viscous_friction", 0.0)
-    if stiffness and command == "effort":
+    if stiffness and command in ("effort", "motor"):
         values = {"stiffness": stiffness, **values}
         why = "a spring around the MJCF's rest position, in addition to the effort"
         report.entries[(*key, "stiffness")] = ("approximated", why)
@@ -194,6 +200,8 @@ def _joint_config(
         values = {"actuator": "position", "kp": stiffness, "kv": values.pop("damping", 0.0), **values}
     elif command == "velocity" and values.get("damping"):
         values = {"actuator": "velocity", "kv": values.pop("damping"), **values}
+    if command == "motor":
+        values["actuator"] = "motor"
     if viscous:
         values["damping"] = values.get("damping", 0.0) + viscous
     if not stiffness and not has_actuator:

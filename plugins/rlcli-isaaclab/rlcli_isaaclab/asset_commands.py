@@ -13,6 +13,8 @@ from rlcli.scene.actuators import JointCommand
 from rlcli.scene.entity import Entity
 from rlcli.scene.jacobian import Jacobian
 from rlcli.sim.rotations import rotate
+from rlcli_isaaclab.substeps import update_state
+from rlcli_isaaclab.utils.math import skew_symmetric_matrix
 
 
 class JointDrive:
@@ -91,6 +93,7 @@ class BodyWrench:
         if self._local is None:
             return
         world = self._local
+        update_state(self._env)
         if not self._is_global:
             quat = self._entity.data.body_quat_w
             world = torch.cat([rotate(quat, world[..., :3]), rotate(quat, world[..., 3:])], dim=-1)
@@ -132,12 +135,61 @@ class PhysxView:
         if self._entity.is_floating:
             raise TaskError("root_physx_view.get_jacobians cannot be used for a floating base", hint="fix the base")
         count = len(self._entity.names["Bodies"])
+        update_state(self._env)
         if self._jacobians is None:
             columns = list(range(len(self._entity.joint_names)))
             self._jacobians = [Jacobian(self._entity, columns, body) for body in range(1, count)]
         positions = self._entity.data.body_pos_w
         return torch.stack([jacobian(positions[:, i + 1]) for i, jacobian in enumerate(self._jacobians)], dim=1)
 
+    def get_generalized_mass_matrices(self) -> Tensor:
+        """Return the inertia of the joints. (num_envs, joints, joints) [kg, kg m^2]"""
+        inertia, motion = self._composite_inertia(), self._motion()
+        forces = (inertia @ motion[..., None])[..., 0]
+        matrix = torch.einsum("eid,ejd->eij", forces, motion) * self._is_below
+        lower = matrix.tril()
+        armature = torch.as_tensor(self._env.engine.model.dof_armature[self._dofs], dtype=torch.float32)
+        return lower + lower.mT - torch.diag_embed(lower.diagonal(dim1=1, dim2=2) - armature.to(lower.device))
+
+    def get_gravity_compensation_forces(self) -> Tensor:
+        """Return the efforts that hold the joints against gravity. (num_envs, joints) [N or N m]"""
+        inertia, motion = self._composite_inertia(), self._motion()
+        up = torch.zeros(6, device=self._env.device)
+        up[3:] = -torch.as_tensor(self._env.engine.model.opt.gravity, dtype=torch.float32)
+        return (motion * (inertia @ up)).sum(dim=-1)
+
+    def _motion(self) -> Tensor:
+        """Return MuJoCo's motion axes of the joints, angular before linear. (num_envs, joints, 6)"""
+        if self._entity.is_floating:
+            raise TaskError("root_physx_view has no joint inertia for a floating base", hint="fix the base")
+        update_state(self._env)
+        self._dofs = self._entity.dof_columns.cpu().numpy()
+        return self._env.sim.derived_field("cdof")[:, self._dofs]
+
+    def _composite_inertia(self) -> Tensor:
+        """Return the inertia of all bodies that each joint moves, as a matrix on a motion. (num_envs, joints, 6, 6)"""
+        model = self._env.engine.model
+        bodies = model.jnt_bodyid[self._entity.joint_ids]
+        parents = [_ancestors(model, int(body)) for body in bodies]
+        rows = [[float(int(other) in above) for other in bodies] for above in parents]
+        self._is_below = torch.tensor(rows, device=self._env.device)
+        update_state(self._env)
+        ten = self._env.sim.derived_field("crb")[:, bodies]
+        offset = skew_symmetric_matrix(ten[..., 6:9])
+        xx, yy, zz, xy, xz, yz = ten[..., :6].unbind(-1)
+        turning = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1).unflatten(-1, (3, 3))
+        moving = ten[..., 9, None, None] * torch.eye(3, device=self._env.device)
+        return torch.cat([torch.cat([turning, offset], dim=-1), torch.cat([-offset, moving], dim=-1)], dim=-2)
+
     def get_link_incoming_joint_force(self) -> Tensor:
         """Return force and torque of each body's parent on the body, body frame. (num_envs, bodies, 6) [N, N m]"""
         return self._entity.data.body_incoming_wrench_b
+
+
+def _ancestors(model: Any, body: int) -> set[int]:
+    """Return a body and the bodies between it and the world."""
+    found = set()
+    while body:
+        found.add(body)
+        body = int(model.body_parentid[body])
+    return found

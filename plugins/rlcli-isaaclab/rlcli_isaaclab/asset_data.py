@@ -11,8 +11,11 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
 from rlcli.scene.entity import Entity
-from rlcli.sim.rotations import rotate, rotate_inverse
+from rlcli.scene.entity_data import EntityData
+from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
 from rlcli.sim.selection import ALL
+from rlcli_isaaclab.substeps import update_state
+from rlcli_isaaclab.utils.math import quat_from_matrix
 
 _DATA_NAMES = {
     "applied_torque": "applied_effort",
@@ -30,6 +33,9 @@ _DATA_NAMES = {
     "body_link_quat_w": "body_quat_w",
     "body_link_ang_vel_w": "body_ang_vel_w",
     "body_com_ang_vel_w": "body_ang_vel_w",
+    "body_com_lin_acc_w": "body_lin_acc_w",
+    "body_com_ang_acc_w": "body_ang_acc_w",
+    "body_incoming_joint_wrench_b": "body_incoming_wrench_b",
 }
 """Isaac Lab's name -> rlcli's name, where they differ. Isaac Lab's velocities without `link` are those of the centre of
 mass, whatever the entity's `velocity_point` is."""
@@ -43,8 +49,14 @@ class Data:
     """State of an asset under Isaac Lab's names. The names of `rlcli.scene.entity_data.EntityData` work too."""
 
     def __init__(self, env: VecEnv, entity: Entity) -> None:
-        self._env, self._entity, self._data = env, entity, entity.data
+        self._env, self._entity = env, entity
         self.joint_names, self.body_names = list(entity.joint_names), list(entity.names["Bodies"])
+
+    @property
+    def _data(self) -> EntityData:
+        """State of the entity, of the physics step that comes next."""
+        update_state(self._env)
+        return self._entity.data
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -70,7 +82,101 @@ class Data:
         limits = self._data.joint_vel_limits.clamp(max=_MOST_VELOCITY)
         return limits if limits.dim() == 2 else limits.expand(self._env.num_envs, -1)
 
-    soft_joint_vel_limits = joint_vel_limits
+    soft_joint_vel_limits = joint_velocity_limits = joint_vel_limits
+    joint_limits = default_joint_limits = default_joint_pos_limits = joint_pos_limits
+
+    @property
+    def joint_pos_target(self) -> Tensor:
+        """Position targets; the default position of joints without one. (num_envs, joints) [m or rad]"""
+        return self._targets("position", self._data.default_joint_pos)
+
+    @property
+    def joint_vel_target(self) -> Tensor:
+        """Velocity targets; 0 for joints without one. (num_envs, joints) [m/s or rad/s]"""
+        return self._targets("velocity", torch.zeros_like(self._data.default_joint_pos))
+
+    @property
+    def joint_effort_target(self) -> Tensor:
+        """Effort targets; 0 for joints without one. (num_envs, joints) [N or N m]"""
+        return self._targets("motor", torch.zeros_like(self._data.default_joint_pos))
+
+    def _targets(self, kind: str, start: Tensor) -> Tensor:
+        """Return the last commands of one kind to the joints; `start` for joints without such an actuator."""
+        found = start.clone()
+        gear = self._env.engine.model.actuator_gear[:, 0]
+        for joint, actuator in self._entity.actuators_of(kind):
+            control = self._env.engine.field("ctrl")[:, actuator].float()
+            found[:, joint] = control * float(gear[actuator] if kind == "motor" else 1.0 / gear[actuator])
+        for model in self._entity.actuators:
+            found[:, model.joints] = model.targets[:, ("position", "velocity", "motor").index(kind)]
+        return found
+
+    @property
+    def default_mass(self) -> Tensor:
+        """Masses of the bodies in the model. (num_envs, bodies) [kg]"""
+        masses = self._env.engine.model.body_mass[self._entity.body_ids]
+        return torch.as_tensor(masses, dtype=torch.float32).expand(self._env.num_envs, -1).clone()
+
+    @property
+    def body_com_quat_w(self) -> Tensor:
+        """Principal axes of the bodies' inertia (w, x, y, z), world frame. (num_envs, bodies, 4)"""
+        update_state(self._env)
+        axes = self._env.sim.derived_field("ximat")[:, self._entity.body_ids]
+        return quat_from_matrix(axes.reshape(*axes.shape[:2], 3, 3))
+
+    @property
+    def body_com_pose_w(self) -> Tensor:
+        """Centres of mass [m] and principal axes (w, x, y, z), world frame. (num_envs, bodies, 7)"""
+        return torch.cat([self._data.body_com_pos_w, self.body_com_quat_w], dim=-1)
+
+    @property
+    def body_com_pos_b(self) -> Tensor:
+        """Centres of mass in the frames of the bodies. (num_envs, bodies, 3) [m]"""
+        return rotate_inverse(self._data.body_quat_w, self._data.body_com_pos_w - self._data.body_pos_w)
+
+    @property
+    def body_com_quat_b(self) -> Tensor:
+        """Principal axes (w, x, y, z) in the frames of the bodies. (num_envs, bodies, 4)"""
+        return multiply(conjugate(self._data.body_quat_w), self.body_com_quat_w)
+
+    com_pos_b, com_quat_b = body_com_pos_b, body_com_quat_b
+
+    @property
+    def body_com_pose_b(self) -> Tensor:
+        """Centres of mass [m] and principal axes in the frames of the bodies. (num_envs, bodies, 7)"""
+        return torch.cat([self.body_com_pos_b, self.body_com_quat_b], dim=-1)
+
+    @property
+    def body_com_state_w(self) -> Tensor:
+        """Centres of mass, principal axes, and velocities of the centres, world frame. (num_envs, bodies, 13)"""
+        return torch.cat([self.body_com_pose_w, self.body_vel_w], dim=-1)
+
+    @property
+    def body_acc_w(self) -> Tensor:
+        """Linear accelerations of the centres of mass and angular ones, world frame. (num_envs, bodies, 6)"""
+        return torch.cat([self._data.body_lin_acc_w, self._data.body_ang_acc_w], dim=-1)
+
+    body_com_acc_w = body_acc_w
+
+    @property
+    def root_com_pos_w(self) -> Tensor:
+        """Centre of mass of the root, world frame. (num_envs, 3) [m]"""
+        return self._data.body_com_pos_w[:, 0]
+
+    @property
+    def root_com_quat_w(self) -> Tensor:
+        """Principal axes of the root's inertia (w, x, y, z), world frame. (num_envs, 4)"""
+        return self.body_com_quat_w[:, 0]
+
+    @property
+    def root_com_pose_w(self) -> Tensor:
+        """Centre of mass of the root [m] and its principal axes, world frame. (num_envs, 7)"""
+        return self.body_com_pose_w[:, 0]
+
+    @property
+    def root_com_state_w(self) -> Tensor:
+        """Centre of mass of the root, its principal axes and its velocity, world frame. (num_envs, 13)"""
+        return self.body_com_state_w[:, 0]
 
     @property
     def soft_joint_pos_limits(self) -> Tensor:

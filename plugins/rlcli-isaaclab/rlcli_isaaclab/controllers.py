@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rlcli_isaaclab.config_class import MISSING, configclass
+from rlcli_isaaclab.operational_space import OperationalSpaceController
 
 
 @configclass
@@ -16,3 +17,11 @@ class DifferentialIKControllerCfg:
     use_relative_mode: bool = False
     ik_method: str = "dls"
     ik_params: Any = None
+
+
+def convert_usd_to_urdf(usd_path: str, output_path: str, force_conversion: bool = True) -> tuple[str, str]:
+    """Return the files that Isaac Lab would write: only Pink reads them, and actions of Pink are refused."""
+    return f"{output_path}/urdf", f"{output_path}/meshes"
+
+
+__all__ = ["DifferentialIKControllerCfg", "OperationalSpaceController", "convert_usd_to_urdf"]

@@ -20,7 +20,7 @@ def task(
     report: Report,
     root: Path,
     defaults: Any = None,
-    models: Mapping[str, str] | None = None,
+    models: Mapping[str, Any] | None = None,
     cfg: Any = None,
 ) -> dict[str, Any]:
     """Return the task that the settings of a `ManagerBasedRLEnvCfg` describe.
@@ -47,7 +47,7 @@ def task(
     }
     scene = SceneReader(top.node("scene"), root, models)
     config["scene"] = scene.read()
-    terms = TermReader(scene, report, cfg)
+    terms = TermReader(scene, report, cfg, data)
     terms.record_driven_joints(top.node("actions"))
     config["actions"] = {name: terms.read_action(node) for name, node in top.node("actions").nodes()}
     config["observations"] = {name: terms.read_group(node) for name, node in top.node("observations").nodes()}
@@ -58,6 +58,7 @@ def task(
         config["rewards"] = {"no_reward": {"func": "is_alive", "weight": 0.0}}
     config["commands"] = {name: terms.read_command(node) for name, node in top.node("commands").nodes()}
     scene.add_joint_settings(terms.driven_joints)
+    config["sim"] |= scene.integrator()
     for section in ("events", "curriculum", "commands"):
         if not config[section]:
             del config[section]
@@ -186,7 +187,7 @@ def _sim(node: Node) -> dict[str, Any]:
         else:
             node.note("ignored", "physics_material", "the MJCF sets friction, and scene.ground.friction for the ground")
     if node.data.get("physx"):
-        node.note("ignored", "physx", "MuJoCo's solver has its own settings: sim.integrator, sim.iterations")
+        node.note("ignored", "physx", "MuJoCo's solver has its own settings: sim.iterations, sim.tolerance")
     return config
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,12 @@ from rlcli_isaaclab.sensor_facade import TerrainImporter
 from rlcli_isaaclab.settings import Node, Report
 from rlcli_isaaclab.term_reader import TermReader
 
-_KINDS = {"set_joint_effort_target": "effort", "set_joint_velocity_target": "velocity"}
+_KINDS = {"set_joint_effort_target": "motor", "set_joint_velocity_target": "velocity"}
 _BODY_FORCES = ("get_link_incoming_joint_force", "body_incoming_joint_wrench")
 
 
-def direct_task(cfg: Any, env_class: type, root: Path) -> PythonTask:
-    """Return the task of a configuration and its environment class.
+def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]) -> PythonTask:
+    """Return the task of a configuration and its environment class, with the models that the user gives.
 
     Raises:
         ConfigError: if the task cannot be expressed in rlcli.
@@ -42,7 +43,7 @@ def direct_task(cfg: Any, env_class: type, root: Path) -> PythonTask:
         scene_data[f"spawned_{index}"] = {"prim_path": path, "spawn": to_dict(settings)}
     declared = to_dict(cfg.scene)
     scene_data |= {key: value for key, value in declared.items() if key not in scene_data}
-    scene = SceneReader(Node(scene_data, ("scene",), report), root)
+    scene = SceneReader(Node(scene_data, ("scene",), report), root, models)
     data = to_dict(cfg)
     top = Node(data, (), report)
     config: dict[str, Any] = {
@@ -57,8 +58,7 @@ def direct_task(cfg: Any, env_class: type, root: Path) -> PythonTask:
     assets = [name for name, (made, _) in zip(names, setup.created, strict=True) if isinstance(made, Asset)]
     driven = {name: dict.fromkeys(scene.names(name, "joint") or [], kind) for name in assets}
     scene.add_joint_settings(driven)
-    if kind == "effort":
-        _add_motors(scene, driven)
+    config["sim"] |= scene.integrator()
     terms = TermReader(scene, report, cfg)
     events = {name: term for member in top.node("events").nodes() for name, term in terms.read_terms("events", *member)}
     hook = _Hooks(env_class, cfg, any(word in source for word in _BODY_FORCES))
@@ -128,16 +128,3 @@ def _source_of(env_class: type) -> str:
     """Return the text of a class and of its bases that belong to the task."""
     bases = [base for base in env_class.__mro__ if not base.__module__.startswith(("rlcli_isaaclab", "gymnasium"))]
     return "\n".join(inspect.getsource(base) for base in bases if base is not object)
-
-
-def _add_motors(scene: SceneReader, driven: dict[str, dict[str, str]]) -> None:
-    """Give every joint of articulations a motor, so that the task can set any effort."""
-    for name, joints in driven.items():
-        entity = scene.entities.get(name)
-        if entity is None or not joints:
-            continue
-        settings = entity.setdefault("joints", {})
-        for values in settings.values():
-            values.setdefault("actuator", "motor")
-        if not settings:
-            settings[".*"] = {"actuator": "motor"}

@@ -6,7 +6,9 @@ rlcli runs a direct task as a manager-based one with one action, one reward and 
 
 from __future__ import annotations
 
+import contextlib
 import sys
+from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +25,17 @@ from rlcli_isaaclab.setup_scene import Setup, running
 from rlcli_isaaclab.sim import SimulationCfg
 
 MANAGED: ContextVar[Any] = ContextVar("managed")
-"""The environment of rlcli for which a `DirectRLEnv` is created."""
+"""The environment of rlcli for which an object of the task is created."""
+
+
+@contextlib.contextmanager
+def building(managed: Any) -> Iterator[None]:
+    """Make an environment the one whose USD stage the task's code reads, inside the `with` block."""
+    token = MANAGED.set(managed)
+    try:
+        yield
+    finally:
+        MANAGED.reset(token)
 
 
 class DirectRLEnv(gymnasium.Env):
@@ -215,18 +227,18 @@ class DirectRLEnvCfg:
         """Store the class of the environment that a registration names."""
         self.rlcli_class = entry
 
-    def __rlcli_task__(self, root: Path) -> Any:
-        """Return this configuration as a task of rlcli."""
+    def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
+        """Return this configuration as a task of rlcli, with the models that the user gives."""
         from rlcli_isaaclab.direct_convert import direct_task
 
-        return direct_task(self, _environment_class(self), root)
+        return direct_task(self, _environment_class(self), root, models)
 
 
 @configclass
 class DirectMARLEnvCfg:
     """A task with several agents, which rlcli does not have."""
 
-    def __rlcli_task__(self, root: Path) -> Any:
+    def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
         """Raise the error that it cannot be used."""
         raise ConfigError(
             [

@@ -15,8 +15,9 @@ from torch import Tensor
 from rlcli.config.term_signatures import Signature
 from rlcli.managers.attribute_state import TermState
 from rlcli.sim.selection import Selection
-from rlcli_isaaclab.direct_env import MANAGED, DirectRLEnv
+from rlcli_isaaclab.direct_env import DirectRLEnv, building
 from rlcli_isaaclab.observation_noise import noise_model
+from rlcli_isaaclab.substeps import Substeps
 
 
 class HookTerm:
@@ -54,25 +55,19 @@ class DirectRunner:
         cfg.episode_length_s = managed.config.episode_length_s
         self.cfg = cfg
         self.phase = "build"
-        managed.actuators["direct task"] = self  # called before each physics step
-        token = MANAGED.set(managed)
-        try:
+        self._substeps = Substeps(managed, "direct task", self)
+        with building(managed):
             self.lab: DirectRLEnv = term.env_class(cfg)
-        finally:
-            MANAGED.reset(token)
         self.action_noise = noise_model(cfg.action_noise_model, managed)
         self.observation_noise = noise_model(cfg.observation_noise_model, managed)
         self._memory = TermState(self.lab, excluded=("cfg", "managed", "sim", "scene"))
         self._observed: dict[str, Tensor] = {}
 
-    def compute(self) -> None:
+    def apply(self) -> None:
         """Call `_apply_action` before a physics step."""
         self.lab._apply_action()
         for asset in self.lab.scene.articulations.values():
             asset.apply_wrenches()
-
-    def reset(self, selection: Selection) -> None:
-        """Do nothing: the reset event calls `_reset_idx`."""
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of the task's tensors."""
@@ -86,6 +81,7 @@ class DirectRunner:
     def process(self, action: Tensor) -> None:
         """Call `_pre_physics_step`."""
         self.lab._pre_physics_step(self.action_noise(action.clone()))
+        self._substeps.start()
 
     def compute_dones(self) -> None:
         """Call `_get_dones`, but not for the first value that managers compute before the first reset."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 from torch import Tensor
@@ -27,6 +27,18 @@ class ManagerFacade:
     def active_terms(self) -> list[str]:
         """Names of the terms, in order."""
         return [term.name for term in self._manager.terms]
+
+    @property
+    def cfg(self) -> Any:
+        """Terms by name: `func` is the function or the user's object, `params` are the parameters."""
+        return SimpleNamespace(
+            **{
+                term.name: SimpleNamespace(
+                    func=getattr(term.call, "term", term.call), params=getattr(term.call, "params", {})
+                )
+                for term in self._manager.terms
+            }
+        )
 
 
 class ActionManagerFacade(ManagerFacade):

@@ -145,6 +145,41 @@ class ManagerTermBase:
         raise NotImplementedError
 
 
+class ActionTerm(ManagerTermBase):
+    """An action of the user's own: `process_actions` once per step, `apply_actions` before each physics step."""
+
+    def __init__(self, cfg: Any, env: Any) -> None:
+        super().__init__(cfg, env)
+        self._asset = env.scene[cfg.asset_name]
+
+    @property
+    def action_dim(self) -> int:
+        """Number of columns of the policy's action."""
+        raise NotImplementedError(f"write {type(self).__name__}.action_dim")
+
+    @property
+    def raw_actions(self) -> Tensor:
+        """The policy's action for this term. (num_envs, k)"""
+        raise NotImplementedError(f"write {type(self).__name__}.raw_actions")
+
+    @property
+    def processed_actions(self) -> Tensor:
+        """The action after scale, offset and clip. (num_envs, k)"""
+        raise NotImplementedError(f"write {type(self).__name__}.processed_actions")
+
+    def process_actions(self, actions: Tensor) -> None:
+        """Store or process the action, once per step. (num_envs, k)"""
+        raise NotImplementedError(f"write {type(self).__name__}.process_actions")
+
+    def apply_actions(self) -> None:
+        """Write targets to the assets, before each physics step."""
+        raise NotImplementedError(f"write {type(self).__name__}.apply_actions")
+
+    def set_debug_vis(self, debug_vis: bool) -> bool:
+        """Do nothing: actions are not shown. Returns False."""
+        return False
+
+
 class CommandTerm(ManagerTermBase):
     """A command of the user's own. The environment decides when to resample it."""
 

@@ -13,6 +13,7 @@ from typing import Any
 from rlcli.config.term_signatures import SECTIONS, Parameter, builtin_terms
 from rlcli.errors import did_you_mean
 from rlcli_isaaclab.config_class import MISSING, config_subclass, configclass
+from rlcli_isaaclab.curricula import modify_env_param, modify_term_cfg
 from rlcli_isaaclab.managers import ActionTermCfg, CommandTermCfg, SceneEntityCfg
 from rlcli_isaaclab.table import TERMS, Entry
 
@@ -124,6 +125,7 @@ def _names() -> list[str]:
     return sorted(name for name in names if _has_counterpart(name))
 
 
+@functools.cache
 def _has_counterpart(name: str) -> bool:
     try:
         return bool(find_term(name))
@@ -135,11 +137,16 @@ def __getattr__(name: str) -> Any:
     if name.startswith("_"):
         raise AttributeError(name)
     if not _has_counterpart(name):
-        near = did_you_mean(name, _names())
-        raise AttributeError(
-            f"rlcli_isaaclab.mdp has no '{name}'; {near or 'docs/reference/isaac-lab-terms.md lists the terms'}"
-        )
+        raise _UnknownTermError(name)
     return _function(name)
+
+
+class _UnknownTermError(AttributeError):
+    """A name that this module lacks. The search for similar names takes milliseconds: only a message needs it."""
+
+    def __str__(self) -> str:
+        near = did_you_mean(self.args[0], _names()) or "docs/reference/isaac-lab-terms.md lists the terms"
+        return f"rlcli_isaaclab.mdp has no '{self.args[0]}'; {near}"
 
 
 @configclass
@@ -305,4 +312,9 @@ class UniformPose2dCommandCfg(CommandTermCfg):
     ranges: Any = MISSING
 
 
-__all__ = [name for name in dict(globals()) if name.endswith("Cfg")] + _names()
+__all__ = [
+    "modify_env_param",
+    "modify_term_cfg",
+    *(name for name in dict(globals()) if name.endswith("Cfg")),
+    *_names(),
+]

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from rlcli.errors import TaskError, did_you_mean
+from rlcli.errors import TaskError
 from rlcli.registry.models import MODELS
 
 MODEL_MAP = "models.yaml"
@@ -40,16 +40,19 @@ class GivenModels:
     """Entity -> group of actuators -> stiffness and damping that replace an actuator network."""
 
 
-def given_models(root: Path) -> GivenModels:
-    """Return what every `models.yaml` of a task gives for entities, or for ends of paths.
+def given_models(root: Path, asked: Mapping[str, Any]) -> GivenModels:
+    """Return the models of entities, or of ends of paths: those of `--model`, then those of every `models.yaml`.
 
     The files are those in the task's folder, in the folders above it that belong to its package, and in the folders of
-    RLCLI_MODELS. Earlier files win.
+    RLCLI_MODELS. Earlier ones win.
 
     Raises:
         TaskError: if a file is not a mapping of text, or names a file that does not exist.
     """
     found = GivenModels()
+    for name, value in asked.items():
+        model = value["model"] if isinstance(value, Mapping) else value
+        _add(found, name, value, "file:" if Path(model).is_absolute() else "")
     for folder, prefix in _folders(root):
         file = folder / MODEL_MAP
         if not file.is_file():
@@ -64,12 +67,23 @@ def given_models(root: Path) -> GivenModels:
             model = value.get("model") if isinstance(value, Mapping) else value
             if not isinstance(model, str):
                 raise TaskError(f"{file}: {name}: expected a file", hint="for example robot: robot.xml")
-            if isinstance(value, Mapping):
-                found.gains.setdefault(str(name), value.get("gains") or {})
             if ":" not in model and not (folder / model).is_file():
                 raise TaskError(f"{file}: {name}: there is no file '{model}' in {folder}", hint="correct the path")
-            found.files.setdefault(str(name), model if ":" in model else f"{prefix}{model}")
+            _add(found, str(name), value, prefix)
     return found
+
+
+def _add(found: GivenModels, name: str, value: Any, prefix: str) -> None:
+    """Add a model, and the gains that are given with it."""
+    model = value["model"] if isinstance(value, Mapping) else value
+    if isinstance(value, Mapping):
+        found.gains.setdefault(name, value.get("gains") or {})
+    found.files.setdefault(name, model if ":" in model else f"{prefix}{model}")
+
+
+def model_hint(entity: str) -> str:
+    """Return how the user gives a model."""
+    return f"give a model: --model {entity}=FILE.xml, or --model {MODEL_MAP} with lines {entity}: FILE.xml"
 
 
 def mjcf_of(usd: str, root: Path, given: Mapping[str, str], entity: str) -> str:
@@ -91,12 +105,7 @@ def mjcf_of(usd: str, root: Path, given: Mapping[str, str], entity: str) -> str:
     for folder, prefix in _folders(root):
         if (folder / file).is_file():
             return f"{prefix}{file}"
-    near = did_you_mean(Path(path).name, [Path(end).name for end in USD_TO_MJCF])
-    raise TaskError(
-        f"no MJCF model is known for '{path.rsplit('/', 1)[-1]}'",
-        hint=f"write the line {entity}: FILE.xml into {MODEL_MAP} in {root}, or put {file} there"
-        + (f"; {near}" if near else ""),
-    )
+    raise TaskError(f"no MJCF model is known for '{path.rsplit('/', 1)[-1]}'", hint=model_hint(entity))
 
 
 def _folders(root: Path) -> Iterator[tuple[Path, str]]:

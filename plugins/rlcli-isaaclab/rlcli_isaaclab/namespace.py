@@ -26,8 +26,9 @@ _EXTRA = {
     "isaaclab_rl": ("rsl_rl",),
     "isaaclab_assets": ("assets",),
     "isaaclab_tasks": ("mdp", "task_utils"),
-    "isaaclab.envs.mdp": ("mdp",),
-    "isaaclab.sim": ("usd_stage",),
+    "isaaclab_contrib": ("multirotor", "action_terms"),
+    "isaaclab.envs.mdp": ("mdp", "action_terms", "command_terms"),
+    "isaaclab.sim": ("usd_stage", "usd_geometry"),
 }
 """Module of Isaac Lab -> modules of this package that define further names of it."""
 _TEXTS = ("isaaclab_tasks", "isaaclab_assets")
@@ -70,8 +71,8 @@ def module_of(name: str, file: str) -> ModuleType | None:
             return import_from(folder, inner, run_start=top != "isaaclab_tasks")  # it imports every task
     if top in _LIBRARIES and importlib.util.find_spec(top) is not None:
         return None
-    if top == "toml":
-        return importlib.import_module(f"{_OWN}.toml_reader")
+    if top in ("toml", "trimesh"):
+        return importlib.import_module(f"{_OWN}.{top}_reader" if top == "toml" else f"{_OWN}.triangle_mesh")
     if name == "isaacsim.core.utils.stage":
         return importlib.import_module(f"{_OWN}.usd_stage")
     if name in _SIM:
@@ -122,9 +123,17 @@ def _member(module: str, name: str) -> Any:
         return _lab_module(path)
     found = _definitions().get(name)
     if found is None:
-        near = did_you_mean(name, public_names(module)) or did_you_mean(name, list(_definitions()))
-        raise AttributeError(f"Isaac Lab 2.3.2 has no '{name}' in '{module}'" + (f"; {near}" if near else ""))
+        raise _UnknownNameError(name, module)
     return lab_name(name)
+
+
+class _UnknownNameError(AttributeError):
+    """A name that Isaac Lab lacks. The search for similar names takes milliseconds: only a message needs it."""
+
+    def __str__(self) -> str:
+        name, module = self.args
+        near = did_you_mean(name, public_names(module)) or did_you_mean(name, list(_definitions()))
+        return f"Isaac Lab 2.3.2 has no '{name}' in '{module}'" + (f"; {near}" if near else "")
 
 
 @functools.cache

@@ -20,11 +20,14 @@ from rlcli.errors import did_you_mean, listing
 from rlcli_isaaclab.manager_facade import (
     ActionManagerFacade,
     CommandManagerFacade,
+    ManagerFacade,
     ObservationManagerFacade,
     RewardManagerFacade,
     TerminationManagerFacade,
 )
+from rlcli_isaaclab.multirotor import Multirotor
 from rlcli_isaaclab.scene_facade import Scene
+from rlcli_isaaclab.settings import kind_of
 
 
 class ManagerBasedRLEnv(gymnasium.Env):
@@ -59,6 +62,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
     selection: Any = None
     """The environments for which a term is called; None outside of such a call."""
     _context: Any = None
+    _has_run_reset_events = False
     _scene: Scene | None
     _manager_facades: dict[str, Any]
 
@@ -103,6 +107,16 @@ class ManagerBasedRLEnv(gymnasium.Env):
         return self._manager(
             "reward_manager", lambda manager: RewardManagerFacade(manager, self.managed._binder.tunable)
         )
+
+    @property
+    def curriculum_manager(self) -> Any:
+        """Curriculum manager."""
+        return self._manager("curriculum_manager", ManagerFacade)
+
+    @property
+    def event_manager(self) -> Any:
+        """Event manager."""
+        return self._manager("event_manager", ManagerFacade)
 
     @property
     def max_episode_length_s(self) -> float:
@@ -184,8 +198,16 @@ class ManagerBasedRLEnv(gymnasium.Env):
             self._context, self.cfg = context, copy.deepcopy(context.cfg)
             self.cfg.scene.num_envs = self.managed.num_envs
             self.scene.user_cfg = self.cfg.scene
+            for settings in vars(self.cfg.scene).values():
+                if isinstance(getattr(settings, "prim_path", None), str):
+                    settings.prim_path = settings.prim_path.replace("{ENV_REGEX_NS}", "/World/envs/env_.*")
+            self.scene.add_collections(self.cfg.scene)
             for name, asset in self.scene.articulations.items():
                 asset.cfg = getattr(self.cfg.scene, name, asset.cfg)
+                if kind_of(getattr(asset.cfg, "class_type", None)) == "Multirotor":
+                    made = self.scene.articulations[name] = Multirotor.of(self.managed, self.managed.entities[name])
+                    made.cfg = asset.cfg
+                    made.start()
 
     @property
     def unwrapped(self) -> Any:
@@ -201,6 +223,15 @@ class ManagerBasedRLEnv(gymnasium.Env):
     def obs_buf(self) -> Any:
         """Observations of the last step, by group."""
         return self.managed._last_obs
+
+    def run_own_reset_events(self) -> None:
+        """Run the user's reset events once, before the first episode: they create attributes that terms read."""
+        if self._has_run_reset_events:
+            return
+        self._has_run_reset_events = True
+        for term in self.managed._bound["events"]:
+            if term.config.mode == "reset" and type(term.call).__module__ == "rlcli_isaaclab.terms":
+                term.call(self.managed._select_all().stream(term.stream))
 
     def open_weights(self) -> None:
         """Make the weights of all rewards changeable. Call this before the reward manager is created."""

@@ -13,11 +13,12 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem
-from rlcli.sim.rotations import rotate_inverse
-from rlcli_isaaclab.absent import NoEffect
+from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
+from rlcli_isaaclab.absent import NoEffect, absence
 from rlcli_isaaclab.asset_commands import BodyWrench, JointDrive, PhysxView
 from rlcli_isaaclab.asset_data import Data
 from rlcli_isaaclab.sensor_facade import FrameTransformer, TerrainImporter, bound, camera_or_sensor, find_elements
+from rlcli_isaaclab.sensor_reader import filter_name
 from rlcli_isaaclab.setup_scene import current_setup
 
 
@@ -86,6 +87,10 @@ class Asset:
     def write_data_to_sim(self) -> None:
         """Do nothing: targets are written when they are set."""
 
+    def state(self) -> dict[str, Tensor]:
+        """Return the tensors that a checkpoint contains; the simulation has the others."""
+        return {}
+
     def update(self, dt: float) -> None:
         """Do nothing: data are computed when they are read."""
 
@@ -101,6 +106,8 @@ class Asset:
         hint = did_you_mean(name, known) or f"attributes: {listing(known, 40)}"
         if "physx" in name and not did_you_mean(name, known):
             hint = "rlcli has no PhysX; use `data` and the randomization events"
+        if "tendon" in name or name.startswith("write_joint_"):
+            raise absence(f"Articulation.{name}", hint="use a randomization event, or set the value in the MJCF")
         raise AttributeError(f"an asset has no '{name}'; {hint}")
 
     def find_joints(self, name_keys: Any, joint_subset: Any = None, preserve_order: bool = False) -> Any:
@@ -177,6 +184,18 @@ class Asset:
 
     write_root_link_pose_to_sim, write_root_com_velocity_to_sim = write_root_pose_to_sim, write_root_velocity_to_sim
 
+    def write_root_com_pose_to_sim(self, root_pose: Tensor, env_ids: Any = None) -> None:
+        """Set the position of the root's centre of mass [m], and its principal axes (w, x, y, z). (rows, 7)"""
+        rows = slice(None) if env_ids is None else env_ids
+        quat = multiply(root_pose[:, 3:], conjugate(self.data.body_com_quat_b[rows, 0]))
+        position = root_pose[:, :3] - rotate(quat, self.data.body_com_pos_b[rows, 0])
+        self.write_root_pose_to_sim(torch.cat([position, quat], dim=1), env_ids)
+
+    def write_root_com_state_to_sim(self, root_state: Tensor, env_ids: Any = None) -> None:
+        """Set the pose and the velocity of the root's centre of mass, world frame. (rows, 13)"""
+        self.write_root_com_pose_to_sim(root_state[:, :7], env_ids)
+        self.write_root_velocity_to_sim(root_state[:, 7:], env_ids)
+
     def _require_same_base(self, root_pose: Tensor, env_ids: Any) -> None:
         """Check that the pose of a fixed base does not change."""
         rows = slice(None) if env_ids is None else env_ids
@@ -203,6 +222,7 @@ class Scene(Mapping[str, Any]):
         self.articulations = {name: Asset.of(env, entity) for name, entity in env.entities.items()}
         self.rigid_objects = {name: a for name, a in self.articulations.items() if not a.joint_names}
 
+        self.collections: dict[str, Any] = {}
         self._frames: dict[str, FrameTransformer] = {}
         self.user_cfg: Any = None
         self.looks: dict[str, Any] = {}
@@ -218,6 +238,16 @@ class Scene(Mapping[str, Any]):
                 continue
             self._frames.setdefault(name, FrameTransformer(self.articulations, settings))
 
+    def add_collections(self, cfg: Any) -> None:
+        """Add the collections of rigid objects of the user's configuration of the scene."""
+        from rlcli_isaaclab.collection import RigidObjectCollection, entity_name
+
+        for name, settings in vars(cfg).items():
+            parts = getattr(settings, "rigid_objects", None)
+            if parts and name not in self.collections:
+                objects = {part: self.articulations[entity_name(name, part)] for part in parts}
+                self.collections[name] = RigidObjectCollection(settings, objects)
+
     @property
     def sensors(self) -> Mapping[str, Any]:
         """Sensors by name."""
@@ -225,6 +255,9 @@ class Scene(Mapping[str, Any]):
         found = {name: camera_or_sensor(sensor) for name, sensor in sensors} | self._frames
         for name, made in found.items():
             made.cfg = getattr(self.user_cfg, name, None)
+            made.filters = []
+            while filter_name(name, len(made.filters)) in found:
+                made.filters.append(found[filter_name(name, len(made.filters))])
         return found
 
     def clone_environments(self, *args: Any, **options: Any) -> None:
@@ -262,6 +295,8 @@ class Scene(Mapping[str, Any]):
     def __getitem__(self, name: str) -> Any:
         if name in self.articulations:
             return self.articulations[name]
+        if name in self.collections:
+            return self.collections[name]
         sensors = self.sensors
         if name in sensors:
             return sensors[name]
@@ -272,10 +307,10 @@ class Scene(Mapping[str, Any]):
         raise KeyError(f"no '{name}' in the scene; entities and sensors: {listing([*self.articulations, *sensors])}")
 
     def __iter__(self) -> Iterator[str]:
-        return iter([*self.articulations, *self.sensors, *self.looks])
+        return iter([*self.articulations, *self.collections, *self.sensors, *self.looks])
 
     def __len__(self) -> int:
-        return len(self.articulations) + len(self.sensors) + len(self.looks)
+        return len(list(iter(self)))
 
     def resolve(self, cfg: Any) -> None:
         """Resolve the names of a `SceneEntityCfg` to ids.

@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rlcli.errors import TaskError
+from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli_isaaclab.absent import reason_of
 from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
-from rlcli_isaaclab.model_lookup import given_models, mjcf_of
-from rlcli_isaaclab.sensor_reader import read_sensor
+from rlcli_isaaclab.collection import entity_name
+from rlcli_isaaclab.model_lookup import given_models, mjcf_of, model_hint
+from rlcli_isaaclab.sensor_reader import filter_name, read_filters, read_sensor
 from rlcli_isaaclab.settings import Key, Node, as_float, kind_of
 from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
 
@@ -19,11 +20,11 @@ from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terra
 class SceneReader:
     """Reader of assets, lights, ground and sensors. It compiles the models to find the names of their elements."""
 
-    def __init__(self, node: Node, root: Path, models: Mapping[str, str] | None = None) -> None:
+    def __init__(self, node: Node, root: Path, models: Mapping[str, Any] | None = None) -> None:
         self.node, self.root, self.report = node, root, node.report
-        self._asked = models
-        self._given = given_models(root)
-        self._given_models = {**self._given.files, **(models or {})}
+        self._asked = dict(models or {})
+        self._given = given_models(root, self._asked)
+        self._given_models = self._given.files
         self.entities: dict[str, dict[str, Any]] = {}
         self.prims: dict[str, str] = {}
         """Entity -> the last part of its prim path."""
@@ -49,9 +50,12 @@ class SceneReader:
             kind = kind_of(item.data.get("class_type"))
             spawn = item.node("spawn") if "spawn" in item else None
             spawn_function = kind_of(spawn.data.get("func")) if spawn else ""
-            if kind in ("Articulation", "RigidObject"):
+            if kind in ("Articulation", "RigidObject", "Multirotor"):
                 self._read_entity(name, item, spawn)
-            elif kind in ("RigidObjectCollection", "DeformableObject", "SurfaceGripper", "Multirotor"):
+            elif kind == "RigidObjectCollection":
+                for part, content in item.node("rigid_objects").nodes():
+                    self._read_entity(entity_name(name, part), content, content.node("spawn"))
+            elif kind in ("DeformableObject", "SurfaceGripper"):
                 reason, hint = reason_of(kind)
                 self.report.problem(item.key, f"a {kind} cannot be used: {reason}", hint)
             elif kind == "TerrainImporter":
@@ -72,6 +76,9 @@ class SceneReader:
             sensor = read_sensor(kind, item, self.prims, self.frames)
             if sensor is not None:
                 self.sensors[item.key[-1]] = sensor
+            if kind == "ContactSensor" and sensor is not None:
+                for index, part in enumerate(read_filters(item, sensor, self.prims)):
+                    self.sensors[filter_name(item.key[-1], index)] = part
         config["ground"] = ground
         config["lights"] = lights
         if not self.entities and not self.report.problems:
@@ -79,6 +86,9 @@ class SceneReader:
                 node.key, "the scene has no robot or object; add an ArticulationCfg or a RigidObjectCfg"
             )
         config["entities"] = self.entities
+        for name in self._asked.keys() - self.entities.keys() if not self.report.problems else ():
+            near = did_you_mean(name, self.entities) or f"robots and objects: {listing(self.entities)}"
+            self.report.problem(node.key, f"--model {name}: the scene has no '{name}'", near)
         if self.sensors:
             config["sensors"] = self.sensors
         self.has_terrain = "terrain" in config
@@ -99,10 +109,22 @@ class SceneReader:
             if joints:
                 entity["joints"] = joints
 
+    def integrator(self) -> dict[str, str]:
+        """Return the `integrator` of joints with a drive: PhysX integrates their damping implicitly.
+
+        MuJoCo's method of Euler does so only with the damping of joints, and a drive's damping can diverge.
+        """
+        joints = [settings for entity in self.entities.values() for settings in entity.get("joints", {}).values()]
+        return {"integrator": "implicitfast"} if any(settings.get("kv") for settings in joints) else {}
+
     def names(self, entity: str, kind: str) -> list[str] | None:
         """Return the joints or bodies of an entity in its model's order; None if there is no model."""
         model = self._models.get(entity)
         return None if model is None else model[kind]
+
+    def is_fixed(self, entity: str) -> bool:
+        """Return whether the model of an entity has a fixed base; False without a model."""
+        return bool(self._models.get(entity, {}).get("fixed"))
 
     def order_names(self, entity: str, kind: str, wanted: Any, preserve: bool, key: Key) -> Any:
         """Return names or regexes as Isaac Lab orders them: in the model's order, or as written if `preserve`."""
@@ -195,7 +217,8 @@ class SceneReader:
 
     def _read_entity(self, name: str, item: Node, spawn: Node | None) -> None:
         item.skip("class_type", "prim_path", "collision_group", "debug_vis", "articulation_root_prim_path")
-        item.skip("actuator_value_resolution_debug_print")
+        item.skip("actuator_value_resolution_debug_print", "allocation_matrix", "rotor_directions")
+        item.skip("thruster_force_direction")  # Isaac Lab does not use it
         prim = str(item.data.get("prim_path") or "")
         self.prims[name] = prim.rstrip("/").rsplit("/", 1)[-1]
         path = spawn.get("usd_path", spawn.get("asset_path")) if spawn else None
@@ -203,6 +226,15 @@ class SceneReader:
         shape = _SHAPES.get(kind_of(spawn.data.get("func"))) if spawn and path is None else None  # a model overrides
         if spawn and shape:
             self.entities[name] = self._read_shape(item, spawn, shape)
+            return
+        several = spawn is not None and (
+            bool(spawn.data.get("assets_cfg")) or isinstance(spawn.data.get("usd_path"), list)
+        )
+        if several and spawn and isinstance(path, str):
+            item.report.entries[(*spawn.key, "assets_cfg")] = ("approximated", "one model in all environments")
+        elif several:
+            what = "has assets that differ by environment, and MuJoCo has one model for all environments"
+            self.report.problem(item.key, what, model_hint(name))
             return
         if not isinstance(path, str):
             source = kind_of(spawn.data.get("func")) if spawn else "nothing"
@@ -213,8 +245,7 @@ class SceneReader:
         try:
             model = mjcf_of(path, self.root, self._given_models, name)
         except TaskError as error:
-            hint = error.hint if self._asked is None else f"give a model: --model {name}=FILE.xml"
-            self.report.problem((*spawn.key, "usd_path"), error.message, hint)
+            self.report.problem((*spawn.key, "usd_path"), error.message, error.hint)
             return
         spawn.skip("func", "visible", "copy_from_source", "activate_contact_sensors", "semantic_tags")
         spawn.skip("visual_material_path", "variants")
@@ -233,6 +264,7 @@ class SceneReader:
         factor = item.get("soft_joint_pos_limit_factor", 1.0)
         if factor != 1.0:
             entity["soft_joint_pos_limit_factor"] = as_float(factor)
+        init.skip("rps")  # of a Multirotor, which reads it and its actuators when it is created
         self._joint_settings[name], explicit = read_actuators(
             item.node("actuators"),
             lambda patterns, group: self.order_names(name, "joint", patterns, False, group.key),
@@ -296,6 +328,7 @@ class SceneReader:
             "joint": names,
             "body": [compiled.body(b).name for b in range(1, compiled.nbody)],  # body 0 is the world
             "root": (compiled.body_pos[1].tolist(), compiled.body_quat[1].tolist()) if compiled.nbody > 1 else None,
+            "fixed": not any(compiled.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_FREE) for j in range(compiled.njnt)),
             "damping": dict(zip(names, compiled.dof_damping[dofs].tolist(), strict=True)),
             "armature": dict(zip(names, compiled.dof_armature[dofs].tolist(), strict=True)),
             "friction_loss": dict(zip(names, compiled.dof_frictionloss[dofs].tolist(), strict=True)),

@@ -13,6 +13,7 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.scene.names import match
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
+from rlcli_isaaclab.absent import absence
 from rlcli_isaaclab.setup_scene import current_setup
 
 
@@ -99,12 +100,19 @@ class CameraView:
         """Images by type of data, channels last. (num_envs, h, w, c)"""
         kind, image = self._sensor.config.data, self._sensor.image
         names = {"rgb": ("rgb",), "depth": ("depth", "distance_to_image_plane"), "distance": ("distance_to_camera",)}
-        return dict.fromkeys(names[kind], image)
+        return _Images(dict.fromkeys(names[kind], image))
 
     @property
     def image_shape(self) -> tuple[int, int]:
         """Height and width [pixels]."""
         return self._sensor.config.height, self._sensor.config.width
+
+
+class _Images(dict[str, Tensor]):
+    """Images by type of data."""
+
+    def __missing__(self, name: str) -> Tensor:
+        raise absence(f"Camera.data.output[{name!r}]")
 
 
 class TerrainImporter:
@@ -188,6 +196,13 @@ class Sensor:
         current_setup().add(self, cfg)
 
     cfg: Any
+    filters: list[Sensor]
+    """Sensors of the contacts with each filtered body."""
+
+    @property
+    def force_matrix_w(self) -> Tensor | None:
+        """Contact force between each body and each filtered body, world frame. (num_envs, bodies, filters, 3) [N]"""
+        return torch.stack([part._sensor.force for part in self.filters], dim=2) if self.filters else None
 
     def bind(self, sensor: Any) -> None:
         """Connect the object with a sensor of the simulation."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -158,11 +159,28 @@ def _read_contact_sensor(item: Node, entity: str, body: str | None) -> dict[str,
         config["history"] = history
         item.note("approximated", "history_length", "counts environment steps, not physics steps")
     config["force_threshold"] = as_float(item.get("force_threshold", 1.0))
-    if item.data.get("filter_prim_paths_expr"):
-        item.note("ignored", "filter_prim_paths_expr", "write `against` of the contact sensor")
-    else:
-        item.skip("filter_prim_paths_expr")
     return config
+
+
+def read_filters(item: Node, sensor: Mapping[str, Any], prims: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Return one sensor for each body that a contact sensor filters by: `force_matrix_w` has their forces."""
+    found = []
+    for path in item.get("filter_prim_paths_expr") or ():
+        parts = [part for part in str(path).split("/") if part]
+        entity = next((name for name, last in prims.items() if last in parts), None)
+        other: Any = "ground"
+        if entity is not None:
+            inside = parts[parts.index(prims[entity]) + 1 :]
+            other = {"entity": entity, **({"bodies": inside[-1]} if inside else {})}
+        elif not re.search("ground|terrain|plane", str(path), re.IGNORECASE):
+            item.report.problem((*item.key, "filter_prim_paths_expr"), f"no entity has the prim '{path}'")
+        found.append({"kind": "contact", "entity": sensor["entity"], "bodies": sensor["bodies"], "against": other})
+    return found
+
+
+def filter_name(sensor: str, index: int) -> str:
+    """Return the name of the sensor of one filter."""
+    return f"{sensor}_filter_{index}"
 
 
 def _read_ray_sensor(item: Node, entity: str, body: str | None) -> dict[str, Any]:

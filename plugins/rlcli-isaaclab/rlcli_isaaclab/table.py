@@ -132,9 +132,6 @@ TERMS: dict[str, dict[str, Entry]] = {
     },
     "curriculum": {
         "modify_reward_weight": Entry("stages"),
-        "modify_env_param": Entry("stages"),
-        "modify_term_cfg": Entry("stages"),
-        "initial_final_interpolate_fn": Entry("interpolate"),
         "terrain_levels_vel": Entry("terrain_levels", fixed={"command": "base_velocity"}),
     },
 }
@@ -172,6 +169,9 @@ ACTIONS: dict[str, str] = {
     "DifferentialInverseKinematicsAction": "differential_inverse_kinematics",
 }
 """Isaac Lab's class -> action term."""
+
+ONCE_PER_STEP = {"RelativeJointPositionAction", "DifferentialInverseKinematicsAction"}
+"""Actions whose targets Isaac Lab computes again in each physics step."""
 
 COMMANDS: dict[str, Entry] = {
     "NullCommand": Entry("null_command"),

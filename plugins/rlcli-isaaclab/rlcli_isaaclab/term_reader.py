@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import re
+import contextlib
+import copy
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -10,111 +11,48 @@ from rlcli.config.term_signatures import Signature, SignatureError, builtin_term
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
 from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.config_class import is_missing
+from rlcli_isaaclab.curricula import ChangedSetting, modify_env_param
 from rlcli_isaaclab.lab_terms import LAB_TERMS
 from rlcli_isaaclab.managers import CommandTerm
 from rlcli_isaaclab.mdp import MdpFunction
+from rlcli_isaaclab.object_reader import OBJECT_KEYS, ObjectReader
 from rlcli_isaaclab.observation_reader import read_processing
 from rlcli_isaaclab.randomization import EVENTS, translate_event
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, equals_default, kind_of, to_plain
-from rlcli_isaaclab.table import ACTIONS, COMMANDS, EFFORT_TERMS, HEIGHT_TERMS, TERMS, Entry, finite_times
-from rlcli_isaaclab.term_values import builtin_name, has_no_effect, is_entity, is_plain, triple
+from rlcli_isaaclab.table import (
+    COMMANDS,
+    EFFORT_TERMS,
+    HEIGHT_TERMS,
+    TERMS,
+    Entry,
+    finite_times,
+)
+from rlcli_isaaclab.term_values import builtin_name, is_entity, is_plain, triple
 
 _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
 """Prefixes of the modules whose functions are in `table.py`."""
 
 
-class TermReader:
+class TermReader(ObjectReader):
     """Reader of the terms of all sections."""
 
-    def __init__(self, scene: SceneReader, report: Report, cfg: Any = None) -> None:
+    def __init__(self, scene: SceneReader, report: Report, cfg: Any = None, data: Mapping[str, Any] = {}) -> None:
         from rlcli_isaaclab.terms import TermContext
 
-        self.scene, self.report = scene, report
-        self.context = TermContext(cfg, scene.frames)
+        super().__init__(scene, report, TermContext(cfg, scene.frames))
+        self.data = data
         self._user_terms: dict[Any, Any] = {}
-        self.driven_joints: dict[str, dict[str, str]] = {}
-        """Entity -> joint -> what an action commands: effort, velocity or position."""
         self.stubs: dict[str, tuple[str, dict[str, Any]]] = {}
         """Functions whose code is not in the imported files: name -> (section, parameters)."""
 
-    def record_driven_joints(self, actions: Node) -> None:
-        """Record which joints the actions drive, and how."""
-        for _, item in actions.nodes():
-            wanted = item.data.get("joint_names")
-            entity = str(item.data.get("asset_name"))
-            kind = kind_of(item.data.get("class_type"))
-            command = next((word for word in ("effort", "velocity") if word in kind.lower()), "position")
-            patterns = [wanted] if isinstance(wanted, str) else wanted
-            for pattern in patterns if isinstance(patterns, list | tuple) else ():
-                for joint in self.scene.names(entity, "joint") or []:
-                    if re.fullmatch(pattern, joint):
-                        self.driven_joints.setdefault(entity, {})[joint] = command
-
-    def read_action(self, node: Node) -> dict[str, Any]:
-        """Return an action term."""
-        kind = kind_of(node.get("class_type"))
-        name = ACTIONS.get(kind)
-        signature = builtin_terms("actions").get(name or "")
-        if name is None or signature is None:
-            reason, hint = reason_of(kind)
-            self.report.problem(node.key, f"the action '{kind}' cannot be used: {reason}", hint)
-            return {"func": "joint_effort"}
-        node.skip("debug_vis")
-        entity = node.get("asset_name", "robot")
-        config: dict[str, Any] = {"func": name, "entity": entity}
-        preserve = bool(node.get("preserve_order", False))
-        known = {p.name: p for p in signature.parameters}
-        for key in node.data:
-            if key in ("class_type", "debug_vis", "asset_name", "preserve_order"):
-                continue
-            value = node.get(key)
-            if key == "joint_names":
-                config["joints"] = self.scene.order_names(entity, "joint", value, preserve, (*node.key, key))
-            elif key == "body_name":
-                config["bodies"] = value
-            elif key in ("open_command_expr", "close_command_expr"):
-                config[key.removesuffix("_expr")] = {str(k): as_float(v) for k, v in dict(value).items()}
-            elif key == "controller" and isinstance(value, Mapping):
-                config |= self._read_ik_controller(node.node(key))
-            elif key == "body_offset":
-                offset = node.node(key)
-                config["offset_pos"] = [as_float(v) for v in offset.get("pos", (0.0, 0.0, 0.0))]
-                config["offset_quat"] = [as_float(v) for v in offset.get("rot", (1.0, 0.0, 0.0, 0.0))]
-            elif value is None:
-                continue
-            elif key in known and not known[key].required and equals_default(value, known[key].default):
-                continue  # the term's default
-            elif key in known:
-                config[key] = self._read_action_value(key, value, config.get("joints"))
-            elif has_no_effect(key, value):
-                continue
-            else:
-                node.note("ignored", key, f"'{name}' has no such setting")
-        return config
-
-    def _read_ik_controller(self, node: Node) -> dict[str, Any]:
-        """Return the settings of differential inverse kinematics."""
-        node.skip("class_type")
-        config = {"mode": node.get("command_type", "pose"), "relative": bool(node.get("use_relative_mode", False))}
-        if node.get("ik_method", "dls") != "dls":
-            node.note("approximated", "ik_method", "replaced by damped least squares")
-        params = node.get("ik_params") or {}
-        return config | ({"damping": as_float(params["lambda_val"])} if "lambda_val" in params else {})
-
-    def _read_action_value(self, key: str, value: Any, joints: Any) -> Any:
-        """Return a value of an action term. A clip for all joints is written as one pair of bounds."""
-        if key == "clip" and isinstance(value, Mapping) and len(value) == 1:
-            (pattern, bounds), *_ = value.items()
-            if pattern == ".*" or [pattern] == joints:
-                return [as_float(v) for v in bounds]
-        return to_plain(value)
-
     def read_command(self, node: Node) -> dict[str, Any]:
         """Return a command term."""
-        kind = kind_of(node.get("class_type"))
+        class_type = node.get("class_type")
+        kind = kind_of(class_type)
         entry = COMMANDS.get(kind)
-        if entry is None or entry.name is None:
+        own = isinstance(class_type, type) and not class_type.__module__.startswith("rlcli_isaaclab")
+        if entry is None or entry.name is None or own:
             return self._read_user_command(kind, node)
         times = finite_times(node.require("resampling_time_range"))
         config: dict[str, Any] = {"func": entry.name, "resampling_time_s": times}
@@ -142,13 +80,11 @@ class TermReader:
 
     def _read_user_command(self, kind: str, node: Node) -> dict[str, Any]:
         """Return a command term for the user's own class. A YAML file has only its name: then write a stub."""
-        from rlcli_isaaclab.terms import UserCommand, key_of
-
         config: dict[str, Any] = {"resampling_time_s": finite_times(node.require("resampling_time_range"))}
         class_type = node.data.get("class_type")
-        settings = {key: node.get(key) for key in node.data if key not in _COMMAND_KEYS}
         node.skip("debug_vis")
         if isinstance(class_type, str) and not class_type.startswith(_ISAAC_LAB_MODULES) and ":" in class_type:
+            settings = {key: node.get(key) for key in node.data if key not in OBJECT_KEYS}
             named = {("entity" if key == "asset_name" else key): value for key, value in settings.items()}
             params = {key: to_plain(value) for key, value in named.items() if is_plain(value)}
             self.stubs[kind] = ("commands", params)
@@ -158,19 +94,7 @@ class TermReader:
             near = did_you_mean(kind, COMMANDS) or f"use {listing(COMMANDS)}, or write your own CommandTerm"
             self.report.problem(node.key, f"the command '{kind}' has no counterpart in rlcli", near)
             return {"func": "null_command"}
-        self._report_missing(node.data, node.key)
-        plain = {key: value for key, value in settings.items() if is_plain(value)}
-        for key in settings.keys() - plain.keys():
-            node.note("ignored", key, "only numbers, text, lists and mappings can be written to a file")
-        command = UserCommand(class_type, node.key[-1], tuple(plain))
-        return {"func": command, **config, **{key_of(key): to_plain(value) for key, value in plain.items()}}
-
-    def _report_missing(self, value: Mapping[str, Any], key: Key) -> None:
-        for name, item in value.items():
-            if is_missing(item):
-                self.report.problem(key, f"missing '{name}'; give it a value")
-            elif isinstance(item, Mapping):
-                self._report_missing(item, (*key, str(name)))
+        return config | self._read_user_object(class_type, node)
 
     def read_group(self, node: Node) -> dict[str, Any]:
         """Return a group of observations."""
@@ -195,6 +119,9 @@ class TermReader:
         if section == "events" and function in _LOOKS:
             self.report.entries[node.key] = ("ignored", "rlcli does not randomize colours and textures")
             return
+        if section == "events" and function == "reset_root_state_uniform" and self._moves_nothing(node):
+            node.skip(*node.data)
+            return
         if section == "events" and function in EVENTS:
             node.get("func")
             parts = translate_event(function, node.node("params"), self.scene)
@@ -204,10 +131,18 @@ class TermReader:
         for suffix, config in parts.items():
             yield name if len(parts) == 1 else f"{name}_{suffix}", {"func": config["func"], **common, **config}
 
+    def _moves_nothing(self, node: Node) -> bool:
+        """Return whether a reset of the root has a fixed base and only ranges of zero."""
+        params = node.data.get("params") or {}
+        asset = params.get("asset_cfg") or {"name": "robot"}
+        name = asset["name"] if isinstance(asset, Mapping) else asset.name
+        ranges = [params.get(key) or {} for key in ("pose_range", "velocity_range")]
+        return self.scene.is_fixed(name) and not any(any(pair) for values in ranges for pair in values.values())
+
     def read_term(self, section: str, node: Node) -> dict[str, Any]:
         """Return a term with its function and parameters."""
         function, params = node.require("func"), node.node("params")
-        if isinstance(function, AbsentValue):
+        if isinstance(function, AbsentValue) or (isinstance(function, type) and hasattr(function, "absent_name")):
             reason, hint = reason_of(function.absent_name)
             self.report.problem((*node.key, "func"), f"{function.absent_name} cannot be used: {reason}", hint)
             return {"func": "missing"}
@@ -220,13 +155,10 @@ class TermReader:
         name = builtin_name(function)
         if name == "modify_reward_weight":
             return self._read_reward_stage(params)
-        if name in ("modify_env_param", "modify_term_cfg", "initial_final_interpolate_fn"):
-            hint = "use the term 'stages' or 'interpolate', which change a value by its address"
-            what = f"'{name}' has no counterpart, because it calls a function that edits the configuration"
-            self.report.problem(node.key, what, hint)
-            return {"func": "stages", "address": "", "steps": [], "values": []}
+        if isinstance(function, type) and issubclass(function, modify_env_param):
+            return self._read_changed_setting(function, node, params)
         special = LAB_TERMS.get(name or "")
-        if special is not None and special.needed(params.data):
+        if special is not None and not isinstance(function, str) and special.needed(params.data):
             return self._read_user_term(section, special.function, None, node, params)
         ours, entry = self._find_builtin(section, name)
         config: dict[str, Any]
@@ -249,6 +181,38 @@ class TermReader:
         else:
             config = self._read_user_term(section, function, name, node, params)
         return config
+
+    def _read_changed_setting(self, function: type, node: Node, params: Node) -> dict[str, Any]:
+        """Return a curriculum term that changes a setting by a function of the user's."""
+        from rlcli_isaaclab.terms import SettingTerm
+
+        address = str(params.require("address"))
+        values = {key: params.get(key) for key in ("modify_fn", "modify_params")}
+        setting = None
+        with contextlib.suppress(KeyError, AttributeError, TypeError, IndexError, ValueError):
+            setting = ChangedSetting(self.data, address, self._read_again)
+        if setting is None or not (setting.addresses or setting.is_own):
+            hint = "use the address of a number: SECTION.TERM.params.KEY, rewards.TERM.weight, commands.TERM.ranges.KEY"
+            what = f"the address '{address}' names no setting that rlcli can change during training"
+            self.report.problem((*params.key, "address"), what, hint)
+            return {"func": "stages", "address": "", "steps": [], "values": []}
+        return {"func": SettingTerm(function, setting, values, self.context), **dict(setting.addresses)}
+
+    def _read_again(
+        self, section: str, term: list[str], settings: Mapping[str, Any]
+    ) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield the address and the settings of the terms that one term of Isaac Lab becomes with other settings."""
+        reader = copy.copy(self)
+        reader.report, reader.stubs = Report(), {}
+        node = Node(settings, (section, *term), reader.report)
+        if section in ("commands", "actions"):
+            read = reader.read_command if section == "commands" else reader.read_action
+            yield f"{section}.{term[0]}", read(node)
+        elif section == "observations":
+            yield ".".join((section, *term)), reader.read_term(section, node)
+        else:
+            for name, config in reader.read_terms(section, term[0], node):
+                yield f"{section}.{name}", config
 
     def _find_builtin(self, section: str, name: str | None) -> tuple[str | None, Entry]:
         """Return rlcli's name of one of Isaac Lab's terms (None if there is none), and its row of the table."""
@@ -433,8 +397,6 @@ class TermReader:
 
 _LOOKS = ("randomize_visual_color", "randomize_visual_texture_material")
 """Events that only change how a scene looks."""
-
-_COMMAND_KEYS = ("class_type", "resampling_time_range", "debug_vis")
 
 
 def _find_signature(terms: Mapping[str, Signature], name: str) -> Signature:

@@ -18,7 +18,11 @@ from torch import Tensor
 from rlcli.config.schema import Names, Number, StrictModel
 from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, SignatureError
 from rlcli.sim.selection import Selection
+from rlcli_isaaclab.config_class import to_dict
+from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
+from rlcli_isaaclab.settings import to_plain
+from rlcli_isaaclab.substeps import Substeps
 
 _RESERVED = {name for model in SECTIONS.values() for name in model.model_fields} | {"params"}
 _PLAIN: dict[Any, Any] = {float: Number, int: int, bool: bool, str: str}
@@ -120,16 +124,24 @@ class UserTerm:
         return Parameter(key_of(p.name), kind, default, required, None)
 
 
-class UserCommand:
-    """The user's command class `Name(cfg, env)` as the command term of one name."""
+class UserObject:
+    """The user's class `Name(cfg, env)` of an action or a command, as the term of one name.
 
-    def __init__(self, function: Any, name: str, settings: tuple[str, ...]) -> None:
-        self.function, self.name = function, name
+    Args:
+        function: the user's class.
+        section: `actions` or `commands`.
+        name: name of the term.
+        settings: names of the settings that a file can hold; they are the parameters of the term.
+        context: the user's configuration, which has the settings that no file can hold.
+    """
+
+    def __init__(self, function: Any, section: str, name: str, settings: tuple[str, ...], context: TermContext) -> None:
+        self.function, self.section, self.name, self.context = function, section, name, context
         self.__name__, self.__module__ = function.__name__, function.__module__
-        self.target = functools.partial(_bind_command, self)
+        self.target = functools.partial(_bind_object, self)
         self.original = {key_of(key): key for key in settings}
 
-    def __deepcopy__(self, memo: Any) -> UserCommand:
+    def __deepcopy__(self, memo: Any) -> UserObject:
         return self
 
     def __call__(self, *args: Any) -> Any:
@@ -142,6 +154,44 @@ class UserCommand:
         summary = (inspect.getdoc(self.function) or "").split("\n")[0]
         parameters = tuple(Parameter(key, Any, None, True, None) for key in self.original)
         return Signature(name, self.__name__, True, file, 1, summary, parameters, target=self.target)
+
+    def settings(self, params: Mapping[str, Any]) -> Any:
+        """Return the configuration object of the term, with the values of its parameters."""
+        values = {self.original[key]: value for key, value in params.items()}
+        cfg = copy.deepcopy(getattr(getattr(self.context.cfg, self.section, None), self.name, None))
+        if cfg is None:
+            return SimpleNamespace(class_type=self.function, **{k: _to_namespace(v) for k, v in values.items()})
+        _set_members(cfg, values)
+        return cfg
+
+
+class SettingTerm:
+    """Curriculum term that changes a setting by a function of the user's.
+
+    Args:
+        function: class of the term, `modify_env_param` or a subclass.
+        setting: the setting, a `ChangedSetting`.
+        params: parameters of the term that no file can hold.
+        context: the user's configuration.
+    """
+
+    def __init__(self, function: Any, setting: Any, params: dict[str, Any], context: TermContext) -> None:
+        self.function, self.setting, self.params, self.context = function, setting, params, context
+        self.__name__, self.__module__ = function.__name__, function.__module__
+        self.target = functools.partial(_bind_setting, self)
+
+    def __deepcopy__(self, memo: Any) -> SettingTerm:
+        return self
+
+    def __call__(self, *args: Any) -> Any:
+        """Create an object of the class."""
+        return self.function(*args)
+
+    def __rlcli_term__(self, name: str) -> Signature:
+        """Return the signature of the term under a name; its parameters are the addresses that it changes."""
+        file = Path(inspect.getsourcefile(self.function) or "?")
+        addresses = tuple(Parameter(key, str, None, True, "Address") for key, _ in self.setting.addresses)
+        return Signature(name, self.__name__, True, file, 1, "Changes a setting.", addresses, target=self.target)
 
 
 def key_of(name: str) -> str:
@@ -172,18 +222,31 @@ class _Bound:
     """The user's function, bound to an environment and parameters."""
 
     def __init__(self, function: Any, section: str, env: Any, params: dict[str, Any]) -> None:
-        self.term, self._section, self._env, self._params = function, section, env, params
+        self.term, self._section, self._env, self.params = function, section, env, params
+        self._reads_reset = section == "observations" and "hasattr(env" in _source(function)
 
     def __call__(self, selection: Selection | None = None) -> Any:
         if selection is not None:
             self._env.selection = selection
-            value = self.term(self._env, selection.env_ids(), **self._params)
+            value = self.term(self._env, selection.env_ids(), **self.params)
             # a curriculum term may return several values to log; rlcli logs one
             return next(iter(value.values()), None) if isinstance(value, dict) else value
-        value = self.term(self._env, **self._params)
+        if self._reads_reset:  # the first value has the shape of all values: let the reset make what the term reads
+            self._reads_reset = False
+            self._env.run_own_reset_events()
+        value = self.term(self._env, **self.params)
         if self._section == "observations" and value.dim() == 1:
             return value.unsqueeze(1).float()  # a group that is not concatenated may have such terms
+        if self._section == "observations" and value.dim() == 3:
+            return value.flatten(1)  # as Isaac Lab does for a term with a history
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
+
+
+def _source(function: Any) -> str:
+    try:
+        return inspect.getsource(function)
+    except (OSError, TypeError):
+        return ""
 
 
 class _BoundObject:
@@ -241,13 +304,76 @@ class _BoundCommand(_BoundObject):
         self._has_command = True
 
 
-def _bind_command(term: UserCommand, env: Any, **params: Any) -> _BoundCommand:
+class _BoundAction(_BoundObject):
+    """The user's action, bound to an environment."""
+
+    unit = ""
+
+    def __init__(self, term: Any, managed: Any, name: str) -> None:
+        self.term = term
+        self.size = term.action_dim
+        self.elements = tuple(f"{name}[{i}]" for i in range(self.size))
+        self.sinks = (f"action {name}",)
+        self._substeps = Substeps(managed, f"action {name}", self)
+
+    def process(self, action: Tensor) -> None:
+        """Call `process_actions`."""
+        self.term.process_actions(action)
+        self._substeps.start()
+
+    def apply(self) -> None:
+        """Call `apply_actions` before a physics step."""
+        self.term.apply_actions()
+        self.term._asset.write_data_to_sim()
+        self.term._asset.apply_wrenches()
+
+    def reset(self, selection: Selection) -> None:
+        """Reset the action and its asset at the start of episodes."""
+        super().reset(selection)
+        self.term._asset.reset(selection.env_ids())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of the tensors of the action and of its asset."""
+        asset = {f"asset.{name}": value.clone() for name, value in self.term._asset.state().items()}
+        return {**super().state_dict(), **asset}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore the tensors returned by `state_dict`."""
+        for name, value in self.term._asset.state().items():
+            value.copy_(state[f"asset.{name}"])
+        super().load_state_dict({name: value for name, value in state.items() if not name.startswith("asset.")})
+
+
+def _bind_object(term: UserObject, env: Any, **params: Any) -> _BoundObject:
     from rlcli_isaaclab.runtime import facade_of
 
-    settings = {term.original[key]: _to_namespace(value) for key, value in params.items()}
-    times = list(env.config.commands[term.name].resampling_time_s)
-    cfg = SimpleNamespace(class_type=term.function, debug_vis=False, resampling_time_range=times, **settings)
-    return _BoundCommand(term.function(cfg, facade_of(env)))
+    cfg, facade = term.settings(params), facade_of(env)
+    cfg.debug_vis = False
+    facade.use(term.context)
+    if term.section == "commands":
+        cfg.resampling_time_range = tuple(env.config.commands[term.name].resampling_time_s)
+    with building(env):
+        made = term.function(cfg, facade)
+    return _BoundAction(made, env, term.name) if term.section == "actions" else _BoundCommand(made)
+
+
+def _bind_setting(term: SettingTerm, env: Any, **opened: Tensor) -> _BoundClass:
+    from rlcli_isaaclab.runtime import facade_of
+
+    facade = facade_of(env)
+    facade.use(term.context)
+    cfg = SimpleNamespace(func=term.function, params=term.params, setting=term.setting)
+    return _BoundClass(term.function(cfg, facade), "curriculum", facade, {**term.params, **opened})
+
+
+def _set_members(target: Any, values: Mapping[str, Any]) -> None:
+    """Set members of a configuration object that differ from the values; a list replaces an equal tuple only then."""
+    for name, value in values.items():
+        now = getattr(target, name, None)
+        if isinstance(value, Mapping) and hasattr(now, "__dataclass_fields__"):
+            _set_members(now, value)
+        elif to_plain(to_dict(now)) != value:
+            setattr(target, name, tuple(value) if isinstance(now, tuple) and isinstance(value, list) else value)
 
 
 def _resolved(value: Any, scene: Any) -> Any:
@@ -286,7 +412,8 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
         values[term.original[key]] = value
     if not term.is_class:
         return _Bound(term.function, term.section, facade, values)
-    instance = term.function(cfg=ManagerTermBaseCfg(func=term.function, params=values), env=facade)
+    with building(env):
+        instance = term.function(cfg=ManagerTermBaseCfg(func=term.function, params=values), env=facade)
     return _BoundClass(instance, term.section, facade, values)
 
 

@@ -1,4 +1,4 @@
-"""Poses of prims, which direct tasks read from the USD stage while they start."""
+"""Poses of prims, which tasks read from the USD stage while they start."""
 
 from __future__ import annotations
 
@@ -29,15 +29,20 @@ class Prim:
             if name in bodies:
                 index = bodies.index(name)
                 return entity.data.body_pos_w[0, index], entity.data.body_quat_w[0, index]
+            if name.lower() == entity.name:
+                return entity.data.root_pos_w[0], entity.data.root_quat_w[0]
         raise TaskError(f"no body '{name}' for the prim {self.path}", hint="name a body of the MJCF like the prim")
 
 
 class Stage:
     """The stage: its prims are bodies."""
 
-    def GetPrimAtPath(self, path: Any) -> Prim:  # noqa: N802
-        """Return the prim of a path."""
-        return Prim(str(path))
+    def GetPrimAtPath(self, path: Any) -> Any:  # noqa: N802
+        """Return the prim of a path: the root of an entity, or else a body."""
+        from rlcli_isaaclab.usd_geometry import prims_below
+
+        name = str(path).rstrip("/").rsplit("/", 1)[-1].lower()
+        return prims_below(str(path))[0] if name in MANAGED.get().entities else Prim(str(path))
 
 
 class _Xformable:

@@ -15,6 +15,7 @@ from rlcli_isaaclab.config_class import MISSING, configclass
 from rlcli_isaaclab.direct_env import DirectMARLEnv, DirectMARLEnvCfg, DirectRLEnv, DirectRLEnvCfg
 from rlcli_isaaclab.envs import ManagerBasedEnv, ManagerBasedEnvCfg, ManagerBasedRLEnvCfg, ViewerCfg
 from rlcli_isaaclab.managers import (
+    ActionTerm,
     ActionTermCfg,
     CommandTerm,
     CommandTermCfg,

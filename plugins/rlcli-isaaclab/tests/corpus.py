@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from standins import write
 SOURCE = "ISAACLAB_SOURCE"
 STAGES = ("imports", "validates", "steps", "trains")
 ENVS, STEPS, ITERATIONS = 16, 200, 3
+LIMIT_S = 3600
+"""Time for one task [s]; the slowest reset an inverse kinematics of their own for each episode."""
 OUTSIDE = ("pick_place",)
 """Packages that Isaac Lab does not import by default."""
 
@@ -164,17 +167,38 @@ def write_page(rows: dict[str, Any], page: Path) -> None:
     """Write the table of the documentation from the results."""
     text = page.read_text(encoding="utf-8")
     start, end = "<!-- table -->\n", "<!-- end of table -->"
-    lines = ["| task | imports | validates | steps | trains | why it stops |", "| --- | --- | --- | --- | --- | --- |"]
+    lines = [
+        "| task | imports | validates | steps | trains | what is lost, or why it stops |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
     for name, row in sorted(rows.items()):
         marks = ["yes" if row["stage"] > i else "no" for i in range(len(STAGES))]
         if row["stage"] == row["last"] < len(STAGES):
             marks[row["last"] :] = ["not run"] * (len(STAGES) - row["last"])
         if not row["agent"]:
             marks[-1] = "no agent"
-        reason = re.sub(r"/\S*/", "", row["reason"]).replace("|", ";")[:200] if row["stage"] < row["last"] else ""
+        stops = row["stage"] < (row["last"] if row["agent"] else min(row["last"], STAGES.index("trains")))
+        reason = re.sub(r"/\S*/", "", row["reason"]).replace("|", ";")[:300] if stops else lost(row.get("lost", ()))
         lines.append(f"| `{name}` | {' | '.join(marks)} | {reason} |")
     before, after = text.partition(start)[0], text.partition(end)[2]
     page.write_text(before + start + "\n".join(lines) + "\n" + end + after, encoding="utf-8")
+
+
+USUAL = ("physx", "rigid_props", "articulation_props", "collision_props", "experiment_name", "run_name", "num_envs")
+"""Parts of keys that most tasks lose; the page names them once."""
+
+
+def lost(notes: Sequence[str]) -> str:
+    """Return the keys of a task that are ignored or approximated, without those that most tasks lose."""
+    keys = []
+    for note in notes:
+        key, _, rest = re.sub(r"^/\S*?: ", "", note).partition(": ")
+        status = rest.partition(":")[0]
+        if not any(word in key for word in USUAL) and not key.startswith(
+            ("agent", "params", "models", "policy_kwargs")
+        ):
+            keys.append(f"{'~' if status == 'approximated' else ''}{key}")
+    return ", ".join(f"`{key}`" for key in sorted(set(keys)))
 
 
 def main_() -> None:
@@ -186,8 +210,15 @@ def main_() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--steps", type=int, default=STEPS, help="steps of the stage `steps`")
     parser.add_argument("--page", type=Path, help="page whose table is written from the results")
+    parser.add_argument("--merge", type=Path, nargs="*", help="write the page from files of --out, and run nothing")
     parser.add_argument("--part", default="0/1", help="i/n: every n-th task")
     options = parser.parse_args()
+    rows: dict[str, Any]
+    if options.merge:
+        rows = {name: row for file in options.merge for name, row in json.loads(file.read_text()).items()}
+        write_page(rows, options.page)
+        count(rows)
+        return
     source = Path(os.environ[SOURCE])
     import torch  # noqa: F401  (imported once, before the forks)
 
@@ -195,7 +226,7 @@ def main_() -> None:
 
     found = tasks(source)
     part, parts = map(int, options.part.split("/"))
-    rows: dict[str, Any] = {}
+    rows = {}
     with tempfile.TemporaryDirectory() as folder:
         wanted = [n for n in found if re.search(options.only, n)]
         for number, name in enumerate(wanted):
@@ -204,7 +235,7 @@ def main_() -> None:
                 continue
             package = source / "isaaclab_tasks" / "isaaclab_tasks"
             stage, reason, facts = isolated(
-                900, run, name, found[name], package, Path(folder) / name, options.stage, options.steps
+                LIMIT_S, run, name, found[name], package, Path(folder) / name, options.stage, options.steps
             )
             with_agent = any(
                 key.endswith("_cfg_entry_point") and key not in ("env_cfg_entry_point",) and "robomimic" not in key
@@ -223,6 +254,11 @@ def main_() -> None:
                 options.out.write_text(json.dumps(rows, indent=1))
     if options.page:
         write_page(rows, options.page)
+    count(rows)
+
+
+def count(rows: dict[str, Any]) -> None:
+    """Print how many tasks pass each stage."""
     for direct in (False, True):
         kind = [row for row in rows.values() if row["direct"] == direct]
         counts = {stage: sum(row["stage"] > i for row in kind) for i, stage in enumerate(STAGES)}

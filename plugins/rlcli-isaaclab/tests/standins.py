@@ -170,6 +170,7 @@ def collect(data: Any) -> dict[str, dict[str, list[str]]]:
         for group in (actuators or {}).values() if isinstance(actuators, Mapping) else ():
             if isinstance(group, Mapping):
                 add(name, "joint", group.get("joint_names_expr"))
+                add(name, "body", group.get("thruster_names_expr"))
                 for value in group.values():
                     if isinstance(value, Mapping):
                         add(name, "joint", list(value))
@@ -254,11 +255,16 @@ def mjcf(name: str, path: str, joints: list[str], bodies: list[str], articulated
 def write(data: Any, folder: Path) -> None:
     """Write stand-in models of all entities that have a file, and `models.yaml`, which names them."""
     folder.mkdir(parents=True, exist_ok=True)
+    scene = dict(data["scene"])
+    for name, item in data["scene"].items():
+        for part, content in (item.get("rigid_objects") or {}).items() if isinstance(item, Mapping) else ():
+            scene[f"{name}_{part}"] = content
+    data = {**data, "scene": scene}
     lines = []
     for name, wanted in collect(data).items():
         item = data["scene"][name]
         spawn = item.get("spawn")
-        if not isinstance(spawn, Mapping) or not any(spawn.get(k) for k in ("usd_path", "asset_path")):
+        if not isinstance(spawn, Mapping) or not any(spawn.get(k) for k in ("usd_path", "asset_path", "assets_cfg")):
             continue
         path = str(spawn.get("usd_path") or spawn.get("asset_path"))
         extra = [b for word, names in EXTRA_BODIES.items() if word in path.lower() for b in names]

@@ -1,6 +1,7 @@
 # ruff: noqa: E501
 """Task files of Isaac Lab run without a changed line: imports, models beside the files, agents, and direct tasks."""
 
+import json
 import os
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 import torch
 from cartpole_files import write
 
+from rlcli.config.given_models import MODELS, read_models
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError, TaskError
@@ -195,8 +197,44 @@ def test_missing_model_names_the_mapping_file(direct):
     with pytest.raises(ConfigError) as caught:
         resolve(find_task(f"{direct}:PoleEnvCfg"))
     assert "no MJCF model is known for 'pole.usd'" in caught.value.problems[0].message
-    assert "robot: FILE.xml" in caught.value.problems[0].hint
-    assert "models.yaml" in caught.value.problems[0].hint
+    hint = "give a model: --model robot=FILE.xml, or --model models.yaml with lines robot: FILE.xml"
+    assert caught.value.problems[0].hint == hint
+
+
+def test_model_on_the_command_line(direct, tmp_path):
+    (direct.parent / "models.yaml").unlink()
+    given = tmp_path / "given.yaml"
+    given.write_text("robot: {model: 'cartpole:cartpole.xml', gains: {}}\n")
+    for word in ("robot=cartpole:cartpole.xml", str(given)):
+        words = [f'{MODELS}."{name}"={json.dumps(value)}' for name, value in read_models([word]).items()]
+        found = resolve(find_task(f"{direct}:PoleEnvCfg"), overrides=words)
+        assert found.task.scene.entities["robot"].model.endswith("cartpole.xml")
+
+
+def test_model_for_a_name_that_the_scene_lacks(direct):
+    words = [f'{MODELS}."robt"="{direct.parent / "pole.xml"}"']
+    with pytest.raises(ConfigError) as caught:
+        resolve(find_task(f"{direct}:PoleEnvCfg"), overrides=words)
+    (problem,) = caught.value.problems
+    assert problem.message == "--model robt: the scene has no 'robt'"
+    assert "robot" in problem.hint
+
+
+@pytest.mark.slow
+def test_run_remembers_its_model(unchanged, monkeypatch):
+    file = next(file for file in unchanged.glob("*env_cfg.py"))
+    text = file.read_text().replace(
+        "@configclass", 'CARTPOLE_CFG.spawn.usd_path = "nowhere/other.usd"\n\n\n@configclass', 1
+    )
+    file.write_text(text)
+    monkeypatch.chdir(unchanged.parent)
+    model = ["--model", "robot=cartpole:cartpole.xml"]
+    for words in (
+        ["train", str(unchanged), *model, "--max-iterations", "1", "--num-envs", "4"],
+        ["eval", "--checkpoint", "latest", "--episodes", "1"],
+    ):
+        done = subprocess.run([sys.executable, "-m", "rlcli", *words], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
 
 
 def test_mapping_file_with_a_file_that_does_not_exist(direct):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -127,7 +128,7 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
         if "overrides" in values and (model := values.pop("model")):
             from rlcli.config.given_models import MODELS, read_models
 
-            words = [f'{MODELS}."{name}"="{file}"' for name, file in read_models(model).items()]
+            words = [f'{MODELS}."{name}"={json.dumps(value)}' for name, value in read_models(model).items()]
             values["overrides"] = [*(values["overrides"] or []), *words]
         progress.view = WorkView
         given = {option: value for option, value in values.items() if option not in _COMMON}

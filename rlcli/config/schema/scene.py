@@ -194,7 +194,9 @@ class EntityConfig(StrictModel):
     """Part of the joint range, around its middle, that is inside the soft limits, in (0, 1]."""
 
     @model_validator(mode="after")
-    def _one_kind(self) -> EntityConfig:
+    def _one_kind(self, info: ValidationInfo) -> EntityConfig:
+        if (self.model or "").startswith("file:") and not (info.context or {}).get("given_models"):
+            raise ValueError(f"'{self.model}' lies outside the task's folder; move it inside")
         if (self.model is None) == (self.shape is None):
             raise ValueError("an entity has either `model` (an MJCF file) or `shape`: write one of the two")
         if self.shape is not None:

@@ -94,9 +94,9 @@ class CameraSensorConfig(StrictModel):
     data: Literal["rgb", "depth", "distance"] = "rgb"
     """rgb: red, green and blue in 0 to 255; depth: distance along the camera's axis [m]; distance: distance from the
     camera's position [m]."""
-    width: Annotated[int, Field(ge=1, le=1024)]
+    width: Annotated[int, Field(ge=1, le=4096)]
     """Image width [pixels]."""
-    height: Annotated[int, Field(ge=1, le=1024)]
+    height: Annotated[int, Field(ge=1, le=4096)]
     """Image height [pixels]."""
     entity: str | None = None
     """The entity to which the camera is attached; null: the camera is fixed in the environment."""

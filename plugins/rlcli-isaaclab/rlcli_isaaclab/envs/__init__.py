@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,14 +47,14 @@ class ManagerBasedEnvCfg:
     export_io_descriptors: bool = False
     log_dir: Any = None
 
-    def __rlcli_task__(self, root: Path) -> Any:
-        """Return this configuration as a task of rlcli."""
+    def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
+        """Return this configuration as a task of rlcli, with the models that the user gives."""
         from rlcli.config.python_task import PythonTask
         from rlcli_isaaclab.convert import task
         from rlcli_isaaclab.settings import Report
 
         report = Report()
-        data = task(to_dict(self), report, root, cfg=self)
+        data = task(to_dict(self), report, root, models=models, cfg=self)
         return PythonTask(data, notes=report.user_notes())
 
 

@@ -127,12 +127,12 @@ def quat_from_angle_axis(angle: Tensor, axis: Tensor) -> Tensor:
 
 
 def axis_angle_from_quat(quat: Tensor, eps: float = 1.0e-6) -> Tensor:
-    """Return axis x angle [rad]. (..., 4) -> (..., 3)"""
+    """Return axis x angle [rad], times the quaternion's length. (..., 4) -> (..., 3)"""
     quat = torch.where(quat[..., :1] < 0.0, -quat, quat)
-    length = quat[..., 1:].norm(p=2, dim=-1, keepdim=True)
-    angle = 2.0 * torch.atan2(length, quat[..., :1])
-    small = length < eps
-    return quat[..., 1:] * torch.where(small, 2.0 * torch.ones_like(angle), angle / torch.where(small, 1.0, length))
+    half = torch.atan2(quat[..., 1:].norm(p=2, dim=-1, keepdim=True), quat[..., :1])
+    small = half.abs() < 0.5 * eps
+    # the sine of the angle, not the length of the axis: a quaternion that is not normalized scales the result
+    return quat[..., 1:] * torch.where(small, 2.0, 2.0 * half / torch.where(small, 1.0, half.sin()))
 
 
 def matrix_from_quat(quaternions: Tensor) -> Tensor:
@@ -183,7 +183,7 @@ def compute_pose_error(
     t01: Tensor, q01: Tensor, t02: Tensor, q02: Tensor, rot_error_type: str = "axis_angle"
 ) -> tuple[Tensor, Tensor]:
     """Return the error of position and rotation from pose 1 to pose 2. (n, 3), (n, 3 or 4)"""
-    turn = multiply(q02, quat_conjugate(q01))
+    turn = multiply(q02, quat_conjugate(q01) / q01.square().sum(dim=-1, keepdim=True))
     return t02 - t01, turn if rot_error_type == "quat" else axis_angle_from_quat(turn)
 
 

@@ -1,0 +1,172 @@
+"""Curriculum terms that change a setting by its address. Names as in `isaaclab.envs.mdp`."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from rlcli_isaaclab.managers import ManagerTermBase
+
+_SECTION = re.compile(r"^(\w+?)s?(?:_manager\.cfg)?\.")
+
+
+class modify_env_param(ManagerTermBase):  # noqa: N801  (Isaac Lab's name)
+    """Curriculum term that sets a setting to `modify_fn(env, env_ids, value, **modify_params)`."""
+
+    NO_CHANGE: ClassVar[object] = object()
+    """Result of a function that does not change the value."""
+
+    def __init__(self, cfg: Any, env: Any) -> None:
+        super().__init__(cfg, env)
+        self._setting: ChangedSetting = cfg.setting
+        self._value = torch.tensor(self._setting.start, dtype=torch.float64)
+
+    def __call__(self, env: Any, env_ids: Any, modify_fn: Any, modify_params: Any = None, **opened: Tensor) -> None:
+        """Change the setting."""
+        value = _in_form_of(self._setting.start, self._value.tolist())
+        new = modify_fn(env, env_ids, value, **(modify_params or {}))
+        if new is self.NO_CHANGE:
+            return
+        self._value = torch.tensor(new, dtype=torch.float64)
+        if self._setting.addresses:
+            for (key, _), number in zip(self._setting.addresses, self._setting.translate(new), strict=True):
+                opened[key].copy_(torch.as_tensor(number, dtype=torch.float32))
+        else:
+            self._setting.write(env, new)
+
+
+class modify_term_cfg(modify_env_param):  # noqa: N801  (Isaac Lab's name)
+    """The same, with an address that starts with a section: `events.NAME.params.KEY`."""
+
+
+class ChangedSetting:
+    """A setting of one of Isaac Lab's terms, and the settings of rlcli that depend on it.
+
+    Args:
+        data: settings of all sections, as nested dicts.
+        address: Isaac Lab's address.
+        read: returns the terms of rlcli, by path, for a section, the path of a term in it and its settings.
+
+    Raises:
+        KeyError: if the address names nothing, or no number.
+    """
+
+    def __init__(
+        self, data: Mapping[str, Any], address: str, read: Callable[[str, list[str], Mapping[str, Any]], Any]
+    ) -> None:
+        match = _SECTION.match(address)
+        if match is None or f"{match[1]}s" not in data:
+            raise KeyError(address)
+        self.section = f"{match[1]}s"
+        parts = re.sub(r"\[(\d+)\]", r".\1", address[match.end() :]).split(".")
+        depth = 2 if self.section == "observations" else 1
+        self.term, self.path = parts[:depth], parts[depth:]
+        settings: Any = data[self.section]
+        for part in self.term:
+            settings = settings[part]
+        self._settings, self._read = settings, read
+        self.start = _get(settings, self.path)
+        if not _is_number(self.start):
+            raise KeyError(address)
+        self.is_own = False
+        """Whether the term is the user's own."""
+        changed = set(self._numbers(_moved(self.start)).items()) - set(self._numbers(self.start).items())
+        names = sorted(name for name, _ in changed)
+        self.addresses = [(f"address_{index}", name) for index, name in enumerate(names)]
+        """Parameter of the curriculum term -> address of a setting of rlcli that depends on the value."""
+
+    def translate(self, value: Any) -> list[Any]:
+        """Return the settings of rlcli for a value, in the order of `addresses`."""
+        found = self._numbers(value)
+        return [found[name] for _, name in self.addresses]
+
+    def write(self, env: Any, value: Any) -> None:
+        """Set the value in the user's own term."""
+        bound = env.managed._bound.get(self.section, [])
+        if self.section == "observations":
+            bound = env.managed._observations[self.term[0]]
+        call = next(term.call for term in bound if term.name == self.term[-1])
+        if self.path[0] == "params":
+            _set(call.params, self.path[1:], value)
+        else:
+            _set(call.term.cfg, self.path, value)
+
+    def _numbers(self, value: Any) -> dict[str, Any]:
+        """Return the numbers of the terms of rlcli for a value, by address."""
+        settings = copy.deepcopy(self._settings)
+        _set(settings, self.path, value)
+        found: dict[str, Any] = {}
+        for path, config in self._read(self.section, self.term, settings):
+            self.is_own = not isinstance(config["func"], str)
+            if self.is_own and self.path[0] not in ("weight", "noise", "scale", "clip"):
+                continue  # the user's own term gets the value itself
+            found.update(_flat(config, path))
+        return found
+
+
+def _flat(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            yield from _flat(item, f"{path}.{name}")
+    elif _is_number(value):
+        yield path, _as_tuple(value)
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(map(_as_tuple, value)) if isinstance(value, list | tuple) else value
+
+
+def _is_number(value: Any) -> bool:
+    """Return whether a value is a number, or a list of numbers."""
+    if isinstance(value, list | tuple):
+        return bool(value) and all(map(_is_number, value))
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _moved(value: Any) -> Any:
+    """Return a value in which every number is another one; pairs stay in order."""
+    if isinstance(value, list | tuple):
+        return type(value)(_moved(item) for item in value)
+    return value + 1.0
+
+
+def _in_form_of(form: Any, value: Any) -> Any:
+    """Return nested lists with the types of another value."""
+    if isinstance(form, list | tuple):
+        return type(form)(_in_form_of(a, b) for a, b in zip(form, value, strict=True))
+    return value if isinstance(form, float) or value != int(value) else type(form)(value)
+
+
+def _get(value: Any, path: list[str]) -> Any:
+    for part in path:
+        value = value[int(part)] if isinstance(value, list | tuple) else _member(value, part)
+    return value
+
+
+def _member(value: Any, name: str) -> Any:
+    return value[name] if isinstance(value, Mapping) else getattr(value, name)
+
+
+def _set(target: Any, path: list[str], value: Any) -> None:
+    """Set a nested member; a tuple on the way is replaced."""
+    name = path[0]
+    if len(path) > 1:
+        inner = target[int(name)] if isinstance(target, list) else _member(target, name)
+        if isinstance(inner, tuple):
+            inner = list(inner)
+            _set(inner, path[1:], value)
+            value = tuple(inner)
+        else:
+            _set(inner, path[1:], value)
+            return
+    if isinstance(target, list):
+        target[int(name)] = value
+    elif isinstance(target, dict):
+        target[name] = value
+    else:
+        setattr(target, name, value)

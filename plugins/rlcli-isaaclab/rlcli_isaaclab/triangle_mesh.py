@@ -1,0 +1,52 @@
+"""The part of the library trimesh that tasks need to sample points on surfaces, for where it is not installed."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlcli_isaaclab.absent import absence
+
+
+class Trimesh:
+    """Triangle mesh: vertices (n, 3) [m] and faces (m, 3)."""
+
+    def __init__(self, vertices: Any, faces: Any, process: bool = False) -> None:
+        self.vertices, self.faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+
+    @property
+    def triangles(self) -> NDArray[np.float64]:
+        """Corners of each face. (m, 3, 3) [m]"""
+        corners: NDArray[np.float64] = self.vertices[self.faces]
+        return corners
+
+    @property
+    def area_faces(self) -> NDArray[np.float64]:
+        """Area of each face. (m,) [m^2]"""
+        a, b, c = self.triangles.transpose(1, 0, 2)
+        areas: NDArray[np.float64] = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        return areas
+
+
+def sample_surface(mesh: Any, count: int, face_weight: Any = None, seed: Any = None) -> tuple[Any, Any]:
+    """Return random points on a surface, uniform by area (or by `face_weight`), and the face of each point."""
+    draws = np.random.default_rng(seed if seed is not None else np.random.randint(2**31))
+    weight = mesh.area_faces if face_weight is None else np.asarray(face_weight)
+    faces = draws.choice(len(weight), size=count, p=weight / weight.sum())
+    a, b, c = mesh.triangles[faces].transpose(1, 0, 2)
+    u, v = draws.random((2, count, 1))
+    flip = u + v > 1.0
+    u, v = np.where(flip, 1.0 - u, u), np.where(flip, 1.0 - v, v)
+    return a + u * (b - a) + v * (c - a), faces
+
+
+sample = SimpleNamespace(sample_surface=sample_surface)
+
+
+def __getattr__(name: str) -> Any:
+    if name.startswith("__"):
+        raise AttributeError(name)
+    raise absence(f"trimesh.{name}", hint="pip install trimesh")
