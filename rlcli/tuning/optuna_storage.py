@@ -162,9 +162,10 @@ def _database(url: str) -> optuna.storages.BaseStorage:
                 return RDBStorage(url, engine_kwargs=no_pool)
             time.sleep(1.0)  # another machine creates the same tables at the same time
         return RDBStorage(url, engine_kwargs=no_pool)
-    except ModuleNotFoundError as error:
-        raise DependencyError(f"--storage needs the driver {error.name}", hint=f"pip install {error.name}") from None
-    except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError) as error:
+    except ImportError as error:
+        driver = getattr(error.__cause__ or error, "name", None) or url.partition(":")[0]
+        raise DependencyError(f"--storage needs the driver {driver}", hint=f"pip install {driver}") from None
+    except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError, ValueError, LookupError) as error:
         message = f"--storage '{without_password(url)}' is not the URL of a database: {_first_line(error)}"
         raise UsageError(message, hint="as in postgresql+psycopg://user@host/name") from None
     except (sqlalchemy.exc.SQLAlchemyError, OSError) as error:
