@@ -9,9 +9,10 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from support.broken_plugins import BROKEN
+from support.broken_plugins import BROKEN, FILES, SPEC
 
-from rlcli.registry import catalog
+from rlcli.cli.app import main
+from rlcli.registry import catalog, imports
 from rlcli.registry.probe import probe
 
 BUILT_IN = {"cartpole", "cartpole-direct", "ant-direct"}
@@ -190,3 +191,10 @@ def test_ctrl_c_during_probe_start_kills_processes(broken_plugins, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         probe([entry for entry in catalog()[0] if entry.name == "hangs-task"], timeout_s=60.0)
     assert time.monotonic() - before < 30.0
+
+
+def test_plugin_that_loads_slowly_is_named(plugins, monkeypatch, capfd):
+    monkeypatch.setattr(imports, "_SLOW_S", 0.1)
+    plugins("slow", "import time\ntime.sleep(0.5)\n" + SPEC, files=FILES)
+    assert main(["validate", "slow-task"]) == 0
+    assert "warning: plugin slow 1.0 still loads after 0.1 s: 'slow-task' = slow:SPEC; Ctrl-C" in capfd.readouterr().err

@@ -205,7 +205,8 @@ def rehash(folder):
         with contextlib.suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
             document = json.loads(manifest.read_text())
             for name, entry in document["files"].items():
-                data = (manifest.parent / name).read_bytes() if (manifest.parent / name).stat().st_size < 1e8 else b""
+                file = manifest.parent / name
+                data = file.read_bytes() if file.is_file() and file.stat().st_size < 1e8 else b""
                 entry.update({"sha256": hashlib.sha256(data).hexdigest()})
                 if "bytes" in entry:
                     entry["bytes"] = len(data)
