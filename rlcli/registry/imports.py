@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import logging
 import operator
 import os
 import re
 import sys
-import threading
 import traceback
 from collections.abc import Iterator
 from importlib import metadata
@@ -17,12 +15,11 @@ from typing import Any, TypeVar
 
 from rlcli.errors import DependencyError, TaskError
 from rlcli.formats import FormatSpec
+from rlcli.progress import track
 from rlcli.registry.entries import Entry
 from rlcli.task import API_VERSION, TaskSpec
 from rlcli.trainers import TrainerSpec
 
-_SLOW_S = 15.0
-"""Time after which a plugin that still loads is named [s]."""
 _Spec = TypeVar("_Spec", TaskSpec, TrainerSpec, FormatSpec)
 
 
@@ -48,15 +45,9 @@ def load_entry(entry: Entry, kind: type) -> Any:
         TaskError: for any error of the plugin, with the name of its distribution.
         DependencyError: raised by the plugin itself, passed on.
     """
-    slow = (
-        f"plugin {entry.distribution} {entry.version} still loads after {_SLOW_S:g} s: '{entry.name}' = {entry.value};"
-        " Ctrl-C ends the command, RLCLI_PLUGINS excludes plugins"
-    )
-    timer = threading.Timer(_SLOW_S, logging.getLogger(__name__).warning, [slow])
-    timer.daemon = True
-    timer.start()
     try:
-        value = import_object(entry.value)
+        with track(f"plugin {entry.qualified} ({entry.value})"):
+            value = import_object(entry.value)
     except DependencyError:
         raise
     except BaseException as error:
@@ -68,9 +59,6 @@ def load_entry(entry: Entry, kind: type) -> Any:
             f" {reason}{error_location(error)}",
             hint=_newer_rlcli(entry),
         ) from error
-    finally:
-        timer.cancel()
-        timer.join()
     if not isinstance(value, kind):
         raise TaskError(
             f"plugin {entry.distribution} {entry.version} is broken: '{entry.name}' = {entry.value} is a"
