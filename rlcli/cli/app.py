@@ -18,7 +18,7 @@ from rlcli.cli.ui.console import console, discard, print_log_records
 from rlcli.cli.ui.help_text import HelpGroup
 from rlcli.cli.ui.options import CHOOSE, add_command
 from rlcli.config.settings_file import read_settings
-from rlcli.errors import ConfigError, MachineError, RlcliError, Stopped, UsageError
+from rlcli.errors import CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
 from rlcli.machine import AddressSpaceCheck, delay_garbage_collection, memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.safe_text import remember_given
@@ -153,7 +153,7 @@ def _run(arguments: list[str]) -> int:
 
 def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
     """Return the error to print for any exception."""
-    if too_little := memory_error(error):
+    if not isinstance(error, CheckpointError) and (too_little := memory_error(error)):  # a file may claim any size
         return too_little
     if isinstance(error, RlcliError):
         return error
