@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
-from rlcli.errors import DependencyError, DeviceError, MachineError, UsageError, one_line, pip_install
+from rlcli.errors import DependencyError, DeviceError, MachineError, RlcliError, UsageError, one_line, pip_install
 
 _GROUPS, _OWN_GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _NO_LIMIT = 1 << 60
@@ -43,8 +43,8 @@ def core_quota(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> float | None:
 
 
 def memory_limit(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> int | None:
-    """Return the memory limit of this process's control group [bytes]; None if there is no limit."""
-    limits = []
+    """Return the memory limit of this process or its control group [bytes]; None if there is no limit."""
+    limits = [address_space() or _NO_LIMIT]
     for folder in _control_groups("memory", groups, own):
         for name in ("memory.max", "memory.limit_in_bytes"):
             try:
@@ -106,36 +106,67 @@ def available_memory(report: Path = Path("/proc/meminfo")) -> int:
         return 8 * 2**30
 
 
-def memory_error(error: BaseException) -> MachineError | None:
-    """Return the error to show for an exception that means too little memory; None for any other exception."""
-    if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
-        return None
-    hint = "close other programs, raise the limit of the process (`ulimit -v`), or lower scene.num_envs"
-    return MachineError(f"too little memory: {one_line(error, 200)}", hint=hint)
+def memory_error(error: BaseException | None) -> MachineError | None:
+    """Return the error to show if an exception, or one that it replaced, means too little memory; else None."""
+    limit = address_space()
+    limited = f" (the process is limited to {limit >> 20} MiB)" if limit else ""
+    while error is not None:
+        text = str(error)
+        if isinstance(error, MemoryError) or (
+            not isinstance(error, RlcliError) and (_NO_MEMORY.search(text) or (limit and _UNDER_A_LIMIT.search(text)))
+        ):
+            hint = "close other programs, raise the limit of the process (`ulimit -v`), or lower scene.num_envs"
+            return MachineError(f"too little memory{limited}: {one_line(error, 200)}", hint=hint)
+        error = error.__cause__ or error.__context__
+    return None
 
 
-def require_address_space() -> None:
-    """Check that a limit such as `ulimit -v` leaves room for torch, which would end the process without a message.
-
-    Raises:
-        MachineError: if it does not.
-    """
-    with contextlib.suppress(ImportError):
+def address_space() -> int | None:
+    """Return the limit that `ulimit -v` sets for this process [bytes]; None if there is no limit."""
+    with contextlib.suppress(ImportError):  # Windows
         import resource
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if 0 < limit < _LEAST_ADDRESS_SPACE:
-            message = f"the process is limited to {limit >> 20} MiB of memory; {_LEAST_ADDRESS_SPACE >> 20} are needed"
-            raise MachineError(message, hint="raise the limit, for example with `ulimit -v unlimited`")
+        return limit if 0 < limit < _NO_LIMIT else None
+    return None
 
 
-_LEAST_ADDRESS_SPACE = 800 << 20
+def require_address_space(least: int = 1 << 30) -> None:
+    """Check that a limit such as `ulimit -v` leaves room for large libraries, which would end the process otherwise.
+
+    Args:
+        least: the limit that the libraries need [bytes]. The default is for torch and MuJoCo.
+
+    Raises:
+        MachineError: if the limit is lower.
+    """
+    if (limit := address_space()) is not None and limit < least:
+        message = f"the process is limited to {limit >> 20} MiB of memory; {least >> 20} are needed"
+        raise MachineError(message, hint="raise the limit, for example with `ulimit -v unlimited`")
+
+
+class AddressSpaceCheck:
+    """Import hook that calls `require_address_space` before a large library is imported."""
+
+    @staticmethod
+    def find_spec(name: str, *_: object) -> None:
+        """Find nothing.
+
+        Raises:
+            MachineError: if the limit is too low for this library.
+        """
+        if name in ("numpy", "mujoco", "torch"):
+            require_address_space()
+
+
 _NO_MEMORY = re.compile(
     r"(not|n't) allocate memory|not enough memory|bad_alloc|failed to map segment|n't start new thread|unable to mmap"
     r"|out of memory",
     re.IGNORECASE,
 )
 """Messages of MuJoCo, torch, the dynamic linker and Python, which raise different classes."""
+_UNDER_A_LIMIT = re.compile(r"failed to load the shared library|framebuffer is not complete", re.IGNORECASE)
+"""Messages of Warp and OpenGL that can have other causes; with a limit on the memory they mean too little memory."""
 
 
 def resident_memory(report: Path = Path("/proc/self/statm")) -> int | None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
+from pathlib import Path
 
-UNSAFE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
-"""Characters that must not reach a terminal: control characters except tab and newline, marks that change the direction
-of text, and single surrogates."""
+UNSAFE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2028\u2029\u2066-\u2069\ud800-\udfff]")
+"""Characters that must not reach a terminal: control characters except tab and newline, line separators, marks that
+change the direction of text, and single surrogates."""
 
 
 def shorten(value: object, limit: int, mark: str = "...") -> str:
@@ -20,10 +22,41 @@ _LONG = re.compile(r"""\S{201,}|(?<!\w)'[^']{199,}'|"[^"]{199,}\"""")
 _MAX_LINE = 2000
 
 
+_given: list[str] = []
+
+
+def remember_given(words: Iterable[str]) -> None:
+    """Store the words of the command line and its environment that messages must not repeat as they are."""
+    parts = {part for word in map(str, words) for part in (word, str(Path(word)), *word.split("=", 1))}
+    parts |= set(map(_printable, parts))
+    _given[:] = sorted((part for part in parts if len(part) > 200 or not part.isprintable()), key=len, reverse=True)
+
+
+def without_control(text: str) -> str:
+    """Return a text in which the words of the command line have their control characters and newlines escaped."""
+    for part in _given:
+        text = text.replace(part, _printable(part))
+    return text
+
+
 def message_line(text: str) -> str:
-    """Return the text of a message on one line: other characters are escaped, words and quotes over 200 are cut."""
-    printable = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[: 10 * _MAX_LINE])
-    return _cut(_LONG.sub(lambda found: _cut(found[0], 200), printable), _MAX_LINE)
+    """Return the text of a message on one line.
+
+    Characters that are not printable are escaped. Words, quotes and arguments of over 200 characters are cut.
+    """
+    for part in _given:
+        text = text.replace(part, _cut(_printable(part), 200))
+    return _cut(_LONG.sub(lambda found: _cut(found[0], 200), _printable(text[: 10 * _MAX_LINE])), _MAX_LINE)
+
+
+def message_lines(text: str) -> str:
+    """Return the text of a message of several lines, each as `message_line` returns it."""
+    return "\n".join(map(message_line, without_control(text).split("\n")))
+
+
+def _printable(text: str) -> str:
+    """Return a text with escapes in place of the characters that are not printable."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _cut(text: str, limit: int) -> str:

@@ -18,9 +18,10 @@ from rlcli.cli.ui.console import console, discard, print_log_records
 from rlcli.cli.ui.help_text import HelpGroup
 from rlcli.cli.ui.options import CHOOSE, add_command
 from rlcli.config.settings_file import read_settings
-from rlcli.errors import ConfigError, MachineError, RlcliError, Stopped, UsageError
-from rlcli.machine import delay_garbage_collection, memory_error, require_address_space
+from rlcli.errors import CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
+from rlcli.machine import AddressSpaceCheck, delay_garbage_collection, memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
+from rlcli.safe_text import remember_given
 from rlcli.settings import settings_file, use_settings
 from rlcli.trainers import TrainerSpec
 
@@ -42,10 +43,6 @@ COMMANDS = tuple(name for names in PANELS.values() for name in names if name not
 """Other commands: each has a module of `rlcli.cli.commands` of its name with a function `command`."""
 
 _HELP_FLAGS = frozenset(("-h", "--help", "--version", "--install-completion", "--show-completion"))
-_LIGHT = frozenset(
-    (*_HELP_FLAGS, "list-tasks", "terms", "show", "new", "validate", "lint", "sweep", "runs", "diff", "doctor")
-)
-"""First words of command lines that need not import torch."""
 _INTERRUPTED = 130
 _COMPLETION_VARIABLE = "_RLCLI_COMPLETE"
 """Environment variable that a shell sets to complete a command line."""
@@ -101,7 +98,9 @@ def main(arguments: list[str] | None = None) -> int:
     console.owns_process = arguments is None
     if console.owns_process:
         delay_garbage_collection()
+        sys.meta_path.insert(0, AddressSpaceCheck)
     arguments = sys.argv[1:] if arguments is None else arguments
+    remember_given([*arguments, *(value for name, value in os.environ.items() if name.startswith("RLCLI_"))])
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
     console.has_document = False  # an earlier command of this process may have printed one
     with console.stdout_kept(), malformed_metadata_ignored():
@@ -133,8 +132,6 @@ def _command_name(arguments: list[str]) -> str | None:
 
 def _run(arguments: list[str]) -> int:
     try:
-        if not _LIGHT.intersection([*arguments[:1], *_HELP_FLAGS.intersection(arguments)]) or "--deep" in arguments:
-            require_address_space()
         with use_settings(_user_settings(arguments)):
             result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
         if result == _INTERRUPTED:  # typer turns Ctrl-C into this exit code
@@ -156,6 +153,8 @@ def _run(arguments: list[str]) -> int:
 
 def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
     """Return the error to print for any exception."""
+    if not isinstance(error, CheckpointError) and (too_little := memory_error(error)):  # a file may claim any size
+        return too_little
     if isinstance(error, RlcliError):
         return error
     if isinstance(error, ClickException):
@@ -167,9 +166,6 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
     if isinstance(error, OSError):
         file = f"{error.filename}: " if error.filename else ""
         return MachineError(f"{file}{error.strerror or error}")
-
-    if too_little := memory_error(error):  # before imports, which need memory
-        return too_little
 
     from rlcli.cli.ui.error_origin import error_of_task
     from rlcli.sim.gl import opengl_import_error

@@ -24,7 +24,7 @@ from rlcli.deploy.graph import DeployedPolicy
 from rlcli.deploy.metadata import metadata_of, mjlab_properties
 from rlcli.errors import MachineError, UsageError, VerdictError, require_known
 from rlcli.rl.policy import PolicySpec
-from rlcli.runs.atomic_io import sync_folder, write_synced
+from rlcli.runs.atomic_io import remove_leftovers, sync_folder, write_synced
 from rlcli.runs.checkpoint_manifest import deployment_of, layout_of
 from rlcli.runs.checkpoint_reader import Checkpoint
 
@@ -172,6 +172,7 @@ def _temporary_file(file: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, file)
         made = []
+        remove_leftovers(file.parent, file.stem)
         sync_folder(file.parent)
     except OSError as error:
         message = f"cannot write {file}: {error.strerror or error}"

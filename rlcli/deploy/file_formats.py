@@ -17,12 +17,15 @@ from torch import Tensor
 from rlcli.deploy.graph import DeployedPolicy
 from rlcli.deploy.numpy_export import numpy_bytes, read_numpy
 from rlcli.errors import CheckpointError, DependencyError, pip_install
+from rlcli.machine import require_address_space
 
 KEY = "rlcli"
 """Key of the metadata in a file: a property of the ONNX model, an extra file of the torch program."""
 FORMATS = {"onnx": ".onnx", "torch": ".pt2", "numpy": ".py"}
 """Format -> suffix of its files."""
 _OPSET = 18
+_ONNX_ADDRESS_SPACE = 3 << 29
+"""Limit of a process [bytes] below which onnxruntime ends it without a message."""
 
 PolicyFunction = Callable[[dict[str, Tensor]], dict[str, Tensor]]
 """Inputs by name -> outputs by name."""
@@ -58,6 +61,7 @@ def require_packages(format_: str) -> None:
     """
     if format_ != "onnx":
         return
+    require_address_space(_ONNX_ADDRESS_SPACE)
     try:
         with _quiet():
             for module in ("onnx", "onnxscript", "onnxruntime"):

@@ -11,6 +11,7 @@ from rlcli.doctor.compute_and_graphics import check_isolated
 from rlcli.doctor.installation import entry_checks, installation_checks, metadata_checks
 from rlcli.doctor.machine import machine_checks
 from rlcli.doctor.settings import settings_checks
+from rlcli.machine import require_address_space
 from rlcli.registry import FORMATS, TASKS, TRAINERS
 from rlcli.registry.probe import TIMEOUT_S
 
@@ -25,7 +26,11 @@ def run_checks(runs_dir: Path, timeout_s: float = TIMEOUT_S) -> list[Check]:
     Args:
         runs_dir: the folder that runs would be written to.
         timeout_s: time limit for each task, trainer and driver [s].
+
+    Raises:
+        MachineError: if a limit such as `ulimit -v` leaves no room for torch.
     """
+    require_address_space()
     stop = threading.Event()
     with ThreadPoolExecutor(2) as pool:
         try:

@@ -26,14 +26,14 @@ def memory_check(free: int, limit: int | None) -> Check:
 
     Args:
         free: memory that the process may still allocate [bytes].
-        limit: memory limit of the container [bytes]; None: no limit.
+        limit: memory limit of the process or its container [bytes]; None: no limit.
     """
     details = {"available_bytes": free, "limit_bytes": limit}
     least = free if limit is None else min(free, limit)
-    found = f"{free / 1e9:.1f} GB free" + (f", the control group allows {limit / 1e9:.1f} GB" if limit else "")
+    found = f"{free / 1e9:.1f} GB free" + (f", this process may use {limit / 1e9:.1f} GB" if limit else "")
     if least >= LOW_MEMORY_BYTES:
         return Check("memory", "ok", found, details=details)
-    hint = "end other programs" if limit is None or free < limit else "give the container more memory"
+    hint = "end other programs" if limit is None or free < limit else "raise that limit (container, `ulimit -v`)"
     return Check("memory", "warning", f"{found}: too little to train", f"{hint}, or set scene.num_envs lower", details)
 
 

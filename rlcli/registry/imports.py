@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from rlcli.errors import DependencyError, TaskError
 from rlcli.formats import FormatSpec
+from rlcli.progress import track
 from rlcli.registry.entries import Entry
 from rlcli.task import API_VERSION, TaskSpec
 from rlcli.trainers import TrainerSpec
@@ -45,7 +46,8 @@ def load_entry(entry: Entry, kind: type) -> Any:
         DependencyError: raised by the plugin itself, passed on.
     """
     try:
-        value = import_object(entry.value)
+        with track(f"plugin {entry.qualified} ({entry.value})"):
+            value = import_object(entry.value)
     except DependencyError:
         raise
     except BaseException as error:

@@ -21,7 +21,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rlcli.machine import available_cores, python_command
+from rlcli.machine import address_space, available_cores, python_command, require_address_space
 from rlcli.registry import OWN, TASKS, Entry, package_folder
 
 TIMEOUT_S = 30.0
@@ -106,7 +106,9 @@ def probe(
 
     Raises:
         InterruptedError: if `stop` was set before the end.
+        MachineError: if a limit such as `ulimit -v` leaves no room for torch.
     """
+    require_address_space()
     entries = list(entries)
     owners: dict[str, list[Entry]] = {}
     for entry in entries:
@@ -122,7 +124,7 @@ def probe(
             raise
     if stop.is_set():
         raise InterruptedError("the probe was stopped before its end")
-    if group == TASKS:
+    if group == TASKS and address_space() is None:  # with a limit on the memory, a task may only seem broken
         _update_cache({_key(entry): found[entry.qualified].record() for entry in entries})
     return {entry.qualified: found[entry.qualified] for entry in entries}
 

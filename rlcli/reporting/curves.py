@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from rlcli.config.layers import leaves
 from rlcli.config.messages import dotted
 from rlcli.errors import CheckpointError
-from rlcli.runs.metric_rows import is_number, read_rows
+from rlcli.runs.metric_rows import read_rows
 from rlcli.runs.run import STUDY, Run
 from rlcli.safe_text import shorten
 
@@ -132,7 +132,7 @@ def read_history(run: Run) -> History:
         if not all(before < now < 2**62 for before, now in zip(last, current, strict=True)):
             break
         last = current
-        numbers = {name: float(value) for name, value in row.items() if is_number(value)}
+        numbers = {name: float(value) for name, value in row.items()}
         elapsed += sum(max(0.0, numbers.get(f"Perf/{part}_time", 0.0)) for part in ("collection", "learning"))
         for name, value in zip(AXES, (current[1], current[0], elapsed), strict=True):
             axes[name].append(value)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import math
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,6 +41,25 @@ def write_synced(file: Path, data: bytes) -> None:
         handle.write(data)
         handle.flush()
         os.fsync(handle.fileno())
+
+
+def remove_leftovers(folder: Path, name: str) -> None:
+    """Remove the temporary files and folders `.NAME.tmp-PID...` of processes that have ended: they were killed."""
+    for leftover in folder.glob(f".{glob.escape(name)}.tmp-*") if os.name == "posix" else ():
+        process = re.match(r"\d+", leftover.name.rpartition(".tmp-")[2])
+        with contextlib.suppress(OSError):
+            if process is not None and not _is_running(int(process[0])):
+                shutil.rmtree(leftover) if leftover.is_dir() and not leftover.is_symlink() else leftover.unlink()
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # a process of another user
+        return True
+    return True
 
 
 def sync_folder(folder: Path) -> None:

@@ -18,7 +18,7 @@ import torch
 from pydantic import Field
 
 from rlcli.errors import CheckpointError, UsageError, VerdictError
-from rlcli.runs.atomic_io import disk_errors, sync_folder, to_json, write_synced
+from rlcli.runs.atomic_io import disk_errors, remove_leftovers, sync_folder, to_json, write_synced
 from rlcli.runs.checkpoint_manifest import layout_of
 from rlcli.runs.checkpoint_reader import FORMAT, Checkpoint, open_checkpoint, sha256
 from rlcli.runs.run import Run, TaskRecord
@@ -139,6 +139,7 @@ def _write_folder(output: Path, contents: Mapping[str, bytes], checkpoint: Check
                 if old.exists():
                     old.rename(output)
                 raise
+            remove_leftovers(output.parent, output.name)
             sync_folder(output.parent)
     finally:
         shutil.rmtree(fresh, ignore_errors=True)

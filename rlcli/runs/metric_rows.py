@@ -48,14 +48,13 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
 
 
 def parse_row(line: bytes) -> dict[str, Any] | None:
-    """Return one line as a row; None if it is not JSON with integers `iteration` and `step`."""
+    """Return the numbers of one line; None if it is not JSON with integers `iteration` and `step`."""
     try:
         row = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    if not isinstance(row, dict) or not all(type(row.get(key)) is int for key in ("iteration", "step")):
-        return None
-    return row
+    row = {name: value for name, value in row.items() if is_number(value)} if isinstance(row, dict) else {}
+    return row if all(type(row.get(key)) is int for key in ("iteration", "step")) else None
 
 
 def is_number(value: Any) -> bool:

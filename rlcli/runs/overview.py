@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import CheckpointError
-from rlcli.runs.metric_rows import is_number, parse_row
+from rlcli.runs.metric_rows import parse_row
 from rlcli.runs.run import CONFIG, RECORD, WAITING, Run, is_locked, open_run, run_folders
 from rlcli.runs.safe_io import read_tail
 
@@ -173,7 +173,7 @@ def _row(line: bytes) -> dict[str, Any] | None:
     row = parse_row(line)
     if row is None or any(count(row[key]) is None for key in ("iteration", "step")):
         return None
-    return {name: value for name, value in row.items() if is_number(value)}
+    return row
 
 
 def _row_at(run: Run, step: int) -> dict[str, Any]:

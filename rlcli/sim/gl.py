@@ -13,8 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import MachineError, one_line
+from rlcli.machine import require_address_space
 
 _PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6", "glfw": "a running display server"}
+_ADDRESS_SPACE = 2 << 30
+"""Limit of a process [bytes] below which OpenGL fails with errors that do not name the memory."""
 
 
 def opengl_import_error(error: BaseException) -> MachineError | None:
@@ -53,6 +56,7 @@ def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[A
     Raises:
         MachineError: if no backend works; the message has all that were tried and the packages to install.
     """
+    require_address_space(_ADDRESS_SPACE)
     tried = []
     backends = candidates()
     if in_thread:

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Literal
 
 from rlcli.errors import RlcliError
+from rlcli.machine import memory_error
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,12 @@ class NotRunError(Exception):
 
 
 def error_text(error: Exception) -> str:
-    """Return the message of an error as one line."""
+    """Return the message of an error of the task as one line.
+
+    Raises:
+        MachineError: for an error that means too little memory, which no change of the task corrects.
+    """
+    if too_little := memory_error(error):
+        raise too_little from error
     message = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"
     return " ".join(message.split())

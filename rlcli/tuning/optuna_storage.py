@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
-from rlcli.errors import CheckpointError, DependencyError, MachineError, UsageError, pip_install
+from rlcli.errors import CheckpointError, DependencyError, MachineError, UsageError, one_line, pip_install
 from rlcli.runs.atomic_io import disk_errors
 
 if TYPE_CHECKING:
@@ -125,14 +125,19 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
                         raise ValueError("a line is not a log entry of Optuna")
                     yield entry
             except ValueError as error:
-                raise CheckpointError(
-                    f"{file} is corrupt: {error}",
-                    hint="choose another --name for a new sweep; the runs of the trials are not damaged",
-                ) from None
+                raise _corrupt(file, error) from None
             except OSError as error:
                 raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
 
-    return JournalStorage(Backend(str(file), lock_obj=lock))
+    try:
+        return JournalStorage(Backend(str(file), lock_obj=lock))
+    except (TypeError, ValueError, LookupError, AttributeError) as error:  # of Optuna, for entries with wrong values
+        raise _corrupt(file, error) from None
+
+
+def _corrupt(file: Path, error: Exception) -> CheckpointError:
+    hint = "choose another --name for a new sweep; the runs of the trials are not damaged"
+    return CheckpointError(f"{file} is corrupt: {type(error).__name__}: {one_line(error)}", hint=hint)
 
 
 def _remove_partial_line(file: Path) -> None:
@@ -162,9 +167,10 @@ def _database(url: str) -> optuna.storages.BaseStorage:
                 return RDBStorage(url, engine_kwargs=no_pool)
             time.sleep(1.0)  # another machine creates the same tables at the same time
         return RDBStorage(url, engine_kwargs=no_pool)
-    except ModuleNotFoundError as error:
-        raise DependencyError(f"--storage needs the driver {error.name}", hint=f"pip install {error.name}") from None
-    except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError) as error:
+    except ImportError as error:
+        driver = getattr(error.__cause__ or error, "name", None) or url.partition(":")[0]
+        raise DependencyError(f"--storage needs the driver {driver}", hint=f"pip install {driver}") from None
+    except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError, ValueError, LookupError) as error:
         message = f"--storage '{without_password(url)}' is not the URL of a database: {_first_line(error)}"
         raise UsageError(message, hint="as in postgresql+psycopg://user@host/name") from None
     except (sqlalchemy.exc.SQLAlchemyError, OSError) as error:

@@ -44,6 +44,8 @@ _REQUIRED_NAMES = {
 }
 """Module of `mujoco.studio` -> the names that are used from it."""
 _MAX_MESSAGE_BYTES = 2**20
+_REQUEST_S = 10.0
+"""Time after which the server closes a connection without a complete request [s]."""
 
 
 def load() -> SimpleNamespace:
@@ -172,7 +174,7 @@ def _serve_with_checks(server: Any, port: int) -> Any:
             response.headers.update(own_headers)
             return response
 
-        settings["max_size"] = _MAX_MESSAGE_BYTES
+        settings |= {"max_size": _MAX_MESSAGE_BYTES, "open_timeout": _REQUEST_S, "close_timeout": _REQUEST_S}
         return serve(*arguments, **settings, process_request=check, process_response=respond)
 
     return serve_checked

@@ -235,6 +235,19 @@ def test_thousands_of_mistakes_are_listed_in_part_and_in_little_time(tmp_path, m
     assert len(printed) < 30_000
 
 
+NUM_ENVS = ["0", "-1", "-0", "1e12", "1e3", "1.5", "1e-5", "nan", ".nan", ".inf", "true", "null", "", "[]", "{}", "abc",
+            "0x10", "\u0661\u0662", "\uff11\uff12", "16777217", "1000000000000", "9" * 5000, "'4'", "!!int 4", "4,5",
+            "~", "-" * 10]  # fmt: skip
+
+
+@pytest.mark.parametrize("value", NUM_ENVS)
+def test_hostile_number_of_environments_is_refused(value, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["validate", "cartpole", f"scene.num_envs={value}"]) == 3
+    assert main(["eval", "cartpole", "--policy", "zero", "--num-envs", value]) in (2, 3)
+    assert "num" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("first", range(amount(1, 20, 400)))
 def test_task_files_and_overrides_of_the_grammar_end_with_a_message(first, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -228,3 +228,38 @@ def test_cartpole_training_killed_five_times_has_equal_weights(tmp_path):
     message = process.communicate()[0]
     assert process.returncode == 0, message
     assert weights(tmp_path / "killed") == weights(tmp_path / "whole")
+
+
+WRITERS = {
+    "out.gif": ("play", "cartpole", "--video", "out.gif", "-q"),
+    "out.mp4": ("play", "cartpole", "--video", "out.mp4", "-q"),
+    "out.safetensors": ("eval", "cartpole", "--episodes", 16, *SMALL[:2], "--record", "out.safetensors", "-q"),
+    "out.py": ("export", "cartpole", "--format", "numpy", "--output", "out.py", "-q"),
+    "out.onnx": ("export", "cartpole", "--output", "out.onnx", "-q"),
+    "out": ("export", "cartpole", "--format", "bundle", "--output", "out", "-q"),
+}
+
+
+def written(path):
+    return {file.name: file.read_bytes() for file in ([path] if path.is_file() else path.glob("*"))}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", chosen(list(WRITERS), 2))
+def test_killed_writer_leaves_a_complete_file_or_none(child, uninterrupted, tmp_path, name):
+    for folder in ("whole", "killed"):
+        shutil.copytree(uninterrupted("sb3-ppo")[0], tmp_path / folder / "runs" / "cartpole" / "r")
+    begin = time.monotonic()
+    assert child(tmp_path / "whole", *WRITERS[name]).ended(200).code == 0
+    took, draw, folder = time.monotonic() - begin, random.Random(32), tmp_path / "killed"
+    expected = written(tmp_path / "whole" / name)
+    for _ in range(amount(2, 5, 40)):
+        process = child(folder, *WRITERS[name])
+        time.sleep(draw.uniform(0.1, 1.0) * took)
+        os.kill(process.pid, signal.SIGKILL)
+        process.ended()
+        assert written(folder / name) in ({}, expected)
+    ended = child(folder, *WRITERS[name]).ended(200)
+    assert ended.code == 0, ended.err
+    assert written(folder / name) == expected
+    assert not list(folder.glob(".out*")), "files of the killed processes"

@@ -190,3 +190,12 @@ def test_ctrl_c_during_probe_start_kills_processes(broken_plugins, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         probe([entry for entry in catalog()[0] if entry.name == "hangs-task"], timeout_s=60.0)
     assert time.monotonic() - before < 30.0
+
+
+def test_plugin_that_hangs_is_named_by_the_progress(plugins):
+    plugins("slow", "import time\ntime.sleep(600)\n")
+    command = [sys.executable, "-m", "rlcli", "validate", "slow-task"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        line = process.stderr.readline()
+        process.kill()
+    assert line.startswith("rlcli validate: plugin slow:slow-task (slow:SPEC), 0:10 so far")

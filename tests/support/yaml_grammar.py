@@ -145,7 +145,11 @@ def complaint(code, printed, seconds):
     if seconds > SECONDS:
         return f"{seconds:.0f} s"
     for line in printed.splitlines():
-        if not re.match("error: |hint: |warning: ", line) or "hint: run" in line[:9] or "curl" in line[:15]:
+        if (
+            not re.match("error: |hint: |warning: |rlcli validate: ", line)
+            or "hint: run" in line[:9]
+            or "curl" in line[:15]
+        ):
             return f"foreign line {line[:200]!r}"
         if line.startswith("error: ") and not PLACE.match(line):
             return f"no place: {line[:300]!r}"

@@ -171,3 +171,16 @@ def test_stopped_server_frees_port_and_stdout_is_one_document(tmp_path, stop):
         assert json.loads(one.out)["error"]["kind"] == "stopped"
         assert "error: interrupted" in one.err
     assert "Traceback" not in one.err
+
+
+@pytest.mark.slow
+def test_connection_without_a_complete_request_is_closed(playing):
+    beginnings = ["", "GET ", "GET / HTTP/1.1\r\n", f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{playing.port}\r\nX: "]
+    connections = [socket.create_connection(("127.0.0.1", playing.port), timeout=PATIENCE) for _ in range(100)]
+    for number, connection in enumerate(connections):
+        connection.sendall(beginnings[number % len(beginnings)].encode())
+    for connection in connections:
+        while connection.recv(65536):  # an answer, perhaps, and then the end; without it a timeout
+            pass
+        connection.close()
+    assert status(ask(playing, "/", f"Host: 127.0.0.1:{playing.port}")) == 200

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.cli.ui.terminal import supports_styles
 from rlcli.errors import ConfigError, RlcliError
-from rlcli.safe_text import UNSAFE, message_line
+from rlcli.safe_text import UNSAFE, message_line, message_lines, without_control
 
 if TYPE_CHECKING:
     from rlcli.reporting.heat_map import HeatMap
@@ -80,12 +80,12 @@ class Console:
     def info(self, text: str) -> None:
         """Print a message about progress, unless -q is set."""
         if not self.quiet and not self.muted:
-            _write(sys.stderr, text)
+            _write(sys.stderr, message_lines(text))
 
     def detail(self, text: str) -> None:
         """Print a message if -v is set."""
         if self.verbose and not self.quiet and not self.muted:
-            _write(sys.stderr, text)
+            _write(sys.stderr, message_lines(text))
 
     def warn(self, text: str) -> None:
         """Print a non-fatal warning."""
@@ -183,7 +183,7 @@ def discard(stream: Any) -> None:
 def _write(stream: Any, text: str) -> None:
     if stream is None:  # the parent process closed it
         return
-    text = plain(text)
+    text = plain(without_control(text))
     console.clear_line()
     try:
         print(text, file=stream, flush=True)

@@ -107,13 +107,13 @@ class WorkView:
 def work_line(running: Sequence[Work]) -> str:
     """Return one line about nested work, the outermost first: what, how far, time left."""
     works = list(running)
-    counts = [f"{work.what} {work.done:,}/{work.total:,}" for work in works if work.total]
+    counts = [f"{work.what} {work.done:,}/{work.total:,}" if work.total else work.what for work in works]
     counted = [work for work in works if work.total]
     share = 0.0
     for work in reversed(counted):  # the inner work is a part of one part of the outer one
         share = max(work.fraction(), (work.done + share) / (work.total or 1))
     elapsed = time.monotonic() - counted[0].begin if counted else 0.0
-    title = "" if not works or works[0].total else f"{works[0].what}: "
+    title = "" if not works or works[0].total else f"{counts.pop(0)}: "
     if share > 0.0:
         return f"{title}{', '.join(counts)}, {share:.0%}, {clock(elapsed * (1.0 - share) / share)} left"
     since = f"{clock(time.monotonic() - works[0].begin)} so far" if works else ""
