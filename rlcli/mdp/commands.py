@@ -292,7 +292,8 @@ class UniformPose2d(EntityTerm, TensorState):
         goal = self.entity.data.root_pos_w + rotate(upright, self.command[:, :3])
         turn = self.command[:, 3]
         towards = torch.stack([torch.cos(turn), torch.sin(turn), torch.zeros_like(turn)], dim=1)
-        return [Sphere(goal, radius=0.05, label="goal"), Arrow(goal, goal + rotate(upright, 0.5 * towards), label="goal")]
+        tip = goal + rotate(upright, 0.5 * towards)
+        return [Sphere(goal, radius=0.05, label="goal"), Arrow(goal, tip, label="goal")]
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the goal position and heading."""

@@ -17,6 +17,7 @@ import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -120,7 +121,8 @@ def probe(
     workers = max(1, min(len(owners), available_cores()))
     with track("tasks and plugins", len(entries)) as work, ThreadPoolExecutor(workers) as pool:
         try:  # Ctrl-C may come while `map` still starts threads, and the first process may already run then
-            rows = pool.map(lambda owned: _probe_distribution(owned, timeout_s, group, stop, env, work), owners.values())
+            load = partial(_probe_distribution, timeout_s=timeout_s, group=group, stop=stop, env=env, work=work)
+            rows = pool.map(load, owners.values())
             found = {name: row for part in rows for name, row in part.items()}
         except BaseException:  # Ctrl-C
             stop.set()

@@ -109,7 +109,7 @@ class Rollout:
 
 
 def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollout:
-    """Run a fixed policy from `reset(seed=env.seed)` for some steps, or until an error is raised, and record the rollout."""
+    """Run a fixed policy for some steps from a reset, or until an error is raised, and record the rollout."""
     act, limits = FIXED_POLICIES[policy](env, bound), policy == "random"
     steps_of: defaultdict[str, list[Tensor]] = defaultdict(list)
     terms: defaultdict[str, list[Tensor]] = defaultdict(list)

@@ -120,7 +120,7 @@ def _check_outputs(
 def _check_shape(name: str, value: Tensor, expected: tuple[int, ...]) -> Iterator[Finding]:
     found = tuple(value.shape)
     if found != expected:
-        message = f"has shape {found}, expected {expected} for {subject.num_envs} environments"
+        message = f"has shape {found}, expected {expected} for {expected[0]} environments"
         hint = "return one row for each environment, and fill buffers in place: buf[:] = ..."
         yield error_at(name, message, hint)
 

@@ -28,7 +28,7 @@ class RewardCurves:
 
 
 class EpisodeHistory:
-    """Rewards of the shown environment in the last seconds, and returns and ends of the episodes of all environments."""
+    """Rewards of the shown environment in the last seconds; returns and ends of the episodes of all environments."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env

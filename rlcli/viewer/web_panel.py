@@ -135,7 +135,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         node, page = imgui.GetWindowDockID(), imgui.GetIO().DisplaySize
         if node and page.x != self._page_width:
             self._page_width = page.x
-            imgui.DockBuilderSetNodeSize(node, imgui.Vec2(min(_WIDTH, 0.6 * page.x), page.y))
+            imgui.DockBuilderSetNodeSize(node, imgui.Vec2(min(_WIDTH, 0.5 * page.x), page.y))
 
     def _checkpoints(self, view: View) -> None:
         if not view.checkpoints:
@@ -174,7 +174,9 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         imgui.SeparatorText(f"Episode {view.episodes + 1}")
         imgui.TextWrapped(f"{view.episode_s:.2f} s, return {view.episode_return:.4g}")
         for condition in view.conditions:
-            imgui.TextWrapped(f"success: {condition}")
+            value, _, state = condition.rpartition(": ")
+            imgui.TextWrapped(f"success: {value}")
+            imgui.BulletText(state)
         if view.last_episode:
             imgui.TextWrapped(f"last episode: {view.last_episode}")
         if view.conditions and view.episodes:
@@ -216,9 +218,9 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         self._ux.camera_index = ux.TUMBLE_CAMERA_IDX
 
     def _place(self, shown: int) -> np.ndarray:
-        """Return what the camera moves with: the environment's origin, and the way of the entity that it follows. [m]"""
+        """Return the point with which the camera moves: the environment's origin, or the followed entity. (3,) [m]"""
         if self._followed is None:
-            return self._env_origins[shown]
+            return np.asarray(self._env_origins[shown])
         body, start = self._followed
         return np.asarray(self.viewer.data.xpos[body] - start)
 
