@@ -32,7 +32,7 @@ class Robot:
         _clean(spec)
         self.model = model = spec.compile()
         self.xml, self.assets = _collect_assets(spec, file)
-        self.dt = model.opt.timestep if 0.001 <= model.opt.timestep <= 0.01 else 0.005
+        self.dt = model.opt.timestep if model.opt.timestep <= 0.01 else 0.005
         self.decimation = max(1, round(_CONTROL_DT / self.dt))
         balls = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_BALL)]
         if balls:

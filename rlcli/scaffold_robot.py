@@ -142,10 +142,8 @@ def _velocity(robot: Robot) -> dict[str, Any]:
             "tilted": {"func": "bad_orientation", "limit_angle": 1.0},
         },
         "success": {
-            "func": "velocity_tracked_on_average",
-            "command": "velocity",
-            "linear_tolerance": 0.25,
-            "angular_tolerance": 0.3,
+            "velocity": {"func": "mean_velocity_error", "command": "velocity", "at_most": 0.25},
+            "yaw_rate": {"func": "mean_yaw_rate_error", "command": "velocity", "at_most": 0.3},
         },
         "_sensors": {
             "feet": {"kind": "contact", "bodies": feet, "against": "ground"},
@@ -189,37 +187,29 @@ def _reach(robot: Robot) -> dict[str, Any]:
             "joint_vel": {"func": "joint_vel_l2", "weight": -0.001, "joints": joints},
         },
         "terminations": {"time_out": {"func": "time_out", "time_out": True}},
-        "success": {"func": "body_at_goal", **goal, "tolerance": 0.05, "hold_s": 0.5},
+        "success": {"position": {"func": "body_goal_distance", **goal, "at_most": 0.05, "hold_s": 0.5}},
     }
 
 
 def _balance(robot: Robot) -> dict[str, Any]:
     driven = [robot.name(j) for j in robot.driven]
     hinges = [j for j in robot.passive if robot.model.jnt_type[j] == SCALAR[0]] or robot.passive or robot.driven
-    held = [robot.name(j) for j in hinges]
-    values = {round(float(robot.data.qpos[robot.model.jnt_qposadr[j]]), 4) for j in hinges}
+    held: dict[float, list[str]] = {}
+    for joint in hinges:
+        held.setdefault(round(float(robot.data.qpos[robot.model.jnt_qposadr[joint]]), 4), []).append(robot.name(joint))
     every = [robot.name(j) for j in robot.joints]
     scale = {robot.name(j): short(abs(robot.effort(j))) for j in robot.driven}
     floating: dict[str, Any] = {"projected_gravity": {"func": "projected_gravity"}} if robot.free else {}
     start = {"root": {"func": "reset_root_state_uniform", "mode": "reset"}} if robot.free else {}
-    target = values.pop() if len(values) == 1 else None
-    success: dict[str, Any] = {
-        "func": "joints_near",
-        "joints": held,
-        "target": target or 0.0,
-        "tolerance": 0.2,
-        "hold_s": 1.0,
-    }
-    tilt: dict[str, Any] = {
-        "fallen": {
-            "func": "joint_pos_out_of_manual_limit",
-            "joints": held,
-            "bounds": [(target or 0.0) - 1.0, (target or 0.0) + 1.0],
-        }
-    }
-    if robot.free:
-        success = {"func": "root_upright", "hold_s": 1.0}
-        tilt = {"fallen": {"func": "bad_orientation", "limit_angle": 1.0}}
+    success: dict[str, Any] = {"upright": {"func": "root_tilt", "at_most": 0.2, "hold_s": 1.0}}
+    ends: dict[str, Any] = {"fallen": {"func": "bad_orientation", "limit_angle": 1.0}}
+    if not robot.free:
+        success, ends = {}, {}
+        for number, (target, joints) in enumerate(held.items()):
+            name = "pose" if len(held) == 1 else f"pose_{number}"
+            success[name] = {"func": "joint_error", "joints": joints, "target": target, "at_most": 0.2, "hold_s": 1.0}
+            bounds = [target - 1.0, target + 1.0]
+            ends[f"{name}_lost"] = {"func": "joint_pos_out_of_manual_limit", "joints": joints, "bounds": bounds}
     return {
         "actions": {"effort": {"func": "joint_effort", "joints": driven, "scale": scale}},
         "observations": {"policy": {**floating, **_joint_observations(every)}},
@@ -234,14 +224,14 @@ def _balance(robot: Robot) -> dict[str, Any]:
         },
         "rewards": {
             "alive": {"func": "is_alive", "weight": 1.0},
-            "pose": {"func": "joint_deviation_l1", "weight": -0.5, "joints": held},
+            "pose": {"func": "joint_deviation_l1", "weight": -0.5, "joints": [robot.name(j) for j in hinges]},
             "speed": {"func": "joint_vel_l2", "weight": -0.005, "joints": every},
             "effort": {"func": "action_l2", "weight": -0.005},
             "fall": {"func": "is_terminated", "weight": -2.0},
         },
         "terminations": {
             "time_out": {"func": "time_out", "time_out": True},
-            **(tilt if robot.free or target is not None else {}),
+            **ends,
         },
         "success": success,
     }

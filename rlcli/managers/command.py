@@ -29,6 +29,7 @@ class CommandTerm(Protocol):
     Optional members: `metrics() -> dict[str, Tensor]`, errors of following the command, (num_envs,) each, whose means
     over an episode are logged. `reset(selection)`, `state_dict` and `load_state_dict` for further state. `elements`,
     names of the columns of `command` that a person may set ("" for other columns). `limits`, their usual [low, high].
+    `units`, their units.
 
     `markers() -> list[Marker]` returns the command as arrows, spheres and frames (`rlcli.sim.markers`): positions in
     the world frame (num_envs, 3) [m], like `entity.data.root_pos_w`, and quaternions (w, x, y, z), (num_envs, 4). It is
@@ -57,6 +58,12 @@ class Knob:
     column: int
     low: float
     high: float
+    unit: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name and unit, as in `vx [m/s]`."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
 class CommandManager(TensorState):
@@ -91,12 +98,12 @@ class CommandManager(TensorState):
         for term in self.terms:
             width = term.instance.command.shape[1]
             names = getattr(term.instance, "elements", None) or [f"{term.name}[{column}]" for column in range(width)]
-            limits = list(getattr(term.instance, "limits", ()))
+            limits, units = list(getattr(term.instance, "limits", ())), getattr(term.instance, "units", ())
             for column, name in enumerate(names[:width]):
                 low, high = limits[column] if column < len(limits) else (-1.0, 1.0)
                 low, high = (float(low), float(high)) if float(high) > float(low) else (-1.0, 1.0)
                 if name:
-                    found.append(Knob(name, term.name, column, low, high))
+                    found.append(Knob(name, term.name, column, low, high, units[column] if column < len(units) else ""))
         counts = Counter(knob.name for knob in found)
         return [replace(knob, name=f"{knob.term}.{knob.name}") if counts[knob.name] > 1 else knob for knob in found]
 
@@ -121,8 +128,12 @@ class CommandManager(TensorState):
         else:
             self.held[knob.name], self._held_knobs[knob.name] = value, knob
 
+    def value(self, knob: Knob, env_id: int) -> float:
+        """Return the command of one environment in a column."""
+        return float(self._by_name[knob.term].instance.command[env_id, knob.column])
+
     def markers(self) -> list[Marker]:
-        """Return the markers of all terms.
+        """Return the markers of all terms; one without a label has the term's name.
 
         Raises:
             ConfigError: for a value that is not a marker with one row for each environment.
@@ -132,7 +143,7 @@ class CommandManager(TensorState):
             markers = list(term.instance.markers()) if hasattr(term.instance, "markers") else []
             for marker in markers:
                 _require_marker(term, marker, len(self._steps))
-            found += markers
+            found += [marker if marker.label else marker._replace(label=term.name) for marker in markers]
         return found
 
     def get_command(self, name: str) -> Tensor:

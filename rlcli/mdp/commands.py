@@ -38,6 +38,7 @@ class _VelocityCommand(EntityTerm, TensorState):
     """Base class of velocity commands: `_drawn` holds the samples, `command` the values after heading and standing."""
 
     elements = ("vx", "vy", "wz")
+    units = ("m/s", "m/s", "rad/s")
 
     rel_standing: float = 0.0
 
@@ -76,9 +77,10 @@ class _VelocityCommand(EntityTerm, TensorState):
         """
         data = self.entity.data
         actual = torch.cat([data.root_lin_vel_b[:, :2], data.root_ang_vel_b[:, 2:]], dim=1)
-        return [*self._arrows(self.command, COMMANDED, 0.5), *self._arrows(actual, ACTUAL, 0.45)]
+        commanded = self._arrows(self.command, COMMANDED, 0.5, "commanded velocity")
+        return [*commanded, *self._arrows(actual, ACTUAL, 0.45, "actual velocity")]
 
-    def _arrows(self, velocity: Tensor, color: Color, height: float) -> list[Marker]:
+    def _arrows(self, velocity: Tensor, color: Color, height: float, label: str) -> list[Marker]:
         """Return the arrows of a velocity (vx, vy, wz), at a height above the root [m]."""
         data = self.entity.data
         vx, vy, wz = velocity.unbind(1)
@@ -89,7 +91,8 @@ class _VelocityCommand(EntityTerm, TensorState):
 
         above = data.root_pos_w + torch.tensor([0.0, 0.0, height], device=velocity.device)
         ahead = above + in_world(zero + _ARM, zero)
-        return [Arrow(above, above + in_world(vx, vy), color), Arrow(ahead, ahead + in_world(zero, wz * _ARM), color)]
+        ways = ((above, above + in_world(vx, vy)), (ahead, ahead + in_world(zero, wz * _ARM)))
+        return [Arrow(start, end, color, label=label) for start, end in ways]
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the samples."""
@@ -179,6 +182,7 @@ class UniformPose(EntityTerm):
     """
 
     elements = ("x", "y", "z", "", "", "", "")
+    units = ("m", "m", "m")
 
     bodies: Bodies
     x: Range
@@ -235,7 +239,7 @@ class UniformPose(EntityTerm):
     def markers(self) -> list[Marker]:
         """Return a green sphere at the goal, and the axes of the goal pose."""
         position, quat = self.pose_w
-        return [Sphere(position), Frame(position, quat)]
+        return [Sphere(position, label="goal"), Frame(position, quat, label="goal")]
 
 
 @dataclass(kw_only=True, eq=False)
@@ -248,6 +252,7 @@ class UniformPose2d(EntityTerm, TensorState):
     """
 
     elements = ("ahead", "left", "", "turn")
+    units = ("m", "m", "m", "rad")
 
     x: Range
     y: Range
@@ -287,7 +292,8 @@ class UniformPose2d(EntityTerm, TensorState):
         goal = self.entity.data.root_pos_w + rotate(upright, self.command[:, :3])
         turn = self.command[:, 3]
         towards = torch.stack([torch.cos(turn), torch.sin(turn), torch.zeros_like(turn)], dim=1)
-        return [Sphere(goal, radius=0.05), Arrow(goal, goal + rotate(upright, 0.5 * towards))]
+        tip = goal + rotate(upright, 0.5 * towards)
+        return [Sphere(goal, radius=0.05, label="goal"), Arrow(goal, tip, label="goal")]
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the goal position and heading."""

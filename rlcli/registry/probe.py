@@ -1,7 +1,7 @@
-"""Details of tasks for `list-tasks`, read from a cache that `list-tasks --probe` fills.
+"""Details of tasks for `list-tasks`, read from a cache; `probe` loads tasks in other processes and fills the cache.
 
 A distribution may ship the details as `index.json` in its top-level package, as the built-in tasks do. The details of
-other tasks are in the user's cache folder, under the distribution's name, version and time of installation.
+other tasks are in the user's cache folder, under the distribution's name and version, and the time of its last change.
 """
 
 from __future__ import annotations
@@ -17,14 +17,17 @@ import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from rlcli.machine import address_space, available_cores, python_command, require_address_space
+from rlcli.progress import Work, track
 from rlcli.registry import OWN, TASKS, Entry, package_folder
 
 TIMEOUT_S = 30.0
+_SUFFIXES = (".py", ".yaml", ".xml")
 _BUILDER = "rlcli.envs.describe_plugins"
 """Module that loads the tasks. It runs in a separate process because plugins may hang or crash, and because the layer
 `envs` must not be imported from here."""
@@ -78,8 +81,10 @@ def cached_details(entries: Iterable[Entry]) -> dict[str, Details]:
 def _known_details(entry: Entry, cache: dict[str, Any]) -> Details | None:
     folder = package_folder(entry)
     shipped = _parse_details(_read_json(folder / "index.json").get(entry.name)) if folder else None
+    if entry.distribution == OWN:
+        return shipped
     probed = _parse_details(cache.get(_key(entry)))
-    if entry.distribution != OWN and probed is not None and probed.broken:
+    if probed is not None and probed.broken:
         return probed  # the task is broken on this machine, whatever the plugin's own index says
     return shipped or probed
 
@@ -115,9 +120,11 @@ def probe(
         owners.setdefault(entry.distribution, []).append(entry)
     stop = stop or threading.Event()
     env = {name: value for name, value in os.environ.items() if name not in without}
-    with ThreadPoolExecutor(max(1, min(len(owners), available_cores()))) as pool:
+    workers = max(1, min(len(owners), available_cores()))
+    with track("tasks and plugins", len(entries)) as work, ThreadPoolExecutor(workers) as pool:
         try:  # Ctrl-C may come while `map` still starts threads, and the first process may already run then
-            rows = pool.map(lambda owned: _probe_distribution(owned, timeout_s, group, stop, env), owners.values())
+            load = partial(_probe_distribution, timeout_s=timeout_s, group=group, stop=stop, env=env, work=work)
+            rows = pool.map(load, owners.values())
             found = {name: row for part in rows for name, row in part.items()}
         except BaseException:  # Ctrl-C
             stop.set()
@@ -139,14 +146,16 @@ def _update_cache(details: dict[str, Any]) -> None:
 
 
 def _probe_distribution(
-    entries: list[Entry], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str]
+    entries: list[Entry], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str], work: Work
 ) -> dict[str, Details]:
     """Load the entries of one distribution, in as many processes as needed."""
     found: dict[str, Details] = {}
     while remaining := [entry.qualified for entry in entries if entry.qualified not in found]:
         if stop.is_set():
             break
-        found.update(_probe_names(remaining, timeout_s, group, stop, env))
+        rows = _probe_names(remaining, timeout_s, group, stop, env)
+        found.update(rows)
+        work.advance(len(rows))
     return found
 
 
@@ -238,16 +247,19 @@ def signal_name(number: int) -> str:
 
 
 def _key(entry: Entry) -> str:
-    return f"{entry.qualified} {entry.version} {_fingerprint(entry.distribution)}"
+    return f"{entry.qualified} {entry.version} {_last_change(entry)}"
 
 
-def _fingerprint(distribution: str) -> str:
-    """Return the modification time of the distribution's RECORD, which changes when it is installed again."""
-    try:
-        folder = Path(str(getattr(metadata.distribution(distribution), "_path", "")))
-        return str((folder / "RECORD").stat().st_mtime_ns)
-    except (OSError, metadata.PackageNotFoundError):
-        return "0"
+def _last_change(entry: Entry) -> int:
+    """Return the time at which the distribution was installed, or a file of its package was edited last [ns]."""
+    files = [file for suffix in _SUFFIXES for file in (package_folder(entry) or Path("/none")).rglob(f"*{suffix}")]
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        files.append(Path(str(getattr(metadata.distribution(entry.distribution), "_path", ""))) / "RECORD")
+    times = [0]
+    for file in files:
+        with contextlib.suppress(OSError):
+            times.append(file.stat().st_mtime_ns)
+    return max(times)
 
 
 def _cache_file() -> Path:

@@ -28,6 +28,8 @@ class Arrow(NamedTuple):
     color: Color = COMMANDED
     radius: float = 0.015
     """Radius of the shaft [m]."""
+    label: str = ""
+    """Meaning of the marker, for the legend of viewers."""
 
 
 class Sphere(NamedTuple):
@@ -38,6 +40,8 @@ class Sphere(NamedTuple):
     color: Color = COMMANDED
     radius: float = 0.02
     """Radius [m]."""
+    label: str = ""
+    """Meaning of the marker, for the legend of viewers."""
 
 
 class Frame(NamedTuple):
@@ -49,6 +53,8 @@ class Frame(NamedTuple):
     """Orientation (w, x, y, z), of length 1. (num_envs, 4)"""
     length: float = 0.1
     """Length of each axis [m]."""
+    label: str = ""
+    """Meaning of the marker, for the legend of viewers."""
 
 
 Marker: TypeAlias = Arrow | Sphere | Frame

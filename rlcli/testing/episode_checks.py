@@ -20,11 +20,10 @@ from rlcli.testing.steps import (
     record_outputs,
     step_outputs,
 )
-from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, column_names, engine_state, expire_episodes, task_of
+from rlcli.testing.task_under_test import TaskUnderTest, column_names, engine_state, expire_episodes, task_of
 
 _ENDING = [1, 4, 5]
 """Environments whose episodes are ended while the episodes of the others continue."""
-_RUNNING = [row for row in range(NUM_ENVS) if row not in _ENDING]
 _LIMITS = (6, 9)
 """Two episode lengths [steps]; an end that occurs at both follows the limit."""
 
@@ -81,11 +80,11 @@ def _difference(env: VecEnv, output: str, a: Tensor, b: Tensor, when: str) -> tu
 def start_states(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that start states differ between environments and between episodes."""
     env = subject.env()
-    first = _start(env, env.reset(seed=0))
+    first = _start(env, env.reset(seed=env.seed))
     second = _start(env, env.reset())
     hint = "add an event of mode reset with a range (reset_joints_by_offset), or draws(env_ids).uniform in reset_idx"
     if bool((first == first[0]).all()):
-        message = f"the start states of {NUM_ENVS} environments are all the same; they must vary"
+        message = f"the start states of {env.num_envs} environments are all the same; they must vary"
         yield error_at("between environments", message, hint)
     if bitwise_equal(first, second):
         message = "two episodes in a row start in the same states; they must vary"
@@ -110,7 +109,7 @@ class _EnvPair:
         self._actions, self._steps, self._scale = random_actions(self.kept, subject.bound), 0, scale
         for env in (self.kept, self.ended):
             torch.manual_seed(0)
-            env.reset(seed=0)
+            env.reset(seed=env.seed)
 
     def step(self, count: int = 1) -> tuple[StepResult, StepResult]:
         """Make steps with the next actions; return the results of the last one."""
@@ -140,7 +139,7 @@ def partial_reset(subject: TaskUnderTest) -> Iterator[Finding]:
         pairs = {name: (value, engine_state(pair.ended)[name]) for name, value in engine_state(pair.kept).items()}
         pairs |= {name: (value, step_outputs(ended)[name]) for name, value in step_outputs(kept).items()}
         for name, (a, b) in pairs.items():
-            rows = [row for row in _RUNNING if not bitwise_equal(a[row], b[row])]
+            rows = [row for row in range(subject.num_envs) if row not in _ENDING and not bitwise_equal(a[row], b[row])]
             if rows:
                 later = f", {number} steps later" if number else ""
                 where = "the simulation's state" if name == "state" else name
@@ -174,10 +173,10 @@ def _episode_ends(subject: TaskUnderTest, limit: int) -> list[EndedEpisode]:
     If an episode exceeds the limit, the last item stands for it, with a length of `limit + 1`.
     """
     env = subject.env(episode_steps=limit)
-    env.reset(seed=0)
+    env.reset(seed=env.seed)
     ends = []
     for _ in range(2 * limit + 2):
-        ends += ended_episodes(env.step(torch.zeros(NUM_ENVS, env.layout.action_size)))
+        ends += ended_episodes(env.step(torch.zeros(env.num_envs, env.layout.action_size)))
         if bool((env.episode_length_buf >= limit).any()):
             ends.append(EndedEpisode(0, limit + 1, False, False, ()))
             break
@@ -245,7 +244,7 @@ def termination(subject: TaskUnderTest) -> Iterator[Finding]:
     for before in (0, 1):
         reached = [[e for e in ends if e.length >= limit - before] for limit, ends in ends_of.items()]
         by_clock = [
-            len(ends) >= NUM_ENVS and all(e.terminated and e.length == limit - before for e in ends)
+            len(ends) >= subject.num_envs and all(e.terminated and e.length == limit - before for e in ends)
             for limit, ends in zip(ends_of, reached, strict=True)
         ]
         if all(by_clock):
@@ -257,7 +256,7 @@ def termination(subject: TaskUnderTest) -> Iterator[Finding]:
             return
     ended = [result.episodes for result in subject.recording().steps if result.episodes is not None]
     lengths = [n for e in ended for n, out in zip(e.lengths.tolist(), e.truncated.tolist(), strict=True) if not out]
-    if len(lengths) >= NUM_ENVS and len(set(lengths)) == 1 and lengths[0] > 1:
+    if len(lengths) >= subject.num_envs and len(set(lengths)) == 1 and lengths[0] > 1:
         message = f"all {len(lengths)} terminations under random actions came after exactly {lengths[0]} steps: a timer"
         yield warning_at("terminations", message, hint)
 
@@ -305,7 +304,8 @@ def observation_after_reset(subject: TaskUnderTest) -> Iterator[Finding]:
     task.get_observations = recorded  # type: ignore[method-assign]
     result = pair.step()[1]
     over = (result.terminated | result.truncated).tolist()
-    running = [row for row in _RUNNING if not over[row]]  # an episode of these may end in this step too
+    # an episode of the others may end in this step too
+    running = [row for row in range(subject.num_envs) if row not in _ENDING and not over[row]]
     for before, after in pairwise(observations):
         rows = [row for row in running if not bitwise_equal(before[row], after[row])]
         if rows:

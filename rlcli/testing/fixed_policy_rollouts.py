@@ -17,7 +17,6 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.testing.steps import EndedEpisode, ended_episodes
 from rlcli.testing.task_under_test import TaskUnderTest, element_names
 
-NUM_ENVS = 16
 MAX_STEPS = 1000
 """Longest rollout if no duration is given [steps]."""
 FixedPolicy = Callable[[int], Tensor]
@@ -36,14 +35,14 @@ def zero(env: VecEnv, bound: float) -> FixedPolicy:
 
 def uniform(env: VecEnv, bound: float) -> FixedPolicy:
     """Return a policy that samples each action uniformly within the bound."""
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(env.seed)
     shape = (env.num_envs, env.layout.action_size)
     return lambda step: (torch.rand(shape, generator=generator) * 2.0 - 1.0) * bound
 
 
 def bang_bang(env: VecEnv, bound: float) -> FixedPolicy:
     """Return a policy whose columns are at the bound and change sign at random times."""
-    generator = torch.Generator().manual_seed(1)
+    generator = torch.Generator().manual_seed(env.seed + 1)
     shape = (env.num_envs, env.layout.action_size)
     sign = torch.where(torch.rand(shape, generator=generator) < 0.5, -1.0, 1.0)
     switches = min(0.5, env.step_dt / SWITCH_S)
@@ -57,7 +56,7 @@ def bang_bang(env: VecEnv, bound: float) -> FixedPolicy:
 
 def sine(env: VecEnv, bound: float) -> FixedPolicy:
     """Return a policy of sines as high as the bound, each column with its own frequency and phase."""
-    generator = torch.Generator().manual_seed(2)
+    generator = torch.Generator().manual_seed(env.seed + 2)
     frequency, phase = torch.rand(2, env.num_envs, env.layout.action_size, generator=generator).unbind(0)
     low, high = SINE_HZ
     turn = 2.0 * math.pi * env.step_dt * (low + (high - low) * frequency)
@@ -100,7 +99,7 @@ class Rollout:
 
 
 def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollout:
-    """Run a fixed policy from `reset(seed=0)` for some steps, or until an error is raised, and record the rollout."""
+    """Run a fixed policy for some steps from a reset, or until an error is raised, and record the rollout."""
     act, limits = FIXED_POLICIES[policy](env, bound), policy == "random"
     steps_of: defaultdict[str, list[Tensor]] = defaultdict(list)
     terms: defaultdict[str, list[Tensor]] = defaultdict(list)
@@ -110,7 +109,7 @@ def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollou
     physics = _PhysicsObserver(env, limits=limits)
     with env.observers.added(physics):
         try:
-            _append(obs, env.reset(seed=0))
+            _append(obs, env.reset(seed=env.seed))
             for step in range(steps):
                 action = act(step)
                 result = env.step(action)
@@ -221,8 +220,10 @@ class RolloutEvidence:
         """Whether a recorded rollout ended in an error."""
         return any(rollout.error is not None for rollout in self._rollouts or ())
 
-    def env(self, num_envs: int = NUM_ENVS, **settings: Any) -> VecEnv:
+    def env(self, num_envs: int | None = None, **settings: Any) -> VecEnv:
         """Return a new environment with further settings; in their names `__` stands for a dot."""
         flags = {key.replace("__", "."): value for key, value in settings.items()}
         # all cores: the number of engine threads does not change the results
-        return self.subject.env(flags={"scene.num_envs": num_envs, "sim.engine_threads": None, **flags})
+        return self.subject.env(
+            flags={"scene.num_envs": num_envs or self.subject.num_envs, "sim.engine_threads": None, **flags}
+        )

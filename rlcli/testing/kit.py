@@ -16,7 +16,7 @@ from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError
 from rlcli.progress import tracked
 from rlcli.testing import episode_checks, portability_checks, step_and_file_checks
 from rlcli.testing.findings import Finding, NotRunError, error_text
-from rlcli.testing.task_under_test import TaskUnderTest, open_task
+from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, open_task
 
 Check = Callable[[TaskUnderTest], Iterable[Finding]]
 OnCheck = Callable[[str, "list[Finding] | None"], None]
@@ -46,6 +46,8 @@ def check_task(
     agent: str | None = None,
     overrides: Sequence[str] = (),
     config: Path | None = None,
+    num_envs: int = NUM_ENVS,
+    seed: int = 0,
     only: Sequence[str] = (),
     on_check: OnCheck = lambda name, findings: None,
     on_note: OnNote = lambda name, text: None,
@@ -57,6 +59,8 @@ def check_task(
         agent: the agent whose changes to the task and action bound are used; None: the default agent.
         overrides: `key.path=value`, as on the command line.
         config: a further configuration file, as that of `--config`.
+        num_envs: number of environments, whatever the task's number is; at least 8.
+        seed: seed of the environments and of the actions.
         only: names of checks to run; all if empty.
         on_check: called after each check with its name and findings; with None for a check that was not run.
         on_note: called after a check with its name and a note: why it was not run, or what it measured.
@@ -65,13 +69,13 @@ def check_task(
         Violations of the contract; empty if there are none.
 
     Raises:
-        UsageError: for a check that does not exist.
+        UsageError: for a check that does not exist, or fewer than 8 environments.
         ConfigError: if the files are not valid; `rlcli validate` prints the same errors.
         TaskError: if there is no such task, or it cannot be imported.
     """
     for name in only:
         require_known(name, list(CHECKS), "check", "checks")
-    subject = open_task(task, agent, overrides, config)
+    subject = open_task(task, agent, overrides, config, num_envs, seed)
     selected = [n for n in CHECKS if (not only or n in only) and (subject.is_direct or n not in _DIRECT_ONLY)]
     found: list[Finding] = []
     with torch.random.fork_rng(devices=[]):
@@ -106,7 +110,7 @@ def record_layout(
         ConfigError: if the task is not valid.
         TaskError: if there is no such task, or it cannot be imported.
     """
-    subject = open_task(task, agent, overrides, config)
+    subject = open_task(task, agent, overrides, config, NUM_ENVS, 0)
     record, file = subject.env().layout.record(), portability_checks.layout_file(subject)
     columns = {part: record[part] for part in ("observations", "actions")}
     file.write_text(json.dumps(columns, indent=1) + "\n", encoding="utf-8")

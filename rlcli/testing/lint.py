@@ -31,6 +31,8 @@ def lint_task(
     agent: str | None = None,
     overrides: Sequence[str] = (),
     config: Path | None = None,
+    num_envs: int = 16,
+    seed: int = 0,
     seconds: float | None = None,
     only: Sequence[str] = (),
     ignore: Sequence[str] = (),
@@ -43,6 +45,8 @@ def lint_task(
         agent: the agent whose changes to the task, action bound and discount are used; None: the default agent.
         overrides: `key.path=value`, as on the command line.
         config: a further configuration file, as that of `--config`.
+        num_envs: number of environments of each rollout, whatever the task's number is; at least 8.
+        seed: seed of the environments and of the fixed policies.
         seconds: simulated time of each rollout [s]; None: one episode, but at most 1000 steps.
         only: names of rules; all if empty.
         ignore: names of rules that are left out.
@@ -52,7 +56,7 @@ def lint_task(
         Obstacles to learning; empty if there are none.
 
     Raises:
-        UsageError: for a rule that does not exist.
+        UsageError: for a rule that does not exist, or fewer than 8 environments.
         ConfigError: if the task is not valid; `rlcli validate --deep` prints the same errors.
         TaskError: if there is no such task, or it cannot be imported.
     """
@@ -60,7 +64,7 @@ def lint_task(
         require_known(name, list(RULES), "rule", "rules")
     if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
         raise UsageError(f"--seconds {seconds:g} is not a duration", hint="give simulated seconds, above 0")
-    evidence = RolloutEvidence(open_task(task, agent, overrides, config), seconds)
+    evidence = RolloutEvidence(open_task(task, agent, overrides, config, num_envs, seed), seconds)
     found: list[Remark] = []
     with torch.random.fork_rng(devices=[]):
         for name in tracked(RULES, "rules", len(RULES)):

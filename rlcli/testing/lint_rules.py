@@ -245,7 +245,7 @@ DEAD = 1e-6
 def dead_action(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that every column of the action changes the state."""
     env = evidence.env(8)
-    env.reset(seed=0)
+    env.reset(seed=env.seed)
     start = env.state_dict()
     steps = max(5, math.ceil(0.1 / env.step_dt))
     bound = evidence.subject.bound
@@ -291,7 +291,7 @@ def timestep(evidence: RolloutEvidence) -> Iterator[Remark]:
         yield error_at(where, message, hint, {"diverged": sum(diverged.values())})
         return
     env = evidence.env(8)
-    env.reset(seed=0)
+    env.reset(seed=env.seed)
     for step in range(5):
         env.step(FIXED_POLICIES["random"](env, evidence.subject.bound)(step))
     drift = energy_drift(env)

@@ -28,7 +28,7 @@ from rlcli.testing.episode_checks import compare_trajectories
 from rlcli.testing.findings import Finding, NotRunError, error_at, warning_at
 from rlcli.testing.host_sync import HostSyncError, HostSyncGuard
 from rlcli.testing.steps import bitwise_equal, random_actions, record_outputs, step_outputs
-from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, element_names, task_of
+from rlcli.testing.task_under_test import TaskUnderTest, element_names, task_of
 
 STEPS = 16
 EPISODE = 12
@@ -71,7 +71,7 @@ def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
         make = error_at
         hint = "compute each row only from its environment; torch's sum over dim 0, atan2 and pow round differently for"
         hint += " other sizes (rlcli.sim.rotations has an atan2 that does not)"
-    message = f"differs between {NUM_ENVS} and {FEW} environments{reason}"
+    message = f"differs between {subject.num_envs} and {FEW} environments{reason}"
     yield from compare_trajectories(many, (of_many, of_few), message, hint, make)
 
 
@@ -80,12 +80,12 @@ def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
 
 def checkpoint(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that a restored environment continues bit-identically: terms, commands and curriculum included."""
-    env, other = subject.env(episode_steps=EPISODE), subject.env(episode_steps=EPISODE, seed=1)
+    env, other = subject.env(episode_steps=EPISODE), subject.env(episode_steps=EPISODE)
     actions = list(random_actions(env, subject.bound, 7 + STEPS))
-    other.reset(seed=1)
+    other.reset(seed=subject.seed + 1)
     for action in actions[-3:]:
         other.step(action.clone())  # so that its state differs before it is restored
-    env.reset(seed=0)
+    env.reset(seed=env.seed)
     for action in actions[:7]:
         result = env.step(action.clone())
     saved = env.state_dict()
@@ -191,7 +191,7 @@ def speed(subject: TaskUnderTest) -> Iterator[Finding]:
     for count in (SMALL, LARGE):
         env = subject.env(flags={"scene.num_envs": count})
         action = torch.zeros(count, env.layout.action_size)
-        env.reset(seed=0)
+        env.reset(seed=env.seed)
         env.step(action.clone())
         env.step(action.clone())  # two steps for everything that is created lazily
         start = time.perf_counter()
@@ -228,7 +228,7 @@ def _count_lines(env: VecEnv, action: Tensor) -> Counter[tuple[str, int]]:
     sys.settrace(count)
     try:
         env.step(action)
-        env.reset(seed=0)
+        env.reset(seed=env.seed)
     finally:
         sys.settrace(before)
     return counts
@@ -249,7 +249,7 @@ def engines(subject: TaskUnderTest) -> Iterator[Finding]:
     outputs = []
     for one in (env, warp):
         torch.manual_seed(0)  # draws from torch's own generator are checked by `same-seed`
-        outputs.append((one.reset(seed=0), step_outputs(one.step(action.clone()))))
+        outputs.append((one.reset(seed=one.seed), step_outputs(one.step(action.clone()))))
     warp.check()
     for when, cpu, gpu in zip(("at the start", "after a step"), *outputs, strict=True):
         for name, values in cpu.items():
@@ -277,7 +277,7 @@ def captured(subject: TaskUnderTest) -> Iterator[Finding]:
             raise NotRunError("reset_idx takes ids, so a GPU cannot record it; `reset(selection)` could be recorded")
     env = _warp_env(subject)
     action = torch.zeros(FEW_WORLDS, env.layout.action_size)
-    env.reset(seed=0)
+    env.reset(seed=env.seed)
     env.step(action)
     try:
         with HostSyncGuard():  # type: ignore[no-untyped-call]  # torch has no type here

@@ -24,7 +24,7 @@ from rlcli.scene.untrusted_mjcf import model_roots, read_mjcf
 from rlcli.testing import steps
 from rlcli.testing.findings import Finding, error_at, warning_at
 from rlcli.testing.steps import STEPS, record, step_outputs
-from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, observation_parts, task_of
+from rlcli.testing.task_under_test import TaskUnderTest, observation_parts, task_of
 
 
 def names(subject: TaskUnderTest) -> Iterator[Finding]:
@@ -102,19 +102,19 @@ def _check_outputs(
     """Apply a check of (name, tensor, expected shape) to the task's own outputs; if they pass, to those of a step."""
     recording = subject.recording()
     layout = recording.env.layout
-    own = [(name, value, (NUM_ENVS, *shape)) for name, value, shape in _task_outputs(recording.env)]
+    own = [(name, value, (subject.num_envs, *shape)) for name, value, shape in _task_outputs(recording.env)]
     findings = [finding for output in own for finding in check(*output)]
     if findings or not recording.steps:
         return findings  # a defect of the task's own outputs causes the same defect in the step's outputs
-    shapes = {f"observation '{group}'": (NUM_ENVS, layout.size(group)) for group in layout.observations}
+    shapes = {f"observation '{group}'": (subject.num_envs, layout.size(group)) for group in layout.observations}
     outputs = step_outputs(recording.steps[-1])
-    return [f for name, value in outputs.items() for f in check(name, value, shapes.get(name, (NUM_ENVS,)))]
+    return [f for name, value in outputs.items() for f in check(name, value, shapes.get(name, (subject.num_envs,)))]
 
 
 def _check_shape(name: str, value: Tensor, expected: tuple[int, ...]) -> Iterator[Finding]:
     found = tuple(value.shape)
     if found != expected:
-        message = f"has shape {found}, expected {expected} for {NUM_ENVS} environments"
+        message = f"has shape {found}, expected {expected} for {expected[0]} environments"
         hint = "return one row for each environment, and fill buffers in place: buf[:] = ..."
         yield error_at(name, message, hint)
 
@@ -184,7 +184,7 @@ def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
             values = obs[:, :, columns]
             if bool((values == values[0, 0]).all()) and where not in fixed:
                 value = f"is {float(values[0, 0]):g}" if values.shape[2] == 1 else "is the same"
-                message = f"{value} in {NUM_ENVS} environments and {len(obs)} observations"
+                message = f"{value} in {subject.num_envs} environments and {len(obs)} observations"
                 hint = "compute the column from the state, or leave it out: a policy cannot learn from it"
                 yield error_at(where, message, hint)
 

@@ -60,8 +60,8 @@ def ended_episodes(result: StepResult) -> list[EndedEpisode]:
 
 
 def random_actions(env: VecEnv, bound: float, steps: int = STEPS) -> Iterator[Tensor]:
-    """Yield uniform actions within the bound. They have a fixed seed. (num_envs, a)"""
-    generator = torch.Generator().manual_seed(0)
+    """Yield uniform actions within the bound. They follow from the environment's seed. (num_envs, a)"""
+    generator = torch.Generator().manual_seed(env.seed)
     for _ in range(steps):
         yield (torch.rand(env.num_envs, env.layout.action_size, generator=generator) * 2.0 - 1.0) * bound
 
@@ -82,7 +82,7 @@ def record(env: VecEnv, actions: Iterator[Tensor]) -> Recording:
     """Step an environment until the actions end or an error is raised."""
     recording = Recording(env)
     try:
-        obs = env.reset(seed=0)
+        obs = env.reset(seed=env.seed)
         recording.obs.append(_copy(obs))
         previous = {f"observation '{group}'": value for group, value in obs.items()}
         copies = _copy(previous)
@@ -107,8 +107,8 @@ def record(env: VecEnv, actions: Iterator[Tensor]) -> Recording:
 
 
 def record_outputs(env: VecEnv, actions: Iterator[Tensor]) -> list[dict[str, Tensor]]:
-    """Return copies of all outputs of `reset(seed=0)` and of the following steps."""
-    trajectory = [{f"observation '{group}'": value.clone() for group, value in env.reset(seed=0).items()}]
+    """Return copies of all outputs of `reset(seed=env.seed)` and of the following steps."""
+    trajectory = [{f"observation '{group}'": value.clone() for group, value in env.reset(seed=env.seed).items()}]
     trajectory += [_copy(step_outputs(env.step(action))) for action in actions]
     return trajectory
 

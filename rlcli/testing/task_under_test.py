@@ -14,20 +14,27 @@ from rlcli.config.load import Resolved, agent_names, resolve
 from rlcli.envs.direct import DirectEnv, DirectTask
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import DependencyError
+from rlcli.errors import DependencyError, UsageError
 from rlcli.registry import TaskSource, find_task
 from rlcli.testing.steps import Recording, random_actions, record
 
 NUM_ENVS = 8
+"""Environments of a check, and the fewest that `--num-envs` allows."""
 
 
 class TaskUnderTest:
     """Task as in training, but with few environments and one engine thread."""
 
     def __init__(
-        self, source: TaskSource, agent: str | None = None, overrides: Sequence[str] = (), config: Path | None = None
+        self,
+        source: TaskSource,
+        agent: str | None = None,
+        overrides: Sequence[str] = (),
+        config: Path | None = None,
+        num_envs: int = NUM_ENVS,
+        seed: int = 0,
     ) -> None:
-        self.source = source
+        self.source, self.num_envs, self.seed = source, num_envs, seed
         self._agent, self._overrides, self._config = agent, tuple(overrides), config
         # the configuration must be valid without our flags, and for playing
         resolve(source, agent=agent, config_file=config, overrides=overrides)
@@ -47,18 +54,17 @@ class TaskUnderTest:
         """Largest action of the checks: the agent's bound, or 1 if it has none."""
         return (self.resolved.agent and self.resolved.agent.action_bound) or 1.0
 
-    def env(self, *, episode_steps: int | None = None, seed: int = 0, flags: Mapping[str, Any] | None = None) -> VecEnv:
+    def env(self, *, episode_steps: int | None = None, flags: Mapping[str, Any] | None = None) -> VecEnv:
         """Return a new environment of the task.
 
         Args:
             episode_steps: length of an episode [steps]; None: the task's.
-            seed: seed of the environment.
             flags: further settings by dotted key.
         """
         settings = dict(flags or {})
         if episode_steps is not None:
             settings["episode_length_s"] = episode_steps * self.resolved.task.step_dt
-        return make_env(self._resolve(settings), seed=seed)
+        return make_env(self._resolve(settings), seed=self.seed)
 
     def recording(self) -> Recording:
         """Return 200 steps of random actions; only the first call raises the error that ended them, if there is one."""
@@ -88,17 +94,24 @@ class TaskUnderTest:
         return agents
 
     def _resolve(self, flags: dict[str, Any]) -> Resolved:
-        values = {"scene.num_envs": NUM_ENVS, "sim.engine_threads": 1, **flags}
+        values = {"scene.num_envs": self.num_envs, "sim.engine_threads": 1, **flags}
         agent, config = self._agent, self._config
         return resolve(self.source, agent=agent, config_file=config, overrides=self._overrides, flags=values)
 
 
 def open_task(
-    task: str | Path, agent: str | None, overrides: Sequence[str], config: Path | None = None
+    task: str | Path, agent: str | None, overrides: Sequence[str], config: Path | None, num_envs: int, seed: int
 ) -> TaskUnderTest:
-    """Open a task by its name, or by the path of its folder."""
+    """Open a task by its name, or by the path of its folder.
+
+    Raises:
+        UsageError: for fewer than `NUM_ENVS` environments.
+    """
+    if num_envs < NUM_ENVS:
+        hint = f"give at least {NUM_ENVS}: some episodes end while others continue"
+        raise UsageError(f"{num_envs} environments are too few", hint=hint)
     name = str(task.resolve()) if isinstance(task, Path) else task
-    return TaskUnderTest(find_task(name), agent, overrides, config)
+    return TaskUnderTest(find_task(name), agent, overrides, config, num_envs, seed)
 
 
 def expire_episodes(env: VecEnv, rows: list[int]) -> None:

@@ -77,6 +77,7 @@ def captions(view: View) -> tuple[str, str]:
         "speed": "paused" if view.paused else f"{view.speed:g} x",
         "environment": f"{view.shown} of {view.num_envs}",
         "episode": f"{view.episodes}, {view.episode_s:.2f} s",
+        "return": f"{view.episode_return:.4g}",
         "reward": f"{view.reward:.4g}",
     }
     for condition in view.conditions:
@@ -84,9 +85,11 @@ def captions(view: View) -> tuple[str, str]:
         rows[f"success: {name}"] = state
     if view.checkpoint is not None:
         rows["checkpoint"] = f"{view.checkpoint}"
-    for number, knob in enumerate(view.knobs):
-        value = f"{view.held[knob.name]:g}" if knob.name in view.held else "from the task"
-        rows[f"{'> ' if number == view.knob else ''}{knob.name}"] = value
+    if view.last_episode:
+        rows["last episode"] = view.last_episode
+    for number, (knob, command) in enumerate(zip(view.knobs, view.commands, strict=True)):
+        value = f"{view.held[knob.name]:g}" if knob.name in view.held else f"{command:.2f} from the task"
+        rows[f"{'> ' if number == view.knob else ''}{knob.label}"] = value
     if view.message:
         rows[""] = view.message[:80]
     return "\n".join(rows), "\n".join(rows.values())

@@ -53,7 +53,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         if env_grid is not None:
             env_grid.fit_camera(self._camera)
         self._lookat = self._camera.lookat.copy()
-        self._followed = _root(model, viewer.follow)
+        self._followed = followed_body(model, viewer.follow)
         self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
         self._rect = mujoco.MjrRect(0, 0, viewer.width, viewer.height)
@@ -99,7 +99,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         self._context.free()
 
 
-def _root(model: mujoco.MjModel, entity: str | None) -> tuple[int, NDArray[np.float64]] | None:
+def followed_body(model: mujoco.MjModel, entity: str | None) -> tuple[int, NDArray[np.float64]] | None:
     """Return the root body of an entity and its default position [m]; None if there is no such entity."""
     bodies = [body for body in range(model.nbody) if model.body(body).name.startswith(f"{entity}/")]
     if entity is None or not bodies:

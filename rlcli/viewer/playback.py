@@ -23,6 +23,7 @@ from rlcli.errors import CheckpointError, UsageError
 from rlcli.managers.command import CommandManager
 from rlcli.rl.acting import Act
 from rlcli.viewer.checkpoints import RunCheckpoints
+from rlcli.viewer.episode_history import EpisodeHistory
 from rlcli.viewer.protocol import View
 
 _log = logging.getLogger(__name__)
@@ -68,8 +69,7 @@ class Playback:
     _push: np.ndarray | None = None
     _reward: Tensor = field(init=False)
     _checkpoints: tuple[int, ...] = ()
-    ended: Tensor = field(init=False)
-    """Episodes that have ended. (num_envs,)"""
+    history: EpisodeHistory = field(init=False)
     _view: View = field(init=False)
     _commands: CommandManager | None = None
 
@@ -77,7 +77,7 @@ class Playback:
         self._commands = _commands(self.env)
         self._obs = self.env.reset(seed=self.env.seed)["policy"] if self.initial_obs is None else self.initial_obs
         self._reward = torch.zeros(self.env.num_envs)
-        self.ended = torch.zeros(self.env.num_envs, dtype=torch.int64)
+        self.history = EpisodeHistory(self.env)
         self.refresh_checkpoints()
         self._publish()
 
@@ -155,12 +155,14 @@ class Playback:
     def reset(self) -> None:
         """Start a new episode in every environment."""
         self._obs = self.env.reset()["policy"]
+        self.history.clear_returns()
         self._reward = torch.zeros(self.env.num_envs)
         self._due = 0.0
 
     def show(self, shown: int) -> None:
         """Show another environment; indices wrap around."""
         self.shown = shown % self.env.num_envs
+        self.history.clear_curves()
         self._push = None
 
     def hold(self, name: str, value: float | None) -> None:
@@ -242,7 +244,7 @@ class Playback:
         finally:
             self.env.pause(not playing)
         self._obs, self._reward = result.obs["policy"], result.reward
-        self.ended += result.terminated | result.truncated
+        self.history.add(result, self.shown)
         self.steps += 1
 
     def _step_under_force(self, action: Tensor, push: np.ndarray) -> Any:
@@ -260,7 +262,8 @@ class Playback:
         _log.info(message)
 
     def _publish(self) -> None:
-        shown = self.shown
+        shown, history = self.shown, self.history
+        knobs = () if self._commands is None else tuple(self._commands.knobs())
         self._view = View(
             paused=not self.env.is_playing(),
             speed=self.speed,
@@ -269,11 +272,16 @@ class Playback:
             episode_s=float(self.env.episode_length_buf[shown]) * self.env.step_dt,
             reward=float(self._reward[shown]),
             conditions=self.env.success_conditions(shown),
-            episodes=int(self.ended[shown]),
+            episode_return=float(history.returns[shown]),
+            episodes=int(history.ended[shown]),
+            succeeded=int(history.succeeded[shown]),
+            last_episode=history.last_episode(shown),
+            curves=history.curves(),
             checkpoint=self.checkpoint,
             checkpoints=self._checkpoints,
             follow=self.follow,
-            knobs=() if self._commands is None else tuple(self._commands.knobs()),
+            knobs=knobs,
+            commands=tuple(self._commands.value(knob, shown) for knob in knobs) if self._commands else (),
             held={} if self._commands is None else dict(self._commands.held),
             knob=self._knob,
             message=self.message,

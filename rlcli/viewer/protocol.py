@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from rlcli.managers.command import Knob
+    from rlcli.viewer.episode_history import RewardCurves
     from rlcli.viewer.playback import Playback
 
 VIEWERS = {"native": "rlcli.viewer.native:run", "web": "rlcli.viewer.web:run"}
@@ -69,13 +70,22 @@ class View:
     """Reward of the last step in the shown environment."""
     conditions: Sequence[str]
     """Conditions of success of the shown environment, with their values and bounds."""
+    episode_return: float
+    """Sum of the rewards of the shown episode so far."""
     episodes: int
     """Episodes of the shown environment that have ended."""
+    succeeded: int
+    """Episodes of the shown environment that have ended with success."""
+    last_episode: str
+    """How the last of them ended: return, length and causes."""
+    curves: RewardCurves
     checkpoint: int | None
     """Step of the policy's checkpoint; None: the policy has no checkpoint."""
     checkpoints: tuple[int, ...]
     follow: bool
     knobs: tuple[Knob, ...]
+    commands: tuple[float, ...]
+    """Value of each of them in the shown environment."""
     held: Mapping[str, float]
     knob: int
     """Index of the command that the keys change."""

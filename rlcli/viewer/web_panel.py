@@ -15,13 +15,18 @@ import numpy as np
 from mujoco.studio import messages, plugin, ux
 from mujoco.studio.app import inputs
 from mujoco.studio.dear_imgui import dear_imgui as imgui
+from mujoco.studio.implot import implot
 
+from rlcli.sim.markers import Frame, Marker
+from rlcli.viewer.offscreen import followed_body
 from rlcli.viewer.playback import SPEEDS, Playback
 from rlcli.viewer.protocol import REQUEST_KEYS, View
 
 TITLE = "Options"
 """Title of the window that MuJoCo's viewer docks to the left."""
 _SPEEDS = ["1/8 x", "1/4 x", "1/2 x", "real time", "2 x", "4 x", "8 x"]
+_WIDTH = 310.0
+"""Width of the panel [pixels]; on a narrow page less."""
 _LAST = 0
 """Priority of handlers that run after those of MuJoCo."""
 
@@ -47,9 +52,12 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         self.overlay_geoms: Sequence[mujoco.MjvGeom] = ()
         """Markers and geoms of further environments; the simulation's thread sets them."""
         self._playback, self._title, self._start_camera, self._env_origins = playback, title, camera, env_origins
-        self._shown = playback.view.shown
+        self._followed = followed_body(playback.env.engine.model, playback.env.config.viewer.follow)
+        self._last_place = self._env_origins[playback.view.shown]
+        self._legend = _legend(playback.env.markers())
         self._ux = ux.UxState()
         self._pushing = False
+        self._page_width = 0.0
 
     @_handler(_LAST)
     def _on_viewer_init(self, _: plugin.ViewerInitEvent) -> None:
@@ -67,9 +75,9 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
     @_handler(messages.Priority.USER)
     def _on_update(self, _: messages.UpdateEvent) -> None:
         view = self._playback.view
-        if view.shown != self._shown:  # on terrain each environment has another origin
-            self.viewer.camera.lookat[:] += self._env_origins[view.shown] - self._env_origins[self._shown]
-            self._shown = view.shown
+        place = self._place(view.shown)
+        self.viewer.camera.lookat[:] += place - self._last_place
+        self._last_place = place
         self.viewer.extra_geoms[:] = self.overlay_geoms
         inputs.handle_mouse_events(
             self.viewer.model,
@@ -95,6 +103,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
                 imgui.EndMenu()
             imgui.EndMainMenuBar()
         imgui.Begin(TITLE)
+        self._widen()
         imgui.TextWrapped(self._title)
         for label, request in (("Go on" if view.paused else "Pause", "pause"), ("Step", "step"), ("Reset", "reset")):
             if imgui.Button(label):
@@ -113,15 +122,20 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         self._checkpoints(view)
         self._commands(view)
         imgui.PopItemWidth()
-        imgui.Separator()
-        imgui.TextUnformatted(f"episode {view.episodes}, {view.episode_s:.2f} s, reward {view.reward:.4g}")
-        for condition in view.conditions:
-            imgui.TextUnformatted(f"success: {condition}")
+        self._episode(view)
+        self._reward_plot(view)
         if view.message:
             imgui.TextWrapped(view.message)
         self._rendering_options()
         imgui.End()
         ux.view_gizmo_gui(self.viewer.model, self.viewer.data, self.viewer.camera, self._ux, area)
+
+    def _widen(self) -> None:
+        """Give the docked panel its width, when the page has opened."""
+        node, page = imgui.GetWindowDockID(), imgui.GetIO().DisplaySize
+        if node and page.x != self._page_width:
+            self._page_width = page.x
+            imgui.DockBuilderSetNodeSize(node, imgui.Vec2(min(_WIDTH, 0.5 * page.x), page.y))
 
     def _checkpoints(self, view: View) -> None:
         if not view.checkpoints:
@@ -138,17 +152,49 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
             playback.submit(partial(playback.set_follow, follow))
 
     def _commands(self, view: View) -> None:
-        for knob in view.knobs:
-            held = knob.name in view.held
-            changed, hold = imgui.Checkbox(f"##{knob.name}", held)
-            if changed:
-                start = min(max(0.0, knob.low), knob.high)
-                self._playback.submit(partial(self._playback.hold, knob.name, start if hold else None))
+        if view.knobs:
+            imgui.SeparatorText("Commands")
+        for knob, command in zip(view.knobs, view.commands, strict=True):
+            changed, hold = imgui.Checkbox(f"hold##{knob.name}", knob.name in view.held)
             imgui.SetItemTooltip("Checked: keep this value. Unchecked: the task samples it.")
             imgui.SameLine()
-            moved, value = imgui.SliderFloat(knob.name, view.held.get(knob.name, 0.0), knob.low, knob.high)
-            if moved:
-                self._playback.submit(partial(self._playback.hold, knob.name, value))
+            imgui.SetNextItemWidth(imgui.GetContentRegionAvail().x * 0.5)
+            moved, value = imgui.SliderFloat(knob.label, command, knob.low, knob.high)
+            imgui.SetItemTooltip("Move the slider to hold the command at a value.")
+            if changed or moved:
+                keep = value if moved else min(max(command, knob.low), knob.high)
+                self._playback.submit(partial(self._playback.hold, knob.name, keep if moved or hold else None))
+        for meaning, color in self._legend:
+            if color is not None:
+                imgui.ColorButton(f"##{meaning}", imgui.Vec4(*color), _SWATCH)
+                imgui.SameLine()
+            imgui.TextWrapped(meaning)
+
+    def _episode(self, view: View) -> None:
+        imgui.SeparatorText(f"Episode {view.episodes + 1}")
+        imgui.TextWrapped(f"{view.episode_s:.2f} s, return {view.episode_return:.4g}")
+        for condition in view.conditions:
+            value, _, state = condition.rpartition(": ")
+            imgui.TextWrapped(f"success: {value}")
+            imgui.BulletText(state)
+        if view.last_episode:
+            imgui.TextWrapped(f"last episode: {view.last_episode}")
+        if view.conditions and view.episodes:
+            imgui.TextWrapped(f"{view.succeeded} of {view.episodes} episodes succeeded")
+
+    def _reward_plot(self, view: View) -> None:
+        """Plot the reward and its terms over the last seconds; the legend has the newest values."""
+        imgui.SeparatorText("Reward per step")
+        size = imgui.Vec2(-1.0, 150.0 + 19.0 * len(view.curves.values))
+        flags = int(implot.Flags.NoTitle) | int(implot.Flags.NoMenus) | int(implot.Flags.NoMouseText)
+        if not view.curves.values or not implot.BeginPlot("##rewards", size, flags):
+            return
+        fit = int(implot.AxisFlags.AutoFit)
+        implot.SetupAxes("time [s]", "", fit, fit)
+        implot.SetupLegend(int(implot.Location.South), int(implot.LegendFlags.Outside))
+        for name, values in view.curves.values:
+            implot.PlotLine(f"{name} {values[-1]:.3g}###{name}", view.curves.time_s, values)
+        implot.EndPlot()
 
     def _rendering_options(self) -> None:
         viewer = self.viewer
@@ -167,9 +213,16 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         """Move the camera to the position in the task's `viewer` settings."""
         camera, begin = self.viewer.camera, self._start_camera
         camera.type, camera.fixedcamid, camera.trackbodyid = int(mujoco.mjtCamera.mjCAMERA_FREE), -1, -1
-        camera.lookat[:] = begin.lookat + self._env_origins[self._shown]
+        camera.lookat[:] = begin.lookat + self._last_place
         camera.distance, camera.azimuth, camera.elevation = begin.distance, begin.azimuth, begin.elevation
         self._ux.camera_index = ux.TUMBLE_CAMERA_IDX
+
+    def _place(self, shown: int) -> np.ndarray:
+        """Return the point with which the camera moves: the environment's origin, or the followed entity. (3,) [m]"""
+        if self._followed is None:
+            return np.asarray(self._env_origins[shown])
+        body, start = self._followed
+        return np.asarray(self.viewer.data.xpos[body] - start)
 
     def _push(self) -> None:
         """Apply the force on a dragged body in the simulation, until the user releases it."""
@@ -194,6 +247,15 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
             inputs.handle_vis_options_keyboard_events(self.viewer.vis_options, is_free_camera)
 
 
+def _legend(markers: Sequence[Marker]) -> list[tuple[str, Sequence[float] | None]]:
+    """Return the meanings of markers with their colours; None for frames, whose axes have three."""
+    entries = [
+        (f"{m.label}: x red, y green, z blue", None) if isinstance(m, Frame) else (m.label, m.color) for m in markers
+    ]
+    return list(dict.fromkeys(entries))
+
+
+_SWATCH = int(imgui.ColorEditFlags.NoTooltip)
 KEYS = (
     "Space: pause, go on. Right: one step. Backspace: new episodes. - and =: speed. Up, Down: environment."
     " PageUp, PageDown: newer, older checkpoint. Escape: free camera. Double click, then Ctrl and drag: push a body."

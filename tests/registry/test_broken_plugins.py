@@ -48,7 +48,7 @@ def test_broken_plugins_are_at_least_24():
 @pytest.mark.parametrize("name", BROKEN)
 def test_list_tasks_works_beside_broken_plugin(broken_plugins, command, name):
     broken_plugins(name)
-    check_listed(document(command("list-tasks", "--json")), [name])
+    check_listed(document(command("list-tasks", "--json", "--probe-timeout", "5")), [name])
     listed = command("list-tasks")
     assert (listed.returncode, "Traceback" in listed.stderr) == (0, False)
     assert "good-task" in listed.stdout
@@ -67,7 +67,7 @@ def test_train_works_beside_broken_plugin(broken_plugins, cli, name):
 def test_all_broken_plugins_together(broken_plugins, cli, capsys):
     broken_plugins(*BROKEN)
     start = time.perf_counter()
-    done = cli("list-tasks")
+    done = cli("list-tasks", "--probe-timeout", "5")
     took = time.perf_counter() - start
     with capsys.disabled():
         print(f"list-tasks with {len(BROKEN)} broken plugins: {took:.2f} s")

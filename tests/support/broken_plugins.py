@@ -18,6 +18,8 @@ rewards: {{alive: {{func: is_alive, weight: 1.0}}}}
 terminations: {{time_out: {{func: time_out, time_out: true}}}}
 agents: {{default: ppo, ppo: {{trainer: sb3, algorithm: ppo, max_iterations: 1, n_steps: 8, num_minibatches: 1}}}}
 """
+DETAILS = {"summary": "Slide.", "workflow": "managed", "observation_size": 2, "action_size": 1, "num_envs": 5}
+DETAILS |= {"agent": "ppo"}
 FILES = {"task.yaml": TASK.format(summary="Slide."), "model.xml": MODEL}
 
 

@@ -1,5 +1,6 @@
 """Installed distributions, created from files in a folder on the path."""
 
+import json
 import os
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from rlcli.cli.app import main
-from support.broken_plugins import BROKEN, FILES, SPEC
+from support.broken_plugins import BROKEN, DETAILS, FILES, SPEC
 
 
 @pytest.fixture
@@ -54,7 +55,7 @@ def broken_plugins(plugins):
     """Return broken_plugins(*names), which installs some of `BROKEN`, and a distribution `good` that works."""
 
     def install(*names):
-        plugins("good", SPEC, files=FILES)
+        plugins("good", SPEC, files={**FILES, "index.json": json.dumps({"good-task": DETAILS})})
         for name in names:
             plugins(name, BROKEN[name].source, **BROKEN[name].options)
 

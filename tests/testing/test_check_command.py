@@ -17,7 +17,7 @@ def check(capsys, *arguments):
 
 
 def test_correct_task_prints_table_and_exits_0(managed, capsys):
-    code, out, err = check(capsys, managed.write())
+    code, out, err = check(capsys, managed.write(), "--quiet")  # without progress, on a slow machine
     assert code == 0
     assert out.splitlines()[0].split() == ["CHECK", "RESULT"]
     assert "partial-reset         ok" in out
@@ -40,6 +40,34 @@ def test_warnings_alone_exit_0(direct, capsys):
     assert code == 0
     assert "termination              warning" in out
     assert out.splitlines()[-1].endswith("0 errors, 1 warning")
+
+
+def test_num_envs_finds_a_defect_of_the_tenth_environment(direct, capsys):
+    direct.replace(
+        "self.obs_buf[:, 0].abs() > 3.0", "self.obs_buf[:, 0].abs() > 3.0\n        self.obs_buf[9:] = float('nan')"
+    )
+    folder, only = direct.write(), ("--only", "finite")
+    assert check(capsys, folder, *only)[0] == 0
+    code, out, _ = check(capsys, folder, *only, "--num-envs", "10")
+    assert (code, "in 1 of 10 environments, first in environment 9" in out) == (9, True), out
+
+
+def test_seed_changes_start_states_and_actions(managed, capsys):
+    from rlcli.testing.task_under_test import open_task
+
+    folder = managed.write()
+    first, again, other = (
+        open_task(folder, None, (), None, 8, seed).recording().obs[5]["policy"] for seed in (3, 3, 4)
+    )
+    assert (first == again).all()
+    assert (first != other).any()
+    assert check(capsys, folder, "--seed", "4")[0] == 0
+
+
+@pytest.mark.parametrize("command", ["check", "lint"])
+def test_fewer_than_eight_environments_are_refused(managed, capsys, command):
+    code = main([command, str(managed.write()), "--num-envs", "7"])
+    assert (code, "7 environments are too few" in capsys.readouterr().err) == (2, True)
 
 
 def test_json_document_has_checks_and_findings(managed, capsys):

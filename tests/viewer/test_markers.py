@@ -294,6 +294,18 @@ def test_browser_gets_marker_copies(tmp_path):
     assert {geom.castshadow for geom in found} == {0}
 
 
+def test_markers_and_commands_have_names_and_units(tmp_path):
+    given = {"func": "given", "resampling_time_s": [9, 9], "height": 1.0}
+    velocity = {"func": "uniform_velocity", "resampling_time_s": [9, 9], "lin_vel_x": [1, 1]}
+    env = commanded_env(tmp_path, 2, velocity=velocity, own=given)
+    env.command_manager.get_term("own").given = [Sphere(torch.zeros(2, 3))]
+    labels = [marker.label for marker in env.markers()]
+    assert labels == ["commanded velocity"] * 2 + ["actual velocity"] * 2 + ["own"]
+    knobs = env.command_manager.knobs()
+    assert [knob.label for knob in knobs][:3] == ["vx [m/s]", "vy [m/s]", "wz [rad/s]"]
+    assert env.command_manager.value(knobs[0], 1) == 1.0
+
+
 def test_window_gets_markers(tmp_path):
     env = commanded_env(tmp_path, 2, pose=POSE)
     playback = Playback(env, zero_policy(env))

@@ -9,7 +9,7 @@ import typer
 
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.findings import report_findings
-from rlcli.cli.ui.options import Agent, ConfigFile, Overrides, TaskName
+from rlcli.cli.ui.options import Agent, ConfigFile, FewEnvs, Overrides, Seed, TaskName
 
 if TYPE_CHECKING:
     from rlcli.testing import Finding
@@ -22,6 +22,8 @@ def command(
     record: Annotated[bool, typer.Option("--record-layout")] = False,
     agent: Agent = None,
     config: ConfigFile = None,
+    num_envs: FewEnvs = 8,
+    seed: Seed = 0,
 ) -> None:
     """Check that a task keeps the contract of rlcli: shapes, seeds, resets, rewards, devices.
 
@@ -52,6 +54,8 @@ def command(
         agent=agent,
         overrides=overrides or (),
         config=config,
+        num_envs=num_envs,
+        seed=seed,
         only=only or (),
         on_check=lambda name, found: checks.append((name, found)),
         on_note=notes.__setitem__,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rlcli.cli.ui.findings import report_findings
-from rlcli.cli.ui.options import Agent, ConfigFile, Overrides, TaskName
+from rlcli.cli.ui.options import Agent, ConfigFile, FewEnvs, Overrides, Seed, TaskName
 
 if TYPE_CHECKING:
     from rlcli.testing import Remark
@@ -25,6 +25,8 @@ def command(
     ignore: Annotated[list[str] | None, typer.Option(metavar="RULE")] = None,
     agent: Agent = None,
     config: ConfigFile = None,
+    num_envs: FewEnvs = 16,
+    seed: Seed = 0,
 ) -> None:
     """Find what makes a task hard to learn: run simple fixed policies, and check their episodes.
 
@@ -56,6 +58,8 @@ def command(
         agent=agent,
         overrides=overrides or (),
         config=config,
+        num_envs=num_envs,
+        seed=seed,
         seconds=seconds,
         only=only or (),
         ignore=ignore or (),

@@ -1,4 +1,4 @@
-"""`rlcli list-tasks`: the installed tasks, from package metadata and a cache; imports no plugin."""
+"""`rlcli list-tasks`: the installed tasks, from package metadata and a cache; imports no plugin in this process."""
 
 from __future__ import annotations
 
@@ -21,21 +21,25 @@ def command(
 ) -> None:
     """List installed tasks.
 
+    A new or changed plugin is loaded once, in another process, and its details are cached.
+
     Options:
         pattern: Show only tasks whose name or summary contains this text.
-        probe_all: Load each listed task in a subprocess and update its cached details.
+        probe_all: Load each listed task again, also if its details are cached.
 
     Examples:
         rlcli list-tasks
             List all tasks.
         rlcli list-tasks cartpole --probe
-            Load the matching tasks and show their sizes.
+            Load the matching tasks again.
     """
     entries, broken = catalog()
     by_name = Counter(entry.name for entry in entries)
     shared = {name for name, count in by_name.items() if count > 1}
     built_in = {entry.name for entry in entries if entry.distribution == OWN}
     details = cached_details(entries)
+    if not probe_all:
+        details.update(probe([entry for entry in entries if _is_unread(details.get(entry.qualified))], timeout))
     if pattern:
         texts = ((entry, f"{entry.name} {details.get(entry.qualified, Details()).summary}") for entry in entries)
         entries = [entry for entry, text in texts if pattern.lower() in text.lower()]
@@ -44,8 +48,8 @@ def command(
     rows = [(entry, details.get(entry.qualified, Details())) for entry in entries]
     if rows or not pattern:
         _show(rows, shared)
-        if any(known.status == "?" for _, known in rows):
-            console.info("? is not known until a task has been loaded: rlcli list-tasks --probe")
+        if any(known.broken for _, known in rows) and not probe_all:
+            console.info("after a repair, load broken tasks again: rlcli list-tasks --probe")
     else:
         near = did_you_mean(pattern.lower(), by_name)
         console.info(f"no task's name or summary contains '{pattern}'; {near or 'rlcli list-tasks shows all'}")
@@ -82,13 +86,13 @@ def _show(rows: list[tuple[Entry, Details]], shared: set[str]) -> None:
             [
                 entry.qualified if entry.name in shared and entry.distribution != OWN else entry.name,
                 f"{entry.distribution} {entry.version}",
-                known.workflow or "?",
+                known.workflow or "",
                 _number(known.observation_size),
                 _number(known.action_size),
                 _number(known.num_envs),
                 known.agent or "",
                 known.status,
-                known.summary or ("" if known.broken else "(`rlcli list-tasks --probe` shows more)"),
+                known.summary,
             ]
             for entry, known in rows
         ],
@@ -96,4 +100,8 @@ def _show(rows: list[tuple[Entry, Details]], shared: set[str]) -> None:
 
 
 def _number(value: int | None) -> str:
-    return "?" if value is None else str(value)
+    return "" if value is None else str(value)
+
+
+def _is_unread(known: Details | None) -> bool:
+    return known is None or (known.workflow is None and known.broken is None)

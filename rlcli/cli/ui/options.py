@@ -43,6 +43,7 @@ _POLICY_TASK = "Task: its newest run is used, else the policy shipped with the t
 _OVERRIDES = "Overrides of settings; agent.KEY=VALUE changes the chosen agent."
 _AGENT = "Agent of the task. [default: the task's]"
 _CONFIG = "YAML file merged over the task; its key `agent` changes the chosen agent."
+_FEW_ENVS = "Number of environments, whatever scene.num_envs is; at least 8."
 _SEED = "Seed of all random numbers; -1 picks a random one and records it."
 _TASK_FOLDER = "Folder of the task's code, if the task is not installed and its folder has moved."
 _RUNS_DIR = "Folder of runs. [default: RLCLI_RUNS_DIR, the settings' runs_dir, or runs]"
@@ -56,6 +57,7 @@ RunRef = Annotated[str, typer.Argument(autocompletion=runs, metavar="RUN", help=
 ConfigFile = Annotated[Path | None, typer.Option(metavar="FILE", help=_CONFIG)]
 Agent = Annotated[str | None, typer.Option(autocompletion=agents, metavar="NAME", help=_AGENT)]
 NumEnvs = Annotated[int | None, typer.Option(help="Sets scene.num_envs. [default: the task's]")]
+FewEnvs = Annotated[int, typer.Option("--num-envs", help=_FEW_ENVS)]
 Seed = Annotated[int, typer.Option(min=-1, max=MAX_SEED, callback=draw_seed, help=_SEED)]
 Device = Annotated[str, choice("DEVICE", "auto", "cpu", "cuda", help="auto, cpu, cuda or cuda:N.")]
 RunName = Annotated[str | None, typer.Option(help="Text at the end of the run folder's name.")]

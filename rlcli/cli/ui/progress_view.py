@@ -43,9 +43,9 @@ class LiveView:
         self._own.__enter__()
         console.clear_line()
         if is_terminal(sys.stderr) and not console.quiet:
-            from rich.live import Live
+            from rlcli.cli.ui.resizable_live import ResizableLive
 
-            self._live = Live(console=screen(sys.stderr), **self._options)
+            self._live = ResizableLive(console=screen(sys.stderr), **self._options)
             self._live.__enter__()
         return self
 

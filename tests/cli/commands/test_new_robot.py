@@ -20,6 +20,8 @@ CART = """<mujoco><worldbody><body name="cart"><joint name="slide" type="slide" 
 <geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.6" mass="0.1"/></body></body></worldbody>
 <actuator><motor joint="slide" gear="10" ctrlrange="-1 1" ctrllimited="true"/></actuator>
 <keyframe><key name="home" qpos="0.3 0"/></keyframe></mujoco>"""
+POLE = """<body pos="0 0 0.6"><joint name="second" axis="0 1 0"/>
+<geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.4" mass="0.1"/></body>"""
 ARM = """<mujoco><worldbody><body name="upper"><joint name="a" axis="0 1 0" range="-90 90"/>
 <geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.4" mass="0.5"/><body name="lower" pos="0 0 0.4">
 <joint name="b" axis="1 0 0" range="-90 90"/><geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.3" mass="0.3"/>
@@ -33,6 +35,8 @@ def written(cli, tmp_path, text):
     (tmp_path / "robot.xml").write_text(text)
     result = cli("new", "my-robot", "--robot", "robot.xml", "--json")
     assert result.code == 0, result.err
+    valid = cli("validate", "my-robot/my_robot")
+    assert valid.code == 0, valid.err
     return result, yaml.safe_load((tmp_path / "my-robot" / "my_robot" / "task.yaml").read_text())
 
 
@@ -54,7 +58,14 @@ def test_other_robot_balances_about_its_keyframe(cli, tmp_path):
     _, task = written(cli, tmp_path, CART)
     assert task["actions"]["effort"]["scale"] == {"slide": 10.0}
     assert task["scene"]["entities"]["robot"]["init"] == {"joint_pos": {"slide": 0.3}}
-    assert task["success"]["joints"] == ["hinge"]
+    assert task["success"]["pose"]["joints"] == ["hinge"]
+
+
+def test_joints_with_different_defaults_have_a_condition_each(cli, tmp_path):
+    text = CART.replace("</body></body></worldbody>", POLE + "</body></body></worldbody>").replace("0.3 0", "0.3 0 0.5")
+    _, task = written(cli, tmp_path, text)
+    targets = {tuple(each["joints"]): each["target"] for each in task["success"].values()}
+    assert targets == {("hinge",): 0.0, ("second",): 0.5}
 
 
 def test_fixed_base_reaches_with_its_last_body(cli, tmp_path):

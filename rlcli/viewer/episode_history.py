@@ -1,0 +1,85 @@
+"""History of a playback for the panels of viewers: rewards of the last seconds, returns, and ends of episodes."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import torch
+
+from rlcli.envs.step import StepResult
+from rlcli.envs.vec_env import VecEnv
+from rlcli.managers.reward import RewardManager
+
+_SHOWN_S = 5.0
+"""Time of which rewards are kept [s]."""
+_MAX_POINTS = 150
+"""Largest number of points of a curve; they travel to the browser in every frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class RewardCurves:
+    """Rewards of the shown environment in the last steps, for a plot."""
+
+    time_s: tuple[float, ...] = ()
+    """Time of each point, at most 0: now [s]."""
+    values: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    """(name, points) of the reward and of each of its terms, with their weights."""
+
+
+class EpisodeHistory:
+    """Rewards of the shown environment in the last seconds; returns and ends of the episodes of all environments."""
+
+    def __init__(self, env: VecEnv) -> None:
+        self._env = env
+        self._terms: RewardManager | None = getattr(env, "reward_manager", None)
+        self._every = max(1, round(_SHOWN_S / env.step_dt / _MAX_POINTS))
+        self._rows: deque[tuple[float, ...]] = deque(maxlen=round(_SHOWN_S / env.step_dt / self._every))
+        self._steps = 0
+        self.returns = torch.zeros(env.num_envs)
+        """Return of each running episode. (num_envs,)"""
+        self.ended = torch.zeros(env.num_envs, dtype=torch.int64)
+        """Episodes that have ended. (num_envs,)"""
+        self.succeeded = torch.zeros(env.num_envs, dtype=torch.int64)
+        """Episodes that have ended with success. (num_envs,)"""
+        self._last: dict[int, str] = {}
+
+    def add(self, result: StepResult, shown: int) -> None:
+        """Record a step."""
+        self._steps += 1
+        self.returns += result.reward.cpu()
+        if self._steps % self._every == 0:
+            terms = [] if self._terms is None else self._terms.step_terms[:, shown].tolist()
+            self._rows.append((float(result.reward[shown]), *terms))
+        over = (result.terminated | result.truncated).cpu()
+        self.ended += over
+        self.returns[over] = 0.0
+        episodes = result.episodes.ended() if result.episodes is not None else None
+        if episodes is None:
+            return
+        if episodes.success is not None:
+            self.succeeded[episodes.ids.cpu()] += episodes.success.cpu()
+        for row, env_id in enumerate(episodes.ids.tolist()):
+            fired = [name for name, causes in episodes.causes.items() if bool(causes[row])]
+            parts = [f"return {float(episodes.returns[row]):.4g}", f"{int(episodes.lengths[row])} steps", *fired]
+            self._last[env_id] = ", ".join(parts)
+
+    def last_episode(self, env_id: int) -> str:
+        """Return how the last episode of an environment ended; the empty text before its first end."""
+        return self._last.get(env_id, "")
+
+    def clear_curves(self) -> None:
+        """Remove the rewards: another environment is shown."""
+        self._rows.clear()
+
+    def clear_returns(self) -> None:
+        """Start new episodes in every environment."""
+        self.returns.zero_()
+        self.clear_curves()
+
+    def curves(self) -> RewardCurves:
+        """Return the curves of the rewards."""
+        names = ["reward", *(() if self._terms is None else [term.name for term in self._terms.terms])]
+        step_s = self._every * self._env.step_dt
+        times = tuple(step_s * (number - len(self._rows) + 1) for number in range(len(self._rows)))
+        return RewardCurves(times, tuple(zip(names, zip(*self._rows, strict=True), strict=False)))
