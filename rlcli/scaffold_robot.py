@@ -4,8 +4,6 @@ A floating base with at least four driven joints follows velocity commands, a fi
 brings its last body to goals, and any other robot balances its passive joints at the default pose.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass

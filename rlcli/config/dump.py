@@ -1,7 +1,5 @@
 """Output of a resolved configuration: YAML that reads back as the same configuration, origins, JSON Schema."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import PurePath

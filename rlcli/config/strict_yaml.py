@@ -5,8 +5,6 @@ with its position: duplicate keys, anchors, tags, merge keys, a second document,
 `.nan`).
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import re

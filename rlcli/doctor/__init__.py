@@ -1,7 +1,5 @@
 """Checks of `rlcli doctor`: whether this machine, this installation and every installed plugin work."""
 
-from __future__ import annotations
-
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path

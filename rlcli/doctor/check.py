@@ -1,7 +1,5 @@
 """Result of one check of `rlcli doctor`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

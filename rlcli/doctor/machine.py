@@ -1,7 +1,5 @@
 """Checks of the machine: cores, memory, the folder for runs, the encoding of text."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

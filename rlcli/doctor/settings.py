@@ -1,7 +1,5 @@
 """Checks of the user's settings file and of environment variables."""
 
-from __future__ import annotations
-
 import os
 
 from rlcli.config.settings_file import read_settings

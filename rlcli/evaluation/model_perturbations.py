@@ -1,7 +1,5 @@
 """Model parameters that a stress test changes, with a value for each environment."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import torch

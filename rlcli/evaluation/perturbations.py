@@ -4,8 +4,6 @@ Every environment has its own values, so that one set of environments holds many
 changes nothing: the environment runs the same episodes as without perturbations.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

@@ -4,8 +4,6 @@ A distribution may ship the details as `index.json` in its top-level package, as
 other tasks are in the user's cache folder, under the distribution's name, version and time of installation.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

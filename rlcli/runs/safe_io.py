@@ -1,7 +1,5 @@
 """Reading of untrusted files: plain files of limited size, strict JSON, and pydantic models of the JSON's content."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

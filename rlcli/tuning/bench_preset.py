@@ -1,7 +1,5 @@
 """The settings that `rlcli bench` recommends, as a `--config` file with the measurements in comments."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any

@@ -1,7 +1,5 @@
 """Presets: the settings of a training that differ from its task's own, in the form of a `--config` file."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from rlcli.config.load import Resolved

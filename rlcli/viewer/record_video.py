@@ -1,7 +1,5 @@
 """Recording of one episode to a video file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

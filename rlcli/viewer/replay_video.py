@@ -1,7 +1,5 @@
 """Videos of trajectory files."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """View of a study of several seeds: its progress during training, and the table at the end."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables and JSON documents of `sweep show` and `sweep compare`."""
 
-from __future__ import annotations
-
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.tables import cell
 from rlcli.errors import Stopped

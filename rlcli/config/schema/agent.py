@@ -1,9 +1,7 @@
 """Settings that all trainers share."""
 
-from __future__ import annotations
-
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -71,7 +69,7 @@ class AgentConfig(StrictModel):
     """Actions of the policy are clipped to +-`action_bound` in training, play and export; null: no clipping."""
 
     @model_validator(mode="after")
-    def _budget(self) -> AgentConfig:
+    def _budget(self) -> Self:
         if self.max_iterations is None and self.max_steps is None:
             raise ValueError("the training has no length: set max_iterations or max_steps")
         return self

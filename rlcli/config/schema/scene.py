@@ -1,8 +1,6 @@
 """Schema of the scene: ground, lights, robots and objects with their joints and actuators."""
 
-from __future__ import annotations
-
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticKnownError
@@ -114,7 +112,7 @@ class ActuatorConfig(StrictModel):
     at the start of an episode."""
 
     @model_validator(mode="after")
-    def _motor(self) -> ActuatorConfig:
+    def _motor(self) -> Self:
         curve = (self.saturation_effort is not None, self.velocity_limit is not None)
         if self.kind == "dc_motor" and not all(curve):
             raise ValueError("kind dc_motor needs saturation_effort and velocity_limit: set both")
@@ -194,7 +192,7 @@ class EntityConfig(StrictModel):
     """Part of the joint range, around its middle, that is inside the soft limits, in (0, 1]."""
 
     @model_validator(mode="after")
-    def _one_kind(self) -> EntityConfig:
+    def _one_kind(self) -> Self:
         if (self.model is None) == (self.shape is None):
             raise ValueError("an entity has either `model` (an MJCF file) or `shape`: write one of the two")
         if self.shape is not None:
