@@ -140,10 +140,8 @@ def _velocity(robot: Robot) -> dict[str, Any]:
             "tilted": {"func": "bad_orientation", "limit_angle": 1.0},
         },
         "success": {
-            "func": "velocity_tracked_on_average",
-            "command": "velocity",
-            "linear_tolerance": 0.25,
-            "angular_tolerance": 0.3,
+            "velocity": {"func": "mean_velocity_error", "command": "velocity", "at_most": 0.25},
+            "yaw_rate": {"func": "mean_yaw_rate_error", "command": "velocity", "at_most": 0.3},
         },
         "_sensors": {
             "feet": {"kind": "contact", "bodies": feet, "against": "ground"},
@@ -187,7 +185,7 @@ def _reach(robot: Robot) -> dict[str, Any]:
             "joint_vel": {"func": "joint_vel_l2", "weight": -0.001, "joints": joints},
         },
         "terminations": {"time_out": {"func": "time_out", "time_out": True}},
-        "success": {"func": "body_at_goal", **goal, "tolerance": 0.05, "hold_s": 0.5},
+        "success": {"position": {"func": "body_goal_distance", **goal, "at_most": 0.05, "hold_s": 0.5}},
     }
 
 
@@ -201,23 +199,13 @@ def _balance(robot: Robot) -> dict[str, Any]:
     floating: dict[str, Any] = {"projected_gravity": {"func": "projected_gravity"}} if robot.free else {}
     start = {"root": {"func": "reset_root_state_uniform", "mode": "reset"}} if robot.free else {}
     target = values.pop() if len(values) == 1 else None
-    success: dict[str, Any] = {
-        "func": "joints_near",
-        "joints": held,
-        "target": target or 0.0,
-        "tolerance": 0.2,
-        "hold_s": 1.0,
-    }
-    tilt: dict[str, Any] = {
-        "fallen": {
-            "func": "joint_pos_out_of_manual_limit",
-            "joints": held,
-            "bounds": [(target or 0.0) - 1.0, (target or 0.0) + 1.0],
-        }
-    }
+    middle = target or 0.0
     if robot.free:
-        success = {"func": "root_upright", "hold_s": 1.0}
-        tilt = {"fallen": {"func": "bad_orientation", "limit_angle": 1.0}}
+        success = {"tilt": {"func": "root_tilt", "at_most": 0.5}}
+        fallen = {"func": "bad_orientation", "limit_angle": 1.0}
+    else:
+        success = {"joints": {"func": "joint_error", "joints": held, "target": middle, "at_most": 0.2}}
+        fallen = {"func": "joint_pos_out_of_manual_limit", "joints": held, "bounds": [middle - 1.0, middle + 1.0]}
     return {
         "actions": {"effort": {"func": "joint_effort", "joints": driven, "scale": scale}},
         "observations": {"policy": {**floating, **_joint_observations(every)}},
@@ -239,7 +227,7 @@ def _balance(robot: Robot) -> dict[str, Any]:
         },
         "terminations": {
             "time_out": {"func": "time_out", "time_out": True},
-            **(tilt if robot.free or target is not None else {}),
+            **({"fallen": fallen} if robot.free or target is not None else {}),
         },
         "success": success,
     }

@@ -27,12 +27,16 @@ ARM = """<mujoco><worldbody><body name="upper"><joint name="a" axis="0 1 0" rang
 </body></body></worldbody><actuator><position joint="a" kp="20" forcerange="-9 9"/><motor joint="b" gear="5"
 ctrlrange="-1 1" ctrllimited="true"/><motor joint="c" gear="2" ctrlrange="-1 1" ctrllimited="true"/></actuator></mujoco>
 """
+WHEEL = """<mujoco><worldbody><body name="body" pos="0 0 0.3"><freejoint/><geom size="0.1" mass="1"/>
+<body name="wheel" pos="0 0 -0.2"><joint name="axle" axis="0 1 0"/><geom size="0.1" mass="0.2"/></body></body>
+</worldbody><actuator><motor joint="axle" gear="2"/></actuator></mujoco>"""
 
 
 def written(cli, tmp_path, text):
     (tmp_path / "robot.xml").write_text(text)
     result = cli("new", "my-robot", "--robot", "robot.xml", "--json")
     assert result.code == 0, result.err
+    assert cli("validate", "my-robot/my_robot").code == 0
     return result, yaml.safe_load((tmp_path / "my-robot" / "my_robot" / "task.yaml").read_text())
 
 
@@ -54,7 +58,12 @@ def test_other_robot_balances_about_its_keyframe(cli, tmp_path):
     _, task = written(cli, tmp_path, CART)
     assert task["actions"]["effort"]["scale"] == {"slide": 10.0}
     assert task["scene"]["entities"]["robot"]["init"] == {"joint_pos": {"slide": 0.3}}
-    assert task["success"]["joints"] == ["hinge"]
+    assert task["success"]["joints"]["joints"] == ["hinge"]
+
+
+def test_floating_base_without_legs_balances(cli, tmp_path):
+    _, task = written(cli, tmp_path, WHEEL)
+    assert task["success"] == {"tilt": {"func": "root_tilt", "at_most": 0.5}}
 
 
 def test_fixed_base_reaches_with_its_last_body(cli, tmp_path):
