@@ -5,22 +5,18 @@ brings its last body to goals, and any other robot balances its passive joints a
 """
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jinja2
+
+from rlcli.config import strict_yaml
 from rlcli.errors import TaskError, UsageError
 from rlcli.robot_model import SCALAR, Robot, short
 from rlcli.scene.untrusted_mjcf import BadModel, read_mjcf
 
-_AGENT = {
-    **{"trainer": "ppo", "algorithm": "ppo", "num_steps": 24, "num_epochs": 5, "num_minibatches": 4},
-    **{"learning_rate": 1.0e-3, "schedule": "adaptive_linear", "desired_kl": 0.01, "gamma": 0.99, "lam": 0.95},
-    **{"clip_range": 0.2, "entropy_coef": 0.005, "max_grad_norm": 1.0, "normalize_observations": True},
-    **{"init_std": 0.6, "action_bound": None},
-    **{part: {"hidden": [128, 64], "activation": "elu"} for part in ("actor", "critic")},
-}
+_TEMPLATES = Path(__file__).parent / "templates" / "robot_task"
 
 
 @dataclass(slots=True)
@@ -58,184 +54,38 @@ def read_robot(file: Path, name: str) -> RobotTask:
             f"{file}: no joint can be driven", hint="add hinges or slides, with motors or position actuators"
         )
     kind = robot.kind()
-    parts = {"velocity": _velocity, "reach": _reach, "balance": _balance}[kind](robot)
-    sensors = parts.pop("_sensors", {})
-    task = {
-        "summary": f"{_SUMMARIES[kind]} ({name}).",
-        "decimation": robot.decimation,
-        "episode_length_s": 20.0 if kind == "velocity" else 8.0,
-        "sim": {"dt": robot.dt},
-        "scene": robot.scene() | {"sensors": sensors},
-        **parts,
-        "play": {"scene": {"num_envs": 16}},
-        "agents": {
-            "default": "ppo",
-            "ppo": {**_AGENT, "max_iterations": 1000 if kind == "velocity" else 300},
-        },
-    }
-    task = json.loads(json.dumps(task))  # without shared lists, which YAML would write as anchors
-    return RobotTask(kind, robot.xml, robot.assets, task, robot.found)
-
-
-_SUMMARIES = {
-    "velocity": "Follow velocity commands",
-    "reach": "Bring the last body to goals",
-    "balance": "Keep the default pose",
-}
+    values = {"velocity": _velocity, "reach": _reach, "balance": _balance}[kind](robot)
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_TEMPLATES),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        autoescape=False,  # the filter `json` quotes the names of the MJCF
+    )
+    environment.filters["json"] = json.dumps
+    driven = [robot.name(j) for j in robot.driven]
+    text = environment.get_template(f"{kind}.yaml.jinja").render(name=name, robot=robot, driven=driven, **values)
+    return RobotTask(kind, robot.xml, robot.assets, strict_yaml.load(text).data, robot.found)
 
 
 def _velocity(robot: Robot) -> dict[str, Any]:
-    joints, feet, trunk = [robot.name(j) for j in robot.driven], robot.feet(), robot.body(robot.root)
-    return {
-        "commands": {
-            "velocity": {
-                **{"func": "uniform_velocity", "resampling_time_s": [10.0, 10.0], "lin_vel_x": [-0.6, 0.6]},
-                **{"lin_vel_y": [-0.3, 0.3], "ang_vel_z": [-0.6, 0.6], "rel_standing": 0.05},
-            }
-        },
-        "actions": {"joint_position": {"func": "joint_position", "joints": joints, "scale": 0.25}},
-        "observations": {
-            "policy": {
-                "base_lin_vel": {"func": "base_lin_vel", "noise": {"kind": "uniform", "low": -0.1, "high": 0.1}},
-                "base_ang_vel": {"func": "base_ang_vel", "noise": {"kind": "uniform", "low": -0.2, "high": 0.2}},
-                "projected_gravity": {"func": "projected_gravity"},
-                "velocity_command": {"func": "generated_commands", "command": "velocity"},
-                **_joint_observations(joints),
-                "last_action": {"func": "last_action"},
-            }
-        },
-        "events": {
-            "friction": {
-                "func": "randomize_geom_friction",
-                "mode": "startup",
-                "axes": [0],
-                "range": [0.6, 1.2],
-                "operation": "scale",
-                "shared": True,
-            },
-            "root": {"func": "reset_root_state_uniform", "mode": "reset", "yaw": [-3.1415927, 3.1415927]},
-            "joints": {"func": "reset_joints_by_offset", "mode": "reset", "joints": joints, "position": [-0.1, 0.1]},
-        },
-        "rewards": {
-            "track_lin_vel": {"func": "track_lin_vel_xy_exp", "weight": 1.5, "command": "velocity", "std": 0.5},
-            "track_ang_vel": {"func": "track_ang_vel_z_exp", "weight": 0.75, "command": "velocity", "std": 0.5},
-            "lin_vel_z": {"func": "lin_vel_z_l2", "weight": -2.0},
-            "ang_vel_xy": {"func": "ang_vel_xy_l2", "weight": -0.05},
-            "flat_orientation": {"func": "flat_orientation_l2", "weight": -2.5},
-            "pose": {"func": "joint_deviation_l1", "weight": -0.05, "joints": joints},
-            "joint_acc": {"func": "joint_acc_l2", "weight": -2.5e-7, "joints": joints},
-            "action_rate": {"func": "action_rate_l2", "weight": -0.01},
-            "feet_air_time": {
-                "func": "feet_air_time",
-                "weight": 0.5,
-                "sensor": "feet",
-                "command": "velocity",
-                "threshold": 0.2,
-            },
-            "fall": {"func": "is_terminated", "weight": -100.0},
-        },
-        "terminations": {
-            "time_out": {"func": "time_out", "time_out": True},
-            "trunk_contact": {"func": "illegal_contact", "sensor": "trunk", "threshold": 1.0},
-            "tilted": {"func": "bad_orientation", "limit_angle": 1.0},
-        },
-        "success": {
-            "velocity": {"func": "mean_velocity_error", "command": "velocity", "at_most": 0.25},
-            "yaw_rate": {"func": "mean_yaw_rate_error", "command": "velocity", "at_most": 0.3},
-        },
-        "_sensors": {
-            "feet": {"kind": "contact", "bodies": feet, "against": "ground"},
-            "trunk": {"kind": "contact", "bodies": [trunk], "against": "ground"},
-        },
-    }
+    sensors = {"feet": robot.feet(), "trunk": [robot.body(robot.root)]}
+    return {"sensors": {n: {"kind": "contact", "bodies": b, "against": "ground"} for n, b in sensors.items()}}
 
 
 def _reach(robot: Robot) -> dict[str, Any]:
-    joints, last = [robot.name(j) for j in robot.driven], robot.last_body()
-    hand, box = robot.body(last), robot.workspace(last)
-    goal = {"bodies": hand, "command": "goal"}
-    return {
-        "commands": {
-            "goal": {
-                "func": "uniform_pose",
-                "bodies": hand,
-                "resampling_time_s": [8.0, 8.0],
-                **dict(zip("xyz", box, strict=True)),
-            }
-        },
-        "actions": {"joint_position": {"func": "joint_position", "joints": joints, "scale": 0.5}},
-        "observations": {
-            "policy": {
-                **_joint_observations(joints),
-                "goal": {
-                    "func": "generated_commands",
-                    "command": "goal",
-                    "columns": [i for i in range(3) if box[i][0] < box[i][1]],
-                },
-                "last_action": {"func": "last_action"},
-            }
-        },
-        "events": {
-            "joints": {"func": "reset_joints_by_offset", "mode": "reset", "joints": joints, "position": [-0.2, 0.2]}
-        },
-        "rewards": {
-            "distance": {"func": "position_command_error", "weight": -2.0, **goal},
-            "near": {"func": "position_command_error_tanh", "weight": 1.0, **goal, "std": 0.1},
-            "action_rate": {"func": "action_rate_l2", "weight": -0.001},
-            "joint_vel": {"func": "joint_vel_l2", "weight": -0.001, "joints": joints},
-        },
-        "terminations": {"time_out": {"func": "time_out", "time_out": True}},
-        "success": {"position": {"func": "body_goal_distance", **goal, "at_most": 0.05, "hold_s": 0.5}},
-    }
+    last = robot.last_body()
+    box = robot.workspace(last)
+    return {"hand": robot.body(last), "box": box, "columns": [i for i in range(3) if box[i][0] < box[i][1]]}
 
 
 def _balance(robot: Robot) -> dict[str, Any]:
-    driven = [robot.name(j) for j in robot.driven]
     hinges = [j for j in robot.passive if robot.model.jnt_type[j] == SCALAR[0]] or robot.passive or robot.driven
-    held = [robot.name(j) for j in hinges]
-    values = {round(float(robot.data.qpos[robot.model.jnt_qposadr[j]]), 4) for j in hinges}
-    every = [robot.name(j) for j in robot.joints]
-    scale = {robot.name(j): short(abs(robot.effort(j))) for j in robot.driven}
-    floating: dict[str, Any] = {"projected_gravity": {"func": "projected_gravity"}} if robot.free else {}
-    start = {"root": {"func": "reset_root_state_uniform", "mode": "reset"}} if robot.free else {}
-    target = values.pop() if len(values) == 1 else None
-    middle = target or 0.0
-    if robot.free:
-        success = {"tilt": {"func": "root_tilt", "at_most": 0.5}}
-        fallen = {"func": "bad_orientation", "limit_angle": 1.0}
-    else:
-        success = {"joints": {"func": "joint_error", "joints": held, "target": middle, "at_most": 0.2}}
-        fallen = {"func": "joint_pos_out_of_manual_limit", "joints": held, "bounds": [middle - 1.0, middle + 1.0]}
+    positions = {round(float(robot.data.qpos[robot.model.jnt_qposadr[j]]), 4) for j in hinges}
+    target = positions.pop() if len(positions) == 1 else None
     return {
-        "actions": {"effort": {"func": "joint_effort", "joints": driven, "scale": scale}},
-        "observations": {"policy": {**floating, **_joint_observations(every)}},
-        "events": {
-            **start,
-            "joints": {
-                "func": "reset_joints_by_offset",
-                "mode": "reset",
-                "position": [-0.1, 0.1],
-                "velocity": [-0.1, 0.1],
-            },
-        },
-        "rewards": {
-            "alive": {"func": "is_alive", "weight": 1.0},
-            "pose": {"func": "joint_deviation_l1", "weight": -0.5, "joints": held},
-            "speed": {"func": "joint_vel_l2", "weight": -0.005, "joints": every},
-            "effort": {"func": "action_l2", "weight": -0.005},
-            "fall": {"func": "is_terminated", "weight": -2.0},
-        },
-        "terminations": {
-            "time_out": {"func": "time_out", "time_out": True},
-            **({"fallen": fallen} if robot.free or target is not None else {}),
-        },
-        "success": success,
-    }
-
-
-def _joint_observations(joints: Sequence[str]) -> dict[str, Any]:
-    noise = {"kind": "uniform", "low": -0.01, "high": 0.01}
-    return {
-        "joint_pos": {"func": "joint_pos_rel", "joints": list(joints), "noise": noise},
-        "joint_vel": {"func": "joint_vel_rel", "joints": list(joints), "scale": 0.1},
+        "held": [robot.name(j) for j in hinges],
+        "every": [robot.name(j) for j in robot.joints],
+        "efforts": {robot.name(j): short(abs(robot.effort(j))) for j in robot.driven},
+        "target": target or 0.0,
+        "bounds": None if target is None else [target - 1.0, target + 1.0],
     }

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from rlcli.config.schema.base import Count, Positive, StrictModel, Threads, _FractionString
+from rlcli.safe_text import float_or_nan
 
 
 class AutopsyConfig(StrictModel):
@@ -21,10 +22,7 @@ class AutopsyConfig(StrictModel):
 
 def _check_bar(text: str) -> str:
     key, _, number = text.partition("=")
-    try:
-        value = float(number)
-    except ValueError:
-        value = math.nan
+    value = float_or_nan(number)
     if key not in ("success", "return", "length") or not math.isfinite(value):
         raise ValueError(f"'{text}' is not a bar; write success=0.97, return=200 or length=250")
     if key == "success" and not 0.0 < value < 1.0:
