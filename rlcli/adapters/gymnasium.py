@@ -3,10 +3,8 @@
 `rlcli.gym` registers them: `gym.make_vec("rlcli.gym:rlcli/cartpole", num_envs=8)`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -24,9 +22,7 @@ from rlcli.envs.make import make_env
 from rlcli.envs.step import StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.registry import find_task
-
-if TYPE_CHECKING:
-    from rlcli.viewer.offscreen import Renderer
+from rlcli.viewer.offscreen import Renderer
 
 Floats = NDArray[np.float32]
 Changes = Mapping[str, Any] | Iterable[str] | TaskConfig | Resolved | None
@@ -61,33 +57,6 @@ def open_task(
     return make_env(resolved, seed=seed, device=device)
 
 
-def make_vector(
-    task: str,
-    num_envs: int = 1,
-    cfg: Changes = None,
-    *,
-    autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
-    action_bound: float | None = 1.0,
-    render_mode: str | None = None,
-    **settings: Any,
-) -> GymnasiumVectorEnv:
-    """Return a vector environment; `gym.make_vec` calls it. Arguments: see `open_task` and `GymnasiumVectorEnv`."""
-    env = open_task(task, num_envs, cfg, **settings)
-    return GymnasiumVectorEnv(env, autoreset_mode, action_bound=action_bound, render_mode=render_mode)
-
-
-def make_single(
-    task: str,
-    cfg: Changes = None,
-    *,
-    action_bound: float | None = 1.0,
-    render_mode: str | None = None,
-    **settings: Any,
-) -> GymnasiumEnv:
-    """Return a single environment; `gym.make` calls it. Arguments: see `open_task` and `GymnasiumEnv`."""
-    return GymnasiumEnv(open_task(task, 1, cfg, **settings), action_bound=action_bound, render_mode=render_mode)
-
-
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     """Gymnasium vector environment of the observation group `policy`. Each step returns new float32 arrays.
 
@@ -120,7 +89,11 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.num_envs = env.num_envs
         self.mode = AutoresetMode(autoreset_mode)
         self.metadata = {**_metadata(env), "autoreset_mode": self.mode}
-        self.render_mode = _check_mode(render_mode)
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(
+                f"render_mode must be 'rgb_array' or None, found {render_mode!r}; `rlcli play` has viewers"
+            )
+        self.render_mode = render_mode
         self.single_observation_space = observation_space(env)
         self.single_action_space = action_space(env, action_bound)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -285,6 +258,33 @@ class GymnasiumEnv(gymnasium.Env):
         self._vector.close()
 
 
+def make_vector(
+    task: str,
+    num_envs: int = 1,
+    cfg: Changes = None,
+    *,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+    action_bound: float | None = 1.0,
+    render_mode: str | None = None,
+    **settings: Any,
+) -> GymnasiumVectorEnv:
+    """Return a vector environment; `gym.make_vec` calls it. Arguments: see `open_task` and `GymnasiumVectorEnv`."""
+    env = open_task(task, num_envs, cfg, **settings)
+    return GymnasiumVectorEnv(env, autoreset_mode, action_bound=action_bound, render_mode=render_mode)
+
+
+def make_single(
+    task: str,
+    cfg: Changes = None,
+    *,
+    action_bound: float | None = 1.0,
+    render_mode: str | None = None,
+    **settings: Any,
+) -> GymnasiumEnv:
+    """Return a single environment; `gym.make` calls it. Arguments: see `open_task` and `GymnasiumEnv`."""
+    return GymnasiumEnv(open_task(task, 1, cfg, **settings), action_bound=action_bound, render_mode=render_mode)
+
+
 def observation_space(env: VecEnv) -> spaces.Box:
     """Return the unbounded observation space of one environment: the group `policy`, float32 (d,)."""
     return spaces.Box(-np.inf, np.inf, (env.layout.size("policy"),), np.float32)
@@ -311,8 +311,6 @@ class _Camera:
     def image(self) -> NDArray[np.uint8]:
         """Render the current state. (height, width, 3)"""
         if self._renderer is None:
-            from rlcli.viewer.offscreen import Renderer
-
             self._renderer = Renderer(self._env.engine.model, self._env.config.viewer)
         return self._renderer.picture(self._env)
 
@@ -324,12 +322,6 @@ class _Camera:
 
 def _metadata(env: VecEnv) -> dict[str, Any]:
     return {"render_modes": ["rgb_array"], "render_fps": max(1, round(1.0 / env.step_dt))}
-
-
-def _check_mode(render_mode: str | None) -> str | None:
-    if render_mode not in (None, "rgb_array"):
-        raise ValueError(f"render_mode must be 'rgb_array' or None, found {render_mode!r}; `rlcli play` has viewers")
-    return render_mode
 
 
 def _policy_obs(groups: Mapping[str, Tensor]) -> Floats:
