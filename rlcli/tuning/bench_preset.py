@@ -4,10 +4,9 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from rlcli.config.dump import to_yaml
+from rlcli.config.dump import preset_of, put, to_yaml
 from rlcli.config.load import Resolved
 from rlcli.tuning.bench import Findings, Trained
-from rlcli.tuning.changed_settings import preset_of, put
 
 
 def bench_preset(

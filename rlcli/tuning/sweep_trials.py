@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from rlcli.config.dump import preset_of
 from rlcli.config.load import Resolved
 from rlcli.errors import DivergedError, RlcliError, UsageError, did_you_mean, listing
 from rlcli.evaluation.limits import require_success
@@ -16,7 +17,6 @@ from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.signals import StopRequest
 from rlcli.training.subprocesses import POLL_S, STOPPED, TrainingProcess, start_command, start_training
 from rlcli.training.time_to_threshold import training_s
-from rlcli.tuning.changed_settings import preset_of
 from rlcli.tuning.search_space import Objective, Parameter
 from rlcli.tuning.sweep import Sweep, Trial
 
