@@ -98,7 +98,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.single_action_space = action_space(env, action_bound)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.ended = np.zeros(self.num_envs, dtype=bool)
+        self.ended: NDArray[np.bool_] = np.zeros(self.num_envs, dtype=bool)
         """Environments whose episode has ended and that wait for a reset; in the mode SAME_STEP none. (num_envs,)"""
         # The `VecEnv` resets an ended environment within the step. The first observation of the new episode is kept
         # here until Gymnasium's mode allows it to be returned.

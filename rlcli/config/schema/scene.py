@@ -231,7 +231,7 @@ class SceneConfig(StrictModel):
     """Uneven ground. All environments share it and start at different positions on it."""
     lights: LightsConfig = LightsConfig(dome=DomeLightConfig())
     """Lights."""
-    entities: Annotated[dict[str, EntityConfig], Field(json_schema_extra={"minProperties": 1})]
+    entities: dict[str, EntityConfig] = Field(json_schema_extra={"minProperties": 1})
     """Name -> robot or object."""
     sensors: dict[str, SensorConfig] = {}
     """Name -> contact sensor, ray sensor or camera that terms use. Sensors of the MJCF need no entry."""
