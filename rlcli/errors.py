@@ -1,7 +1,5 @@
 """Errors that the user can fix, each with its exit code. Any other exception is a bug and keeps its traceback."""
 
-from __future__ import annotations
-
 import difflib
 import itertools
 from collections.abc import Iterable, Sequence

@@ -5,8 +5,6 @@ when its environment is made. If two plugins offer the same name, the ids are `r
 `rlcli/task` takes the folder of a task as its argument `task`.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 
 import gymnasium

@@ -1,7 +1,5 @@
 """Resources of the machine that this process may use: cores, memory, devices."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import gc

@@ -1,7 +1,5 @@
 """Progress of long work: a library function reports it with `track`, and the command line shows it."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator

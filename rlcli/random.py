@@ -5,8 +5,6 @@ other environments reset or sample. The mixing function is the finaliser of Spli
 https://doi.org/10.1145/2660193.2660195).
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 

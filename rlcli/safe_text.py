@@ -1,7 +1,5 @@
 """Helpers for text from files and command lines: find unsafe characters, shorten long text, read numbers."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable

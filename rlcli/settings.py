@@ -4,8 +4,6 @@ The file `settings.yaml` is in the platform's folder for user configuration; `rl
 Precedence: flag, environment variable, settings file, default. Programs that import the library ignore the file.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

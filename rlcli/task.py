@@ -1,7 +1,5 @@
 """Interface of task plugins: `TaskSpec`, and the type aliases for the parameters of terms."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias

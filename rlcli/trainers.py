@@ -1,7 +1,5 @@
 """Interface of trainer plugins: `TrainerSpec`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -3,10 +3,8 @@
 `rlcli.gym` registers them: `gym.make_vec("rlcli.gym:rlcli/cartpole", num_envs=8)`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -24,9 +22,7 @@ from rlcli.envs.make import make_env
 from rlcli.envs.step import StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.registry import find_task
-
-if TYPE_CHECKING:
-    from rlcli.viewer.offscreen import Renderer
+from rlcli.viewer.offscreen import Renderer
 
 Floats = NDArray[np.float32]
 Changes = Mapping[str, Any] | Iterable[str] | TaskConfig | Resolved | None
@@ -61,33 +57,6 @@ def open_task(
     return make_env(resolved, seed=seed, device=device)
 
 
-def make_vector(
-    task: str,
-    num_envs: int = 1,
-    cfg: Changes = None,
-    *,
-    autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
-    action_bound: float | None = 1.0,
-    render_mode: str | None = None,
-    **settings: Any,
-) -> GymnasiumVectorEnv:
-    """Return a vector environment; `gym.make_vec` calls it. Arguments: see `open_task` and `GymnasiumVectorEnv`."""
-    env = open_task(task, num_envs, cfg, **settings)
-    return GymnasiumVectorEnv(env, autoreset_mode, action_bound=action_bound, render_mode=render_mode)
-
-
-def make_single(
-    task: str,
-    cfg: Changes = None,
-    *,
-    action_bound: float | None = 1.0,
-    render_mode: str | None = None,
-    **settings: Any,
-) -> GymnasiumEnv:
-    """Return a single environment; `gym.make` calls it. Arguments: see `open_task` and `GymnasiumEnv`."""
-    return GymnasiumEnv(open_task(task, 1, cfg, **settings), action_bound=action_bound, render_mode=render_mode)
-
-
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     """Gymnasium vector environment of the observation group `policy`. Each step returns new float32 arrays.
 
@@ -120,12 +89,17 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.num_envs = env.num_envs
         self.mode = AutoresetMode(autoreset_mode)
         self.metadata = {**_metadata(env), "autoreset_mode": self.mode}
-        self.render_mode = _check_mode(render_mode)
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(
+                f"render_mode must be 'rgb_array' or None, found {render_mode!r}; `rlcli play` has viewers"
+            )
+        self.render_mode = render_mode
         self.single_observation_space = observation_space(env)
         self.single_action_space = action_space(env, action_bound)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._ended = np.zeros(self.num_envs, dtype=bool)
+        self.ended: NDArray[np.bool_] = np.zeros(self.num_envs, dtype=bool)
+        """Environments whose episode has ended and that wait for a reset; in the mode SAME_STEP none. (num_envs,)"""
         # The `VecEnv` resets an ended environment within the step. The first observation of the new episode is kept
         # here until Gymnasium's mode allows it to be returned.
         self._first: Floats | None = None
@@ -145,9 +119,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
         # a mask of all environments is a full reset, unless all have ended and wait for their next episode
-        if mask is not None and not (np.all(mask) and (seed is not None or not self._ended.all())):
+        if mask is not None and not (np.all(mask) and (seed is not None or not self.ended.all())):
             return self._start_episodes(np.asarray(mask, dtype=bool)), {}
-        self._ended[:] = False
+        self.ended[:] = False
         self._last_obs = _policy_obs(self.env.reset(seed=seed))
         return self._last_obs.copy(), {}
 
@@ -164,7 +138,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             RuntimeError: in mode DISABLED, if an episode has ended and no new one was started.
         """
         action = torch.as_tensor(np.asarray(actions, dtype=np.float32), device=self.env.device)
-        waiting = self._ended.copy()
+        waiting = self.ended.copy()
         if not waiting.any():
             result = self.env.step(action)
         elif self.mode is AutoresetMode.DISABLED:
@@ -179,11 +153,11 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         if self.mode is AutoresetMode.SAME_STEP:
             infos = self._final_infos(result, infos)
         else:
-            self._ended = terminated | truncated
-            if self._ended.any():
+            self.ended = terminated | truncated
+            if self.ended.any():
                 assert result.final_obs is not None
                 self._first = obs
-                obs = np.where(self._ended[:, None], _policy_obs(result.final_obs), obs)
+                obs = np.where(self.ended[:, None], _policy_obs(result.final_obs), obs)
         self._last_obs = obs
         return obs.copy(), result.reward.cpu().numpy().astype(np.float64), terminated, truncated, infos
 
@@ -200,13 +174,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Start the next episode in the environments of a mask."""
         if mask.shape != (self.num_envs,):
             raise ValueError(f"reset_mask has shape {mask.shape}; pass shape {(self.num_envs,)}")
-        running = np.flatnonzero(mask & ~self._ended).tolist()
+        running = np.flatnonzero(mask & ~self.ended).tolist()
         if running or self._last_obs is None:
             raise ValueError(f"set reset_mask to false for environments {running}: their episodes have not ended")
         if mask.any():
             assert self._first is not None
             self._last_obs = np.where(mask[:, None], self._first, self._last_obs)
-            self._ended &= ~mask
+            self.ended &= ~mask
         return self._last_obs.copy()
 
     def _infos(self, result: StepResult) -> dict[str, Any]:
@@ -246,21 +220,21 @@ class GymnasiumEnv(gymnasium.Env):
     def __init__(self, env: VecEnv, *, action_bound: float | None = 1.0, render_mode: str | None = None) -> None:
         if env.num_envs != 1:
             raise ValueError(f"GymnasiumEnv takes 1 environment, found {env.num_envs}; use GymnasiumVectorEnv")
+        self._vector = GymnasiumVectorEnv(
+            env, AutoresetMode.DISABLED, action_bound=action_bound, render_mode=render_mode
+        )
         self.env = env
         self.metadata = _metadata(env)
-        self.render_mode = _check_mode(render_mode)
-        self.observation_space = observation_space(env)
-        self.action_space = action_space(env, action_bound)
-        self._first: Floats | None = None  # first observation of the next episode, kept until `reset`
-        self._camera = _Camera(env)
+        self.render_mode = render_mode
+        self.observation_space = self._vector.single_observation_space
+        self.action_space = self._vector.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Start a new episode and return its first observation. (d,)"""
         super().reset(seed=seed)
-        first, self._first = self._first, None
-        if first is None or seed is not None:
-            first = _policy_obs(self.env.reset(seed=seed))[0]
-        return first.copy(), {}
+        starts_next = self._vector.ended[0] and seed is None  # the `VecEnv` has already reset the environment
+        obs, _ = self._vector.reset(seed=seed, options={"reset_mask": [True]} if starts_next else None)
+        return obs[0], {}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Step the environment. action (a,)
@@ -268,27 +242,47 @@ class GymnasiumEnv(gymnasium.Env):
         Raises:
             RuntimeError: if the episode has ended and `reset` was not called.
         """
-        if self._first is not None:
+        if self._vector.ended[0]:
             raise RuntimeError("the episode has ended; call reset()")
-        actions = torch.as_tensor(np.asarray(action, dtype=np.float32), device=self.env.device)
-        result = self.env.step(actions[None])
-        obs, info = _policy_obs(result.obs)[0], {}
-        terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
-        if terminated or truncated:
-            assert result.final_obs is not None
-            self._first, obs = obs, _policy_obs(result.final_obs)[0]
-            if result.episodes is not None and result.episodes.success is not None:
-                info["success"] = bool(result.episodes.success[0])
-        return obs.copy(), float(result.reward[0]), terminated, truncated, info
+        obs, reward, terminated, truncated, infos = self._vector.step(np.asarray(action)[None])
+        info = {"success": bool(infos["success"][0])} if "success" in infos else {}
+        return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return an image, uint8 (height, width, 3); None without a `render_mode`."""
-        return None if self.render_mode is None else self._camera.image()
+        images = self._vector.render()
+        return None if images is None else images[0]
 
     def close(self) -> None:
         """Close the environment."""
-        self._camera.close()
-        self.env.close()
+        self._vector.close()
+
+
+def make_vector(
+    task: str,
+    num_envs: int = 1,
+    cfg: Changes = None,
+    *,
+    autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+    action_bound: float | None = 1.0,
+    render_mode: str | None = None,
+    **settings: Any,
+) -> GymnasiumVectorEnv:
+    """Return a vector environment; `gym.make_vec` calls it. Arguments: see `open_task` and `GymnasiumVectorEnv`."""
+    env = open_task(task, num_envs, cfg, **settings)
+    return GymnasiumVectorEnv(env, autoreset_mode, action_bound=action_bound, render_mode=render_mode)
+
+
+def make_single(
+    task: str,
+    cfg: Changes = None,
+    *,
+    action_bound: float | None = 1.0,
+    render_mode: str | None = None,
+    **settings: Any,
+) -> GymnasiumEnv:
+    """Return a single environment; `gym.make` calls it. Arguments: see `open_task` and `GymnasiumEnv`."""
+    return GymnasiumEnv(open_task(task, 1, cfg, **settings), action_bound=action_bound, render_mode=render_mode)
 
 
 def observation_space(env: VecEnv) -> spaces.Box:
@@ -317,8 +311,6 @@ class _Camera:
     def image(self) -> NDArray[np.uint8]:
         """Render the current state. (height, width, 3)"""
         if self._renderer is None:
-            from rlcli.viewer.offscreen import Renderer
-
             self._renderer = Renderer(self._env.engine.model, self._env.config.viewer)
         return self._renderer.picture(self._env)
 
@@ -330,12 +322,6 @@ class _Camera:
 
 def _metadata(env: VecEnv) -> dict[str, Any]:
     return {"render_modes": ["rgb_array"], "render_fps": max(1, round(1.0 / env.step_dt))}
-
-
-def _check_mode(render_mode: str | None) -> str | None:
-    if render_mode not in (None, "rgb_array"):
-        raise ValueError(f"render_mode must be 'rgb_array' or None, found {render_mode!r}; `rlcli play` has viewers")
-    return render_mode
 
 
 def _policy_obs(groups: Mapping[str, Tensor]) -> Floats:

@@ -1,7 +1,5 @@
 """Adapter of a `VecEnv` to RSL-RL's interface, for the runners of RSL-RL."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

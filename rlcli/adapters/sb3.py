@@ -1,7 +1,5 @@
 """Environments of a task for scripts that use Stable-Baselines3 directly."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from rlcli.adapters.gymnasium import Changes, open_task

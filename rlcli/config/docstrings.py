@@ -1,7 +1,5 @@
 """Reader of the docstrings below the fields of a model, which become descriptions in its JSON Schema."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import inspect

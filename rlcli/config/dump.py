@@ -1,7 +1,5 @@
 """Output of a resolved configuration: YAML that reads back as the same configuration, origins, JSON Schema."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import PurePath
@@ -128,9 +126,36 @@ def origins(resolved: Resolved, data: dict[str, Any] | None = None) -> dict[str,
 
 def explicit_values(resolved: Resolved) -> dict[str, str]:
     """Return the origin of every value set on the command line or in a `--config` file, by dotted key."""
-    found = resolved.layers.origins.items()
-    layers = ("config", "override", "flag")
-    return {messages.dotted(path): _location(origin) for path, origin in found if path and origin.layer in layers}
+    return {messages.dotted(path): _location(origin) for path, origin in _explicit_origins(resolved)}
+
+
+def preset_of(resolved: Resolved, names_agent: bool) -> dict[str, Any]:
+    """Return the values set on the command line or in a `--config` file, in the form of such a file.
+
+    Args:
+        resolved: the configuration.
+        names_agent: whether the preset makes the chosen agent the default.
+    """
+    preset: dict[str, Any] = {}
+    agent = ("agents", resolved.agent_name)
+    for path, _ in _explicit_origins(resolved):
+        inner, value = _until_list(resolved.layers.data, path)
+        if isinstance(value, dict) and value:
+            continue  # its entries have their own paths
+        put(preset, ("agent", *inner[2:]) if inner[:2] == agent else inner, value)
+    if names_agent:
+        put(preset, ("agents", "default"), resolved.agent_name)
+    return preset
+
+
+def put(data: dict[str, Any], path: tuple[Any, ...], value: object) -> None:
+    """Set a value in nested mappings; create missing mappings."""
+    for key in path[:-1]:
+        inner = data.get(key)
+        if not isinstance(inner, dict):
+            inner = data[key] = {}
+        data = inner
+    data[path[-1]] = value
 
 
 def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -> dict[str, Any]:
@@ -203,3 +228,18 @@ def _origin(resolved: Resolved, path: Path) -> str:
 def _location(origin: Origin) -> str:
     where = " ".join(origin.where.split())
     return where if origin.layer in ("task", "override", "flag") else f"{origin.layer}: {where}"
+
+
+def _explicit_origins(resolved: Resolved) -> list[tuple[Path, Origin]]:
+    """Return path and origin of every value set on the command line or in a `--config` file."""
+    found = resolved.layers.origins.items()
+    return [(path, origin) for path, origin in found if path and origin.layer in ("config", "override", "flag")]
+
+
+def _until_list(data: object, path: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
+    """Return the path up to the first list, and the value there, because a file can only replace a whole list."""
+    for depth, step in enumerate(path):
+        if not isinstance(data, dict):
+            return path[:depth], data
+        data = data.get(step)
+    return path, data

@@ -1,7 +1,5 @@
 """Top-level keys of other frameworks in a task file: they move into `foreign`, by format."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Models of robots that a user gives for task files of other frameworks: `--model NAME=FILE`, or a YAML file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path as FilePath
 from typing import Any

@@ -1,7 +1,5 @@
 """Layers of raw configuration, merged in order. Every value keeps its origin: the file and line it was written in."""
 
-from __future__ import annotations
-
 import copy
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping

@@ -5,12 +5,10 @@ patch < the task's `play:` patch (play and eval only) < `--config` < overrides. 
 with its file and line.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, Self
 
 from pydantic import BaseModel
 
@@ -53,7 +51,7 @@ class Resolved:
         """Return a problem at a path of this configuration."""
         return Problem(self.place(path), messages.dotted(path), message, hint)
 
-    def with_num_envs(self, count: int) -> Resolved:
+    def with_num_envs(self, count: int) -> Self:
         """Return the configuration with another number of environments."""
         scene = self.task.scene.model_copy(update={"num_envs": count})
         return replace(self, task=self.task.model_copy(update={"scene": scene}))

@@ -1,7 +1,5 @@
 """Messages for the validation errors of pydantic: the key, the value found, what is allowed, the most similar key."""
 
-from __future__ import annotations
-
 import functools
 import json
 import operator

@@ -1,7 +1,5 @@
 """The key `success` of runs that were saved before it had named conditions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ of another framework with a method `__rlcli_task__(root, models) -> PythonTask`.
 function that is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import logging

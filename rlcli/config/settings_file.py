@@ -1,7 +1,5 @@
 """Reader of the user's settings file."""
 
-from __future__ import annotations
-
 import os
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Schema of the user's settings file."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field

@@ -5,9 +5,8 @@ with its position: duplicate keys, anchors, tags, merge keys, a second document,
 `.nan`).
 """
 
-from __future__ import annotations
-
 import functools
+import itertools
 import math
 import re
 from collections.abc import Iterator
@@ -55,15 +54,6 @@ class Document:
 
     data: dict[str, Any]
     marks: dict[Path, Mark] = field(default_factory=dict)
-
-
-@dataclass(slots=True)
-class _Frame:
-    """A mapping or list that is being read. `key` is the key whose value comes next."""
-
-    container: dict[str, Any] | list[Any]
-    path: Path
-    key: str | None = None
 
 
 def load(text: str | bytes) -> Document:
@@ -117,7 +107,7 @@ def _copy(value: Any) -> Any:
 @functools.lru_cache(maxsize=8)  # a command reads the same file several times: for its format, then as a task
 def _parse_cached(text: str) -> tuple[Any, dict[Path, Mark]]:
     try:
-        return _Reader().read(text)
+        return _read(text)
     except yaml.MarkedYAMLError as error:
         raise YamlError(
             error.problem or error.context or "syntax error", error.problem_mark or error.context_mark
@@ -139,81 +129,70 @@ def _events(text: str) -> Iterator[events.Event]:
         loader.dispose()
 
 
-class _Reader:
-    """Builder of data and positions from PyYAML's events."""
-
-    def __init__(self) -> None:
-        self.marks: dict[Path, Mark] = {}
-        self.stack: list[_Frame] = []
-        self.root: Any = None
-
-    def read(self, text: str) -> tuple[Any, dict[Path, Mark]]:
-        documents = 0
-        for count, event in enumerate(_events(text)):
-            if count > MAX_ITEMS:
-                raise YamlError(f"the file has more than {MAX_ITEMS} items; make it smaller", event.start_mark)
-            self._refuse(event)
-            if isinstance(event, events.DocumentStartEvent):
-                documents += 1
-                if documents > 1:
-                    raise YamlError("only one document per file is allowed; remove the line `---`", event.start_mark)
-            elif isinstance(event, events.ScalarEvent):
-                self._put(_scalar(event, key=self._awaits_key()), event.start_mark)
-            elif isinstance(event, events.MappingStartEvent):
-                self._open({}, event.start_mark)
-            elif isinstance(event, events.SequenceStartEvent):
-                self._open([], event.start_mark)
-            elif isinstance(event, (events.MappingEndEvent, events.SequenceEndEvent)):
-                self.stack.pop()
-        return self.root, self.marks
-
-    def _awaits_key(self) -> bool:
-        """Return whether the next event is the key of a mapping."""
-        return bool(self.stack) and isinstance(self.stack[-1].container, dict) and self.stack[-1].key is None
-
-    def _refuse(self, event: events.Event) -> None:
+def _checked_events(text: str) -> Iterator[events.Event]:
+    """Yield PyYAML's events; refuse long files, further documents, anchors, aliases and tags."""
+    documents = 0
+    for count, event in enumerate(_events(text)):
+        if count > MAX_ITEMS:
+            raise YamlError(f"the file has more than {MAX_ITEMS} items; make it smaller", event.start_mark)
         if getattr(event, "anchor", None):
             raise YamlError("anchors and aliases are not allowed; write the value again", event.start_mark)
-        tag = getattr(event, "tag", None)
-        if tag not in (None, "!"):
-            raise YamlError(f"tags are not allowed; remove {str(tag)[:60]}", event.start_mark)
+        if getattr(event, "tag", None) not in (None, "!"):
+            raise YamlError(f"tags are not allowed; remove {str(event.tag)[:60]}", event.start_mark)
+        documents += isinstance(event, events.DocumentStartEvent)
+        if documents > 1:
+            raise YamlError("only one document per file is allowed; remove the line `---`", event.start_mark)
+        yield event
 
-    def _open(self, container: dict[str, Any] | list[Any], mark: Any) -> None:
-        if len(self.stack) >= MAX_DEPTH:
-            raise YamlError(f"values are nested deeper than {MAX_DEPTH} levels; write them flatter", mark)
-        if self._awaits_key():
-            raise YamlError("a key must be text, not a list or mapping; write `name: value`", mark)
-        self.stack.append(_Frame(container, self._put(container, mark)))
 
-    def _put(self, value: Any, mark: Any) -> Path:
-        """Add a value to the innermost container (or use it as a key) and return its path."""
-        position = (mark.line + 1, mark.column + 1)
-        if not self.stack:
-            self.root = value
-            self.marks[()] = position
-            return ()
-        frame = self.stack[-1]
-        if isinstance(frame.container, list):
-            path = (*frame.path, len(frame.container))
-            frame.container.append(value)
-        elif frame.key is None:
-            return self._key(frame, value, mark)
-        else:
-            path = (*frame.path, frame.key)
-            frame.container[frame.key] = value
-            frame.key = None
-        self.marks.setdefault(path, position)  # for a mapping this is the position of the key, set by `_key`
-        return path
+def _read(text: str) -> tuple[Any, dict[Path, Mark]]:
+    """Return the value of a text, and the position of every key and item."""
+    reader = _Reader(_checked_events(text))
+    root = [reader.value(event, ()) for event in reader.stream if isinstance(event, events.NodeEvent)]
+    return root[0] if root else None, reader.marks
 
-    def _key(self, frame: _Frame, key: Any, mark: Any) -> Path:
-        if not isinstance(key, str):
-            raise YamlError(f"keys must be text, found {key!r}; quote it", mark)
-        path = (*frame.path, key)
-        if key in frame.container:
-            raise YamlError(f"duplicate key '{key}' (first on line {self.marks[path][0]}); remove one", mark)
-        frame.key = key
-        self.marks[path] = (mark.line + 1, mark.column + 1)
-        return path
+
+@dataclass(slots=True)
+class _Reader:
+    """Reader of values from PyYAML's events."""
+
+    stream: Iterator[events.Event]
+    marks: dict[Path, Mark] = field(default_factory=dict)
+
+    def value(self, event: events.Event, path: Path) -> Any:
+        """Return the value that starts with an event."""
+        self.marks.setdefault(path, _position(event))  # `_mapping` has stored the position of the key
+        if isinstance(event, events.ScalarEvent):
+            return _scalar(event, key=False)
+        if len(path) >= MAX_DEPTH:
+            raise YamlError(f"values are nested deeper than {MAX_DEPTH} levels; write them flatter", event.start_mark)
+        if isinstance(event, events.MappingStartEvent):
+            return self._mapping(path)
+        return [self.value(item, (*path, index)) for index, item in enumerate(self._until(events.SequenceEndEvent))]
+
+    def _mapping(self, path: Path) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for event in self._until(events.MappingEndEvent):
+            if not isinstance(event, events.ScalarEvent):
+                raise YamlError("a key must be text, not a list or mapping; write `name: value`", event.start_mark)
+            key = _scalar(event, key=True)
+            if not isinstance(key, str):
+                raise YamlError(f"keys must be text, found {key!r}; quote it", event.start_mark)
+            below = (*path, key)
+            if key in found:
+                first = self.marks[below][0]
+                raise YamlError(f"duplicate key '{key}' (first on line {first}); remove one", event.start_mark)
+            self.marks[below] = _position(event)
+            found[key] = self.value(next(self.stream), below)
+        return found
+
+    def _until(self, end: type[events.Event]) -> Iterator[events.Event]:
+        """Yield the events up to the end of a container; the caller reads the events inside of each value."""
+        return itertools.takewhile(lambda event: not isinstance(event, end), self.stream)
+
+
+def _position(event: events.Event) -> Mark:
+    return event.start_mark.line + 1, event.start_mark.column + 1
 
 
 def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:

@@ -3,8 +3,6 @@
 The signatures come from the source (`term_signatures`), the meanings of the keys from `rlcli/mdp/term_keys.yaml`.
 """
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Iterable, Mapping

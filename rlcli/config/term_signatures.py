@@ -6,8 +6,6 @@ inherit its `__init__` from a base in the same file, in another file of the task
 `@dataclass`.
 """
 
-from __future__ import annotations
-
 import ast
 import functools
 import inspect
@@ -16,7 +14,7 @@ import textwrap
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Union
+from typing import Any, Literal, Self, Union
 
 from pydantic import ConfigDict, Field, create_model
 
@@ -100,7 +98,7 @@ class Vocabulary:
     own: dict[str, Signature] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, files: tuple[Path, ...]) -> Vocabulary:
+    def of(cls, files: tuple[Path, ...]) -> Self:
         """Read the task's own term files. If two files define a term, the later file wins."""
         own: dict[str, Signature] = {}
         for file in files:

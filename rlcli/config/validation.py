@@ -1,12 +1,10 @@
 """Validation of a configuration against the schema, the signatures of its terms and the settings of its trainer."""
 
-from __future__ import annotations
-
 import functools
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
@@ -54,7 +52,7 @@ class _AnyAgent(AgentConfig):
     algorithm: str | dict[str, Any]  # type: ignore[assignment]
 
     @model_validator(mode="after")
-    def _budget(self) -> _AnyAgent:
+    def _budget(self) -> Self:
         return self  # the trainer may have other keys for its budget
 
 

@@ -11,8 +11,6 @@ start each step from the same state. If both arrive at the same state within rou
 plain MuJoCo. A step in which they disagree is not corrected, so that an error shows in the return.
 """
 
-from __future__ import annotations
-
 import copy
 import logging
 from collections.abc import Callable, Iterable

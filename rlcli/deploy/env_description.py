@@ -1,7 +1,5 @@
 """Description of an environment for code without rlcli; it is stored in checkpoints and in exported files."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 

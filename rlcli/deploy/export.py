@@ -5,8 +5,6 @@ the task's package nor MuJoCo is imported. The graph has the input `obs` and the
 `env.step`) and `command` (what the actuators receive).
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

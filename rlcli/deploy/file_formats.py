@@ -1,7 +1,5 @@
 """Formats of exported policies: a writer for each, and a reader that checks the file."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import io

@@ -13,8 +13,6 @@ these. Every value is a row of float32.
 A term without a formula can only be computed by its own code.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 

@@ -1,11 +1,9 @@
 """Module that every export format contains: the policy, followed by the scaling of the action terms."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -72,7 +70,7 @@ class DeployedPolicy(nn.Module):
                 command = torch.minimum(torch.maximum(command, bounds[0]), bounds[1])
         return {"action": action, "command": command}
 
-    def for_onnx(self) -> DeployedPolicy:
+    def for_onnx(self) -> Self:
         """Return a copy without ELU modules, which ONNX runtimes implement for float32 only."""
         graph = copy.deepcopy(self)
         for module in list(graph.modules()):

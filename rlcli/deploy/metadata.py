@@ -1,7 +1,5 @@
 """Metadata of an exported file: everything that a program needs to run the policy, also in mjlab's format."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Export of a policy to one Python file that needs only numpy: the template `deployed/policy.py` with the weights."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

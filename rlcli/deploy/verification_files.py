@@ -1,7 +1,5 @@
 """Files that `export --verify` writes beside a policy: the trained model, and a program that runs the policy on it."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 from collections.abc import Iterator

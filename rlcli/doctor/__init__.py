@@ -1,7 +1,5 @@
 """Checks of `rlcli doctor`: whether this machine, this installation and every installed plugin work."""
 
-from __future__ import annotations
-
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -9,8 +7,7 @@ from pathlib import Path
 from rlcli.doctor.check import Check
 from rlcli.doctor.compute_and_graphics import check_isolated
 from rlcli.doctor.installation import entry_checks, installation_checks, metadata_checks
-from rlcli.doctor.machine import machine_checks
-from rlcli.doctor.settings import settings_checks
+from rlcli.doctor.machine import machine_checks, settings_checks
 from rlcli.machine import require_address_space
 from rlcli.registry import FORMATS, TASKS, TRAINERS
 from rlcli.registry.probe import TIMEOUT_S

@@ -1,13 +1,7 @@
 """Result of one check of `rlcli doctor`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
-
-STATES = ("ok", "absent", "warning", "broken")
-"""ok: works; absent: an optional extra is not installed, which is no fault; warning: something will not work, or will
-work badly; broken: something that is installed or configured does not work."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,6 +10,8 @@ class Check:
 
     name: str
     state: str
+    """ok: works; absent: an optional extra is not installed, which is no fault; warning: something will not work, or
+    will work badly; broken: something that is installed or configured does not work."""
     found: str
     hint: str | None = None
     details: dict[str, Any] = field(default_factory=dict)

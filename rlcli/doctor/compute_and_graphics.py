@@ -1,7 +1,5 @@
 """Checks that run in separate processes because they may hang or crash: torch and MuJoCo, OpenGL, GPU drivers."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

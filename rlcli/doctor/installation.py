@@ -1,7 +1,5 @@
 """Checks of the installed packages: whether they are present, load, and fit together."""
 
-from __future__ import annotations
-
 import platform
 import re
 import sys

@@ -1,7 +1,5 @@
 """`python -m rlcli.doctor.isolated_process CHECK`: run a check that may crash, and print its result as JSON."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import json

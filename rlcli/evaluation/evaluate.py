@@ -1,11 +1,9 @@
 """Evaluation of a policy: a fixed number of episodes of each environment, so that short episodes are not favoured."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -19,7 +17,11 @@ from rlcli.replay.rerun_episode import require_end
 from rlcli.rl.acting import Act
 from rlcli.rl.confidence import mean, proportion
 
-T = TypeVar("T")
+_COLUMNS = (
+    *("envs", "returns", "lengths", "truncated", "successes", "held", "condition_values"),
+    *("reward_terms", "causes", "values"),
+)
+"""Fields of an evaluation with one value for each episode."""
 
 
 @dataclass(slots=True)
@@ -70,34 +72,25 @@ class Evaluation:
             result["value"] = _mean_of_finite(self.condition_values[name])
         return result
 
-    def part(self, first: int, stop: int) -> Evaluation:
+    def part(self, first: int, stop: int) -> Self:
         """Return the episodes of the environments `first` to `stop` - 1, which are numbered from 0."""
         rows = [row for row, env in enumerate(self.envs) if first <= env < stop]
         return self._rows(rows, first)
 
-    def in_environment_order(self) -> Evaluation:
+    def in_environment_order(self) -> Self:
         """Return the episodes ordered by environment: equal positions in two evaluations have equal random streams."""
         return self._rows(sorted(range(len(self.envs)), key=lambda row: self.envs[row]), 0)  # a stable sort
 
-    def _rows(self, rows: list[int], first: int) -> Evaluation:
-        def take(values: list[T]) -> list[T]:
-            return [values[row] for row in rows] if values else []
+    def _rows(self, rows: list[int], first: int) -> Self:
+        def take(column: Any) -> Any:
+            if isinstance(column, dict):
+                return {name: take(values) for name, values in column.items()}
+            return [column[row] for row in rows] if column else []
 
-        causes = {name: take(fired) for name, fired in self.causes.items()}
-        return Evaluation(
-            envs=[env - first for env in take(self.envs)],
-            returns=take(self.returns),
-            lengths=take(self.lengths),
-            successes=take(self.successes),
-            conditions=self.conditions,
-            held={name: take(flags) for name, flags in self.held.items()},
-            condition_values={name: take(values) for name, values in self.condition_values.items()},
-            truncated=take(self.truncated),
-            reward_terms={name: take(values) for name, values in self.reward_terms.items()},
-            causes=causes,
-            diverged=sum(causes.get(DIVERGED, [])),
-            values={name: take(values) for name, values in self.values.items()},
-        )
+        taken = replace(self, **{name: take(getattr(self, name)) for name in _COLUMNS}, diverged_by={})
+        taken.envs = [env - first for env in taken.envs]
+        taken.diverged = sum(taken.causes.get(DIVERGED, []))
+        return taken
 
 
 def evaluate(

@@ -5,8 +5,6 @@ actions. The regulator uses the policy's observations and actions. A task has no
 an equilibrium, if the observations do not determine the state, or if no linear feedback stabilises it.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace

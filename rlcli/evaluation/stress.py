@@ -1,7 +1,5 @@
 """Stress test: evaluation of a policy in many variants of its task, with the same random numbers in each variant."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math

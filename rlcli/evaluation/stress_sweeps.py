@@ -1,7 +1,5 @@
 """Parameters of a stress test and their values on a command line: `body_mass.pole=0.5:2`, `action_delay=0:3`."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

@@ -1,7 +1,5 @@
 """Registry of tasks, trainers and formats by name. Names come from package metadata; plugins are imported when used."""
 
-from __future__ import annotations
-
 from rlcli.registry.entries import (
     FORMATS,
     OWN,

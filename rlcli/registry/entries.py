@@ -3,8 +3,6 @@
 Distributions are read one by one, so that a broken one does not hide the others.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Lookup of a task by the name or path that the user typed."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tasks that are not installed: a folder with a YAML file, or a configuration in a Python file or package."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Installed formats (entry-point group `rlcli.formats`), and known formats whose plugin is not installed."""
 
-from __future__ import annotations
-
 import functools
 import json
 import logging

@@ -1,7 +1,5 @@
 """Import of plugins, protected against what their code prints, raises or changes."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import operator

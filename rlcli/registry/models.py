@@ -1,7 +1,5 @@
 """Lookup of a robot model: in the task's folder, another task's folder, a package, or a folder of the user."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -5,8 +5,6 @@ entry for another framework: an installed original is neither imported for a tas
 a task that import something later use the same `__import__`.
 """
 
-from __future__ import annotations
-
 import builtins
 import contextlib
 import functools

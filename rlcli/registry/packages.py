@@ -1,7 +1,5 @@
 """Tasks of installed packages: their files, and the packages that a configuration may name."""
 
-from __future__ import annotations
-
 import importlib.util
 from importlib.machinery import ModuleSpec
 from pathlib import Path

@@ -4,8 +4,6 @@ A distribution may ship the details as `index.json` in its top-level package, as
 other tasks are in the user's cache folder, under the distribution's name and version, and the time of its last change.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Import of task files by module name or path."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import importlib

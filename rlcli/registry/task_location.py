@@ -1,7 +1,5 @@
 """Location of a task: the files and modules from which it is read, checked and built."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

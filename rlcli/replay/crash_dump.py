@@ -1,7 +1,5 @@
 """Crash dumps: trajectory files with the engine calls that led to a divergence."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import shlex

@@ -1,7 +1,5 @@
 """Recorder of whole episodes of an evaluation; a replay can simulate them again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

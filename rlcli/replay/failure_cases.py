@@ -1,7 +1,5 @@
 """Failure cases of a training, as `rlcli autopsy` reads them; no code of a run is executed."""
 
-from __future__ import annotations
-
 import logging
 import re
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ than the checkpoint are removed, because their episodes are run again.
 Recording draws no random numbers and writes nothing to the environment, so that the trained bits stay the same.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 from collections import Counter

@@ -6,8 +6,6 @@ episodes, noise, curricula, or terms with a state. Then the episodes before K ar
 the evaluation, and the reasons are reported.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -5,8 +5,6 @@ resets are computed again. Engine calls of crash dumps and failure files are rep
 without the task's terms.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field

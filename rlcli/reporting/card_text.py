@@ -1,7 +1,5 @@
 """Short texts for the values of a configuration in a task card."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

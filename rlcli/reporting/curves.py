@@ -6,8 +6,6 @@ arXiv:2108.13264). The strata are tasks. A curve has one task, so whole runs are
 a fixed seed: the same runs give the same curves.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Heat map of a stress test: one value for each pair of values of two sweeps."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

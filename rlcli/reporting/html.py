@@ -1,7 +1,5 @@
 """HTML of a run's page: one file without scripts and external resources, with all text escaped."""
 
-from __future__ import annotations
-
 import base64
 import functools
 import re

@@ -1,7 +1,5 @@
 """Evaluation and video for the HTML report of a run: taken from the run's folder, or made if they are missing."""
 
-from __future__ import annotations
-
 import logging
 from functools import cached_property
 from pathlib import Path

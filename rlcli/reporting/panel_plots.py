@@ -1,7 +1,5 @@
 """Plots of learning curves, made with matplotlib: without a window, and with the same bytes for the same curves."""
 
-from __future__ import annotations
-
 import importlib.util
 import io
 import math

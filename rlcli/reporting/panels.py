@@ -1,7 +1,5 @@
 """Panels of a picture of learning curves: one for each metric, and one for all terminations."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Content of a run's page, read from the run's files. If a part cannot be read, the page shows the other parts."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shlex

@@ -4,8 +4,6 @@ Nothing is built or imported. Sizes of terms and names of joints come from the c
 layout: the `layout` of a checkpoint's manifest, or the `task.layout.json` that a task ships.
 """
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import html

@@ -1,7 +1,5 @@
 """Atomic writing of files: after a crash a reader finds either the old content or the new one."""
 
-from __future__ import annotations
-
 import contextlib
 import glob
 import json

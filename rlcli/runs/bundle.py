@@ -4,8 +4,6 @@ A bundle is a checkpoint reduced to `policy.json`, `policy.safetensors` and a ma
 and training. It is read like any checkpoint, with the same checks.
 """
 
-from __future__ import annotations
-
 import os
 import secrets
 import shutil

@@ -1,7 +1,5 @@
 """Layout and deployment records of a checkpoint's manifest, checked as content of an untrusted file."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping

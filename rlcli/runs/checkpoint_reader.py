@@ -1,7 +1,5 @@
 """Checkpoints: folders of safetensors and JSON files, which are verified before use and never unpickled."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path

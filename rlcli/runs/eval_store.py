@@ -1,7 +1,5 @@
 """Evaluations stored in a run: the last result of `rlcli eval` for each checkpoint."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

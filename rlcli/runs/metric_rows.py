@@ -1,7 +1,5 @@
 """Reader of a run's `metrics.jsonl`, which has one row for each iteration."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from typing import Any

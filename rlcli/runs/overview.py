@@ -1,7 +1,5 @@
 """States and scores of the runs in a folder, read from their files alone: fast for thousands of untrusted runs."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

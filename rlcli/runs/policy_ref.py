@@ -1,7 +1,5 @@
 """References to policies on a command line: a run's checkpoint, a bundle, or the policy shipped with a task."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reproduction of a run: whether it is possible, what has changed since, and at which iterations to compare."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Task, configuration and compatibility checks of a saved run, used by play, eval and resume."""
 
-from __future__ import annotations
-
 import os
 import shlex
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """References to runs and checkpoints on a command line: folder, name, `latest`, `RUN@best` or `RUN@step:N`."""
 
-from __future__ import annotations
-
 import contextlib
 import glob
 import logging

@@ -1,7 +1,5 @@
 """Reading of untrusted files: plain files of limited size, strict JSON, and pydantic models of the JSON's content."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json
@@ -91,17 +89,16 @@ def read_file(file: Path, limit: int, *, size: int | None = None, missing: str |
         FileNotFoundError: if it does not exist.
     """
     try:
-        handle, status = _open(file)
+        with _opened(file) as (opened, found):
+            if size is not None and found != size:
+                raise manifest_error(file, found, size)
+            if found > limit:
+                raise CheckpointError(f"{file} is too large: {found:,} bytes, at most {limit:,} are read")
+            return opened.read(found)
     except FileNotFoundError:
         if missing is None:
             raise
         raise CheckpointError(missing) from None
-    with os.fdopen(handle, "rb") as opened:
-        if size is not None and status.st_size != size:
-            raise manifest_error(file, status.st_size, size)
-        if status.st_size > limit:
-            raise CheckpointError(f"{file} is too large: {status.st_size:,} bytes, at most {limit:,} are read")
-        return _read(opened, file, 0, status.st_size)
 
 
 def manifest_error(file: Path, found: int, size: int) -> CheckpointError:
@@ -117,40 +114,32 @@ def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
         CheckpointError: if it is a link, not a regular file, or cannot be read.
         FileNotFoundError: if it does not exist.
     """
-    handle, status = _open(file)
-    begin = max(0, status.st_size - limit)
-    with os.fdopen(handle, "rb") as opened:
-        return _read(opened, file, begin, status.st_size - begin), begin == 0
+    with _opened(file) as (opened, size):
+        begin = max(0, size - limit)
+        opened.seek(begin)
+        return opened.read(size - begin), begin == 0
 
 
-def _read(opened: BinaryIO, file: Path, begin: int, count: int) -> bytes:
-    try:
-        if begin:
-            opened.seek(begin)
-        return opened.read(count)
-    except (OSError, MemoryError) as error:
-        reason = getattr(error, "strerror", None) or "there is not enough memory"
-        raise CheckpointError(f"{file} cannot be read: {reason}") from None
-
-
-def _open(file: Path) -> tuple[int, os.stat_result]:
-    """Open a plain file; return its handle and status."""
+@contextlib.contextmanager
+def _opened(file: Path) -> Iterator[tuple[BinaryIO, int]]:
+    """Context with an opened plain file and its size [bytes]; errors in the block name the file."""
     try:
         if file.is_symlink():
             raise CheckpointError(f"{file} is a link; replace it by the file itself")
         handle = os.open(file, os.O_RDONLY | _NO_LINKS)  # O_NONBLOCK: opening a pipe must not block
+        status = os.fstat(handle)
+        if not stat.S_ISREG(status.st_mode):
+            os.close(handle)
+            raise CheckpointError(f"{file} is not a regular file; delete it")
+        with os.fdopen(handle, "rb") as opened:
+            yield opened, status.st_size
     except (FileNotFoundError, NotADirectoryError) as error:
         raise FileNotFoundError(*error.args) from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
+    except (OSError, ValueError, MemoryError) as error:
+        reason = getattr(error, "strerror", None) or str(error) or "there is not enough memory"
         if getattr(error, "errno", None) in _NOT_A_FILE:
             reason = "it is not a regular file"
         raise CheckpointError(f"{file} cannot be read: {reason}") from None
-    status = os.fstat(handle)
-    if not stat.S_ISREG(status.st_mode):
-        os.close(handle)
-        raise CheckpointError(f"{file} is not a regular file; delete it")
-    return handle, status
 
 
 def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Studies: folders with runs of one configuration and several seeds. Importing this module is cheap."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

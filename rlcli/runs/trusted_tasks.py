@@ -5,8 +5,6 @@ them, so they are untrusted. They are loaded only after the user has named them 
 user's state folder has one file for each such task.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """Reading of files saved by torch and Stable-Baselines3; nothing but tensors is unpickled."""
 
-from __future__ import annotations
-
 import io
 import pickletools
 import re

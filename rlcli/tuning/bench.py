@@ -5,8 +5,6 @@ and size of gradient steps. Then the time of an iteration decides the time to a 
 fewer gradient steps per sample would be no gain.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import math
@@ -141,6 +139,29 @@ class Findings:
             entries = asdict(one)
             rows.append({**entries.pop("setting"), **entries, "steps_per_s": one.steps_per_s})
         return {"environment": [asdict(one) for one in self.stepped], "training": rows, "unsteady": self.unsteady}
+
+
+@dataclass(slots=True)
+class _Training:
+    """Trainer with the durations of its iterations."""
+
+    trainer: Trainer
+    blocks: list[float] = field(default_factory=list)
+    """Mean duration of an iteration in each block [s]."""
+    seconds: list[Mapping[str, float]] = field(default_factory=list)
+    """Part -> duration [s], for each iteration."""
+
+    def iterate(self) -> None:
+        """Run one iteration."""
+        self.seconds.append(self.trainer.iterate().seconds)
+
+    def row(self, setting: Setting, *, alike: bool) -> Trained:
+        """Return the measurement."""
+        total = sum(sum(parts.values()) for parts in self.seconds)
+        names = dict.fromkeys(name for parts in self.seconds for name in parts)
+        shares = {name: sum(parts.get(name, 0.0) for parts in self.seconds) / total for name in names}
+        samples, median = self.trainer.steps_per_iteration, statistics.median(self.blocks)
+        return Trained(setting, alike, samples, median, shares, _spread(self.blocks), resident_memory())
 
 
 class Bench:
@@ -319,29 +340,6 @@ class Bench:
         noise = max(present.spread or 0.0, best.spread or 0.0)
         better = best.seconds < present.seconds * min(WORTH, 1.0 - noise)
         self.findings.present, self.findings.recommended = present, best if better else present
-
-
-@dataclass(slots=True)
-class _Training:
-    """Trainer with the durations of its iterations."""
-
-    trainer: Trainer
-    blocks: list[float] = field(default_factory=list)
-    """Mean duration of an iteration in each block [s]."""
-    seconds: list[Mapping[str, float]] = field(default_factory=list)
-    """Part -> duration [s], for each iteration."""
-
-    def iterate(self) -> None:
-        """Run one iteration."""
-        self.seconds.append(self.trainer.iterate().seconds)
-
-    def row(self, setting: Setting, *, alike: bool) -> Trained:
-        """Return the measurement."""
-        total = sum(sum(parts.values()) for parts in self.seconds)
-        names = dict.fromkeys(name for parts in self.seconds for name in parts)
-        shares = {name: sum(parts.get(name, 0.0) for parts in self.seconds) / total for name in names}
-        samples, median = self.trainer.steps_per_iteration, statistics.median(self.blocks)
-        return Trained(setting, alike, samples, median, shares, _spread(self.blocks), resident_memory())
 
 
 def load() -> float | None:

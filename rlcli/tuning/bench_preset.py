@@ -1,15 +1,12 @@
 """The settings that `rlcli bench` recommends, as a `--config` file with the measurements in comments."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from rlcli.config.dump import to_yaml
+from rlcli.config.dump import preset_of, put, to_yaml
 from rlcli.config.load import Resolved
 from rlcli.tuning.bench import Findings, Trained
-from rlcli.tuning.changed_settings import preset_of, put
 
 
 def bench_preset(

@@ -1,7 +1,5 @@
 """Comparison of the best trial of a sweep with the task's own settings: time to a threshold with several seeds."""
 
-from __future__ import annotations
-
 import logging
 import tempfile
 import time

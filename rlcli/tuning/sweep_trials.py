@@ -1,7 +1,5 @@
 """Runner of a sweep's trials: trains, evaluates and prunes them in subprocesses."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time
@@ -9,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from rlcli.config.dump import preset_of
 from rlcli.config.load import Resolved
 from rlcli.errors import DivergedError, RlcliError, UsageError, did_you_mean, listing
 from rlcli.evaluation.limits import require_success
@@ -18,7 +17,6 @@ from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.signals import StopRequest
 from rlcli.training.subprocesses import POLL_S, STOPPED, TrainingProcess, start_command, start_training
 from rlcli.training.time_to_threshold import training_s
-from rlcli.tuning.changed_settings import preset_of
 from rlcli.tuning.search_space import Objective, Parameter
 from rlcli.tuning.sweep import Sweep, Trial
 
@@ -63,6 +61,34 @@ def write_preset(sweep: Sweep, request: TrainingRequest) -> None:
         return preset_of(resolved, names_agent=True)
 
     sweep.write_preset(preset)
+
+
+@dataclass(slots=True)
+class _Stage:
+    """Training or evaluation of a trial."""
+
+    trial: Trial
+    process: TrainingProcess
+    evaluates: bool = False
+    pruned: bool = False
+    reported: int = 0
+    """Last step of the pruner that was reported."""
+    next_report: float = 0.0
+    """Time of the next report to the pruner [s], by `time.monotonic`."""
+    trained_s: float = 0.0
+    """Time of the rollouts and updates so far [s]."""
+    counted: int = 0
+    """Iterations that are included in `trained_s`."""
+
+    def add_trained_time(self, rows: Sequence[Mapping[str, Any]]) -> float:
+        """Add the rollouts and updates of new rows of metrics; return the total time [s]."""
+        new_rows = [row for row in rows if row["iteration"] > self.counted]
+        if new_rows and new_rows[0]["iteration"] > self.counted + 1:  # rows were missed, or the run was resumed
+            self.trained_s = max(self.trained_s, overview(self.trial.folder).duration_s or 0.0)
+        self.trained_s += sum(map(training_s, new_rows))
+        if new_rows:
+            self.counted = new_rows[-1]["iteration"]
+        return self.trained_s
 
 
 class TrialRunner:
@@ -192,31 +218,3 @@ class TrialRunner:
         error, count = self._failures[-1], len(self._failures)
         error.message = f"the first {f'{count} trials' if count > 1 else 'trial'} failed: {error.message}"
         return error
-
-
-@dataclass(slots=True)
-class _Stage:
-    """Training or evaluation of a trial."""
-
-    trial: Trial
-    process: TrainingProcess
-    evaluates: bool = False
-    pruned: bool = False
-    reported: int = 0
-    """Last step of the pruner that was reported."""
-    next_report: float = 0.0
-    """Time of the next report to the pruner [s], by `time.monotonic`."""
-    trained_s: float = 0.0
-    """Time of the rollouts and updates so far [s]."""
-    counted: int = 0
-    """Iterations that are included in `trained_s`."""
-
-    def add_trained_time(self, rows: Sequence[Mapping[str, Any]]) -> float:
-        """Add the rollouts and updates of new rows of metrics; return the total time [s]."""
-        new_rows = [row for row in rows if row["iteration"] > self.counted]
-        if new_rows and new_rows[0]["iteration"] > self.counted + 1:  # rows were missed, or the run was resumed
-            self.trained_s = max(self.trained_s, overview(self.trial.folder).duration_s or 0.0)
-        self.trained_s += sum(map(training_s, new_rows))
-        if new_rows:
-            self.counted = new_rows[-1]["iteration"]
-        return self.trained_s

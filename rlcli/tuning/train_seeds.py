@@ -1,7 +1,5 @@
 """Training of one configuration with several seeds, and their aggregated learning curves."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager

@@ -5,8 +5,6 @@ headers that the browser adds: `Host` (the name it connects to), `Origin` (the p
 `Sec-Fetch-*`. A request is answered only if these headers name our own page.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 SOCKETS = ("/ui", "/state")

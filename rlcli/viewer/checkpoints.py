@@ -1,7 +1,5 @@
 """Checkpoints of a run for a viewer, which can switch between them while the run is still training."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Markers as geoms of a MuJoCo scene, for all viewers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Display of further environments beside the selected one, on the grid of `env_spacing`, and of all their markers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Viewer in a window: MuJoCo's own passive viewer."""
 
-from __future__ import annotations
-
 import copy
 import sys
 import threading

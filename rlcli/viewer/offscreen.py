@@ -1,7 +1,5 @@
 """Offscreen rendering of an environment."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ All viewers share this object. The viewer's thread submits requests (`submit`) a
 of the simulation executes the requests between two steps (`advance`), so that nothing changes within a step.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import deque

@@ -1,18 +1,33 @@
-"""Recording of one episode to a video file."""
+"""Videos of an episode: of a policy, of a recording, of a failure case."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+import mujoco
 import torch
 from torch import Tensor
 
+from rlcli.config.schema import TaskConfig
 from rlcli.envs.vec_env import VecEnv
 from rlcli.progress import tracked
+from rlcli.replay.failure_cases import StagedCase
+from rlcli.replay.resimulate import Replay, replay_episodes
+from rlcli.replay.trajectory import Trajectory
 from rlcli.rl.acting import PATIENCE
+from rlcli.viewer.env_grid import EnvGrid
 from rlcli.viewer.offscreen import Renderer
 from rlcli.viewer.video_writer import VideoWriter
+
+
+@contextlib.contextmanager
+def open_video(
+    model: mujoco.MjModel, task: TaskConfig, file: Path, env_grid: EnvGrid | None = None
+) -> Iterator[tuple[Renderer, VideoWriter, int]]:
+    """Context with a renderer, the writer of a video file, and the number of environment steps between two frames."""
+    stride = max(1, task.sim.render_interval // task.decimation)
+    with Renderer(model, task.viewer, env_grid) as renderer, VideoWriter(file, stride * task.step_dt) as writer:
+        yield renderer, writer, stride
 
 
 def record_episode(
@@ -34,9 +49,8 @@ def record_episode(
         DependencyError: if imageio is not installed.
         MachineError: if this machine cannot render, or the file cannot be written.
     """
-    stride = max(1, env.config.sim.render_interval // env.config.decimation)
     steps = PATIENCE * env.max_episode_length if longest_s is None else max(1, round(longest_s / env.step_dt))
-    with Renderer(env.engine.model, env.config.viewer) as renderer, VideoWriter(file, stride * env.step_dt) as writer:
+    with open_video(env.engine.model, env.config, file) as (renderer, writer, stride):
         obs = env.reset(seed=env.seed)["policy"]
         for number in tracked(range(steps), "steps", min(steps, env.max_episode_length)):
             if number % stride == 0:
@@ -47,4 +61,29 @@ def record_episode(
             if bool(step.terminated[0] | step.truncated[0]):
                 break
         env.check()
+    return writer.frames, writer.fps, renderer.backend
+
+
+def film_replay(
+    recording: Trajectory, env: VecEnv, episodes: Iterable[int], filmed: int, file: Path
+) -> tuple[Replay, int]:
+    """Replay episodes of a recording and film one of them; return the result and the number of frames."""
+    episode = recording.header.episodes[filmed]
+    with open_video(env.engine.model, env.config, file) as (renderer, writer, stride):
+
+        def draw(step: int) -> None:
+            number = step - episode.begin
+            if 0 <= number < episode.length and number % stride == 0:
+                writer.add(renderer.picture(env, episode.env))
+
+        result = replay_episodes(recording, env, episodes, draw)
+    return result, writer.frames
+
+
+def film_case(case: StagedCase, file: Path) -> tuple[int, float, str]:
+    """Film the recorded steps of a failure case; return the frames, frames per second and the OpenGL backend."""
+    count = len(case.states)
+    with open_video(case.staged.model, case.staged.resolved.task, file) as (renderer, writer, stride):
+        for number in range((count - 1) % stride, count, stride):  # this start includes the last state
+            writer.add(renderer.draw(*case.forward(number)))
     return writer.frames, writer.fps, renderer.backend

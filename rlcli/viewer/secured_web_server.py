@@ -5,8 +5,6 @@ and loads models from them. The files of that package stay unchanged: while a vi
 functions that open sockets and answer requests. `verify_refusals` then sends requests that the server must refuse.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import http.client

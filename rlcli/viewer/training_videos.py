@@ -1,7 +1,5 @@
 """Videos during a training: every few iterations one episode of the current policy, in a separate environment."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Viewer in the browser: MuJoCo's own web viewer."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import getpass

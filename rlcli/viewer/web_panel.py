@@ -4,8 +4,6 @@ The panel runs in the viewer's thread. It reads the playback's view and submits 
 force on a dragged body is applied in the simulation; other edits in the page have no effect on it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeVar, cast

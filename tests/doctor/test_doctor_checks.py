@@ -14,8 +14,7 @@ from rlcli.doctor.compute_and_graphics import (
     shared_memory_check,
 )
 from rlcli.doctor.installation import installation_checks, violates_bounds
-from rlcli.doctor.machine import machine_checks, memory_check
-from rlcli.doctor.settings import harmful_variables, settings_checks
+from rlcli.doctor.machine import harmful_variables, machine_checks, memory_check, settings_checks
 from rlcli.errors import pip_install
 from rlcli.machine import memory_limit
 from rlcli.settings import settings_file

@@ -5,10 +5,10 @@ import threading
 
 import pytest
 
+from rlcli.config.dump import preset_of
 from rlcli.config.load import resolve
 from rlcli.errors import CheckpointError, MachineError, UsageError
 from rlcli.registry import find_task
-from rlcli.tuning.changed_settings import preset_of
 from rlcli.tuning.optuna_storage import JOURNAL, storage_errors, without_password
 from rlcli.tuning.search_space import read_parameters
 from rlcli.tuning.sweep import open_sweep, read_sweep

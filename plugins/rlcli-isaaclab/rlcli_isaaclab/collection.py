@@ -68,7 +68,7 @@ class RigidObjectCollection:
     def _each(self, values: Tensor, object_ids: Any) -> list[tuple[Asset, Tensor]]:
         """Return each object with its values; `values` may lack the dimension of environments."""
         values = values if values.dim() == 3 else values[None]
-        ids = range(self.num_objects)
+        ids = list(range(self.num_objects))
         if object_ids is not None and not isinstance(object_ids, slice):
             ids = torch.as_tensor(object_ids).tolist()
         return [(self._objects[i], values[:, column]) for column, i in enumerate(ids)]

@@ -86,10 +86,11 @@ class Multirotor(Asset):
         self.num_thrusters = len(self.thruster_names)
         speeds = match_values(dict(self.cfg.init_state.rps), self.thruster_names, "thruster")
         row = torch.tensor([0.0 if speed is None else float(speed) for speed in speeds], device=self.device)
-        self.data.default_thruster_rps = row.expand(self.num_instances, -1).clone()
+        data: Any = self.data  # Isaac Lab adds these tensors to the data of its articulations
+        data.default_thruster_rps = row.expand(self.num_instances, -1).clone()
         for name in ("thrust_target", "computed_thrust", "applied_thrust"):
-            setattr(self.data, name, torch.zeros_like(self.data.default_thruster_rps))
-        self.data.thruster_names = self.thruster_names
+            setattr(data, name, torch.zeros_like(data.default_thruster_rps))
+        data.thruster_names = self.thruster_names
         self.allocation_matrix = torch.tensor(self.cfg.allocation_matrix, dtype=torch.float32, device=self.device)
         for group, names in groups.items():
             cfg, ids = self.cfg.actuators[group], [self.thruster_names.index(name) for name in names]

@@ -77,8 +77,8 @@ class SceneReader:
             if sensor is not None:
                 self.sensors[item.key[-1]] = sensor
             if kind == "ContactSensor" and sensor is not None:
-                for index, part in enumerate(read_filters(item, sensor, self.prims)):
-                    self.sensors[filter_name(item.key[-1], index)] = part
+                for index, filtered in enumerate(read_filters(item, sensor, self.prims)):
+                    self.sensors[filter_name(item.key[-1], index)] = filtered
         config["ground"] = ground
         config["lights"] = lights
         if not self.entities and not self.report.problems:

@@ -36,7 +36,7 @@ class Substeps:
     def __init__(self, managed: VecEnv, name: str, code: StepCode) -> None:
         self._managed, self._code = managed, code
         self._is_first = True
-        actuators: dict[str, Any] = managed.actuators  # type: ignore[assignment]
+        actuators: dict[str, Any] = managed.actuators
         models = dict(actuators)
         actuators.clear()
         actuators[name] = self  # before the actuator models, which read the targets

@@ -33,7 +33,8 @@ class Matrix:
 
     def GetInverse(self) -> Matrix:  # noqa: N802
         """Return the inverse pose."""
-        return Matrix(np.linalg.inv(self._values))
+        inverse = np.linalg.inv(self._values).astype(np.float64)
+        return Matrix(inverse)
 
 
 class GeomPrim(Prim):

@@ -141,7 +141,7 @@ def _print_case(
         _print_contacts(contacts)
     frames = 0
     if staged is not None and video is not None:
-        from rlcli.viewer.replay_video import film_case
+        from rlcli.viewer.record_video import film_case
 
         frames, fps, backend = film_case(staged, video)
         console.info(f"{frames} frames at {fps:g} per second, rendered with {backend}")

@@ -1,7 +1,5 @@
 """`rlcli check`: the contract tests of a task."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 

@@ -1,7 +1,5 @@
 """`rlcli doctor`: checks of the machine, the installation and the plugins."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 import typer

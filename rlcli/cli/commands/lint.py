@@ -4,8 +4,6 @@ The linter runs simple fixed policies (zero, random, bang-bang, sine) and checks
 obstacle. `rlcli.testing.lint_rules.RULES` contains all rules.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """`rlcli list-tasks`: the installed tasks, from package metadata and a cache; imports no plugin in this process."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Annotated, Any
 

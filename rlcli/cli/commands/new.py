@@ -1,7 +1,5 @@
 """`rlcli new`: an installable package with a new task."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

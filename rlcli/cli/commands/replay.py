@@ -54,7 +54,7 @@ def command(
     if video is None:
         result = replay_episodes(trajectory, env, chosen)
     else:
-        from rlcli.viewer.replay_video import film_replay
+        from rlcli.viewer.record_video import film_replay
 
         result, frames = film_replay(trajectory, env, chosen, chosen[0], video)
     _print_episodes(trajectory, result, len(chosen), video, frames)

@@ -1,7 +1,5 @@
 """`rlcli show`: the resolved configuration of a task, the origin of its values, or its JSON Schema."""
 
-from __future__ import annotations
-
 import json as json_module
 from typing import Annotated
 

@@ -104,7 +104,7 @@ def command(
 
 def _show(request: TrainingRequest, storage: str | None, plot: bool) -> None:
     """Print the trials of a sweep, and plot them with --plot."""
-    from rlcli.cli.ui.sweep_tables import print_sweep
+    from rlcli.cli.ui.several_trainings import print_sweep
     from rlcli.tuning.sweep import draw_sweep, find_sweep
 
     sweep = find_sweep(request.overrides, request.runs, storage)
@@ -117,7 +117,7 @@ def _compare(
     request: TrainingRequest, seeds: str, until: str | None, episodes: int, storage: str | None, stop: StopRequest
 ) -> None:
     """Compare the best trial's settings with the task's own."""
-    from rlcli.cli.ui.sweep_tables import print_comparison
+    from rlcli.cli.ui.several_trainings import print_comparison
     from rlcli.runs.study import read_seeds
     from rlcli.tuning.sweep import find_sweep
     from rlcli.tuning.sweep_compare import compare
@@ -135,7 +135,7 @@ def _search(
     request: TrainingRequest, task: str, settings: dict[str, Any], storage: str | None, jobs: int, stop: StopRequest
 ) -> None:
     """Create or join a sweep, and run trials until none is left or a signal arrives."""
-    from rlcli.cli.ui.sweep_tables import print_sweep
+    from rlcli.cli.ui.several_trainings import print_sweep
     from rlcli.runs.run import require_name
     from rlcli.runs.trusted_tasks import named_task
     from rlcli.tuning.optuna_storage import without_password

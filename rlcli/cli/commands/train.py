@@ -198,7 +198,7 @@ def _train_seeds(
     stop: StopRequest,
 ) -> None:
     """Train the runs of a new study, or the unfinished runs of a resumed one."""
-    from rlcli.cli.ui.seeds_view import SeedsView, print_study
+    from rlcli.cli.ui.several_trainings import SeedsView, print_study
     from rlcli.tuning.train_seeds import new_study, resume_options, train_seeds
 
     if isinstance(study, Path):

@@ -1,7 +1,5 @@
 """`rlcli validate`: check the configuration of a task, and with `--deep` its model."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """Completion of command lines in a shell; imports nothing heavy and no plugins."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Origin of an unexpected exception: the code of a task or plugin, or a bug in rlcli."""
 
-from __future__ import annotations
-
 import contextlib
 import sysconfig
 import traceback

@@ -1,7 +1,5 @@
 """Text of `--help`: commands and options in panels, and examples; plain text, because rich is slow to import."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import textwrap

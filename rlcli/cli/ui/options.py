@@ -1,7 +1,5 @@
 """Options that several commands share, so that a flag means the same everywhere."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import json

@@ -166,15 +166,10 @@ def film(session: Session, file: Path, env_id: int = 0, drawn: int = 1) -> Itera
         drawn: number of environments in the picture.
     """
     from rlcli.viewer.env_grid import EnvGrid
-    from rlcli.viewer.offscreen import Renderer
-    from rlcli.viewer.video_writer import VideoWriter
+    from rlcli.viewer.record_video import open_video
 
     env = session.env
-    stride = max(1, env.config.sim.render_interval // env.config.decimation)
-    with (
-        Renderer(env.engine.model, env.config.viewer, EnvGrid(env, drawn)) as renderer,
-        VideoWriter(file, stride * env.step_dt) as writer,
-    ):
+    with open_video(env.engine.model, env.config, file, EnvGrid(env, drawn)) as (renderer, writer, stride):
         yield Filming(session, env_id, stride, renderer, writer)
 
 

@@ -1,7 +1,5 @@
 """Views of running work: a live block on a terminal, else a line every few seconds."""
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import threading

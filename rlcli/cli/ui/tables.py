@@ -1,7 +1,5 @@
 """Tables that fit the width of a terminal: a table that is too wide becomes one block of lines for each row."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from typing import Any

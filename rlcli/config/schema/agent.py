@@ -1,13 +1,12 @@
 """Settings that all trainers share."""
 
-from __future__ import annotations
-
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
 from rlcli.config.schema.base import Count, Positive, StrictModel, Threads, _FractionString
+from rlcli.safe_text import float_or_nan
 
 
 class AutopsyConfig(StrictModel):
@@ -23,10 +22,7 @@ class AutopsyConfig(StrictModel):
 
 def _check_bar(text: str) -> str:
     key, _, number = text.partition("=")
-    try:
-        value = float(number)
-    except ValueError:
-        value = math.nan
+    value = float_or_nan(number)
     if key not in ("success", "return", "length") or not math.isfinite(value):
         raise ValueError(f"'{text}' is not a bar; write success=0.97, return=200 or length=250")
     if key == "success" and not 0.0 < value < 1.0:
@@ -71,7 +67,7 @@ class AgentConfig(StrictModel):
     """Actions of the policy are clipped to +-`action_bound` in training, play and export; null: no clipping."""
 
     @model_validator(mode="after")
-    def _budget(self) -> AgentConfig:
+    def _budget(self) -> Self:
         if self.max_iterations is None and self.max_steps is None:
             raise ValueError("the training has no length: set max_iterations or max_steps")
         return self

@@ -1,7 +1,5 @@
 """Number types and the base class of all configuration models."""
 
-from __future__ import annotations
-
 import math
 import re
 import sys

@@ -1,8 +1,6 @@
 """Schema of the scene: ground, lights, robots and objects with their joints and actuators."""
 
-from __future__ import annotations
-
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticKnownError
@@ -114,7 +112,7 @@ class ActuatorConfig(StrictModel):
     at the start of an episode."""
 
     @model_validator(mode="after")
-    def _motor(self) -> ActuatorConfig:
+    def _motor(self) -> Self:
         curve = (self.saturation_effort is not None, self.velocity_limit is not None)
         if self.kind == "dc_motor" and not all(curve):
             raise ValueError("kind dc_motor needs saturation_effort and velocity_limit: set both")
@@ -194,7 +192,7 @@ class EntityConfig(StrictModel):
     """Part of the joint range, around its middle, that is inside the soft limits, in (0, 1]."""
 
     @model_validator(mode="after")
-    def _one_kind(self, info: ValidationInfo) -> EntityConfig:
+    def _one_kind(self, info: ValidationInfo) -> Self:
         if (self.model or "").startswith("file:") and not (info.context or {}).get("given_models"):
             raise ValueError(f"'{self.model}' lies outside the task's folder; move it inside")
         if (self.model is None) == (self.shape is None):
@@ -235,7 +233,7 @@ class SceneConfig(StrictModel):
     """Uneven ground. All environments share it and start at different positions on it."""
     lights: LightsConfig = LightsConfig(dome=DomeLightConfig())
     """Lights."""
-    entities: Annotated[dict[str, EntityConfig], Field(json_schema_extra={"minProperties": 1})]
+    entities: dict[str, EntityConfig] = Field(json_schema_extra={"minProperties": 1})
     """Name -> robot or object."""
     sensors: dict[str, SensorConfig] = {}
     """Name -> contact sensor, ray sensor or camera that terms use. Sensors of the MJCF need no entry."""

@@ -1,8 +1,6 @@
 """Schema of contact sensors, ray sensors and cameras."""
 
-from __future__ import annotations
-
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -74,7 +72,7 @@ class RaySensorConfig(StrictModel):
     world."""
 
     @model_validator(mode="after")
-    def _straight_down(self) -> RaySensorConfig:
+    def _straight_down(self) -> Self:
         if not self.lookup:
             return self
         pattern = self.pattern
@@ -118,7 +116,7 @@ class CameraSensorConfig(StrictModel):
     pixel."""
 
     @model_validator(mode="after")
-    def _relations(self) -> CameraSensorConfig:
+    def _relations(self) -> Self:
         if self.entity is None and (self.camera or self.body):
             raise ValueError("camera and body belong to an entity: set entity")
         placed = sorted({"body", "eye", "lookat", "fov"} & self.model_fields_set)

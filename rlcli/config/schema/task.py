@@ -1,7 +1,5 @@
 """Schema of a whole task, of its simulation and of its viewer camera."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any, Literal
 

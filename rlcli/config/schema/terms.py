@@ -3,11 +3,9 @@
 Each term has further keys, the keyword-only parameters of its function. `rlcli.config.term_signatures` checks them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
@@ -74,7 +72,7 @@ class EventConfig(TermConfig):
     event."""
 
     @model_validator(mode="after")
-    def _interval(self) -> EventConfig:
+    def _interval(self) -> Self:
         if (self.mode == "interval") != (self.interval_range_s is not None):
             raise ValueError("interval_range_s and mode: interval need each other: set both or neither")
 
@@ -187,7 +185,7 @@ class DelayConfig(StrictModel):
     """Probability that an environment draws a new delay in a step, in [0, 1]."""
 
     @model_validator(mode="after")
-    def _one_unit(self) -> DelayConfig:
+    def _one_unit(self) -> Self:
         if (self.steps is None) == (self.seconds is None):
             raise ValueError("give either steps or seconds")
         return self

@@ -1,7 +1,5 @@
 """Schema of uneven ground: a generator of patches, or a height field from a file."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator

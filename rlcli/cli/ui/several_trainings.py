@@ -1,6 +1,4 @@
-"""View of a study of several seeds: its progress during training, and the table at the end."""
-
-from __future__ import annotations
+"""Views and tables of several trainings: of a study of seeds, and of a sweep."""
 
 import time
 from collections.abc import Sequence
@@ -9,10 +7,12 @@ from typing import Any
 
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.progress_view import LiveView
-from rlcli.cli.ui.tables import flow
+from rlcli.cli.ui.tables import cell, flow
 from rlcli.errors import Stopped
 from rlcli.reporting.curves import FEWEST_FOR_IQM
 from rlcli.runs.overview import Overview, overview
+from rlcli.tuning.sweep import PRESET, Sweep
+from rlcli.tuning.sweep_compare import ARMS, Comparison, Training
 from rlcli.tuning.train_seeds import METRICS, StudyResult
 
 _LINE_EVERY_S = 10.0
@@ -87,3 +87,71 @@ def _cells(run: Overview) -> list[str]:
     if run.iterations:
         cells.append(f"{run.iteration or 0}/{run.iterations}")
     return cells + [f"{name} {run.last[name]:.4g}" for name in METRICS if name in run.last]
+
+
+def print_sweep(sweep: Sweep) -> None:
+    """Print the trials and the best one, as a table and as a JSON document."""
+    settings, best = sweep.settings, sweep.best()
+    rows, documents = [], {}
+    for trial in sweep.trials():
+        document = documents[trial.number] = sweep.document(trial)
+        value, params = document["value"], document["params"]
+        cells = [_value(params.get(parameter.key)) for parameter in sweep.parameters]
+        mark = "best" if best is not None and trial.number == best.number else ""
+        rows.append([str(trial.number), document["state"], cell(value, ".6g"), *cells, mark])
+    console.table(["TRIAL", "STATE", settings["objective"].upper(), *(p.key for p in sweep.parameters), ""], rows)
+    file = sweep.folder / PRESET
+    if best is not None:
+        run = documents[best.number]["run"] or "on the machine that trained it"
+        console.info(f"best: trial {best.number}; its run: {run}; rlcli train {settings['task']} --config {file}")
+    console.document(
+        "sweep",
+        sweep=str(sweep.folder),
+        task=settings["task"],
+        objective=settings["objective"],
+        direction=settings["direction"],
+        ended=len(sweep.ended()),
+        wanted=settings["trials"],
+        best=None if best is None else documents[best.number],
+        preset=str(file) if file.is_file() else None,
+        trials=list(documents.values()),
+    )
+
+
+def print_comparison(comparison: Comparison) -> None:
+    """Print the times of all trainings, as a table and as a JSON document.
+
+    Raises:
+        Stopped: after the table, if a signal stopped the comparison.
+    """
+    rows = [
+        [str(seed), *(cell for arm in ARMS for cell in _times(comparison.training(seed, arm)))]
+        for seed in comparison.seeds
+    ]
+    medians, ratios = comparison.medians(), comparison.ratios()
+    if medians:
+        cells = []
+        for arm in ARMS:
+            median = medians.get(arm, {})
+            cells += [cell(median.get("seconds"), ".2f"), cell(median.get("steps"), ",.0f")]
+        rows.append(["median", *cells])
+    if ratios:
+        rows.append(["ratio", "", "", *(cell(ratio, ".3g", " x") for ratio in ratios.values())])
+    threshold = comparison.threshold
+    console.info(f"{comparison.task}: training until {threshold.key} >= {threshold.value:g}")
+    console.table(["SEED", "DEFAULT S", "STEPS", f"TRIAL {comparison.trial} S", "STEPS"], rows)
+    if comparison.stop_code is not None:
+        hint = "run the same command again to continue"
+        raise Stopped("stopped on request", exit_code=comparison.stop_code, hint=hint)
+    console.document("sweep", **comparison.document())
+
+
+def _times(training: Training | None) -> list[str]:
+    if training is None:
+        return ["-", "-"]
+    time = training.time()
+    return [cell(time["seconds"], ".2f") if training.reached else training.state, cell(time["steps"], ",.0f")]
+
+
+def _value(value: object) -> str:
+    return cell(value, ".4g" if isinstance(value, float) else "")
