@@ -89,7 +89,9 @@ def make_single(
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
-    """Gymnasium vector environment of the observation group `policy`. Each step returns new float32 arrays.
+    """Gymnasium vector environment of the observation group `policy`.
+
+    Each step returns new arrays; observations are float32.
 
     The autoreset mode decides what `step` returns when an episode ends. The episodes are the same in each mode, because
     the start state of an episode depends only on the environment and the index of the episode:
@@ -144,7 +146,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             raise TypeError(f"seed must be one number for all environments, found {seed!r}")
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
-        # a mask of all environments is a full reset, unless all have ended and wait for their next episode
+        # a mask of all environments is a full reset, unless there is no seed and all episodes have ended
         if mask is not None and not (np.all(mask) and (seed is not None or not self._ended.all())):
             return self._start_episodes(np.asarray(mask, dtype=bool)), {}
         self._ended[:] = False
@@ -200,8 +202,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Start the next episode in the environments of a mask."""
         if mask.shape != (self.num_envs,):
             raise ValueError(f"reset_mask has shape {mask.shape}; pass shape {(self.num_envs,)}")
+        if self._last_obs is None:
+            raise ValueError("no episode has started yet; call reset() without a mask first")
         running = np.flatnonzero(mask & ~self._ended).tolist()
-        if running or self._last_obs is None:
+        if running:
             raise ValueError(f"set reset_mask to false for environments {running}: their episodes have not ended")
         if mask.any():
             assert self._first is not None
@@ -320,7 +324,7 @@ class _Camera:
             from rlcli.viewer.offscreen import Renderer
 
             self._renderer = Renderer(self._env.engine.model, self._env.config.viewer)
-        return self._renderer.picture(self._env)
+        return self._renderer.image(self._env)
 
     def close(self) -> None:
         if self._renderer is not None:

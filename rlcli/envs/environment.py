@@ -94,7 +94,7 @@ class Environment(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Raise the `DivergedError` of the steps since the last call; a CPU raises it in the step."""
+        """Raise the pending `DivergedError` of the steps since the last call. On a CPU `step` has already raised it."""
 
     @property
     @abstractmethod
@@ -104,7 +104,7 @@ class Environment(ABC):
     @property
     @abstractmethod
     def causes(self) -> dict[str, int]:
-        """Number of diverged simulations by cause: MuJoCo's warning (`BADQACC`), `FIELD not finite`, `engine error`."""
+        """Number of diverged simulations by cause: see `Divergence.cause`."""
 
     @property
     def divergences(self) -> int:

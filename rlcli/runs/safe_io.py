@@ -41,7 +41,7 @@ def _require_printable(text: str) -> str:
 
 
 Count = Annotated[int, Field(ge=0, lt=2**62)]
-Word = Annotated[str, Field(max_length=4096), AfterValidator(_require_printable)]
+PrintableText = Annotated[str, Field(max_length=4096), AfterValidator(_require_printable)]
 """A name or a path."""
 
 
@@ -68,7 +68,7 @@ def check_json(kind: type[Model], value: object, file: Path, *keys: str, hint: s
 
 @contextlib.contextmanager
 def read_errors(file: Path) -> Iterator[None]:
-    """Turn an OSError inside the block into a CheckpointError that names the file, but for a FileNotFoundError."""
+    """Turn an OSError inside the block, except a FileNotFoundError, into a CheckpointError that names the file."""
     try:
         yield
     except FileNotFoundError:
@@ -98,16 +98,15 @@ def read_file(file: Path, limit: int, *, size: int | None = None, missing: str |
         raise CheckpointError(missing) from None
     with os.fdopen(handle, "rb") as opened:
         if size is not None and status.st_size != size:
-            raise manifest_error(file, status.st_size, size)
+            raise manifest_error(file, f"its size is {status.st_size} bytes, but the manifest has {size}")
         if status.st_size > limit:
             raise CheckpointError(f"{file} is too large: {status.st_size:,} bytes, at most {limit:,} are read")
         return _read(opened, file, 0, status.st_size)
 
 
-def manifest_error(file: Path, found: int, size: int) -> CheckpointError:
-    """Return the error for a file of `found` bytes whose size or hash differs from the manifest."""
-    message = f"{file} is corrupt: it does not match the manifest ({found} of {size} bytes)"
-    return CheckpointError(message, hint="choose an older checkpoint: RUN@step:N")
+def manifest_error(file: Path, difference: str) -> CheckpointError:
+    """Return the error for a file that differs from the manifest."""
+    return CheckpointError(f"{file} is corrupt: {difference}", hint="choose an older checkpoint: RUN@step:N")
 
 
 def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:

@@ -87,7 +87,7 @@ class BatchEngine(BatchState):
 
     @property
     def replayable(self) -> Self:
-        """This engine, whose calls can be stepped again bit for bit."""
+        """This engine: its steps can be repeated bit for bit."""
         return self
 
     def use_torch_stream(self) -> None:

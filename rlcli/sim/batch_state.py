@@ -29,6 +29,7 @@ class BatchState(BatchModel):
         self._state = torch.from_numpy(self._rows)
         self._default = np.empty(self._batch.nstate)
         mujoco.mj_getState(model, mujoco.MjData(model), self._default, INTEGRATION_STATE)
+        # the columns after ctrl usually keep their defaults, so the history omits them until one of them differs
         self.history = StateHistory(self._rows, self.state_layout.columns("ctrl").stop, self._default, 1)
         self._fields: dict[str, Tensor] = {}
         """Fields of MjData that are in use (requested with `field`)."""

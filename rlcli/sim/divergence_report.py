@@ -46,7 +46,7 @@ class Divergence:
     env: int
     """Index of the environment."""
     cause: str
-    """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, `qvel out of bounds`, or `engine error`."""
+    """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, `FIELD out of bounds`, or `engine error`."""
     detail: str = ""
     """Element of the model in which it was detected, if known."""
     index: int = -1
@@ -122,7 +122,7 @@ class StateHistory:
         self._episode_start[envs] = self.count
 
     def last_state(self, env: int) -> NDArray[np.float64]:
-        """Return the state before the last call; the default state if the episode has no call yet."""
+        """Return the state before the last engine call; the default state if the episode has no call yet."""
         if self._episode_start[env] == self.count:
             return self._default.copy()
         return self._state(env, self.count - 1)

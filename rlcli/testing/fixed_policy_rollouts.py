@@ -56,7 +56,7 @@ def bang_bang(env: VecEnv, bound: float) -> FixedPolicy:
 
 
 def sine(env: VecEnv, bound: float) -> FixedPolicy:
-    """Return a policy of sines as high as the bound, each column with its own frequency and phase."""
+    """Return a policy of sines with the bound as amplitude, each column with its own frequency and phase."""
     generator = torch.Generator().manual_seed(2)
     frequency, phase = torch.rand(2, env.num_envs, env.layout.action_size, generator=generator).unbind(0)
     low, high = SINE_HZ

@@ -200,7 +200,7 @@ LARGE, SMALL = 100.0, 0.01
 
 
 def constant_observations(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that every observation column varies under the fixed policies; of a picture, at least one pixel."""
+    """Check that every observation column varies under the fixed policies; of an image, at least one pixel."""
     for where, values in _columns(evidence):
         if bool((values == values[:, :1]).all()):
             low = float(values.min())
@@ -227,7 +227,7 @@ def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 def _columns(evidence: RolloutEvidence) -> Iterator[tuple[str, Tensor]]:
-    """Yield each observation column or picture, and its values in all rollouts. (columns, steps)"""
+    """Yield each observation column or image, and its values in all rollouts. (columns, steps)"""
     env = evidence.rollouts[0].env
     for group in env.layout.observations:
         rollouts = [rollout.obs[group] for rollout in evidence.rollouts if group in rollout.obs]

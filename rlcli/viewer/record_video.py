@@ -40,7 +40,7 @@ def record_episode(
         obs = env.reset(seed=env.seed)["policy"]
         for number in tracked(range(steps), "steps", min(steps, env.max_episode_length)):
             if number % stride == 0:
-                writer.add(renderer.picture(env))
+                writer.add(renderer.image(env))
             with torch.no_grad():
                 step = env.step(act(obs))
             obs = step.obs["policy"]

@@ -24,7 +24,7 @@ def film_replay(
         def draw(step: int) -> None:
             number = step - episode.begin
             if 0 <= number < episode.length and number % stride == 0:
-                writer.add(renderer.picture(env, episode.env))
+                writer.add(renderer.image(env, episode.env))
 
         result = replay_episodes(recording, env, episodes, draw)
     return result, writer.frames

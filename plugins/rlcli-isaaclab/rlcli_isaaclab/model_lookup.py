@@ -63,7 +63,8 @@ def given_models(root: Path) -> GivenModels:
         for name, value in content.items():
             model = value.get("model") if isinstance(value, Mapping) else value
             if not isinstance(model, str):
-                raise TaskError(f"{file}: {name}: expected a file", hint="for example robot: robot.xml")
+                message = f"{file}: {name}: expected the path of a model file, found {value!r}"
+                raise TaskError(message, hint="for example robot: robot.xml")
             if isinstance(value, Mapping):
                 found.gains.setdefault(str(name), value.get("gains") or {})
             if ":" not in model and not (folder / model).is_file():

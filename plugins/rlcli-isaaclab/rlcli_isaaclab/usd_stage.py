@@ -29,7 +29,7 @@ class Prim:
             if name in bodies:
                 index = bodies.index(name)
                 return entity.data.body_pos_w[0, index], entity.data.body_quat_w[0, index]
-        raise TaskError(f"no body '{name}' for the prim {self.path}", hint="name a body of the MJCF like the prim")
+        raise TaskError(f"no body '{name}' for the prim {self.path}", hint=f"rename a body of the MJCF to '{name}'")
 
 
 class Stage:

@@ -45,7 +45,10 @@ def command(
     if rows or not pattern:
         _show(rows, shared)
         if any(known.status == "?" for _, known in rows):
-            console.info("? is not known until a task has been loaded: rlcli list-tasks --probe")
+            console.info(
+                "? marks a value that is known only after the task is loaded;"
+                " `rlcli list-tasks --probe` loads the tasks"
+            )
     else:
         near = did_you_mean(pattern.lower(), by_name)
         console.info(f"no task's name or summary contains '{pattern}'; {near or 'rlcli list-tasks shows all'}")
