@@ -370,7 +370,7 @@ def picture(task: str) -> None:
         obs = env.reset(seed=env.seed)["policy"]
         for step in range(last + 1):
             if step in wanted:
-                shown.append(renderer.picture(env))
+                shown.append(renderer.image(env))
             result = env.step(session.act(obs))
             if bool((result.terminated | result.truncated).any()):
                 break

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from rlcli.safe_text import message_line
 
+INTERRUPTED, STOPPED = 130, 75
+"""Exit codes after Ctrl-C, and after another signal that stops a run."""
 _UNPINNED = ("rlcli[trackio]",)
 """Extras that do not fit the tested versions; trackio needs pillow < 13."""
 

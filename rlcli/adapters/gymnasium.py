@@ -58,7 +58,9 @@ def open_task(
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
-    """Gymnasium vector environment of the observation group `policy`. Each step returns new float32 arrays.
+    """Gymnasium vector environment of the observation group `policy`.
+
+    Each step returns new arrays; observations are float32.
 
     The autoreset mode decides what `step` returns when an episode ends. The episodes are the same in each mode, because
     the start state of an episode depends only on the environment and the index of the episode:
@@ -312,7 +314,7 @@ class _Camera:
         """Render the current state. (height, width, 3)"""
         if self._renderer is None:
             self._renderer = Renderer(self._env.engine.model, self._env.config.viewer)
-        return self._renderer.picture(self._env)
+        return self._renderer.image(self._env)
 
     def close(self) -> None:
         if self._renderer is not None:

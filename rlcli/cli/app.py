@@ -18,7 +18,7 @@ from rlcli.cli.ui.console import console, discard, print_log_records
 from rlcli.cli.ui.help_text import HelpGroup
 from rlcli.cli.ui.options import CHOOSE, add_command
 from rlcli.config.settings_file import read_settings
-from rlcli.errors import CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
+from rlcli.errors import INTERRUPTED, CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
 from rlcli.machine import AddressSpaceCheck, delay_garbage_collection, memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.safe_text import remember_given
@@ -43,7 +43,6 @@ COMMANDS = tuple(name for names in PANELS.values() for name in names if name not
 """Other commands: each has a module of `rlcli.cli.commands` of its name with a function `command`."""
 
 _HELP_FLAGS = frozenset(("-h", "--help", "--version", "--install-completion", "--show-completion"))
-_INTERRUPTED = 130
 _COMPLETION_VARIABLE = "_RLCLI_COMPLETE"
 """Environment variable that a shell sets to complete a command line."""
 _SETTINGS = {
@@ -134,7 +133,7 @@ def _run(arguments: list[str]) -> int:
     try:
         with use_settings(_user_settings(arguments)):
             result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
-        if result == _INTERRUPTED:  # typer turns Ctrl-C into this exit code
+        if result == INTERRUPTED:  # typer turns Ctrl-C into this exit code
             raise KeyboardInterrupt
         return result if isinstance(result, int) else 0
     except NoArgsIsHelpError as error:
@@ -162,7 +161,7 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
         failure.exit_code = error.exit_code
         return failure
     if isinstance(error, KeyboardInterrupt | typer.Abort):
-        return Stopped("interrupted", exit_code=_INTERRUPTED)
+        return Stopped("interrupted", exit_code=INTERRUPTED)
     if isinstance(error, OSError):
         file = f"{error.filename}: " if error.filename else ""
         return MachineError(f"{file}{error.strerror or error}")

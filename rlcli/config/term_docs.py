@@ -3,8 +3,10 @@
 The signatures come from the source (`term_signatures`), the meanings of the keys from `rlcli/mdp/term_keys.yaml`.
 """
 
+import contextlib
 import functools
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +14,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from rlcli.config.strict_yaml import load
+from rlcli.config.strict_yaml import YamlError, load
 from rlcli.config.term_signatures import SECTIONS, SELECTORS, Parameter, Signature, Vocabulary, builtin_terms
 
 _KEYS = Path(__file__).resolve().parent.parent / "mdp" / "term_keys.yaml"
@@ -80,7 +82,7 @@ def term_entries(pattern: str = "", term_files: Iterable[Path] = ()) -> list[Ter
     """Return the terms whose name, section or summary contains the pattern, in the order of sections and names.
 
     Args:
-        pattern: text to look for, in any case.
+        pattern: text to look for; case is ignored.
         term_files: files with a task's own terms, which are listed too.
     """
     own = Vocabulary.of(tuple(term_files)).own
@@ -115,8 +117,9 @@ def type_text(schema: Mapping[str, Any]) -> str:
 
 def yaml_text(value: Any) -> str:
     """Return a value as one line of YAML; text that needs no quotes has none."""
-    if isinstance(value, str) and value.replace("_", "").replace(".", "").isalnum():
-        return value
+    with contextlib.suppress(YamlError):
+        if isinstance(value, str) and re.fullmatch(r"\w[\w.-]*", value) and load(f"key: {value}").data["key"] == value:
+            return value
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{yaml_text(key)}: {yaml_text(each)}" for key, each in value.items()) + "}"
     if isinstance(value, (list, tuple)):

@@ -161,9 +161,13 @@ def signature_of(term: Any, name: str) -> Signature:
     if isinstance(node, ast.ClassDef):
         call = constructor(SourceClass(Path(file or "?"), node), ClassSearch())
     if not isinstance(node, ast.FunctionDef | ast.ClassDef) or not isinstance(call, ast.FunctionDef):
-        raise SignatureError("a term is a function (env, *, ...), or a class whose __init__ takes (self, env, *, ...)")
+        is_class = isinstance(node, ast.ClassDef)
+        found = "a class without __init__" if is_class else f"an object of type {type(term).__name__}"
+        allowed = "a function (env, *, ...), or a class whose __init__ takes (self, env, *, ...)"
+        raise SignatureError(f"found {found}; a term is {allowed}")
     if not _takes_env(call.args, 1 if isinstance(node, ast.ClassDef) else 0):
-        raise SignatureError("the first parameter of a term must be 'env'; write (env, *, ...)")
+        found = ", ".join(argument.arg for argument in call.args.args) or "no parameters"
+        raise SignatureError(f"the first parameter of a term must be 'env', found ({found}); write (env, *, ...)")
     return replace(_signature(node, call, name, Path(file or "?")), target=term)
 
 

@@ -59,7 +59,8 @@ def check_target(format_: str, output: Path | None) -> None:
     other = next((name for name, suffix in FORMATS.items() if suffix == output.suffix), None)
     if format_ == BUNDLE:
         if other is not None:
-            raise UsageError(f"'{output}' is a file, and a bundle is a folder", hint=f"--format {other}")
+            message = f"'{output}' has the suffix of format {other}, but a bundle is a folder"
+            raise UsageError(message, hint=f"give --format {other}, or a folder as --output")
         return
     suffix = FORMATS[format_]
     if output.suffix != suffix:

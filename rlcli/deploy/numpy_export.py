@@ -18,7 +18,7 @@ _TEMPLATE = Path(__file__).parent / "deployed" / "policy.py"
 
 
 def numpy_bytes(graph: DeployedPolicy, metadata: str) -> bytes:
-    """Return the file: readable code, and at its end the weights as an npz file in base64."""
+    """Return the content of the exported Python file: readable code, then the weights as an npz file in base64."""
     weights = io.BytesIO()
     np.savez(weights, **_weights(graph))  # type: ignore[arg-type]
     text = _TEMPLATE.read_text(encoding="utf-8")
@@ -52,14 +52,15 @@ def _network(graph: DeployedPolicy) -> dict[str, Any]:
     spec = graph.policy.spec
     normalizer = graph.policy.normalizer
     bounds = [values.double() for values in (graph.clip, graph.limits) if values is not None]
+    vision = spec.vision
     return {
         "kind": spec.kind,
         "normalize": normalizer is not None,
         "normalize_clip": None if normalizer is None else normalizer.clip,
-        "cells": list(spec.memory),
-        "pictures": [] if spec.vision is None else [(p.start, p.steps, *p.shape) for p in spec.vision.pictures],
-        "motion": None if spec.vision is None else spec.vision.motion,
-        "windows": [] if spec.vision is None else list(zip(spec.vision.kernels, spec.vision.strides, strict=True)),
+        "lstm_sizes": list(spec.memory),
+        "images": [] if vision is None else [(p.start, p.steps, *p.shape) for p in vision.pictures],
+        "motion": None if vision is None else vision.motion,
+        "kernels_and_strides": [] if vision is None else list(zip(vision.kernels, vision.strides, strict=True)),
         "layers": len(spec.hidden) + 1,
         "activation": spec.activation,
         "squashed": not spec.kind.startswith("gaussian-"),
@@ -81,11 +82,11 @@ def _weights(graph: DeployedPolicy) -> dict[str, np.ndarray]:
             arrays |= {f"in{number}": cell.weight_ih, f"rec{number}": cell.weight_hh}
             arrays[f"bias{number}"] = cell.bias_ih.double() + cell.bias_hh.double()
     if policy.vision is not None:
-        for picture, layers in enumerate(policy.vision.pictures):
+        for image, layers in enumerate(policy.vision.pictures):
             convolutions = [layer for layer in layers.modules() if isinstance(layer, torch.nn.Conv2d)]
             for number, conv in enumerate(convolutions):
                 assert conv.bias is not None
-                arrays |= {f"cw{picture}_{number}": conv.weight.flatten(1), f"cb{picture}_{number}": conv.bias}
+                arrays |= {f"cw{image}_{number}": conv.weight.flatten(1), f"cb{image}_{number}": conv.bias}
     linear = [layer for layer in policy.actor if isinstance(layer, torch.nn.Linear)]
     for number, layer in enumerate(linear):
         arrays |= {f"w{number}": layer.weight, f"b{number}": layer.bias}

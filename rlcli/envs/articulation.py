@@ -77,11 +77,11 @@ class ArticulationView:
         return self._entity.joint_names.index(name)
 
     def get_joint_positions(self, indices: Tensor | None = None, clone: bool = True) -> Tensor:
-        """Return joint positions. (n, num_dof) [m or rad]; without `clone` a live view, which is read-only."""
+        """Return joint positions. (n, num_dof) [m or rad]; without `clone` and `indices` a view: only read it."""
         return _rows(self._entity.data.joint_pos, indices, clone)
 
     def get_joint_velocities(self, indices: Tensor | None = None, clone: bool = True) -> Tensor:
-        """Return joint velocities. (n, num_dof) [m/s or rad/s]; without `clone` a live view, which is read-only."""
+        """Return joint velocities. (n, num_dof) [m/s or rad/s]; without `clone` and `indices` a view: only read it."""
         return _rows(self._entity.data.joint_vel, indices, clone)
 
     def get_dof_limits(self) -> Tensor:
@@ -99,12 +99,12 @@ class ArticulationView:
         return _rows(torch.cat([data.root_origin_lin_vel_w, data.root_ang_vel_w], dim=1), indices, clone)
 
     def set_joint_positions(self, positions: Tensor, indices: Tensor | None = None) -> None:
-        """Set joint positions, and the targets of position actuators to them. (n, num_dof) [m or rad]"""
+        """Set joint positions, and position actuators' targets to the same values. (n, num_dof) [m or rad]"""
         self._set("qpos", positions, indices, self._qpos_index)
         self._command("position", positions, indices)
 
     def set_joint_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
-        """Set joint velocities, and the targets of velocity actuators to them. (n, num_dof) [m/s or rad/s]"""
+        """Set joint velocities, and velocity actuators' targets to the same values. (n, num_dof) [m/s or rad/s]"""
         self._set("qvel", velocities, indices, self._dof_index)
         self._command("velocity", velocities, indices)
 
@@ -152,7 +152,7 @@ class ArticulationView:
     def _set(self, name: str, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
         self._write(self._env.engine.field(name), values, indices, columns)
         self._write(getattr(self._env.sim, name), values, indices, columns)  # getters read this copy
-        self._env.sim.stamp += 1
+        self._env.sim.stamp += 1  # values that were computed from the old state are computed again
 
     def _write(self, field: Tensor, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
         if indices is not None and field.device.type == "cpu":

@@ -14,7 +14,7 @@ from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.layout import Layout, TermLayout
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, RlcliError, TaskError
-from rlcli.managers.attribute_state import TermState
+from rlcli.managers.attribute_state import AttributeState
 from rlcli.managers.termination import DIVERGED
 from rlcli.random import stream
 from rlcli.registry import load_object
@@ -216,7 +216,7 @@ class DirectEnv(VecEnv):
         if len(task.observation_names) == task.num_observations:
             self._observation_columns = list(task.observation_names)
         task.post_reset()
-        self._memory = TermState(task, excluded=("env", "cfg", "params"))
+        self._memory = AttributeState(task, excluded=("env", "cfg", "params"))
 
     def _make_layout(self) -> Layout:
         task = self.task

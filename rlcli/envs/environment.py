@@ -88,7 +88,7 @@ class Environment(Protocol):
         """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""
 
     def check(self) -> None:
-        """Raise the `DivergedError` of the steps since the last call; a CPU raises it in the step."""
+        """Raise the pending `DivergedError` of the steps since the last call. On a CPU `step` has already raised it."""
 
     @property
     def common_step(self) -> int:
@@ -96,7 +96,7 @@ class Environment(Protocol):
 
     @property
     def causes(self) -> dict[str, int]:
-        """Number of diverged simulations by cause: MuJoCo's warning (`BADQACC`), `FIELD not finite`, `engine error`."""
+        """Number of diverged simulations by cause: see `Divergence.cause`."""
 
     @property
     def divergences(self) -> int:

@@ -1,4 +1,4 @@
-"""Observers of the environment loop. They read each step and change nothing in it."""
+"""Observers of the environment loop. They run at fixed points of each step; most of them only read."""
 
 from __future__ import annotations
 

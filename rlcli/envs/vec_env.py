@@ -202,7 +202,12 @@ class VecEnv(Workflow):
     def _end_episodes(
         self, terminated: Tensor, truncated: Tensor
     ) -> tuple[Selection | None, dict[str, Tensor] | None, Episodes | None]:
-        """Return the environments whose episode ends, their last observations and their episodes."""
+        """End episodes; return None for each of the three if none ends.
+
+        Returns:
+            A selection of the environments whose episode ends, their last observations (None if not wanted), and a
+            record of the episodes.
+        """
         finished, timed_out = self._counters.end(terminated, truncated)
         ended = self._select(finished)
         if ended is None:
@@ -285,7 +290,7 @@ class VecEnv(Workflow):
         return functools.reduce(torch.logical_and, held) if held else None
 
     def check(self) -> None:
-        """Raise the `DivergedError` of the steps since the last call; a CPU raises it in the step."""
+        """Raise the pending `DivergedError` of the steps since the last call. On a CPU `step` has already raised it."""
         self._guard.check()
 
     @property
@@ -295,7 +300,7 @@ class VecEnv(Workflow):
 
     @property
     def causes(self) -> dict[str, int]:
-        """Number of diverged simulations by cause: MuJoCo's warning (`BADQACC`), `FIELD not finite`, `engine error`."""
+        """Number of diverged simulations by cause: see `Divergence.cause`."""
         return dict(self._guard.causes)
 
     def compute_efforts(self) -> None:

@@ -1,8 +1,8 @@
 """State of an object of a task: its attributes that change from step to step, saved in checkpoints and restored.
 
-Tensors and arrays are always saved, also in dicts, lists and tuples. Plain values, containers of them and random
-generators are saved once they differ from their first value. Other attributes that may change cannot be saved;
-`TermState.unsaved` lists them.
+Tensors, arrays and torch generators are always saved, also in dicts, lists and tuples. Plain values, containers of them
+and other random generators are saved only after they have changed. Other attributes that may change cannot be saved;
+`AttributeState.unsaved` lists them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class NotSerializableError(TypeError):
     """A value that cannot be written as JSON."""
 
 
-class TermState:
+class AttributeState:
     """Saver of the attributes of an object, and of those of helper objects of the task's own classes.
 
     Args:
@@ -46,10 +46,11 @@ class TermState:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of the current values."""
-        state = {path: value.clone() for slot, value in self._slots() for path, value in _tensors(slot, value)}
+        tensors = (found for attribute, value in self._attributes() for found in _tensors(attribute, value))
+        state = {path: tensor.clone() for path, tensor in tensors}
         values = dict(self._plain())
-        self._changed |= {slot for slot, value in values.items() if value != self._first.get(slot)}
-        kept = {slot: values[slot] for slot in sorted(self._changed & set(values))}
+        self._changed |= {attribute for attribute, value in values.items() if value != self._first.get(attribute)}
+        kept = {attribute: values[attribute] for attribute in sorted(self._changed & set(values))}
         if kept:
             state[_PLAIN] = torch.frombuffer(bytearray(json.dumps(kept).encode()), dtype=torch.uint8)
         return state
@@ -63,10 +64,10 @@ class TermState:
             ValueError: if the state does not belong to this object.
         """
         kept = json.loads(bytes(state[_PLAIN].tolist())) if _PLAIN in state else {}
-        for slot in self._changed | set(kept):
-            written = kept.get(slot, self._first.get(slot))
+        for attribute in self._changed | set(kept):
+            written = kept.get(attribute, self._first.get(attribute))
             if written is not None:
-                self._put(slot, _from_json(json.loads(written)))
+                self._put(attribute, _from_json(json.loads(written)))
         self._changed |= set(kept)
         for path, value in state.items():
             if path != _PLAIN:
@@ -75,9 +76,10 @@ class TermState:
     def unsaved(self) -> list[str]:
         """Return the attributes that may change and cannot be saved, with their types."""
         owner = type(self._owner).__name__
-        return [f"{owner}.{slot} ({type(value).__name__})" for slot, value in self._slots() if _is_stateful(value)]
+        unsaved = [(attribute, value) for attribute, value in self._attributes() if _cannot_be_saved(value)]
+        return [f"{owner}.{attribute} ({type(value).__name__})" for attribute, value in unsaved]
 
-    def _slots(self) -> Iterator[tuple[str, Any]]:
+    def _attributes(self) -> Iterator[tuple[str, Any]]:
         """Yield the attributes by their path: those of the object, and of objects of the task's own classes."""
         seen: set[int] = set()
 
@@ -93,31 +95,31 @@ class TermState:
 
     def _plain(self) -> Iterator[tuple[str, str]]:
         """Yield the attributes that can be written as JSON."""
-        for slot, value in self._slots():
+        for attribute, value in self._attributes():
             with contextlib.suppress(NotSerializableError, RecursionError):
-                yield slot, json.dumps(_to_json(value))
+                yield attribute, json.dumps(_to_json(value))
 
-    def _holder(self, slot: str) -> tuple[Any, str]:
+    def _holder(self, attribute: str) -> tuple[Any, str]:
         """Return the object and the attribute of a path; an untrusted file may name only attributes that are saved."""
-        *path, name = slot.split(".")
+        *path, name = attribute.split(".")
         holder = self._owner
         for step in path:
             holder = vars(holder).get(step)
             if not _is_helper(holder):
-                raise ValueError(f"'{slot}' does not exist in {type(self._owner).__name__}")
+                raise ValueError(f"'{attribute}' does not exist in {type(self._owner).__name__}")
         on_class = getattr(type(holder), name, None)  # a method or a property is not state
         allowed = name.isidentifier() and not name.startswith("__") and (bool(path) or name not in self._excluded)
         if not allowed or not _is_saved_kind(on_class) or not _is_saved_kind(vars(holder).get(name)):
-            raise ValueError(f"'{slot}' is not a saved attribute of {type(self._owner).__name__}")
+            raise ValueError(f"'{attribute}' is not a saved attribute of {type(self._owner).__name__}")
         return holder, name
 
-    def _put(self, slot: str, value: Any) -> None:
-        holder, name = self._holder(slot)
+    def _put(self, attribute: str, value: Any) -> None:
+        holder, name = self._holder(attribute)
         current = getattr(holder, name, None)
         if isinstance(current, random.Random):
             current.setstate(value)
         elif isinstance(current, np.random.Generator):
-            _require_valid_position(value)
+            _require_valid_position(attribute, value)
             current.bit_generator.state = value
         elif isinstance(current, list | dict | set | collections.deque) and type(current) is type(value):
             current.clear()  # in place: other references to the container stay valid
@@ -126,8 +128,8 @@ class TermState:
             setattr(holder, name, value)
 
     def _put_tensor(self, path: str, value: Tensor) -> None:
-        slot, *keys = path.split("/")
-        holder, name = self._holder(slot)
+        attribute, *keys = path.split("/")
+        holder, name = self._holder(attribute)
         if not keys:
             if not _write_into(getattr(holder, name, None), value):
                 setattr(holder, name, value.clone())  # a step creates or replaces this tensor
@@ -227,12 +229,12 @@ def _is_saved_kind(value: object) -> bool:
     return type(value) in plain or isinstance(value, Tensor | np.ndarray | np.generic | generators)
 
 
-def _require_valid_position(state: Mapping[str, Any]) -> None:
+def _require_valid_position(attribute: str, state: Mapping[str, Any]) -> None:
     """Check the position of a generator in its table: numpy does not check it, and would read outside."""
     inner = state.get("state")
     pos = inner.get("pos", 0) if isinstance(inner, dict) else 0
     if not 0 <= int(pos) <= 624 or not 0 <= int(state.get("buffer_pos", 0)) <= 4:
-        raise ValueError("the position of a numpy generator is outside of its table")
+        raise ValueError(f"'{attribute}': the position of the numpy generator is outside of its table")
 
 
 def _is_helper(value: object) -> bool:
@@ -243,8 +245,8 @@ def _is_helper(value: object) -> bool:
     return hasattr(value, "__dict__") and not isinstance(value, types.ModuleType) and not callable(value)
 
 
-def _is_stateful(value: object) -> bool:
-    """Return whether a value cannot be saved: an iterator, a numpy RandomState, a thread, an open file."""
+def _cannot_be_saved(value: object) -> bool:
+    """Return whether a value may change but cannot be saved: an iterator, a RandomState, a thread, an open file."""
     if isinstance(value, Iterator | np.random.RandomState | threading.Thread):
         return True
     odd = isinstance(value, dict) and any(isinstance(v, Tensor) and not isinstance(k, str) for k, v in value.items())

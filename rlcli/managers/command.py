@@ -33,7 +33,7 @@ class CommandTerm(Protocol):
 
     `markers() -> list[Marker]` returns the command as arrows, spheres and frames (`rlcli.sim.markers`): positions in
     the world frame (num_envs, 3) [m], like `entity.data.root_pos_w`, and quaternions (w, x, y, z), (num_envs, 4). It is
-    called once for each picture, never in a step, and must change nothing. It may read the state of roots and joints,
+    called once for each image, never in a step, and must change nothing. It may read the state of roots and joints,
     and the fields that `metrics` or `update` read: a first read of another field makes the engine compute that field in
     each step.
     """

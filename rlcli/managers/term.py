@@ -17,7 +17,7 @@ from rlcli.config.schema import TermConfig
 from rlcli.config.strict_yaml import Path
 from rlcli.config.term_signatures import SELECTORS, Signature
 from rlcli.errors import ConfigError, DivergedError, Problem, ShapeError, TaskError, did_you_mean, listing
-from rlcli.managers.attribute_state import TermState
+from rlcli.managers.attribute_state import AttributeState
 from rlcli.managers.tunable import TunableValues
 from rlcli.random import stream
 from rlcli.registry import is_framework, load_module
@@ -45,7 +45,7 @@ class BoundTerm:
     """Selector parameter -> the names of the selected elements."""
     stream: np.uint64
     """Index of the term's random stream."""
-    memory: TermState | None = None
+    memory: AttributeState | None = None
     """State of a class term of a task's own, if the class has no `state_dict`."""
 
     @property
@@ -141,7 +141,7 @@ class Binder:
             return None
         name = str(path[-1])
         own = signature.is_class and not hasattr(call, "state_dict") and not is_framework(type(call).__module__)
-        memory = TermState(call) if own else None
+        memory = AttributeState(call) if own else None
         draws = stream(".".join(str(step) for step in path))
         return BoundTerm(name, path, config, self.resolved, call, elements, draws, memory)
 

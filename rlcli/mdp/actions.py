@@ -172,7 +172,7 @@ class RelativeJointPosition(_ScaledJointAction):
 
 @dataclass(kw_only=True, eq=False)
 class JointPositionToLimits(_ScaledJointAction):
-    """Targets of position actuators: raw x scale in [-1, 1], stretched over the soft limits [m or rad].
+    """Targets of position actuators: raw x scale, clipped to [-1, 1] and mapped linearly to the soft limits [m or rad].
 
     With `rescale_to_limits: false` raw x scale is the target itself, clipped to the soft limits. Isaac Lab:
     JointPositionToLimitsAction.
@@ -284,18 +284,20 @@ class BinaryJointVelocity(_BinaryJoint):
 
 @dataclass(kw_only=True, eq=False)
 class DifferentialInverseKinematics(_ScaledJointAction):
-    """Joint position targets that move a body's frame to a pose, by damped least squares [m or rad].
+    """Joint position targets that move a frame of a body to a pose, by damped least squares [m or rad].
 
-    Once a step: dq = J^T (J J^T + damping^2 I)^-1 e. J is the geometric Jacobian of the body, e is the pose error.
+    Once a step: dq = J^T (J J^T + damping^2 I)^-1 e. J is the geometric Jacobian of the controlled frame, e is its pose
+    error.
 
     mode: `position` takes 3 columns (x, y, z). `pose` takes 7 columns (position, quaternion w x y z), or 6 with
     `relative` (position, axis times angle). Poses are in the root's frame [m, rad].
 
-    relative: the action x scale is added to the body's current pose; otherwise action x scale is the target pose.
+    relative: action x scale is added to the current pose of the controlled frame; otherwise action x scale is the
+    target pose.
 
-    offset_pos, offset_quat: the controlled frame in the body's frame [m].
+    offset_pos, offset_quat: position [m] and quaternion of the controlled frame in the body's frame.
 
-    posture: fraction of the way to the default pose that redundant joints move in a step, without moving the body:
+    posture: fraction of the way to the default pose that redundant joints move in a step, without moving the frame:
     dq + (I - J^T (J J^T + damping^2 I)^-1 J) posture (default - q). With 0 an arm of seven joints drifts to its limits.
 
     Isaac Lab: DifferentialInverseKinematicsAction (ik_method dls); mjlab: posture_weight.
@@ -360,7 +362,10 @@ class DifferentialInverseKinematics(_ScaledJointAction):
 
 
 def _command_limits(model: mujoco.MjModel, actuators: list[int | None], kind: str) -> tuple[tuple[float, float], ...]:
-    """Return the smallest and largest command with an effect: control range and force limit of each actuator."""
+    """Return the smallest and the largest effective command of each actuator.
+
+    The limits follow from the control range; for motors also from the force limits of the actuator and of the joint.
+    """
     limits = []
     for a in actuators:
         if a is None:  # an actuator model limits efforts, not commands

@@ -251,11 +251,11 @@ def image(env: ManagedEnv, *, sensor: CameraSensor, normalize: bool = True) -> T
     A distance is 0 where nothing is visible. Colours are 0 to 255. With `normalize` they are 0 to 1, minus the mean of
     each channel of the image. Isaac Lab: channels last.
     """
-    picture = sensor.image.movedim(-1, 1).float().contiguous()
+    image = sensor.image.movedim(-1, 1).float().contiguous()
     if sensor.config.data != "rgb" or not normalize:
-        return picture
-    picture = picture / 255.0
-    return picture - picture.flatten(2).mean(dim=2)[:, :, None, None]
+        return image
+    image = image / 255.0
+    return image - image.flatten(2).mean(dim=2)[:, :, None, None]
 
 
 def foot_height(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> Tensor:

@@ -86,7 +86,7 @@ class Draw:
         return new if self._lowest is None else new.clamp(min=self._lowest)
 
     def sample(self, selection: Selection) -> Tensor:
-        """Return samples of the distribution. (rows, elements or 1, axes)"""
+        """Return samples of the distribution. (rows, elements, axes), with 1 in place of elements if `shared`"""
         first, second = self._ranges.now()
         if self._distribution == "gaussian":
             return selection.normal(first, second, self._sample_shape)

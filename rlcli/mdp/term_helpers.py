@@ -56,14 +56,15 @@ def single(values: Tensor, kind: str) -> Tensor:
     return values[:, 0]
 
 
-def require_one_per_body(values: Tensor, sensor: ContactSensor) -> Tensor:
-    """Return values that have one element for each body of the sensor.
+def require_one_per_body(values: Tensor, sensor: ContactSensor, key: str) -> Tensor:
+    """Return values that have one element for each body of the sensor; `key` is the key that selects the elements.
 
     Raises:
         ValueError: if their numbers differ.
     """
     if values.shape[1] != sensor.found.shape[1]:
-        raise ValueError(f"selects {values.shape[1]} elements; select {sensor.found.shape[1]}, one per sensor body")
+        found, wanted = values.shape[1], sensor.found.shape[1]
+        raise ValueError(f"`{key}` selects {found} elements; select {wanted}, one for each body of the sensor")
     return values
 
 

@@ -53,13 +53,13 @@ def load_entry(entry: Entry, kind: type) -> Any:
             raise
         reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise TaskError(
-            f"plugin {entry.distribution} {entry.version} is broken: '{entry.name}' = {entry.value}:"
-            f" {reason}{error_location(error)}",
-            hint=_newer_rlcli(entry),
+            f"plugin {entry.distribution} {entry.version}: entry point '{entry.name}' = {entry.value} cannot be"
+            f" imported: {reason}{error_location(error)}",
+            hint=_newer_rlcli(entry) or f"update or uninstall {entry.distribution}",
         ) from error
     if not isinstance(value, kind):
         raise TaskError(
-            f"plugin {entry.distribution} {entry.version} is broken: '{entry.name}' = {entry.value} is a"
+            f"plugin {entry.distribution} {entry.version}: entry point '{entry.name}' = {entry.value} is a"
             f" {type(value).__name__}, expected a {kind.__name__}; report it to the plugin's authors"
         )
     return value

@@ -78,13 +78,14 @@ def _inside(folder: Path, file: str, what: str) -> Path:
 
 
 def _menagerie_models(robot: str) -> list[Path]:
-    """Return the folders of a robot that the package mujoco-menagerie has downloaded, the newest first."""
+    """Return a robot's folder in MENAGERIE_ROOT, then those that mujoco-menagerie has downloaded, newest first."""
     if not robot or set(robot) & set("*?[]"):
         return []
     import platformdirs
 
     own = os.environ.get("MENAGERIE_ROOT")
     cache = Path(os.environ.get("MENAGERIE_CACHE_DIR") or platformdirs.user_cache_path("mujoco_menagerie", False))
+    # the name of a downloaded folder is ROBOT-, then 16 digits of a hash
     marks = [mark for mark in (cache / "models").glob(f"{robot}-*/.complete") if mark.parent.name[:-17] == robot]
     newest = sorted(marks, key=lambda mark: mark.stat().st_mtime, reverse=True)
     return [*([Path(own) / robot] if own else []), *(mark.parent for mark in newest)]

@@ -11,13 +11,21 @@ class TaskSource:
 
     name: str
     root: Path
+    """Folder of the task; paths in its configuration are relative to this folder."""
     config: Path
+    """File with the task's configuration."""
     distribution: str | None = None
+    """Installed distribution that has the task; None for a task in a folder."""
     version: str | None = None
+    """Version of the distribution."""
     term_files: tuple[Path, ...] = ()
+    """Files with the task's own terms."""
     term_modules: tuple[str, ...] = ()
+    """Modules to import the terms of `term_files` from, in the same order."""
     task: str | None = None
+    """Class of a direct task, `module:Class` or `file.py:Class`; None for a manager-based task."""
     task_file: Path | None = None
+    """File with that class."""
     python: str | None = None
     """A configuration in Python: `module:attribute`, `file.py:attribute` or the folder of a package; None: in YAML."""
     agents: tuple[tuple[str, str], ...] = ()

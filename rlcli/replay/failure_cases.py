@@ -190,7 +190,7 @@ class StagedCase:
 
 
 def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase:
-    """Build the task of a case, for contacts and pictures.
+    """Build the task of a case, for contacts and images.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `rlcli.replay.resimulate.stage`.
@@ -199,7 +199,7 @@ def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase
     staged = stage(case.trajectory, named)
     if not staged.same_model:
         _log.warning(
-            "the installed task's model differs from the one in training: contacts and pictures show the installed one"
+            "the installed task's model differs from the one in training: contacts and images show the installed one"
         )
     first, calls = case.world.first, staged.worlds[0].calls
     calls_per_step = max(1, first // max(1, case.episode.kept - 1))

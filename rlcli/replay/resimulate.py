@@ -268,7 +268,8 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
             world = ReplayWorld(model, resolved, own_model, header.follows_constants)
             width = len(world.engine.state_row(0))
             if states.shape[1] != width or len(final) != width:
-                raise ValueError(f"a state of the file has {len(final)} numbers, one of the model has {width}")
+                found = f"states of {states.shape[1]} numbers and a final state of {len(final)} numbers"
+                raise ValueError(f"the file has {found}; a state of the model has {width}")
         except (ValueError, RuntimeError) as error:
             raise trajectory.mismatch_error(error) from None
         calls = [Call(state, nstep) for state, nstep in zip(states, described.nstep, strict=True)]

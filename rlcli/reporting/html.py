@@ -14,7 +14,7 @@ from rlcli.config.schema import bound_text
 from rlcli.reporting.run_page import Page
 from rlcli.safe_text import UNSAFE, shorten
 
-POLICY = (
+CONTENT_SECURITY_POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; media-src data:; base-uri 'none'; form-action 'none'"
 )
 """Content security policy of the page: no scripts, frames or fonts, and nothing from any host."""
@@ -29,7 +29,7 @@ def render(page: Page) -> str:
     """Return the page as HTML."""
     video = None if page.video is None else f"data:video/mp4;base64,{base64.b64encode(page.video).decode()}"
     template = templates().get_template("page.html.jinja")
-    return template.render(page=page, policy=POLICY, video=video, version=__version__)
+    return template.render(page=page, policy=CONTENT_SECURITY_POLICY, video=video, version=__version__)
 
 
 @functools.cache

@@ -34,7 +34,11 @@ class PageMedia:
         self._name = checkpoint.resolve().name
 
     def add_evaluation(self, *, may_evaluate: bool) -> str:
-        """Add the evaluation to the page; return its origin: `stored`, `made`, or an empty text if there is none."""
+        """Add the evaluation to the page; return its origin.
+
+        Returns:
+            `stored`; `made` (evaluated now); an empty text if there is no evaluation.
+        """
         page = self._page
         try:
             page.evaluation = read_evaluation(self._run, self._name)
@@ -54,7 +58,11 @@ class PageMedia:
         return "made"
 
     def add_video(self) -> str:
-        """Add a video to the page; return its origin: `stored`, `made`, `older` (checkpoint), or an empty text."""
+        """Add a video to the page; return its origin.
+
+        Returns:
+            `stored`; `made` (recorded now); `older` (of an older checkpoint); an empty text if there is no video.
+        """
         page, file = self._page, self._run.folder / "videos" / f"{self._name}.mp4"
         try:
             page.video = self._read_video(file)

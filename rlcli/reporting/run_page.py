@@ -77,7 +77,7 @@ class Page:
 
 
 def gather_page(run: Run, checkpoint: Path | None) -> Page:
-    """Read everything except evaluation and video, which `PageMedia` adds.
+    """Return the page of a run, without evaluation and video, which `PageMedia` adds.
 
     Args:
         run: the run.

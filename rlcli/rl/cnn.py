@@ -12,7 +12,7 @@ from torch import Tensor, nn
 _Size = Annotated[int, Field(ge=1, le=4096)]
 
 
-class PictureSpec(BaseModel):
+class ImageSpec(BaseModel):
     """Columns of one image in an observation, in the order (channels, rows, columns)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -30,34 +30,34 @@ class PictureSpec(BaseModel):
         return self.start + math.prod(self.shape)
 
 
-class VisionSpec(BaseModel):
+class CnnSpec(BaseModel):
     """Structure of a CNN without padding. All images have the same layers, with separate weights."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    pictures: Annotated[list[PictureSpec], Field(min_length=1, max_length=16)]
-    """Images in the order of their columns, without overlap."""
+    pictures: Annotated[list[ImageSpec], Field(min_length=1, max_length=16)]
+    """Images in the order of their columns, without overlap. Saved policies have this key."""
     channels: Annotated[list[_Size], Field(min_length=1, max_length=16)]
     """Output channels of each layer."""
     kernels: list[_Size]
-    """Edge of each layer's square kernel [pixels]."""
+    """Kernel size of each layer (square) [pixels]."""
     strides: list[_Size]
     """Stride of each layer [pixels]."""
     motion: PositiveFloat | None = None
     """Each older image of a history becomes (newest - older) times this factor; null: images are not changed."""
 
     @model_validator(mode="after")
-    def _fits(self) -> VisionSpec:
+    def _fits(self) -> CnnSpec:
         if not len(self.channels) == len(self.kernels) == len(self.strides):
             raise ValueError("give channels, kernels and strides one number for each layer")
         end = 0
-        for picture in self.pictures:
-            if picture.start < end:
+        for image in self.pictures:
+            if image.start < end:
                 raise ValueError("the images overlap or are not sorted by their first column")
-            if picture.shape[0] % picture.steps:
-                raise ValueError(f"{picture.shape[0]} channels are not a multiple of {picture.steps} steps")
-            end = picture.stop
-            self.sizes(picture)
+            if image.shape[0] % image.steps:
+                raise ValueError(f"{image.shape[0]} channels are not a multiple of {image.steps} steps")
+            end = image.stop
+            self.sizes(image)
         return self
 
     @property
@@ -65,13 +65,13 @@ class VisionSpec(BaseModel):
         """First column after the last image."""
         return self.pictures[-1].stop
 
-    def sizes(self, picture: PictureSpec) -> list[tuple[int, int, int]]:
+    def sizes(self, image: ImageSpec) -> list[tuple[int, int, int]]:
         """Return (channels, rows, columns) of an image before the first layer and after each layer.
 
         Raises:
             ValueError: if a kernel is larger than its input.
         """
-        sizes: list[tuple[int, int, int]] = [picture.shape]
+        sizes: list[tuple[int, int, int]] = [image.shape]
         layers = zip(self.channels, self.kernels, self.strides, strict=True)
         for number, (channels, kernel, stride) in enumerate(layers):
             _, rows, columns = sizes[-1]
@@ -83,11 +83,11 @@ class VisionSpec(BaseModel):
 
     def features(self, columns: int) -> int:
         """Return the number of features of an observation with `columns` columns."""
-        kept = columns - sum(math.prod(picture.shape) for picture in self.pictures)
-        return kept + sum(math.prod(self.sizes(picture)[-1]) for picture in self.pictures)
+        kept = columns - sum(math.prod(image.shape) for image in self.pictures)
+        return kept + sum(math.prod(self.sizes(image)[-1]) for image in self.pictures)
 
 
-class Vision(nn.Module):
+class Cnn(nn.Module):
     """CNN of an observation. Its outputs are the features of all images, then the other columns.
 
     Args:
@@ -96,14 +96,14 @@ class Vision(nn.Module):
         wide: compute in float64, as `WideLinear` does, with `WideConv`.
     """
 
-    def __init__(self, spec: VisionSpec, activation: type[nn.Module], *, wide: bool = False) -> None:
+    def __init__(self, spec: CnnSpec, activation: type[nn.Module], *, wide: bool = False) -> None:
         super().__init__()
         kind = WideConv if wide else nn.Conv2d
         self.spec = spec
         self.pictures = nn.ModuleList()
-        for picture in spec.pictures:
+        for image in spec.pictures:
             layers: list[nn.Module] = []
-            inputs = [channels for channels, _, _ in spec.sizes(picture)[:-1]]
+            inputs = [channels for channels, _, _ in spec.sizes(image)[:-1]]
             settings = zip(inputs, spec.channels, spec.kernels, spec.strides, strict=True)
             for channels, outputs, kernel, stride in settings:
                 layers += [kind(channels, outputs, kernel, stride), activation()]
@@ -112,13 +112,13 @@ class Vision(nn.Module):
     def forward(self, obs: Tensor) -> Tensor:
         """Return the features. (n, columns) -> (n, features)"""
         features, rest, end = [], [], 0
-        for picture, layers in zip(self.spec.pictures, self.pictures, strict=True):
-            pixels = torch.unflatten(obs[:, picture.start : picture.stop], 1, picture.shape)
-            if self.spec.motion is not None and picture.steps > 1:
-                pixels = motion_channels(pixels, picture.steps, self.spec.motion)
+        for image, layers in zip(self.spec.pictures, self.pictures, strict=True):
+            pixels = torch.unflatten(obs[:, image.start : image.stop], 1, image.shape)
+            if self.spec.motion is not None and image.steps > 1:
+                pixels = motion_channels(pixels, image.steps, self.spec.motion)
             features.append(layers(pixels).flatten(1))
-            rest.append(obs[:, end : picture.start])
-            end = picture.stop
+            rest.append(obs[:, end : image.start])
+            end = image.stop
         rest.append(obs[:, end:])
         return torch.cat([*features, *(part.to(features[0].dtype) for part in rest if part.shape[1])], dim=1)
 

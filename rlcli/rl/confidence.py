@@ -69,10 +69,11 @@ def difference(left: Sequence[float], right: Sequence[float]) -> dict[str, float
 
 
 def improvement(left: Sequence[float], right: Sequence[float]) -> dict[str, float | None]:
-    """Return P(left > right) + P(left = right) / 2 for one episode each, with a bootstrap interval over the pairs.
+    """Return the probability that a random episode of `left` exceeds a random episode of `right`, with an interval.
 
-    This is the statistic of Mann and Whitney (1947) as a probability of improvement (Agarwal et al. 2021). Episodes
-    with the same index in the two lists are resampled together, because they start in the same state.
+    A pair of equal values counts one half. This is the statistic of Mann and Whitney (1947) as a probability of
+    improvement (Agarwal et al. 2021). The bootstrap interval resamples episodes with the same index in the two lists
+    together, because they start in the same state.
     """
     one, other = np.asarray(left, dtype=np.float64), np.asarray(right, dtype=np.float64)
     probability = _exceeds(one, other)
@@ -84,7 +85,7 @@ def improvement(left: Sequence[float], right: Sequence[float]) -> dict[str, floa
 
 
 def _exceeds(left: NDArray[np.float64], right: NDArray[np.float64]) -> float:
-    """Return the share of all pairs whose left value is larger; a pair of equal values counts one half."""
+    """Return the fraction of all pairs whose left value is larger; a pair of equal values counts one half."""
     order = np.sort(right)
     below, up_to = np.searchsorted(order, left, "left"), np.searchsorted(order, left, "right")
     return float((below + up_to).sum()) / (2.0 * len(left) * len(right))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
-from rlcli.errors import MachineError
+from rlcli.errors import INTERRUPTED, STOPPED, MachineError
 from rlcli.machine import python_command
 from rlcli.progress import track
 
@@ -127,7 +127,9 @@ def join(device: str) -> ProcessGroup:
     try:
         dist.init_process_group("cpu:gloo,cuda:nccl" if on_gpu else "gloo", timeout=_TIMEOUT)
     except (RuntimeError, ValueError) as error:
-        raise MachineError(f"cannot connect to other processes, start all: {' '.join(str(error).split())}") from error
+        message = f"cannot connect to the other training processes: {' '.join(str(error).split())}"
+        hint = f"start all {os.environ.get('WORLD_SIZE', '')} processes"
+        raise MachineError(message, hint=hint) from error
     _current = ProcessGroup(dist.get_rank(), dist.get_world_size(), device)
     return _current
 
@@ -168,7 +170,7 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     except ChildFailedError as error:
         return _exit_code([failure.exitcode for failure in error.failures.values()])
     except SignalException as error:
-        return 75 if error.sigval == signal.SIGTERM else 130
+        return STOPPED if error.sigval == signal.SIGTERM else INTERRUPTED
     return 0
 
 

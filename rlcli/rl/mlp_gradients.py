@@ -27,8 +27,8 @@ shorter operations, and a thread waits for Python's lock between two operations.
 Layers = Iterable[nn.Module]
 OutputGradient = Callable[[slice, Tensor], tuple[Tensor, Tensor]]
 """Function of the rows of a part and of a network's outputs for them, (n, a). It returns the gradient of the loss with
-respect to the outputs, (n, a), and numbers that are summed over the parts: at most 3 + 2 a of the actor, one of the
-critic."""
+respect to the outputs, (n, a), and statistics that are summed over the parts (losses, KL divergence, gradients of the
+standard deviations, ...): at most 3 + 2 a of the actor, one of the critic."""
 
 
 class PartMemory:
@@ -44,7 +44,7 @@ class PartMemory:
     def __init__(self, actor: Layers, critic: Layers, rows: int, tensors: Mapping[str, Tensor] | None = None) -> None:
         linears = [[layer for layer in layers if isinstance(layer, nn.Linear)] for layers in (actor, critic)]
         self._max_rows = part_rows([*linears[0], *linears[1]])
-        # transposed, (inputs, outputs): products with few inputs are several times faster so
+        # transposed, (inputs, outputs): products with few inputs are several times faster this way
         parameters = [parameter for layer in (*linears[0], *linears[1]) for parameter in (layer.weight, layer.bias)]
         self._shapes = [parameter.t().shape for parameter in parameters]
         self._ends = (0, 2 * len(linears[0]), len(parameters))
@@ -67,11 +67,11 @@ class PartMemory:
         return [slice(start, end) for start, end in itertools.pairwise(ends)]
 
     def tasks(self, rows: int) -> list[tuple[int, int, slice]]:
-        """Return what is to be computed for a minibatch: network (0: actor, 1: critic), part and its rows."""
+        """Return the tasks of a minibatch: (network, part, rows of the part). Network 0 is the actor, 1 the critic."""
         return [(network, part, part_of) for network in range(2) for part, part_of in enumerate(self.split(rows))]
 
     def gradients_of(self, network: int, part: int) -> list[Tensor]:
-        """Return where the gradients of a network's parameters for a part belong, transposed."""
+        """Return the (transposed) tensors to write the gradients of one network and part to."""
         return self._views[part][self._ends[network] : self._ends[network + 1]]
 
     def sum_parts(self, rows: int, out: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -95,11 +95,13 @@ class PartGradients:
     def __init__(self, actor: Layers, critic: Layers, memory: PartMemory) -> None:
         self._memory, self._passes = memory, (_Passes(actor, memory.rows), _Passes(critic, memory.rows))
 
-    def compute(self, task: tuple[int, int, slice], inputs: Sequence[Tensor], losses: Sequence[OutputGradient]) -> None:
-        """Write the gradients of one of `PartMemory.tasks`. `inputs` and `losses` are those of actor and critic."""
+    def compute(
+        self, task: tuple[int, int, slice], inputs: Sequence[Tensor], output_gradients: Sequence[OutputGradient]
+    ) -> None:
+        """Write the gradients of one of `PartMemory.tasks`. Each sequence is (actor's, critic's)."""
         network, part, rows = task
         mlp = self._passes[network]
-        gradient, numbers = losses[network](rows, mlp.forward(inputs[network][rows]))
+        gradient, numbers = output_gradients[network](rows, mlp.forward(inputs[network][rows]))
         self._memory.numbers[network, part, : numbers.numel()] = numbers
         mlp.backward(gradient, self._memory.gradients_of(network, part))
 
@@ -124,9 +126,9 @@ class MlpGradients:
         )
 
     def __call__(
-        self, obs: Tensor, critic_obs: Tensor, actor_loss: OutputGradient, critic_loss: OutputGradient
+        self, obs: Tensor, critic_obs: Tensor, actor_gradient: OutputGradient, critic_gradient: OutputGradient
     ) -> tuple[Tensor, Tensor]:
-        """Write the gradients of a minibatch; return the summed numbers of both losses. Inputs (n, d), (n, c)"""
+        """Write the gradients of a minibatch; return the summed statistics of both networks. Inputs (n, d), (n, c)"""
         tasks = deque(self._memory.tasks(len(obs)))
 
         def work(thread: PartGradients) -> None:
@@ -135,7 +137,7 @@ class MlpGradients:
                     task = tasks.popleft()
                 except IndexError:
                     return
-                thread.compute(task, (obs, critic_obs), (actor_loss, critic_loss))
+                thread.compute(task, (obs, critic_obs), (actor_gradient, critic_gradient))
 
         with torch.no_grad():
             others = [self._pool.submit(work, thread) for thread in self._threads[1:]] if self._pool else []

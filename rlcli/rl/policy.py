@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationErro
 from torch import Tensor, nn
 
 from rlcli.errors import CheckpointError
-from rlcli.rl.cnn import Vision, VisionSpec
+from rlcli.rl.cnn import Cnn, CnnSpec
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 _LOG_STD_RANGE = (-20.0, 2.0)
@@ -52,7 +52,7 @@ class PolicySpec(BaseModel):
     [-20, 2]."""
     memory: Layers = []
     """Number of cells of each LSTM layer; empty: no LSTM."""
-    vision: VisionSpec | None = None
+    vision: CnnSpec | None = None
     """CNN and the images that it reads; null: no CNN."""
 
     @model_validator(mode="after")
@@ -169,9 +169,9 @@ class Policy(nn.Module):
         self.normalizer = Normalizer(spec.observation_size, spec.normalize_clip) if spec.normalize else None
         self.memory = Lstm(spec.observation_size, spec.memory, wide=True) if spec.memory else None
         inputs = spec.memory[-1] if spec.memory else spec.observation_size
-        self.vision: Vision | None = None
+        self.vision: Cnn | None = None
         if spec.vision is not None:
-            self.vision = Vision(spec.vision, ACTIVATIONS[spec.activation], wide=True)
+            self.vision = Cnn(spec.vision, ACTIVATIONS[spec.activation], wide=True)
             inputs = spec.vision.features(inputs)
         self.actor = mlp(inputs, spec.hidden, spec.action_size, spec.activation)
         if spec.kind.startswith("gaussian-"):

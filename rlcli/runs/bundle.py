@@ -20,7 +20,7 @@ from rlcli.runs.atomic_io import disk_errors, remove_leftovers, sync_folder, to_
 from rlcli.runs.checkpoint_manifest import layout_of
 from rlcli.runs.checkpoint_reader import FORMAT, Checkpoint, open_checkpoint, sha256
 from rlcli.runs.run import Run, TaskRecord
-from rlcli.runs.safe_io import JSON_LIMIT, FileModel, Word, check_json, parse_json, read_file
+from rlcli.runs.safe_io import JSON_LIMIT, FileModel, PrintableText, check_json, parse_json, read_file
 
 BUNDLE = 1
 """Version of the bundle format, stored in the manifest under the key `bundle`."""
@@ -30,7 +30,7 @@ class _BundleRecord(FileModel):
     """The entries of a manifest that only a bundle has."""
 
     task: TaskRecord
-    agent: Annotated[Word, Field(max_length=200)] | None = None
+    agent: Annotated[PrintableText, Field(max_length=200)] | None = None
 
 
 def is_bundle(folder: Path) -> bool:

@@ -303,8 +303,10 @@ def sha256(data: bytes) -> str:
 def _verified(file: Path, size: int, digest: str, limit: int) -> bytes:
     """Return the content of a file after a check of its size and hash."""
     data = read_file(file, limit, size=size, missing=f"{file} is missing; choose an older checkpoint: RUN@step:N")
-    if len(data) != size or sha256(data) != digest:
-        raise manifest_error(file, len(data), size)
+    if len(data) != size:
+        raise manifest_error(file, f"{len(data)} bytes were read, but the manifest has {size}")
+    if sha256(data) != digest:
+        raise manifest_error(file, "its hash differs from the hash in the manifest")
     return data
 
 

@@ -85,7 +85,7 @@ def built_record(model: mujoco.MjModel, device: str) -> dict[str, Any]:
 
 
 def versions(resolved: Resolved) -> dict[str, str]:
-    """Return the versions of PACKAGES, and of the distributions of task, trainer and format with their requirements."""
+    """Return the versions of PACKAGES, of the packages of the task, trainer and format, and of their requirements."""
     found = {name: _version(name) for name in PACKAGES}
     owners = []
     if resolved.source.distribution:

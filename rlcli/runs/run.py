@@ -18,7 +18,7 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from rlcli.config import strict_yaml
 from rlcli.errors import CheckpointError, MachineError, UsageError
 from rlcli.runs.atomic_io import disk_error, disk_errors, to_json, write_atomic
-from rlcli.runs.safe_io import FileModel, Word, check_json, read_file, read_json, refuse_links, require_inside
+from rlcli.runs.safe_io import FileModel, PrintableText, check_json, read_file, read_json, refuse_links, require_inside
 
 CONFIG = "config.yaml"
 RECORD = "run.json"
@@ -257,13 +257,15 @@ def require_own(run: Run, *parts: str) -> None:
                 pending += path.iterdir()
             elif not stat.S_ISREG(mode):
                 raise OSError(errno.EINVAL, "it is not a regular file")
-            if count > _MAX_FILES:
-                raise OSError(errno.EFBIG, f"the run has more than {_MAX_FILES} files")
         except FileNotFoundError:
             continue
         except (OSError, RuntimeError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise CheckpointError(f"{path} cannot be written to: {reason}", hint="delete this foreign file") from None
+            message, hint = f"{path} cannot be part of a run: {reason}", "delete it, or move it out of the run"
+            raise CheckpointError(message, hint=hint) from None
+        if count > _MAX_FILES:
+            message = f"{run.folder} has more than {_MAX_FILES} files"
+            raise CheckpointError(message, hint="delete files that do not belong to the run")
 
 
 def _require_task_name(name: str) -> str:
@@ -276,11 +278,11 @@ class TaskRecord(FileModel):
     """Record of a task in an untrusted file. Every entry is a name or a path."""
 
     model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, Word | None] = Field(init=False)
+    __pydantic_extra__: dict[str, PrintableText | None] = Field(init=False)
 
-    name: Annotated[Word, AfterValidator(_require_task_name)]
-    folder: Word | None = None
-    distribution: Word | None = None
+    name: Annotated[PrintableText, AfterValidator(_require_task_name)]
+    folder: PrintableText | None = None
+    distribution: PrintableText | None = None
 
 
 class _InstalledTask(TaskRecord):
@@ -294,10 +296,10 @@ class _InstalledTask(TaskRecord):
 
 
 class _Finding(FileModel):
-    check: Word
+    check: PrintableText
     iteration: Annotated[int, Field(ge=0)]
-    message: Word
-    hint: Word
+    message: PrintableText
+    hint: PrintableText
 
 
 class RunRecord(FileModel):

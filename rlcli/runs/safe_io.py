@@ -39,7 +39,7 @@ def _require_printable(text: str) -> str:
 
 
 Count = Annotated[int, Field(ge=0, lt=2**62)]
-Word = Annotated[str, Field(max_length=4096), AfterValidator(_require_printable)]
+PrintableText = Annotated[str, Field(max_length=4096), AfterValidator(_require_printable)]
 """A name or a path."""
 
 
@@ -66,7 +66,7 @@ def check_json(kind: type[Model], value: object, file: Path, *keys: str, hint: s
 
 @contextlib.contextmanager
 def read_errors(file: Path) -> Iterator[None]:
-    """Turn an OSError inside the block into a CheckpointError that names the file, but for a FileNotFoundError."""
+    """Turn an OSError inside the block, except a FileNotFoundError, into a CheckpointError that names the file."""
     try:
         yield
     except FileNotFoundError:
@@ -91,7 +91,7 @@ def read_file(file: Path, limit: int, *, size: int | None = None, missing: str |
     try:
         with _opened(file) as (opened, found):
             if size is not None and found != size:
-                raise manifest_error(file, found, size)
+                raise manifest_error(file, f"its size is {found} bytes, but the manifest has {size}")
             if found > limit:
                 raise CheckpointError(f"{file} is too large: {found:,} bytes, at most {limit:,} are read")
             return opened.read(found)
@@ -101,10 +101,9 @@ def read_file(file: Path, limit: int, *, size: int | None = None, missing: str |
         raise CheckpointError(missing) from None
 
 
-def manifest_error(file: Path, found: int, size: int) -> CheckpointError:
-    """Return the error for a file of `found` bytes whose size or hash differs from the manifest."""
-    message = f"{file} is corrupt: it does not match the manifest ({found} of {size} bytes)"
-    return CheckpointError(message, hint="choose an older checkpoint: RUN@step:N")
+def manifest_error(file: Path, difference: str) -> CheckpointError:
+    """Return the error for a file that differs from the manifest."""
+    return CheckpointError(f"{file} is corrupt: {difference}", hint="choose an older checkpoint: RUN@step:N")
 
 
 def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:

@@ -94,9 +94,9 @@ def _content(archive: zipfile.ZipFile, name: str, where: str) -> bytes:
         with archive.open(name) as member:
             data = member.read(size + 1)
     except Exception as error:
-        raise CheckpointError(f"{where}: {name} is corrupt; save it again: {one_line(error)}") from None
+        raise CheckpointError(f"{where}: {name} is corrupt: {one_line(error)}; save the file again") from None
     if len(data) != size:
-        raise CheckpointError(f"{where}: {name} is corrupt: {len(data)} of {size} bytes; save it again")
+        raise CheckpointError(f"{where}: {name} is corrupt: {len(data)} of {size} bytes; save the file again")
     return data
 
 
@@ -113,7 +113,8 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
     try:
         saved = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:
-        raise CheckpointError(f"{where} must hold only tensors; save it again: {one_line(error, 300)}") from None
+        message = f"{where} cannot be read as tensors and numbers: {one_line(error, 300)}"
+        raise CheckpointError(message, hint="save a state_dict again with torch.save") from None
     if not isinstance(saved, Mapping):
         raise CheckpointError(f"{where} is not a mapping of names to tensors; save a state_dict")
     return saved
@@ -129,4 +130,4 @@ def _require_tensors_only(description: bytes, where: str) -> None:
     except CheckpointError:
         raise
     except Exception as error:
-        raise CheckpointError(f"{where} is corrupt; save it again: {one_line(error)}") from None
+        raise CheckpointError(f"{where} is corrupt: {one_line(error)}; save the file again") from None

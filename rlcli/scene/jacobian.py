@@ -15,13 +15,13 @@ from rlcli.sim.rotations import cross
 class Jacobian:
     """Jacobian of a point of a body with respect to hinge and slide joints of its entity.
 
-    Columns: (a x (x - p), a) for a hinge with axis a and anchor p and a point x; (a, 0) for a slide with axis a; 0 for
-    a joint that is not between the body and the world.
+    The column of a hinge with axis a and anchor p is (cross(a, r - p), a) for a point r. That of a slide with axis a is
+    (a, 0). The column of a joint that is not between the body and the world is 0.
 
     Args:
         entity: the robot.
-        columns: joint columns.
-        body: body column.
+        columns: indices of the joints in the entity.
+        body: index of the body in the entity.
     """
 
     def __init__(self, entity: Entity, columns: Sequence[int], body: int) -> None:

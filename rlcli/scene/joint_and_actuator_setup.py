@@ -78,8 +78,8 @@ class SceneJoints:
                 if change.actuator is not None:
                     self._add_actuator(name, names[position], change.actuator)
 
-    def add_models(self, name: str, entity: EntityConfig) -> None:
-        """Replace the actuators on the joints of actuator models by one motor each, without limits of its own."""
+    def add_motors_of_actuator_models(self, name: str, entity: EntityConfig) -> None:
+        """Give every joint of an actuator model one motor without limits, in place of its actuators."""
         names = self._joint_names(name)
         owner: dict[str, str] = {}
         for key, config in entity.actuators.items():

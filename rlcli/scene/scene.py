@@ -117,7 +117,7 @@ class Scene:
         with warnings.catch_warnings(action="ignore"):
             self.spec.attach(child, prefix=f"{name}/", frame=frame)
         self.joints.override(name, entity, degrees=bool(child.compiler.degree))
-        self.joints.add_models(name, entity)
+        self.joints.add_motors_of_actuator_models(name, entity)
 
     def _set_options(self) -> None:
         """Set the options of `sim`, which override those of the MJCF."""

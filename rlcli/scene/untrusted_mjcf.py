@@ -75,8 +75,8 @@ def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False, com
     cost = scan.read(file)
     if not installed and cost > _MAX_COST:
         raise BadModel(
-            f"{file}: too large: as expensive as {cost:,.0f} elements, {_MAX_COST:,} are allowed;"
-            f" make its most expensive part smaller: {scan.costliest}"
+            f"{file}: the model is too large: its cost is {cost:,.0f}, at most {_MAX_COST:,} is allowed (one element"
+            f" costs 1); the most expensive part is {scan.costliest}; make this part smaller"
         )
     if not installed and cost > SUBPROCESS_COST:
         _compile_in_subprocess(file)
@@ -198,7 +198,8 @@ class _MjcfScan:
                 chain = (*parents, file, other)
                 if other in chain[:-1]:
                     cycle = " -> ".join(each.name for each in chain[chain.index(other) :])
-                    raise BadModel(f"{source}:{line}: model: {cycle}: a model must not attach itself; remove one")
+                    message = f"{source}:{line}: the model attaches itself: {cycle}"
+                    raise BadModel(f"{message}; remove one of these attachments")
                 models[name] = models.get(name, 0.0) + self._model_cost(other, (*parents, file))
         cost = sum(copies * text.cost for _, copies, text in parts) + sum(models.values())
         stored = sum(text.stored for _, _, text in parts)
@@ -218,7 +219,7 @@ class _MjcfScan:
     def _included(self, file: Path, copies: float, parents: tuple[Path, ...]) -> list[tuple[Path, float, _Text]]:
         """Return the text of a file and those that it includes, each with the number of its copies."""
         if file in parents:
-            raise BadModel(f"{file}: includes itself; remove the include")
+            raise BadModel(f"{file}: the file includes itself; remove this include")
         text = self._texts[file]
         found = [(file, copies, text)]
         for count, other in text.includes:
@@ -232,9 +233,10 @@ class _MjcfScan:
         if file.suffix.lower() not in _TEXT:
             allowed = ", ".join(_TEXT)
             raise BadModel(f"{file}: not MJCF; give a text file ({allowed}): compiled models (.mjb) are not opened")
-        if len(self._texts) >= _MAX_FILES or level > _MAX_LEVELS:
-            limits = f"{_MAX_FILES} files, or more than {_MAX_LEVELS} in each other"
-            raise BadModel(f"{self.main}: includes more than {limits}; use fewer")
+        if len(self._texts) >= _MAX_FILES:
+            raise BadModel(f"{self.main}: includes more than {_MAX_FILES} files; use fewer files")
+        if level > _MAX_LEVELS:
+            raise BadModel(f"{file}: is included more than {_MAX_LEVELS} levels deep; use fewer levels")
         text = self._texts[file.resolve()] = _Text()
         try:
             data = read_plain(file, _MAX_TEXT)

@@ -86,7 +86,7 @@ class BatchEngine(BatchWorlds):
 
     @property
     def replayable(self) -> Self:
-        """This engine, whose calls can be stepped again bit for bit."""
+        """This engine: its steps can be repeated bit for bit."""
         return self
 
     def use_torch_stream(self) -> None:

@@ -56,7 +56,7 @@ class BatchWorlds:
         self.num_envs = num_envs
         self.threads = threads
         self._disable_flags = model.opt.disableflags
-        self._batch = make_batch(model, num_envs, threads, skipped_flags=skippable_flags(model), persistent=persistent)
+        self._batch = make_batch(model, num_envs, threads, disable_flags=skippable_flags(model), persistent=persistent)
         self._skips = True
         """Whether steps skip the work that does not change the state."""
         self._expanded = expanded_fields(self._batch)

@@ -49,7 +49,7 @@ class Divergence:
     env: int
     """Index of the environment."""
     cause: str
-    """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, `qvel out of bounds`, or `engine error`."""
+    """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, `FIELD out of bounds`, or `engine error`."""
     detail: str = ""
     """Element of the model in which it was detected, if known."""
     index: int = -1

@@ -1,4 +1,4 @@
-"""Protocol of engines, which step many worlds of one model (one per environment) on a CPU or a GPU."""
+"""Protocol of engines: an engine steps many worlds of one model, one for each environment, on a CPU or a GPU."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class EngineView(Protocol):
 
     @property
     def replayable(self) -> ReplayableView | None:
-        """The engine itself if its calls can be stepped again bit for bit; None on a GPU."""
+        """The engine itself if its steps can be repeated bit for bit; None on a GPU."""
 
     @property
     def warnings(self) -> dict[str, int]:
@@ -61,13 +61,13 @@ class EngineView(Protocol):
 
 
 class ReplayableView(EngineView, Protocol):
-    """View of an engine whose worlds have integration states on the CPU, from which it steps again bit for bit."""
+    """View of an engine with integration states on the CPU: steps from a stored state can be repeated bit for bit."""
 
     state_layout: StateLayout
 
     @property
     def step_stage(self) -> int:
-        """Stage (mjtStage) that is computed after the last physics step of a call, for the fields in use."""
+        """Stage (mjtStage) up to which a call recomputes the derived fields in use after its last physics step."""
 
     @property
     def own_constants(self) -> bool:
@@ -90,7 +90,7 @@ class ReplayableView(EngineView, Protocol):
         """Return copies of the integration states of some worlds. (n, nstate)"""
 
     def own_model_fields(self, env: int) -> dict[str, NDArray[Any]]:
-        """Return copies of the model fields of one world."""
+        """Return copies of one world's values of the expanded model fields."""
 
 
 class Engine(EngineView, Protocol):
@@ -98,7 +98,7 @@ class Engine(EngineView, Protocol):
 
     @property
     def replayable(self) -> ReplayableEngine | None:
-        """The engine itself if its calls can be stepped again bit for bit; None on a GPU."""
+        """The engine itself if its steps can be repeated bit for bit; None on a GPU."""
 
     @property
     def described_divergences(self) -> list[Divergence]:
@@ -120,7 +120,7 @@ class Engine(EngineView, Protocol):
         """Return a model field that has a value for each world; None if all worlds share the model's value."""
 
     def set_constants(self, selection: Selection | None = None) -> None:
-        """Recompute the constants that MuJoCo derives from model fields, after a write to fields with own values.
+        """Recompute the constants that MuJoCo derives from model fields, after a write to expanded fields.
 
         Args:
             selection: the worlds; None: all. An `asynchronous` engine always recomputes all worlds.
@@ -132,7 +132,7 @@ class Engine(EngineView, Protocol):
     def diverged(self, motion_is_finite: bool = False) -> Tensor | None:
         """Return the worlds that diverged in the last `step`, (num_envs,) bool; None for none. Call it once per step.
 
-        An `asynchronous` engine has already restored their state before the step.
+        An `asynchronous` engine has already put these worlds back into the state that they had before the step.
 
         Args:
             motion_is_finite: whether the caller has checked that all positions and velocities are finite.
@@ -192,10 +192,10 @@ class Engine(EngineView, Protocol):
 
 
 class ReplayableEngine(Engine, ReplayableView, Protocol):
-    """Engine whose worlds have integration states on the CPU, from which it steps again bit for bit."""
+    """Engine with integration states on the CPU: steps from a stored state can be repeated bit for bit."""
 
     stream_ids: NDArray[np.int64] | None
-    """Index of each world's random stream; None: the index of the world. (num_envs,)"""
+    """Number of each world in the keys of random numbers; None: the index of the world. (num_envs,)"""
 
     def set_state_row(self, env: int, row: NDArray[np.float64]) -> None:
         """Set the integration state of a world; derived fields keep their values."""
@@ -211,7 +211,10 @@ class ReplayableEngine(Engine, ReplayableView, Protocol):
         """
 
     def write_own_model(self, env: int, model: mujoco.MjModel) -> None:
-        """Write the model of one world into a copy of the model, with the disable flags of the original model."""
+        """Write one world's values of the expanded fields into `model`, a copy of the engine's model.
+
+        The disable flags of `model` stay those of the engine's model.
+        """
 
 
 def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, device: str = "cpu") -> Engine:

@@ -26,7 +26,7 @@ class MaskSelection:
         mask: the selected environments. (num_envs,) bool
         seed: seed of the random numbers.
         counters: index of each environment's random sequence, usually its episode. (num_envs,)
-        stream_key: the stream to draw from, a result of `rlcli.random.stream`.
+        stream_key: key of the purpose of the random numbers (for example a term), a result of `rlcli.random.stream`.
         shared_streams: environments i and i % shared_streams draw the same random numbers; 0: every environment has
             its own stream.
     """
@@ -103,11 +103,11 @@ class MaskSelection:
         return self.mask.nonzero()[:, 0]
 
     def union(self, other: MaskSelection) -> MaskSelection:
-        """Return a selection of the rows that are in one of two selections."""
+        """Return a selection of the rows that are in either selection, or in both."""
         return MaskSelection(self.mask | other.mask, self.seed, self.counters, shared_streams=self.shared_streams)
 
     def stream(self, stream: np.uint64) -> MaskSelection:
-        """Return a selection of the same rows that draws from another stream."""
+        """Return a selection of the same rows that draws for another purpose (a result of `rlcli.random.stream`)."""
         return MaskSelection(self.mask, self.seed, self.counters, stream, self.shared_streams)
 
     def _uniform(self, low: float, high: float, shape: tuple[int, ...]) -> Tensor:

@@ -44,7 +44,7 @@ STATE_FIELDS: dict[str, mujoco.mjtState] = _private(mujoco.batch, "_STATE_FIELDS
 
 
 def make_batch(
-    model: mujoco.MjModel, num_envs: int, threads: int, *, skipped_flags: int = 0, persistent: bool = False
+    model: mujoco.MjModel, num_envs: int, threads: int, *, disable_flags: int = 0, persistent: bool = False
 ) -> Batch:
     """Make a batch of worlds.
 
@@ -52,14 +52,14 @@ def make_batch(
         model: the compiled model; it is copied, because other threads may step it.
         num_envs: number of worlds.
         threads: number of threads that step them.
-        skipped_flags: disable flags (mjtDisableBit) that are set in the batch in addition to the model's.
+        disable_flags: disable flags (mjtDisableBit) to set in the batch in addition to the model's.
         persistent: whether each world has an MjData of its own.
 
     Raises:
         DependencyError: if the installed version of MuJoCo lacks a private name that is used here.
     """
     own = copy.copy(model)
-    own.opt.disableflags |= skipped_flags
+    own.opt.disableflags |= disable_flags
     batch = Batch(own, num_envs, threads, persistent=persistent)
     for name in ("_b", "_check", "_component", "_expanded"):
         _private(batch, name)
@@ -72,13 +72,16 @@ def state_columns(batch: Batch) -> dict[str, tuple[int, int]]:
 
 
 def expanded_fields(batch: Batch) -> dict[str, NDArray[Any]]:
-    """Return the model fields that differ between worlds, name -> (num_envs, ...); the dictionary is live."""
+    """Return the live dictionary of expanded model fields (with a value for each world), name -> (num_envs, ...)."""
     fields: dict[str, NDArray[Any]] = batch._expanded
     return fields
 
 
 def expand_disable_flags(batch: Batch) -> NDArray[np.int32]:
-    """Return the disable flags of each world, live, without an entry in the expanded fields. (num_envs,)"""
+    """Give each world its own disable flags; return a live view of them. (num_envs,)
+
+    The flags have no entry in `expanded_fields`.
+    """
     flags: NDArray[np.int32] = batch._b.expand("opt.disableflags").view(np.int32)
     return flags
 

@@ -1,6 +1,6 @@
 """Rotations by unit quaternions (w, x, y, z), and angles, on (n, ...) tensors.
 
-The result of a row has the same bits for any number of rows. The functions therefore use only operations that torch
+The result of a row is bit-identical for any number of rows. The functions therefore use only operations that torch
 rounds equally in its vectorised and its scalar loops: no `torch.atan2` and no `pow`.
 """
 
@@ -175,6 +175,6 @@ def yaw_only(quat: Tensor) -> Tensor:
 
 
 def wrap_to_pi(angle: Tensor) -> Tensor:
-    """Return the same angle in [-pi, pi] [rad]; an angle in this range is returned bit for bit."""
+    """Return the same angle in [-pi, pi] [rad]; an angle in this range is returned unchanged."""
     turns = (angle * (0.5 / math.pi)).round_()
     return torch.sub(angle, turns.mul_(2.0 * math.pi))

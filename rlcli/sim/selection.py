@@ -91,7 +91,7 @@ class Selection(Protocol):
         """Return the indices of the environments; on a GPU this forces a host sync. (rows,) int64"""
 
     def stream(self, stream: np.uint64) -> Selection:
-        """Return a selection of the same rows that draws from another stream."""
+        """Return a selection of the same rows that draws for another purpose (a result of `rlcli.random.stream`)."""
 
 
 def _as_array(values: Any) -> Any:
@@ -130,9 +130,10 @@ class IdSelection:
         ids: the selected environments, sorted. (rows,)
         seed: seed of the random numbers.
         counters: index of each row's random sequence, usually its episode. (rows,)
-        stream_key: the stream to draw from, a result of `rlcli.random.stream`.
+        stream_key: key of the purpose of the random numbers (for example a term), a result of `rlcli.random.stream`.
         device: device of the random numbers; None: the CPU.
-        stream_ids: index of each environment's random stream; None: its id. (num_envs,)
+        stream_ids: number of each environment in the keys of random numbers: environments with the same number draw
+            the same random numbers; None: the id of the environment. (num_envs,)
     """
 
     ids: NDArray[np.int64]
@@ -207,7 +208,7 @@ class IdSelection:
         return torch.from_numpy(self.ids)
 
     def stream(self, stream: np.uint64) -> IdSelection:
-        """Return a selection of the same rows that draws from another stream."""
+        """Return a selection of the same rows that draws for another purpose (a result of `rlcli.random.stream`)."""
         other = self._with(self.ids, self.counters, stream)
         other._keys = self._row_keys()
         return other

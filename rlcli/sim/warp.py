@@ -46,7 +46,7 @@ class WarpEngine(WarpWorlds):
     threads = 1
     asynchronous = True
     replayable = None
-    """None: a GPU does not compute the same bits again."""
+    """None: steps on a GPU are not bit-identical when they are repeated."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, config: SimConfig, device: str) -> None:
         super().__init__(model, num_envs, config, device)
@@ -145,7 +145,7 @@ class WarpEngine(WarpWorlds):
         self._default_qvel.copy_(qvel)
 
     def as_field(self, tensor: Tensor) -> Tensor:
-        """Return the tensor itself."""
+        """Return a tensor in the form of this engine's fields, which is the tensor itself."""
         return tensor
 
     def select(self, mask: Field, seed: int, counters: Field) -> MaskSelection:

@@ -58,12 +58,13 @@ class WarpWorlds:
         self._fields: dict[str, Tensor] = {}
         """Fields of the data that are in use (requested with `field`)."""
         self._start_inputs: dict[str, Tensor] = {}
-        """Default values of bound `INPUTS`, which a reset restores."""
+        """Default values of the `INPUTS` in use, which a reset restores."""
         self._last_derived: dict[str, Tensor] = {}
         """Derived fields of each world's last state that did not diverge."""
         self._derived: set[int] = set()
-        """Groups of derived fields that are bound."""
+        """Stages whose derived fields are in use."""
         self._needs_only_motion = True
+        """Whether the fields in use can be derived from the state without contacts, constraints and inertias."""
         self._overwritten: dict[str, wp.array] = {}
         """Copies of fields that `fwd_velocity` overwrites."""
         self._substep_fields = config.derived_fields == "substep"
@@ -145,7 +146,7 @@ class WarpWorlds:
         return self._fields[name]
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the state, of bound inputs and of the model fields with a value for each world."""
+        """Return copies of the state, of the inputs in use and of the model fields with a value for each world."""
         inputs = [name for name in INPUTS if name in self._fields]
         return {
             **{name: self.field(name).clone() for name in (*STATE, *inputs)},
@@ -164,7 +165,7 @@ class WarpWorlds:
             self.expand(name).copy_(values)
         substep = substate(state, "substep.")
         for name in substep:
-            self.field(name)  # bind it here too; it was bound when the state was saved
+            self.field(name)  # from now on in use, as it was when the state was saved
         for name, values in state.items():
             if name in (*STATE, *INPUTS):
                 self.field(name).copy_(values)

@@ -14,8 +14,8 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.testing.findings import Finding, NotRunError, error_at, warning_at
 from rlcli.testing.steps import (
     EndedEpisode,
-    bitwise_equal,
     ended_episodes,
+    equal_values,
     random_actions,
     record_outputs,
     step_outputs,
@@ -61,7 +61,7 @@ def compare_trajectories(
     """
     for step, (a, b) in enumerate(zip(*trajectories, strict=True)):
         for name in a:
-            if not bitwise_equal(a[name], b[name]):
+            if not equal_values(a[name], b[name]):
                 where, values = _difference(env, name, a[name], b[name], f"after {step} steps")
                 yield make(where, f"{message}: {values}", hint)
                 return
@@ -86,7 +86,7 @@ def start_states(subject: TaskUnderTest) -> Iterator[Finding]:
     if bool((first == first[0]).all()):
         message = f"the start states of {env.num_envs} environments are all the same; they must vary"
         yield error_at("between environments", message, hint)
-    if bitwise_equal(first, second):
+    if equal_values(first, second):
         message = "two episodes in a row start in the same states; they must vary"
         yield error_at("between episodes", message, hint)
 
@@ -139,7 +139,7 @@ def partial_reset(subject: TaskUnderTest) -> Iterator[Finding]:
         pairs = {name: (value, engine_state(pair.ended)[name]) for name, value in engine_state(pair.kept).items()}
         pairs |= {name: (value, step_outputs(ended)[name]) for name, value in step_outputs(kept).items()}
         for name, (a, b) in pairs.items():
-            rows = [row for row in range(subject.num_envs) if row not in _ENDING and not bitwise_equal(a[row], b[row])]
+            rows = [row for row in range(subject.num_envs) if row not in _ENDING and not equal_values(a[row], b[row])]
             if rows:
                 later = f", {number} steps later" if number else ""
                 where = "the simulation's state" if name == "state" else name
@@ -160,7 +160,7 @@ def final_observations(subject: TaskUnderTest) -> Iterator[Finding]:
         yield error_at("final_obs", message, "this is a defect of rlcli: please report it")
         return
     for group, values in result.final_obs.items():
-        stale = [row for row in _ENDING if bitwise_equal(values[row], result.obs[group][row])]
+        stale = [row for row in _ENDING if equal_values(values[row], result.obs[group][row])]
         if stale:
             message = f"the first observation of the new episode equals the last one of the old in environments {stale}"
             hint = "compute observations from the state at every call, and let the reset change the state"
@@ -201,7 +201,7 @@ def back_fill(subject: TaskUnderTest) -> Iterator[Finding]:
     for group, first in results[0].obs.items():
         second = first.clone()
         second[rows] = results[1].obs[group][rows]
-        if not bitwise_equal(first, second):
+        if not equal_values(first, second):
             where, values = _difference(pair.kept, f"observation '{group}'", first, second, "at its start")
             message = f"the first observation of an episode depends on the actions of the episode before: {values}"
             hint = "fill histories, delays and buffers of the reset environments in reset(selection) or reset_idx"
@@ -270,7 +270,7 @@ def repeated_observation(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that computing the observation of a state a second time gives the same values."""
     hint = "compute it only from the state; advance histories and counters when actions are applied"
     for where, (before, after) in _observe_twice(_env_pair(subject)).items():
-        if not bitwise_equal(before, after):
+        if not equal_values(before, after):
             yield error_at(where, "changes when it is computed a second time in the same state", hint)
 
 
@@ -307,7 +307,7 @@ def observation_after_reset(subject: TaskUnderTest) -> Iterator[Finding]:
     # an episode of the others may end in this step too
     running = [row for row in range(subject.num_envs) if row not in _ENDING and not over[row]]
     for before, after in pairwise(observations):
-        rows = [row for row in running if not bitwise_equal(before[row], after[row])]
+        rows = [row for row in running if not equal_values(before[row], after[row])]
         if rows:
             message = f"of running environments {rows} changes when {_ENDING} are reset"
             yield error_at("obs_buf", message, "compute each row only from the state of its environment")

@@ -216,7 +216,7 @@ def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 def _columns(evidence: RolloutEvidence) -> Iterator[tuple[str, Tensor]]:
-    """Yield each observation column or picture, and its values in all rollouts. (columns, steps)"""
+    """Yield each observation column or image, and its values in all rollouts. (columns, steps)"""
     env = evidence.rollouts[0].env
     for group in env.layout.observations:
         rollouts = [rollout.obs[group] for rollout in evidence.rollouts if group in rollout.obs]

@@ -27,7 +27,7 @@ from rlcli.runs.restore import require_fit
 from rlcli.testing.episode_checks import compare_trajectories
 from rlcli.testing.findings import Finding, NotRunError, error_at, warning_at
 from rlcli.testing.host_sync import HostSyncError, HostSyncGuard
-from rlcli.testing.steps import bitwise_equal, random_actions, record_outputs, step_outputs
+from rlcli.testing.steps import equal_values, random_actions, record_outputs, step_outputs
 from rlcli.testing.task_under_test import TaskUnderTest, element_names, task_of
 
 STEPS = 16
@@ -57,7 +57,7 @@ def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
     torch.manual_seed(0)
     before = rng_state()
     of_many = [{n: v[:FEW] for n, v in step.items()} for step in record_outputs(many, (a.clone() for a in actions))]
-    draws_globally = any(not bitwise_equal(state, before[name]) for name, state in rng_state().items())
+    draws_globally = any(not equal_values(state, before[name]) for name, state in rng_state().items())
     torch.manual_seed(0)
     of_few = record_outputs(few, (a[:FEW].clone() for a in actions))
     make, reason = warning_at, ""

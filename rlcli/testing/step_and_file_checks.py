@@ -175,7 +175,7 @@ def _check_divergence(subject: TaskUnderTest, env: VecEnv, steps: int) -> Iterat
 
 
 def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
-    """Check that every observation column varies between environments or steps; of a picture, at least one pixel."""
+    """Check that every observation column varies between environments or steps; of an image, at least one pixel."""
     recording = subject.recording()
     for group in recording.env.layout.observations:
         fixed = _fixed_command_columns(recording.env, group)

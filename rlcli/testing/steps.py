@@ -92,9 +92,9 @@ def record(env: VecEnv, actions: Iterator[Tensor]) -> Recording:
             recording.steps.append(result)
             recording.obs.append(_copy(result.obs))
             for name, value in previous.items():
-                if not bitwise_equal(value, copies[name]):
+                if not equal_values(value, copies[name]):
                     recording.late_writes.setdefault(name, number)
-            if not bitwise_equal(action, before):
+            if not equal_values(action, before):
                 recording.late_writes.setdefault("the action", number)
             outputs = step_outputs(result)
             for name, value in outputs.items():
@@ -123,8 +123,8 @@ def step_outputs(result: StepResult) -> dict[str, Tensor]:
     }
 
 
-def bitwise_equal(left: Tensor, right: Tensor) -> bool:
-    """Return whether two tensors are equal bit for bit, NaN included."""
+def equal_values(left: Tensor, right: Tensor) -> bool:
+    """Return whether two tensors have equal values: NaN equals NaN, and 0.0 equals -0.0."""
     return left.shape == right.shape and bool(((left == right) | ((left != left) & (right != right))).all())
 
 

@@ -148,12 +148,12 @@ def element_names(elements: Sequence[str], size: int) -> list[str]:
 
 
 def observation_parts(env: VecEnv, group: str) -> list[tuple[str, slice]]:
-    """Return (name for messages, columns) of each column and each picture of an observation group."""
+    """Return (name for messages, columns) of each column and each image of an observation group."""
     names, parts, start = column_names(env, group), [], 0
     for term in env.layout.observations[group]:
         end = start + term.size
         if len(term.shape) > 1:
-            where = f"observations.{group}, columns {start} to {end - 1} (picture {term.name})"
+            where = f"observations.{group}, columns {start} to {end - 1} (image {term.name})"
             parts.append((where, slice(start, end)))
         else:
             columns = range(start, end)

@@ -36,7 +36,7 @@ _MIN_STD = 1e-6
 
 @dataclass(slots=True)
 class ImportedPolicy:
-    """Policy of another library in the form of a saved policy."""
+    """Policy of another library in rlcli's format of saved policies."""
 
     spec: dict[str, Any]
     """Content of `policy.json`."""
@@ -191,10 +191,12 @@ def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:
         if not isinstance(name, str) or type(value) not in (Tensor, torch.nn.Parameter):
             raise CheckpointError(f"{where}: '{str(name)[:60]}' is not a tensor; save only tensors")
         if value.layout != torch.strided or value.device.type != "cpu" or value.is_complex() or value.is_quantized:
-            raise CheckpointError(f"{where}: '{name[:60]}' must be a dense CPU tensor; save value.cpu()")
+            layout, dtype = (str(part).removeprefix("torch.") for part in (value.layout, value.dtype))
+            found = f"'{name[:60]}' is a {layout} {dtype} tensor on {value.device}"
+            raise CheckpointError(f"{where}: {found}; save it as a dense, real CPU tensor")
         # a stride of 0 makes a large tensor of few numbers: its copy would fill the memory
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
-            raise CheckpointError(f"{where}: '{name[:60]}' has fewer numbers than its shape; save a clone")
+            raise CheckpointError(f"{where}: '{name[:60]}' has fewer stored numbers than its shape; save value.clone()")
         total += 4 * value.numel()  # several tensors may share the numbers of the file
         if total > limit:
             raise CheckpointError(f"{where} has tensors of more than {limit:,} bytes; free some memory")
@@ -213,9 +215,10 @@ def _layers(weights: Mapping[str, Tensor], prefix: str, file: Path) -> list[_Lay
     numbers = {n.removeprefix(prefix).partition(".")[0] for n in weights if n.startswith(prefix)}
     if not all(number.isdecimal() and number.isascii() and len(number) < 4 for number in numbers):
         found = ", ".join(sorted(numbers))[:200]
-        raise CheckpointError(f"{file}: number the layers of {prefix}*; found {found}")
+        raise CheckpointError(f"{file}: {prefix}* has the layers {found}; number them 0, 2, 4, ...")
     if sorted(map(int, numbers)) != list(range(0, 2 * len(numbers), 2)):
-        raise CheckpointError(f"{file}: {prefix}* must have linear layers 0, 2, 4, ...")
+        found = ", ".join(sorted(numbers, key=int))[:200]
+        raise CheckpointError(f"{file}: {prefix}* has the layers {found}; rlcli reads linear layers 0, 2, 4, ...")
     return [_layer(weights, f"{prefix}{number}", file) for number in sorted(numbers, key=int)]
 
 
@@ -223,7 +226,9 @@ def _layer(weights: Mapping[str, Tensor], name: str, file: Path) -> _Layer:
     """Return a linear layer of untrusted weights."""
     weight, bias = weights.get(f"{name}.weight"), weights.get(f"{name}.bias")
     if weight is None or bias is None or weight.dim() != 2 or bias.shape != weight.shape[:1] or not weight.numel():
-        raise CheckpointError(f"{file}: {name} must be a linear layer with a bias")
+        shapes = ["missing" if value is None else tuple(value.shape) for value in (weight, bias)]
+        found = f"{name}.weight: {shapes[0]}, {name}.bias: {shapes[1]}"
+        raise CheckpointError(f"{file}: {found}; only linear layers with a bias, (outputs, inputs) and (outputs,), fit")
     return weight, bias
 
 

@@ -152,7 +152,7 @@ def _open_writer(job: Job, env: Environment) -> CheckpointWriter:
 
 
 def _record_begin(job: Job, trainer: Trainer, env: Environment, budget: Budget) -> None:
-    """Write the start of the training into run.json, and whether the run can be resumed with the same bits."""
+    """Write the start of the training into run.json, and whether a resumed run is bit-identical."""
     unsaved = env.unsaved_state()
     if unsaved:
         _log.warning("a resumed run may differ, because no checkpoint can store %s", ", ".join(unsaved))
@@ -162,7 +162,10 @@ def _record_begin(job: Job, trainer: Trainer, env: Environment, budget: Budget) 
 
 
 def _provenance(job: Job, trainer: Trainer, env: Environment) -> dict[str, Any]:
-    """Return run.json's entries on the compiled model and the machine; for a resumed run, only changed entries."""
+    """Return run.json's entries on the compiled model and the machine.
+
+    For a resumed run return the entry `resumed` with the values that have changed, or nothing if none has changed.
+    """
     record, device = job.run.record, str(env.device)
     built = built_record(env.engine.model, device)
     if job.resume_from is None:
@@ -175,7 +178,8 @@ def _provenance(job: Job, trainer: Trainer, env: Environment) -> dict[str, Any]:
     if not changed:
         return {}
     _log.warning(
-        "the run is resumed on another machine or with other versions, so the bits may differ: %s", ", ".join(changed)
+        "the run is resumed on another machine or with other versions, so its results may differ in the last bits: %s",
+        ", ".join(changed),
     )
     return {"resumed": [*record.get("resumed", []), {"step": trainer.env_steps, "changed": changed}]}
 

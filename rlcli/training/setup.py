@@ -57,7 +57,7 @@ def build_trainer(job: Job, device: str) -> tuple[Trainer, Environment]:
 
 
 def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int) -> tuple[Trainer, Environment]:
-    """Make the environment and the trainer of a configuration. Every rank has other seeds for its environments."""
+    """Make the environment and the trainer of a configuration. Every rank has its own seeds for its environments."""
     agent, spec = resolved.require_agent()
     ranks = distributed.current()
     seed_generators(ranks.seed(derive(seed, "task"), "task"))  # a task may draw random numbers while it is built
@@ -73,7 +73,7 @@ def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int)
 def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: Environment) -> None:
     """Load the state of a checkpoint to resume from."""
     require_fit(saved, env.layout)
-    _load(saved, lambda: trainer.load(state), "the run cannot be resumed; choose RUN@step:N")
+    _load(saved, lambda: trainer.load(state), "the run cannot be resumed", hint="choose another checkpoint: RUN@step:N")
     if (trainer.iteration, trainer.env_steps) != (saved.iteration, saved.step):
         raise CheckpointError(f"{saved.folder} is corrupt: manifest.json and state.json have different steps")
     processes, size = state.values.get("processes", 1), distributed.current().world_size
@@ -81,11 +81,11 @@ def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: E
         _log.info("saved by %s processes, continued by %s: every environment starts a new episode", processes, size)
 
 
-def _load(saved: Checkpoint, load: Callable[[], Any], failure: str) -> None:
+def _load(saved: Checkpoint, load: Callable[[], Any], failure: str, hint: str | None = None) -> None:
     """Call a loader of untrusted data; raise any error of it as a CheckpointError."""
     try:
         load()
     except RlcliError:
         raise
     except Exception as error:
-        raise CheckpointError(f"{saved.folder}: {failure}: {one_line(error)}") from error
+        raise CheckpointError(f"{saved.folder}: {failure}: {one_line(error)}", hint=hint) from error

@@ -11,7 +11,7 @@ from types import FrameType
 from typing import Any
 
 from rlcli.envs.observers import StepObserver
-from rlcli.errors import Stopped
+from rlcli.errors import INTERRUPTED, STOPPED, Stopped
 
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGHUP")
 """Ctrl-C; a scheduler that kills or warns; a terminal that closes. Windows has only some of them."""
@@ -41,7 +41,7 @@ class StopRequest(StepObserver):
     @property
     def exit_code(self) -> int:
         """Exit code of the process: 130 after Ctrl-C, 75 after another signal."""
-        return 130 if self.signal in (None, signal.SIGINT) else 75
+        return INTERRUPTED if self.signal in (None, signal.SIGINT) else STOPPED
 
     @contextlib.contextmanager
     def interruptible(self, interruptible: bool = True) -> Iterator[None]:

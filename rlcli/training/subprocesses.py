@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.envs.sharding.choice import ONE_WORKER
-from rlcli.errors import RlcliError
+from rlcli.errors import STOPPED, RlcliError
 from rlcli.machine import python_command
 from rlcli.training.signals import StopRequest
 
@@ -28,8 +28,6 @@ LOG = "train.log"
 """File in a run with the messages of its process."""
 POLL_S = 0.1
 """Time between two checks of running processes [s]."""
-STOPPED = 75
-"""Exit code of a training that SIGTERM has stopped."""
 
 
 @dataclass(slots=True)

@@ -9,13 +9,13 @@ from typing import Any
 
 from rlcli.config.dump import preset_of
 from rlcli.config.load import Resolved
-from rlcli.errors import DivergedError, RlcliError, UsageError, did_you_mean, listing
+from rlcli.errors import INTERRUPTED, STOPPED, DivergedError, RlcliError, UsageError, did_you_mean, listing
 from rlcli.evaluation.limits import require_success
 from rlcli.runs.overview import newest_rows, overview
 from rlcli.runs.run import Run, open_run
 from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.signals import StopRequest
-from rlcli.training.subprocesses import POLL_S, STOPPED, TrainingProcess, start_command, start_training
+from rlcli.training.subprocesses import POLL_S, TrainingProcess, start_command, start_training
 from rlcli.training.time_to_threshold import training_s
 from rlcli.tuning.search_space import Objective, Parameter
 from rlcli.tuning.sweep import Sweep, Trial
@@ -28,7 +28,7 @@ _PRUNER_STEPS = 100
 """Steps of the pruner: it compares trials at each percent of their budget."""
 _MAX_FAILURES = 3
 """Failed trials, without a successful one, after which the sweep ends with an error."""
-_NOT_CAUSED_BY_TRIAL = (7, 8, 10, STOPPED, 130)
+_NOT_CAUSED_BY_TRIAL = (7, 8, 10, STOPPED, INTERRUPTED)
 """Exit codes that do not depend on the settings of a trial: a missing package or device, the machine, a signal."""
 
 

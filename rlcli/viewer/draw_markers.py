@@ -38,7 +38,7 @@ def add_markers(
         scene: the scene, which may contain other geoms.
         markers: markers of all environments.
         numbers: indices of the environments to show.
-        offsets: displacement of each of them in the picture. (len(numbers), 3) [m]
+        offsets: displacement of each of them in the image. (len(numbers), 3) [m]
     """
     for marker in markers:
         for part in _parts(marker):

@@ -19,11 +19,11 @@ _FIELDS = [name for name in dir(mujoco.MjvGeom) if not name.startswith("_")]
 
 @dataclass(frozen=True, slots=True)
 class EnvGrid:
-    """Environments in a picture, and their positions.
+    """Environments in an image, and their positions.
 
     Args:
         env: the environments.
-        count: number of environments in the picture, including the selected one (`shown`), which is the first.
+        count: number of environments in the image, including the selected one (`shown`), which is the first.
     """
 
     env: VecEnv
@@ -45,7 +45,7 @@ class EnvGrid:
         return offsets
 
     def fit_camera(self, camera: mujoco.MjvCamera, shown: int = 0) -> mujoco.MjvCamera:
-        """Move a camera that looks at the selected environment so that all environments are in the picture."""
+        """Move a camera that looks at the selected environment so that all environments are in the image."""
         positions = self.offsets()
         if self.env.terrain is not None:
             origins = self.env.origins.double().cpu().numpy()

@@ -33,8 +33,8 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
 
     Args:
         model: the environment's model.
-        viewer: size of the pictures [pixels] and camera.
-        env_grid: further environments in the picture; None: there are none.
+        viewer: size of the images [pixels] and camera.
+        env_grid: further environments in the image; None: there are none.
 
     Raises:
         MachineError: if this machine has no OpenGL backend that works.
@@ -56,7 +56,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._mjr)
         self._rect = mujoco.MjrRect(0, 0, viewer.width, viewer.height)
 
-    def picture(self, env: VecEnv, number: int = 0) -> NDArray[np.uint8]:
+    def image(self, env: VecEnv, number: int = 0) -> NDArray[np.uint8]:
         """Render an environment with its markers and the other environments of the grid. (height, width, 3)"""
         self._compose(*env.world(number), env.origins[number].tolist())
         env_grid = EnvGrid(env, 1) if self._env_grid is None else self._env_grid

@@ -46,9 +46,9 @@ class Viewer(Protocol):
         Args:
             playback: environments and policy.
             title: task and run, for the user.
-            num_drawn: number of environments in the picture: the shown one and those after it (`EnvGrid.others`).
+            num_drawn: number of environments in the image: the shown one and those after it (`EnvGrid.others`).
             port: port on the loopback interface; 0: any free port. A viewer that is not a server ignores it.
-            ready: the viewer calls it once, when it is open and before it renders the first picture.
+            ready: the viewer calls it once, when it is open and before it renders the first image.
 
         Raises:
             MachineError: if this machine cannot open the viewer.

@@ -54,7 +54,7 @@ def record_episode(
         obs = env.reset(seed=env.seed)["policy"]
         for number in tracked(range(steps), "steps", min(steps, env.max_episode_length)):
             if number % stride == 0:
-                writer.add(renderer.picture(env))
+                writer.add(renderer.image(env))
             with torch.no_grad():
                 step = env.step(act(obs))
             obs = step.obs["policy"]
@@ -74,7 +74,7 @@ def film_replay(
         def draw(step: int) -> None:
             number = step - episode.begin
             if 0 <= number < episode.length and number % stride == 0:
-                writer.add(renderer.picture(env, episode.env))
+                writer.add(renderer.image(env, episode.env))
 
         result = replay_episodes(recording, env, episodes, draw)
     return result, writer.frames

@@ -58,7 +58,7 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
 
     Args:
         file: the video.
-        period: time between two pictures [s].
+        period: time between two images [s].
 
     Raises:
         UsageError: for a file with another suffix.
@@ -95,20 +95,20 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
         finally:
             self._temporary.unlink(missing_ok=True)
 
-    def add(self, picture: NDArray[np.uint8]) -> None:
-        """Append a picture. (height, width, 3)"""
+    def add(self, image: NDArray[np.uint8]) -> None:
+        """Append an image. (height, width, 3)"""
         self._added += 1
         if (self._added - 1) % self._stride:
             return
         try:
-            self._writer.append_data(picture)
+            self._writer.append_data(image)
         except OSError as error:
             raise MachineError(f"cannot write {self.file}: {error}") from error
         self.frames += 1
 
 
 def gif_stride(period: float) -> int:
-    """Return how many pictures a GIF advances from one frame to the next, for a period [s] between pictures."""
+    """Return how many images a GIF advances from one frame to the next, for a period [s] between images."""
     strides = range(1, 64)
     return next(
         (k for k in strides if (n := round(100 * period * k)) >= 2 and abs(n / (100 * period * k) - 1) < 0.02), 1

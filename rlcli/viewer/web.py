@@ -22,7 +22,7 @@ _VISIBLE_FIELDS = (
     *("geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_type", "geom_dataid", "geom_matid", "mat_", "light_"),
     *("site_size", "site_pos", "site_quat", "site_rgba", "body_pos", "body_quat", "jnt_pos", "jnt_axis", "qpos0"),
 )
-"""Prefixes of the model fields that change the picture."""
+"""Prefixes of the model fields that change the image."""
 
 
 def run(playback: Playback, *, title: str, num_drawn: int = 1, port: int, ready: Ready) -> None:

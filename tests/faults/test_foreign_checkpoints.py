@@ -572,11 +572,11 @@ def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
     ("weights", "output"),
     [
         ({}, "must have an actor"),
-        ({"actor.0.weight": torch.zeros(1, 4)}, "must be a linear layer"),
-        ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(3)}, "must be a linear layer"),
+        ({"actor.0.weight": torch.zeros(1, 4)}, "only linear layers with a bias"),
+        ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(3)}, "only linear layers with a bias"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1)}, "depends on the state"),
-        ({"actor.1.weight": torch.zeros(1, 4), "actor.1.bias": torch.zeros(1)}, "must have linear layers"),
-        ({"actor.x.weight": torch.zeros(1, 4), "actor.x.bias": torch.zeros(1)}, "number the layers of"),
+        ({"actor.1.weight": torch.zeros(1, 4), "actor.1.bias": torch.zeros(1)}, "rlcli reads linear layers 0, 2, 4"),
+        ({"actor.x.weight": torch.zeros(1, 4), "actor.x.bias": torch.zeros(1)}, "the layers x; number them 0, 2, 4"),
         ({"actor.00.weight": torch.zeros(1, 4), "actor.0.weight": torch.zeros(1, 4)}, "actor"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1), "std": torch.ones(2)}, "log_std"),
         (

@@ -97,27 +97,27 @@ NAMED = {
     ),
     "a picture of four terapixels": (
         model(asset='<texture name="t" type="2d" file="huge.png"/>'),
-        "too large: as expensive as",
+        "the model is too large: its cost is",
     ),
     "a thousand million copies": (
         model(body='<replicate count="1000000000"><geom size="1"/></replicate>'),
-        "too large: as expensive as",
+        "the model is too large: its cost is",
     ),
     "copies of copies of copies": (
         model(body='<replicate count="1000">' * 3 + '<geom size="1"/>' + "</replicate>" * 3),
-        "too large: as expensive as",
+        "the model is too large: its cost is",
     ),
     "a flex of 3000 cubed": (
         model(body='<flexcomp name="f" type="grid" count="3000 3000 3000" spacing="1 1 1" dim="3"/>'),
-        "too large: as expensive as",
+        "the model is too large: its cost is",
     ),
     "a height field of 100,000 squared": (
         model(asset='<hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/>'),
-        "too large: as expensive as",
+        "the model is too large: its cost is",
     ),
     "a texture of 100,000 squared": (
         model(asset='<texture name="t" type="2d" builtin="flat" width="100000" height="1000000"/>'),
-        "too large: as expensive as",
+        "the model is too large: its cost is",
     ),
     "a time step of nothing": (model('<option timestep="0"/>'), "timestep is 0"),
     "a time step below nothing": (model('<option timestep="-1"/>'), "timestep is -1"),
@@ -147,7 +147,7 @@ NAMED = {
     "an unknown element": (model("<evil/>"), "evil"),
     "a model that attaches itself": (
         model(asset='<model name="m" file="model.xml"/>', body=ATTACH),
-        "must not attach itself",
+        "the model attaches itself",
     ),
     "two models that attach each other": (
         model(asset='<model name="m" file="parts/attaches_back.xml"/>', body=ATTACH),
@@ -158,11 +158,11 @@ NAMED = {
             asset='<model name="m" file="parts/many.xml"/>',
             body='<replicate count="2000">' + ATTACH + "</replicate>",
         ),
-        "too large: as expensive as",
+        "the model is too large: its cost is",
     ),
     "an include in copies": (
         model(body='<replicate count="20000"><body><include file="parts/geoms.xml"/></body></replicate>'),
-        "too large: as expensive as",
+        "the model is too large: its cost is",
     ),
     "a sensor that every copy doubles": (
         model(body='<replicate count="40"><geom size="1"/></replicate>').replace(
@@ -172,15 +172,15 @@ NAMED = {
     ),
     "a sensor of 900 million numbers": (
         model().replace("</mujoco>", '<sensor><user dim="900000000"/></sensor></mujoco>'),
-        "too large: as expensive as",
+        "the model is too large: its cost is",
     ),
     "a sensor of 100 million contacts": (
         model().replace("</mujoco>", '<sensor><contact subtree1="block" num="100000000"/></sensor></mujoco>'),
-        "too large: as expensive as",
+        "the model is too large: its cost is",
     ),
     "user data of every element": (
         model('<size nuser_geom="1000000"/>', body='<replicate count="4000"><geom size="1"/></replicate>'),
-        "too large: as expensive as",
+        "the model is too large: its cost is",
     ),
     "a mesh of 20,000 rows": (
         model(asset='<mesh name="m" builtin="supersphere" params="20000 1 1"/>'),

@@ -1,4 +1,4 @@
-"""`TermState`: the state of a task's own objects is found, saved and restored."""
+"""`AttributeState`: the state of a task's own objects is found, saved and restored."""
 
 import collections
 import itertools
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from rlcli.managers.attribute_state import TermState
+from rlcli.managers.attribute_state import AttributeState
 
 
 class Helper:
@@ -66,7 +66,7 @@ def through_a_file(state):
 
 def test_term_state_restores_another_object():
     first, second = Owner(), Owner()
-    memory, other = TermState(first), TermState(second)
+    memory, other = AttributeState(first), AttributeState(second)
     first.change()
     first.draws()
     state = through_a_file(memory.state_dict())
@@ -76,7 +76,7 @@ def test_term_state_restores_another_object():
 
 def test_term_state_restores_first_state():
     owner = Owner()
-    memory = TermState(owner)
+    memory = AttributeState(owner)
     begin = through_a_file(memory.state_dict())
     fresh = Owner()
     owner.change()
@@ -88,7 +88,7 @@ def test_term_state_restores_first_state():
 
 def test_load_state_dict_writes_in_place():
     owner = Owner()
-    memory = TermState(owner)
+    memory = AttributeState(owner)
     view, window = owner.vector[:2], owner.window
     owner.change()
     state = memory.state_dict()
@@ -102,7 +102,7 @@ def test_load_state_dict_writes_in_place():
 
 def test_state_dict_is_a_copy():
     owner = Owner()
-    state = TermState(owner).state_dict()
+    state = AttributeState(owner).state_dict()
     owner.change()
     assert state["vector"].tolist() == [0.0, 0.0, 0.0]
     assert state["tables/b/1"].tolist() == [0.0]
@@ -110,7 +110,7 @@ def test_state_dict_is_a_copy():
 
 def test_state_dict_omits_constants():
     owner = Owner()
-    memory = TermState(owner)
+    memory = AttributeState(owner)
     assert "plain" not in memory.state_dict()
     owner.phase = 1.0
     assert list(json.loads(bytes(memory.state_dict()["plain"].tolist()))) == ["phase"]
@@ -122,7 +122,7 @@ def test_state_dict_omits_constants():
 )
 def test_unsaved_lists_attributes_with_types(value, kind):
     owner = SimpleNamespace(fine=1.0)
-    memory = TermState(owner)
+    memory = AttributeState(owner)
     assert memory.unsaved() == []
     owner.odd = value
     assert memory.unsaved() == [f"SimpleNamespace.odd ({kind})"]
@@ -130,7 +130,7 @@ def test_unsaved_lists_attributes_with_types(value, kind):
 
 def test_load_state_dict_rejects_state_of_other_object():
     with pytest.raises(ValueError, match="does not exist"):
-        TermState(SimpleNamespace()).load_state_dict({"helper.table": torch.zeros(2)})
+        AttributeState(SimpleNamespace()).load_state_dict({"helper.table": torch.zeros(2)})
 
 
 def state_with(**slots):
@@ -158,7 +158,7 @@ def state_with(**slots):
 )
 def test_load_state_dict_rejects_other_attributes(slot, value):
     owner = Owner()
-    memory, was = TermState(owner), torch.zeros
+    memory, was = AttributeState(owner), torch.zeros
     with pytest.raises((ValueError, TypeError)):
         memory.load_state_dict(state_with(**{slot: value}))
     assert torch.zeros is was
@@ -172,4 +172,4 @@ def test_load_state_dict_rejects_other_attributes(slot, value):
 def test_load_state_dict_rejects_tensor_for_other_type(path):
     owner = Owner()
     with pytest.raises(ValueError, match=path.partition("/")[0].partition(".")[0]):
-        TermState(owner).load_state_dict({path: torch.zeros(7)})
+        AttributeState(owner).load_state_dict({path: torch.zeros(7)})

@@ -201,7 +201,7 @@ SHAPE = f"{HEADER}.shape"
         (log(first=5), "'replay' lacks rows"),
         (log(stop=17), "'replay' lacks rows"),
         (shard(size=2**60), "'replay' needs"),
-        (shard(sha256=DIGEST), "is corrupt: it does not match the manifest"),
+        (shard(sha256=DIGEST), "is corrupt: its hash differs from the hash in the manifest"),
         (lambda f: shutil.rmtree(f.parent / "logs"), "000000000006-000000000012.safetensors is missing"),
         (values(iteration=-1), STATE + "iteration: expected a whole number >= 0, found -1"),
         (values(updates=1.5), STATE + "updates: expected a whole number, found 1.5"),

@@ -111,7 +111,7 @@ def test_rendered_picture_shows_four_poles(env, monkeypatch):
     pictures = {}
     for count in (1, 4):
         with Renderer(env.engine.model, env.config.viewer, EnvGrid(env, count)) as renderer:
-            pictures[count] = renderer.picture(env).astype(int)
+            pictures[count] = renderer.image(env).astype(int)
     blue = {count: (seen[..., 2] - seen[..., 0] > 60) & (seen[..., 1] < 120) for count, seen in pictures.items()}
     columns = {count: np.flatnonzero(found[120:].any(axis=0)) for count, found in blue.items()}
     groups = {count: 1 + int((np.diff(found) > 20).sum()) for count, found in columns.items()}

@@ -77,7 +77,7 @@ def commanded_env(folder, num_envs=2, *overrides, still=True, sensors=None, **co
 def pictures(env, number=0):
     """Return a picture with markers, and one without."""
     with Renderer(env.engine.model, env.config.viewer) as renderer:
-        return renderer.picture(env, number).astype(int), renderer.draw(*env.world(number)).astype(int)
+        return renderer.image(env, number).astype(int), renderer.draw(*env.world(number)).astype(int)
 
 
 def pixel(env, place):
@@ -232,7 +232,7 @@ def test_rendering_does_not_change_simulation(tmp_path):
         with Renderer(env.engine.model, env.config.viewer, EnvGrid(env, 3)) if drawn else nullcontext() as renderer:
             for _ in range(20):
                 if drawn:
-                    renderer.picture(env)
+                    renderer.image(env)
                 results += run(env, 2, reset=False)
         state = env.state_dict()
         steps[drawn] = [*(value for result in results for value in (*result.obs.values(), result.reward)), state]
@@ -268,9 +268,9 @@ def test_grid_picture_shows_all_markers(tmp_path):
     env_grid, counts = EnvGrid(env, 4), {}
     env.command_manager.get_term("own").given = []
     with Renderer(env.engine.model, env.config.viewer, env_grid) as renderer:
-        bare = renderer.picture(env).astype(int)
+        bare = renderer.image(env).astype(int)
         env.command_manager.get_term("own").given = [Sphere(torch.tensor([[0.0, 0.0, 1.0]] * 4), radius=0.1)]
-        seen = renderer.picture(env).astype(int)
+        seen = renderer.image(env).astype(int)
     rows, columns = np.nonzero((seen != bare).any(axis=2))
     labels = np.zeros(len(rows), int)
     for index in range(len(rows)):  # each pixel to the first found within a ball's width of it

@@ -68,7 +68,7 @@ class Reacher(_Arm):
         """Return the vector from the target to the fingertip. (num_envs, 3) [m]"""
         return self.body_position("fingertip") - self.body_position("target")
 
-    def score(self) -> Tensor:
+    def compute_reward(self) -> Tensor:
         """Return minus the distance and the cost of actions."""
         params = self.params
         return -length(self.gap()) * params.reward_dist_weight - self.action_cost(params.reward_control_weight)
@@ -107,7 +107,7 @@ class Pusher(_Arm):
         places = [self.body_position(body) for body in ("tips_arm", "object", "goal")]
         return [self.field.qpos[:, :7], self.field.qvel[:, :7], *places]
 
-    def score(self) -> Tensor:
+    def compute_reward(self) -> Tensor:
         """Return minus the distances and the cost of actions."""
         params, puck = self.params, self.body_position("object")
         near = -length(puck - self.body_position("tips_arm")) * params.reward_near_weight

@@ -1,8 +1,8 @@
-"""Base of Gymnasium's MuJoCo tasks. It reads the engine in its own dtype and converts only at the boundary.
+"""Base of Gymnasium's MuJoCo tasks. It computes in the engine's dtype and converts only its outputs to float32.
 
-Two things are as in Gymnasium and as nowhere else in rlcli. What MuJoCo derives from the state (xpos, cinert, forces)
-is read one physics step late, as `mj_step` leaves it: `sim.derived_fields: substep` in the YAML is the switch. And the
-cost of an action is summed in float32, in the order in which numpy adds.
+Two things are as in Gymnasium and differ from the rest of rlcli. Derived fields (xpos, cinert, forces) lag by one
+physics step, as `mj_step` leaves them; the setting `sim.derived_fields: substep` of the tasks does this. The cost of an
+action is summed in float32, in the order in which numpy adds.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class GymnasiumTask(DirectTask):
     def calculate_metrics(self) -> None:
         """Fill rew_buf."""
         self.check_termination()
-        self.reward.copy_(self.score())
+        self.reward.copy_(self.compute_reward())
         self.rew_buf.copy_(self.reward)
 
     def is_done(self) -> None:
@@ -86,7 +86,7 @@ class GymnasiumTask(DirectTask):
         """Return the parts of the observation. (num_envs, k) each"""
         raise NotImplementedError
 
-    def score(self) -> Tensor:
+    def compute_reward(self) -> Tensor:
         """Return the reward. (num_envs,)"""
         raise NotImplementedError
 
@@ -129,7 +129,7 @@ class GymnasiumTask(DirectTask):
 
 
 def float32_sum(values: Tensor) -> Tensor:
-    """Sum up to eight columns in numpy's order, so that the bits are equal. (num_envs,)"""
+    """Sum up to eight columns in numpy's order, for bit-identical results. (num_envs,)"""
     columns = list(values.unbind(dim=1))
     if len(columns) == 8:
         while len(columns) > 1:

@@ -65,11 +65,13 @@ class Humanoid(_Humanoid):
         """The task's settings, by Gymnasium's names."""
 
         ctrl_cost_weight: float = Field(0.1, ge=0, description="Penalty on the sum of squared controls.")
-        reset_noise_scale: float = Field(0.01, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+        reset_noise_scale: float = Field(
+            0.01, ge=0, description="Half-width of the uniform noise on initial positions and velocities."
+        )
         forward_reward_weight: float = Field(1.25, description="Reward on the speed of the centre of mass [s/m].")
         contact_cost_weight: float = Field(5e-7, ge=0, description="Penalty on the sum of squared contact forces.")
         contact_cost_range: tuple[float | None, float | None] = Field(
-            (None, 10.0), description="Bounds of that penalty; null: none."
+            (None, 10.0), description="Lower and upper bound of that penalty; null: no bound."
         )
         healthy_reward: float = Field(5.0, description="Reward of a step that does not end the episode.")
         healthy_z_range: tuple[float, float] = Field(
@@ -85,14 +87,14 @@ class Humanoid(_Humanoid):
         super().post_reset()
 
     def progress(self) -> Tensor:
-        """Return x of the centre of mass, one physics step late. (num_envs,) [m]"""
+        """Return x of the centre of mass; as in Gymnasium, it lags by one physics step. (num_envs,) [m]"""
         return (self.field.xipos[:, :, 0] * self.share).sum(dim=1)
 
     def healthy(self) -> Tensor:
         """Return whether the torso's height is in range. (num_envs,) bool"""
         return within(self.field.qpos[:, 2], *self.params.healthy_z_range)
 
-    def score(self) -> Tensor:
+    def compute_reward(self) -> Tensor:
         """Return speed and health, minus the cost of controls and contacts."""
         params = self.params
         gains = params.forward_reward_weight * self.speed() + ~self.ended * params.healthy_reward
@@ -111,17 +113,21 @@ class HumanoidStandup(_Humanoid):
         """The task's settings, by Gymnasium's names."""
 
         ctrl_cost_weight: float = Field(0.1, ge=0, description="Penalty on the sum of squared controls.")
-        reset_noise_scale: float = Field(0.01, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
-        uph_cost_weight: float = Field(1.0, description="Reward on the torso's height over the time step [s/m].")
+        reset_noise_scale: float = Field(
+            0.01, ge=0, description="Half-width of the uniform noise on initial positions and velocities."
+        )
+        uph_cost_weight: float = Field(
+            1.0, description="Reward on the torso's height divided by the physics step [s/m]."
+        )
         impact_cost_weight: float = Field(5e-7, ge=0, description="Penalty on the sum of squared contact forces.")
         impact_cost_range: tuple[float | None, float | None] = Field(
-            (None, 10.0), description="Bounds of that penalty; null: none."
+            (None, 10.0), description="Lower and upper bound of that penalty; null: no bound."
         )
 
     params: Params
 
-    def score(self) -> Tensor:
-        """Return height, minus the cost of controls and impacts, plus 1."""
+    def compute_reward(self) -> Tensor:
+        """Return the reward: weight x height / physics step, minus the cost of controls and impacts, plus 1."""
         params = self.params
         height = params.uph_cost_weight * self.field.qpos[:, 2] / self.env.physics_dt
         return height - self.control_cost() - self.force_cost(params.impact_cost_weight, params.impact_cost_range) + 1

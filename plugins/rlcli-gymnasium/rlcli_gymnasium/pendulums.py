@@ -23,7 +23,9 @@ class InvertedPendulum(GymnasiumTask):
     class Params(StrictModel):
         """The task's settings, by Gymnasium's names."""
 
-        reset_noise_scale: float = Field(0.01, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+        reset_noise_scale: float = Field(
+            0.01, ge=0, description="Half-width of the uniform noise on initial positions and velocities."
+        )
 
     params: Params
 
@@ -31,7 +33,7 @@ class InvertedPendulum(GymnasiumTask):
         """Return joint positions and velocities."""
         return [self.field.qpos, self.field.qvel]
 
-    def score(self) -> Tensor:
+    def compute_reward(self) -> Tensor:
         """Return 1, or 0 if the pole fell."""
         return ~self.ended
 
@@ -60,7 +62,9 @@ class InvertedDoublePendulum(GymnasiumTask):
         """The task's settings, by Gymnasium's names."""
 
         healthy_reward: float = Field(10.0, description="Reward of a step that does not end the episode.")
-        reset_noise_scale: float = Field(0.1, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+        reset_noise_scale: float = Field(
+            0.1, ge=0, description="Half-width of position noise; standard deviation of velocity noise."
+        )
 
     params: Params
 
@@ -70,7 +74,7 @@ class InvertedDoublePendulum(GymnasiumTask):
         angles = qpos[:, 1:]
         return [qpos[:, :1], angles.sin(), angles.cos(), self.field.qvel.clamp(-10.0, 10.0), force.clamp(-10.0, 10.0)]
 
-    def score(self) -> Tensor:
+    def compute_reward(self) -> Tensor:
         """Return a bonus, minus the distance of the tip from its goal and the speed of the poles."""
         x, height = self.field.site_xpos[:, 0, 0], self.field.site_xpos[:, 0, 2]
         first, second = self.field.qvel[:, 1], self.field.qvel[:, 2]
@@ -79,7 +83,7 @@ class InvertedDoublePendulum(GymnasiumTask):
         return self.params.healthy_reward * (~self.ended) - distance - rates
 
     def check_termination(self) -> None:
-        """Terminate where the tip is at or below 1 m, one physics step late."""
+        """Terminate where the tip is at or below 1 m; as in Gymnasium, its position lags by one physics step."""
         torch.le(self.field.site_xpos[:, 0, 2], 1, out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:

@@ -36,7 +36,9 @@ class Ant(GymnasiumTask):
             (0.2, 1.0), description="Range of the torso's height; outside it the episode terminates [m]."
         )
         contact_force_range: tuple[float, float] = Field((-1.0, 1.0), description="Clip of contact forces [N, N m].")
-        reset_noise_scale: float = Field(0.1, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+        reset_noise_scale: float = Field(
+            0.1, ge=0, description="Half-width of position noise; standard deviation of velocity noise."
+        )
 
     params: Params
 
@@ -46,7 +48,7 @@ class Ant(GymnasiumTask):
         super().post_reset()
 
     def progress(self) -> Tensor:
-        """Return x of the torso, one physics step late. (num_envs,) [m]"""
+        """Return x of the torso; as in Gymnasium, it lags by one physics step. (num_envs,) [m]"""
         return self.field.xpos[:, self.torso, 0]
 
     def contact_forces(self) -> Tensor:
@@ -63,7 +65,7 @@ class Ant(GymnasiumTask):
         height = self.field.qpos[:, 2]
         return (height >= low) & (height <= high)
 
-    def score(self) -> Tensor:
+    def compute_reward(self) -> Tensor:
         """Return speed and health, minus the cost of actions and contacts."""
         params = self.params
         gains = self.speed() * params.forward_reward_weight + ~self.ended * params.healthy_reward
@@ -92,7 +94,9 @@ class HalfCheetah(GymnasiumTask):
 
         forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
         ctrl_cost_weight: float = Field(0.1, ge=0, description="Penalty on the sum of squared actions.")
-        reset_noise_scale: float = Field(0.1, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+        reset_noise_scale: float = Field(
+            0.1, ge=0, description="Half-width of position noise; standard deviation of velocity noise."
+        )
 
     params: Params
 
@@ -100,7 +104,7 @@ class HalfCheetah(GymnasiumTask):
         """Return joint positions without x, and velocities."""
         return [self.field.qpos[:, 1:], self.field.qvel]
 
-    def score(self) -> Tensor:
+    def compute_reward(self) -> Tensor:
         """Return speed, minus the cost of actions."""
         params = self.params
         return params.forward_reward_weight * self.speed() - self.action_cost(params.ctrl_cost_weight)
@@ -122,7 +126,9 @@ class Swimmer(HalfCheetah):
 
         forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
         ctrl_cost_weight: float = Field(1e-4, ge=0, description="Penalty on the sum of squared actions.")
-        reset_noise_scale: float = Field(0.1, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+        reset_noise_scale: float = Field(
+            0.1, ge=0, description="Half-width of the uniform noise on initial positions and velocities."
+        )
 
     params: Params
 
@@ -152,8 +158,10 @@ class Walker2d(GymnasiumTask):
         healthy_z_range: tuple[float, float] = Field(
             (0.8, 2.0), description="Range of the torso's height; outside it the episode terminates [m]."
         )
-        healthy_angle_range: tuple[float, float] = Field((-1.0, 1.0), description="Its pitch [rad].")
-        reset_noise_scale: float = Field(5e-3, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+        healthy_angle_range: tuple[float, float] = Field((-1.0, 1.0), description="Range of the torso's pitch [rad].")
+        reset_noise_scale: float = Field(
+            5e-3, ge=0, description="Half-width of the uniform noise on initial positions and velocities."
+        )
 
     params: Params
 
@@ -166,7 +174,7 @@ class Walker2d(GymnasiumTask):
         height, angle = self.field.qpos[:, 1], self.field.qpos[:, 2]
         return within(height, *self.params.healthy_z_range) & within(angle, *self.params.healthy_angle_range)
 
-    def score(self) -> Tensor:
+    def compute_reward(self) -> Tensor:
         """Return speed and health, minus the cost of actions."""
         params = self.params
         gains = params.forward_reward_weight * self.speed() + ~self.ended * params.healthy_reward
@@ -194,13 +202,17 @@ class Hopper(Walker2d):
         forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
         ctrl_cost_weight: float = Field(1e-3, ge=0, description="Penalty on the sum of squared actions.")
         healthy_reward: float = Field(1.0, description="Reward of a step that does not end the episode.")
-        healthy_state_range: tuple[float, float] = Field((-100.0, 100.0), description="All of the state but x and z.")
+        healthy_state_range: tuple[float, float] = Field(
+            (-100.0, 100.0), description="Range of all states except x and z."
+        )
         healthy_z_range: tuple[float, float | None] = Field(
             (0.7, None),
             description="Range of the torso's height; outside it the episode terminates [m]; null: no upper end.",
         )
-        healthy_angle_range: tuple[float, float] = Field((-0.2, 0.2), description="Its pitch [rad].")
-        reset_noise_scale: float = Field(5e-3, ge=0, description="Start: positions +-, velocities alike [m, rad, ...].")
+        healthy_angle_range: tuple[float, float] = Field((-0.2, 0.2), description="Range of the torso's pitch [rad].")
+        reset_noise_scale: float = Field(
+            5e-3, ge=0, description="Half-width of the uniform noise on initial positions and velocities."
+        )
 
     params: Params
 

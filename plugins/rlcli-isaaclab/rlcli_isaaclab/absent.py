@@ -70,7 +70,10 @@ def _user_place() -> str:
 
 
 class _AbsentMeta(type):
-    """Class of classes that rlcli does not have: their members are names without a value."""
+    """Metaclass of the stand-ins for classes that rlcli does not have.
+
+    Attributes of a stand-in are `AbsentValue`s. Creating an object of a user's subclass raises an error.
+    """
 
     def __getattr__(cls, name: str) -> Any:
         if name.startswith("__"):

@@ -125,7 +125,7 @@ def _rl_games_parts(network: Node, config: Node, found: dict[str, Any]) -> None:
             network.report.problem(rnn.key, f"'{rnn.get('name')}' has no counterpart in rlcli", "write name: lstm")
         found["rnn"] = {"hidden": rnn.get("units", 64), "layers": rnn.get("layers", 1)}
         rnn.skip("before_mlp")
-        rnn.note("approximated", "concat_input", "the MLP reads only the RNN")
+        rnn.note("approximated", "concat_input", "the MLP receives only the RNN's output, not the observations")
         rnn.note("approximated", "layer_norm", "rlcli has no layer normalization")
     if "cnn" in network:
         cnn = network.node("cnn")

@@ -159,26 +159,26 @@ class DirectRLEnv(gymnasium.Env):
 
     def _pre_physics_step(self, actions: Tensor) -> None:
         """Store or process the actions, once per step."""
-        raise NotImplementedError(f"write {type(self).__name__}._pre_physics_step")
+        raise NotImplementedError(f"class {type(self).__name__} has no method _pre_physics_step; implement it")
 
     def _apply_action(self) -> None:
         """Write targets to the assets, before each physics step."""
-        raise NotImplementedError(f"write {type(self).__name__}._apply_action")
+        raise NotImplementedError(f"class {type(self).__name__} has no method _apply_action; implement it")
 
     def _get_observations(self) -> Any:
         """Return the observations by group."""
-        raise NotImplementedError(f"write {type(self).__name__}._get_observations")
+        raise NotImplementedError(f"class {type(self).__name__} has no method _get_observations; implement it")
 
     def _get_states(self) -> Any:
         """Return the observations of the critic."""
 
     def _get_rewards(self) -> Tensor:
         """Return the reward. (num_envs,)"""
-        raise NotImplementedError(f"write {type(self).__name__}._get_rewards")
+        raise NotImplementedError(f"class {type(self).__name__} has no method _get_rewards; implement it")
 
     def _get_dones(self) -> tuple[Tensor, Tensor]:
         """Return where the task ended the episode, and where it timed out. (num_envs,) bool each"""
-        raise NotImplementedError(f"write {type(self).__name__}._get_dones")
+        raise NotImplementedError(f"class {type(self).__name__} has no method _get_dones; implement it")
 
     def _reset_idx(self, env_ids: Any) -> None:
         """Remove forces on bodies. The environment resets everything else, and runs the reset events."""
@@ -190,10 +190,10 @@ class DirectRLEnv(gymnasium.Env):
 
 
 class DirectMARLEnv(gymnasium.Env):
-    """A task with several agents, which rlcli does not have."""
+    """A multi-agent task, which rlcli does not support."""
 
     def __init__(self, cfg: Any, *args: Any, **kwargs: Any) -> None:
-        raise TaskError("rlcli has no multi-agent tasks", hint="write a DirectRLEnv with one agent")
+        raise TaskError("rlcli does not support multi-agent tasks", hint="write a DirectRLEnv with one agent")
 
 
 @configclass
@@ -236,7 +236,7 @@ class DirectRLEnvCfg:
 
 @configclass
 class DirectMARLEnvCfg:
-    """A task with several agents, which rlcli does not have."""
+    """A multi-agent task, which rlcli does not support."""
 
     def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
         """Raise the error that it cannot be used."""
@@ -245,7 +245,7 @@ class DirectMARLEnvCfg:
                 Problem(
                     "configuration",
                     "",
-                    "a DirectMARLEnv has several agents, and rlcli has no multi-agent tasks",
+                    "a DirectMARLEnv has several agents; rlcli does not support multi-agent tasks",
                     "write a DirectRLEnv with one agent",
                 )
             ]
@@ -253,7 +253,7 @@ class DirectMARLEnvCfg:
 
 
 def _environment_class(cfg: Any) -> type[DirectRLEnv]:
-    """Return the environment class: that of the registration, or the only one in the module of the configuration."""
+    """Return the environment class: the registered one, or else the only one in the configuration's module."""
     from rlcli.registry import load_object
 
     entry = getattr(cfg, "rlcli_class", None)
@@ -265,10 +265,9 @@ def _environment_class(cfg: Any) -> type[DirectRLEnv]:
         kinds = [kind for kind in kinds if issubclass(kind, DirectRLEnv)]
         kinds = [kind for kind in kinds if not any(issubclass(k, kind) and k is not kind for k in kinds)]
         if len(kinds) != 1:
-            what = f"the module of {type(cfg).__name__} has {len(kinds)} classes of a DirectRLEnv, expected 1"
-            raise ConfigError(
-                [Problem("configuration", "", what, "name the task that the package registers: FOLDER:ID")]
-            )
+            what = f"the module of {type(cfg).__name__} has {len(kinds)} subclasses of DirectRLEnv, expected 1"
+            hint = "on the command line, name the registered task as FOLDER:ID"
+            raise ConfigError([Problem("configuration", "", what, hint)])
         found = kinds[0]
     if not (isinstance(found, type) and issubclass(found, DirectRLEnv)):
         raise ConfigError([Problem("configuration", "", f"{entry} is not a DirectRLEnv", "derive it from DirectRLEnv")])
@@ -314,10 +313,9 @@ def _space(value: Any, name: str) -> Any:
         return gymnasium.spaces.Box(-np.inf, np.inf, (value,))
     if isinstance(value, list | tuple) and value and all(isinstance(size, int) for size in value):
         return gymnasium.spaces.Box(-np.inf, np.inf, tuple(value))
-    what = (
-        f"a space of type {type(value).__name__} has no counterpart in rlcli, which has continuous actions and arrays"
-    )
-    raise ConfigError([Problem("configuration", name, what, "write a number of columns, or the shape of an image")])
+    kind = type(value).__name__
+    what = f"a space of type {kind} is not supported; rlcli has only continuous actions and array observations"
+    raise ConfigError([Problem("configuration", name, what, "give a number of columns, a shape or a Box")])
 
 
 def shape_of(value: Any, name: str) -> tuple[int, ...]:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rlcli.config.term_signatures import Signature
-from rlcli.managers.attribute_state import TermState
+from rlcli.managers.attribute_state import AttributeState
 from rlcli.sim.selection import Selection
 from rlcli_isaaclab.direct_env import DirectRLEnv, building
 from rlcli_isaaclab.observation_noise import noise_model
@@ -60,7 +60,7 @@ class DirectRunner:
             self.lab: DirectRLEnv = term.env_class(cfg)
         self.action_noise = noise_model(cfg.action_noise_model, managed)
         self.observation_noise = noise_model(cfg.observation_noise_model, managed)
-        self._memory = TermState(self.lab, excluded=("cfg", "managed", "sim", "scene"))
+        self._memory = AttributeState(self.lab, excluded=("cfg", "managed", "sim", "scene"))
         self._observed: dict[str, Tensor] = {}
 
     def apply(self) -> None:

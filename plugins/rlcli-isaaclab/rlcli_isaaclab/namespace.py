@@ -1,7 +1,8 @@
 """Modules of Isaac Lab and Isaac Sim as task files import them.
 
-`names.json` lists the public names of each module of Isaac Lab; `tools/names.py` writes it. A name that this package
-defines is that object. Any other name of the table is a stand-in, which raises an error when it is used.
+The table `names.json` lists the public names of each module of Isaac Lab; `tools/names.py` writes it. A name that this
+package defines is imported from this package. Any other name of the table is a stand-in, which raises an error when the
+task uses it.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ _EXTRA = {
     "isaaclab.sim": ("usd_stage", "usd_geometry"),
 }
 """Module of Isaac Lab -> modules of this package that define further names of it."""
-_TEXTS = ("isaaclab_tasks", "isaaclab_assets")
-"""Packages whose own files are imported where they are found: they only use other modules of Isaac Lab."""
+_SOURCE_PACKAGES = ("isaaclab_tasks", "isaaclab_assets")
+"""Packages whose original files are imported if they are found: they only use other modules of Isaac Lab."""
 _LIBRARIES = ("toml", "torchvision", "trimesh")
 """Libraries that come with Isaac Lab: an installed one is imported, a missing one raises an error when it is used."""
 _SIM = {"isaacsim.core.utils.torch": "isaacsim_torch", "isaacsim.core.utils.torch.rotations": "isaacsim_torch",
@@ -61,14 +62,16 @@ SOURCE = "RLCLI_ISAACLAB"
 def module_of(name: str, file: str) -> ModuleType | None:
     """Return the module that replaces a module of Isaac Lab or Isaac Sim; None to import an installed one.
 
-    Modules of `isaaclab_tasks` and `isaaclab_assets` are those in a folder above the importing file, of the folder
-    RLCLI_ISAACLAB, or of an installed wheel of Isaac Lab, if there are any.
+    The files of `isaaclab_tasks` and `isaaclab_assets` are searched for in the folders above the importing file, in the
+    folder RLCLI_ISAACLAB and in an installed wheel of Isaac Lab.
     """
     top, _, inner = name.partition(".")
-    if top in _TEXTS and not inner.startswith("utils"):
-        folder = _text_folder(top, Path(file).parent)
+    # `isaaclab_tasks.utils` is replaced by this package's `task_utils`
+    if top in _SOURCE_PACKAGES and not inner.startswith("utils"):
+        folder = _source_folder(top, Path(file).parent)
         if folder is not None:
-            return import_from(folder, inner, run_start=top != "isaaclab_tasks")  # it imports every task
+            # the __init__.py of isaaclab_tasks imports every task, so that file is not run
+            return import_from(folder, inner, run_start=top != "isaaclab_tasks")
     if top in _LIBRARIES and importlib.util.find_spec(top) is not None:
         return None
     if top in ("toml", "trimesh"):
@@ -79,16 +82,16 @@ def module_of(name: str, file: str) -> ModuleType | None:
         return importlib.import_module(f"{_OWN}.{_SIM[name]}")
     if not top.startswith("isaaclab"):
         return absent_module(name)
-    if name not in _packages():
-        near = did_you_mean(name, sorted(_packages()))
+    if name not in _modules():
+        near = did_you_mean(name, sorted(_modules()))
         what = f"Isaac Lab 2.3.2 has no module '{name}'"
         raise ModuleNotFoundError(f"{what}; {near}" if near else what, name=name)
     return _lab_module(name)
 
 
 @functools.cache
-def _text_folder(package: str, start: Path) -> Path | None:
-    """Return the folder of a package whose own files are used; None if there is none."""
+def _source_folder(package: str, start: Path) -> Path | None:
+    """Return the folder with the original files of a package; None if there is none."""
     places = [*start.resolve().parents]
     if os.environ.get(SOURCE):
         places.append(Path(os.environ[SOURCE]).expanduser())
@@ -110,16 +113,14 @@ def _lab_module(name: str) -> LabModule:
 
 def _member(module: str, name: str) -> Any:
     path = f"{module}.{name}"
-    if path not in _packages() and name not in _definitions():  # a package that its parent imports from further below
-        below = (
-            found for found in sorted(_packages()) if found.startswith(f"{module}.") and found.endswith(f".{name}")
-        )
+    if path not in _modules() and name not in _definitions():  # a module that its package imports from further below
+        below = (found for found in sorted(_modules()) if found.startswith(f"{module}.") and found.endswith(f".{name}"))
         path = next(below, path)
     for candidate in _homes(module):
         value = getattr(candidate, name, None)
-        if value is not None and not (isinstance(value, ModuleType) and path in _packages()):
+        if value is not None and not (isinstance(value, ModuleType) and path in _modules()):
             return value
-    if path in _packages():
+    if path in _modules():
         return _lab_module(path)
     found = _definitions().get(name)
     if found is None:
@@ -155,7 +156,7 @@ def lab_name(name: str) -> Any:
 
 
 def _settings_class(name: str, kind: Mapping[str, Any], full: str, qualified: str | None = None) -> Any:
-    """Return a configuration class of the table. What cannot be used is reported where the settings are read."""
+    """Return a configuration class of the table. Settings that rlcli cannot use are reported where they are read."""
     bases = tuple(base for base in map(_base, kind["bases"]) if isinstance(base, type)) or (object,)
     members: dict[str, Any] = {"__doc__": f"Settings of Isaac Lab's `{full}`.", "__module__": f"{_OWN}.namespace"}
     qualified = full.rpartition(".")[2] if qualified is None else qualified
@@ -164,6 +165,7 @@ def _settings_class(name: str, kind: Mapping[str, Any], full: str, qualified: st
         members[inner] = _settings_class(inner, content, f"{full}.{inner}", f"{qualified}.{inner}")
     fields = dict(kind.get("fields", {}))
     known = {field for base in bases for field in getattr(base, "__dataclass_fields__", {})}
+    # null in the table: a value that JSON cannot store; the default of a base class is closer
     fields = {key: value for key, value in fields.items() if not (value is None and key in known)}
     if name.endswith("Cfg") and "class_type" not in fields and full.count(".") and not name[0].islower():
         fields.setdefault("class_type", name.removesuffix("Cfg"))
@@ -176,7 +178,7 @@ def _settings_class(name: str, kind: Mapping[str, Any], full: str, qualified: st
 
 
 def _base(written: str) -> Any:
-    """Return a base class as the table has it: `Name`, `module.Name` or `Name.Nested`."""
+    """Return a base class by its text in the table: `Name`, `module.Name` or `Name.Nested`."""
     parts = written.split(".")
     while len(parts) > 1 and parts[0] not in _definitions():
         parts = parts[1:]
@@ -192,7 +194,7 @@ def _tuple(value: Any) -> Any:
 
 @functools.cache
 def _homes(module: str) -> tuple[Any, ...]:
-    """Return the modules of this package whose names a module of Isaac Lab has."""
+    """Return the modules of this package that define the names of a module of Isaac Lab."""
     parts = module.split(".")
     names = [extra for prefix, extras in _EXTRA.items() for extra in extras if f"{module}.".startswith(f"{prefix}.")]
     if parts[0] == "isaaclab":
@@ -214,7 +216,8 @@ def _table() -> dict[str, dict[str, Any]]:
 
 
 @functools.cache
-def _packages() -> frozenset[str]:
+def _modules() -> frozenset[str]:
+    """Return the names of all modules of Isaac Lab and of the packages that contain them."""
     return frozenset(".".join(name.split(".")[:n]) for name in _table() for n in range(1, name.count(".") + 2))
 
 

@@ -28,7 +28,7 @@ class Setup:
         """Path and configuration of what is spawned without an object."""
 
     def add(self, created: Any, cfg: Any) -> None:
-        """Store an object; bind it to its entity if the scene exists."""
+        """Store an object; if the simulation exists, bind the object to its entity, sensor or terrain."""
         created.cfg = cfg
         self.created.append((created, cfg))
         if self._bind is not None:

@@ -78,7 +78,7 @@ ConeCfg = _settings_class("ConeCfg", "A cone.", func=Spawn("spawn_cone"))
 
 @configclass
 class SimulationCfg:
-    """The simulation."""
+    """Settings of the simulation."""
 
     physics_prim_path: str = "/physicsScene"
     device: str = "cuda:0"

@@ -149,7 +149,7 @@ class UserObject:
         return self.function(*args)
 
     def __rlcli_term__(self, name: str) -> Signature:
-        """Return the signature of the term under a name; its parameters are the settings of its configuration."""
+        """Return the term's signature with this name; the parameters are the keys of its configuration class."""
         file = Path(inspect.getsourcefile(self.function) or "?")
         summary = (inspect.getdoc(self.function) or "").split("\n")[0]
         parameters = tuple(Parameter(key, Any, None, True, None) for key in self.original)
@@ -203,11 +203,11 @@ def entity_data(settings: Any) -> dict[str, Any]:
     """Return the settings of a `SceneEntityCfg` that are not at their default.
 
     Raises:
-        ValueError: if it selects elements that have no counterpart in MuJoCo.
+        ValueError: if it selects fixed tendons or objects of a collection.
     """
     for key in ("fixed_tendon_names", "object_collection_names"):
         if settings.get(key) is not None:
-            raise ValueError(f"{key} has no counterpart in MuJoCo; remove it")
+            raise ValueError(f"{key} is not supported by rlcli; remove it")
     data = {"name": settings["name"]}
     for key in ("joint_names", "body_names"):
         if settings.get(key) is not None:

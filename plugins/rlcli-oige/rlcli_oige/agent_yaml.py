@@ -215,7 +215,8 @@ class _Translator(YamlTranslator):
         self.put(("rnn",), {"hidden": rnn.get("units", 64), "layers": rnn.get("layers", 1)}, at)
         for key, value in rnn.items():
             is_exact = key in ("name", "units", "layers") or (key == "before_mlp" and value is True) or not value
-            self.note((*at, key), "mapped" if is_exact else "approximated", "rnn")
+            text = "rnn" if is_exact else f"rlcli's LSTM has no setting '{key}'"
+            self.note((*at, key), "mapped" if is_exact else "approximated", text)
 
     def _cnn(self, at: Path, cnn: Any, mlp: Any) -> None:
         convs = cnn.get("convs") if isinstance(cnn, dict) else None
@@ -282,7 +283,7 @@ class _Translator(YamlTranslator):
         if "clip_actions" in config:
             mapped("clip_actions", "action_bound", 1.0 if config["clip_actions"] else None)
         if "central_value_config" in config:
-            text = "the critic observes states_buf; its network and schedule are those of the policy"
+            text = "the critic observes states_buf; its own network has the layers and the schedule of the policy"
             self.note((*at, "central_value_config"), "approximated", text)
 
     def _schedule(self, at: Path, config: Mapping[str, Any]) -> None:

@@ -426,7 +426,7 @@ class RLTask(DirectTask):
         self.reset_buf = torch.ones_like(self.reset_buf)
 
     def post_physics_step(self) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Call the hooks that follow physics. The environment calls the hooks directly instead."""
+        """Call the hooks that follow physics, for tasks that call this method. rlcli's environment does not use it."""
         self.progress_buf[:] += 1
         if self.world.is_playing():
             self.get_observations()

@@ -35,7 +35,7 @@ def find_class(folder: Path, name: str) -> tuple[Path, str]:
     if not tasks:
         raise LookupError(f"no task class in {where}; name the class '{name}Task'")
     found = listing(cls for _, cls in tasks)
-    raise LookupError(f"found several task classes: {found}; rename the right one to '{name}Task'")
+    raise LookupError(f"found several task classes in {where}: {found}; rename the right one to '{name}Task'")
 
 
 def _classes(file: Path) -> list[tuple[str, list[str]]]:

@@ -62,7 +62,7 @@ SIM_KEYS: Mapping[str, tuple[Status, str]] = {
     "replicate_physics": ("ignored", "every environment is simulated separately"),
     "rendering_dt": ("approximated", "videos have one frame per step, or fewer with sim.render_interval"),
     "substeps": ("approximated", "for more than 1, set a smaller sim.dt and a larger decimation"),
-    "default_material": ("ignored", "OmniIsaacGymEnvs reads default_physics_material"),
+    "default_material": ("ignored", "OmniIsaacGymEnvs does not read it either, but default_physics_material"),
     "gravity_mag": ("task", ""),
     "disable_gravity": ("task", ""),
     "add_damping": ("task", ""),
@@ -73,7 +73,7 @@ SIM_KEYS: Mapping[str, tuple[Status, str]] = {
 MATERIAL_KEYS: Mapping[str, tuple[Status, str]] = {
     "dynamic_friction": ("mapped", "sliding friction of contacts with the ground"),
     "static_friction": ("approximated", "MuJoCo has one sliding friction: dynamic_friction is used"),
-    "restitution": ("approximated", "the ground's contact damping is set to this restitution"),
+    "restitution": ("approximated", "the ground's contact damping is chosen for this restitution of contacts"),
 }
 _SOLVER = "MuJoCo's solver iterates until it converges; the MJCF's <option> sets its limits"
 _OFFSET = "the MJCF's solref, solimp and margin set how contacts behave"

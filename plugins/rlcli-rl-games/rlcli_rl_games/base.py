@@ -146,7 +146,7 @@ class RlGamesTrainer(BaseTrainer):
         return TrainerState(tensors, values)
 
     def load(self, state: TrainerState) -> None:
-        """Restore a state: the next iteration gives the same bits as it did then."""
+        """Restore a saved state. On a CPU the next iteration is bit-identical to the one that followed the save."""
         values, rest = state.values, state.tensors["trainer"]
         for part, module in self._modules().items():
             module.load_state_dict(below(rest, f"{part}."))

@@ -23,8 +23,8 @@ _DEFAULT: Initializer = {"name": "default"}
 _ZERO: Initializer = {"name": "const_initializer", "val": 0}
 
 IGNORED: Mapping[str, str] = {
-    "name": "the task names the run",
-    "full_experiment_name": "--name",
+    "name": "the task is named on the command line",
+    "full_experiment_name": "use --name",
     "env_name": "rlcli has only one environment loop",
     "device": "use --device",
     "device_name": "use --device",
@@ -34,7 +34,7 @@ IGNORED: Mapping[str, str] = {
     "score_to_win": "training runs until its limit of iterations or steps",
     "save_best_after": "use save_interval",
     "print_stats": "",
-    "player": "rlcli play",
+    "player": "use rlcli play",
     "games_to_track": "",
     "max_frames": "use --max-steps",
     "seq_length": "sequences of recurrent networks are whole rollouts",
@@ -274,7 +274,7 @@ class SacSettings(_Settings):
     learnable_temperature: bool
     """Whether the temperature is trained."""
     target_entropy_coef: Positive = 1.0
-    """Target entropy: minus this for each action."""
+    """The target entropy is minus this factor times the number of action dimensions."""
     alpha_lr: Positive
     """Learning rate of the temperature."""
     actor_lr: Positive
@@ -342,14 +342,17 @@ def _require(named: Named, key: str, name: str, algorithm: str) -> None:
 
 
 class RlGamesConfig(AgentConfig):
-    """Settings of both algorithms. `max_epochs` and `save_frequency` of `params.config` set rlcli's budget."""
+    """Settings of both algorithms.
+
+    `max_epochs` and `save_frequency` of `params.config` set rlcli's `max_iterations` and `save_interval`.
+    """
 
     budget: ClassVar[Mapping[str, str]] = {"max_epochs": "max_iterations", "save_frequency": "save_interval"}
 
     bootstrap: Literal["final_obs", "pre_step", "none"] = "final_obs"
-    """Return after a time-out: gamma times the value of the last observation of the episode; or, as rl_games
-    itself, of the observation before the step; or 0, as for a failure, which is what OmniIsaacGymEnvs' tasks
-    use. `params.config.value_bootstrap: false` is the same as none."""
+    """Return after a time-out. final_obs: gamma times the value of the episode's last observation. pre_step: gamma
+    times the value of the observation before the step, as in rl_games itself. none: 0, as after a failure; the tasks of
+    OmniIsaacGymEnvs use this. `params.config.value_bootstrap: false` is the same as none."""
 
     @model_validator(mode="before")
     @classmethod

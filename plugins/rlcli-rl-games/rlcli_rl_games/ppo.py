@@ -91,7 +91,7 @@ class PpoTrainer(RlGamesTrainer):
         return state
 
     def load(self, state: TrainerState) -> None:
-        """Restore a state: the next iteration gives the same bits as it did then."""
+        """Restore a saved state. On a CPU the next iteration is bit-identical to the one that followed the save."""
         super().load(state)
         self.agent.last_lr = state.values["learning_rate"]
         self.agent.update_lr(self.agent.last_lr)

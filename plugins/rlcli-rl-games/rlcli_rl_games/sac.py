@@ -93,7 +93,7 @@ class SacTrainer(RlGamesTrainer):
         return state
 
     def load(self, state: TrainerState) -> None:
-        """Restore a state: the next iteration gives the same bits as it did then."""
+        """Restore a saved state. On a CPU the next iteration is bit-identical to the one that followed the save."""
         buffer = self.agent.replay_buffer
         for name in _COLUMNS:
             values = state.tensors["replay"][name]

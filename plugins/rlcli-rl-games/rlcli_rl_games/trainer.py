@@ -1,4 +1,4 @@
-"""Trainers that run rl_games' PPO and SAC one iteration at a time, with exact save and restore."""
+"""Choice of the trainer, PPO or SAC, for an agent of rl_games."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ from rlcli_rl_games.sac import SacTrainer
 def make_trainer(
     env: Environment, config: RlGamesConfig, *, seed: int, device: str, torch_threads: int
 ) -> RlGamesTrainer:
-    """Return the trainer of an agent."""
+    """Return the trainer for an agent's algorithm."""
     trainer = SacTrainer if isinstance(config, SacConfig) else PpoTrainer
     return trainer(env, config, seed=seed, device=device, torch_threads=torch_threads)

@@ -123,7 +123,7 @@ def _row(case: FailureCase) -> list[str]:
 def _print_case(
     run: Run, case: FailureCase, number: int, steps: int, video: Path | None, named: TaskSource | None
 ) -> None:
-    """Print one case; contacts and pictures need the task's code."""
+    """Print one case; contacts and images need the task's code."""
     from rlcli.replay.failure_cases import stage_case
 
     staged, error = None, None

@@ -151,7 +151,7 @@ class Filming:
         """Render the state if a frame is due; return the action. obs: (num_envs, obs_size)"""
         env = self.session.env
         if not self.ended and int(env.episode_length_buf[self.env_id]) % self.stride == 0:
-            self.writer.add(self.renderer.picture(env, self.env_id))
+            self.writer.add(self.renderer.image(env, self.env_id))
         return self.session.act(obs)
 
 
@@ -163,7 +163,7 @@ def film(session: Session, file: Path, env_id: int = 0, drawn: int = 1) -> Itera
         session: environments and policy.
         file: an .mp4 or .gif; it is created when the video is complete.
         env_id: the environment in the foreground.
-        drawn: number of environments in the picture.
+        drawn: number of environments in the image.
     """
     from rlcli.viewer.env_grid import EnvGrid
     from rlcli.viewer.record_video import open_video

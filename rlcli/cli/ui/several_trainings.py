@@ -103,7 +103,8 @@ def print_sweep(sweep: Sweep) -> None:
     file = sweep.folder / PRESET
     if best is not None:
         run = documents[best.number]["run"] or "on the machine that trained it"
-        console.info(f"best: trial {best.number}; its run: {run}; rlcli train {settings['task']} --config {file}")
+        console.info(f"best: trial {best.number}; its run: {run}")
+        console.info(f"to train with its settings: rlcli train {settings['task']} --config {file}")
     console.document(
         "sweep",
         sweep=str(sweep.folder),

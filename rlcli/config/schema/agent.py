@@ -20,11 +20,11 @@ class AutopsyConfig(StrictModel):
     """Memory for the last seconds of all environments [MiB]. If it is too small, fewer seconds are recorded."""
 
 
-def _check_bar(text: str) -> str:
+def _check_threshold(text: str) -> str:
     key, _, number = text.partition("=")
     value = float_or_nan(number)
     if key not in ("success", "return", "length") or not math.isfinite(value):
-        raise ValueError(f"'{text}' is not a bar; write success=0.97, return=200 or length=250")
+        raise ValueError(f"'{text}' is not a threshold; write success=0.97, return=200 or length=250")
     if key == "success" and not 0.0 < value < 1.0:
         raise ValueError(f"no evaluation can show a success rate of {value:g}; give a number between 0 and 1")
     return text
@@ -55,7 +55,7 @@ class AgentConfig(StrictModel):
     the checkpoint with the best evaluation."""
     eval_episodes: Count = 100
     """Number of episodes of each of these evaluations."""
-    until: Annotated[str, AfterValidator(_check_bar)] | None = None
+    until: Annotated[str, AfterValidator(_check_threshold)] | None = None
     """Bar at which training ends before its budget: success=X, return=X or length=X. It is reached when the lower end
     of an evaluation's 95 % interval is at least X. The bar sets `eval_interval` to a twentieth of the budget if it is
     null, and raises `eval_episodes` to the number that the interval of a success rate needs."""

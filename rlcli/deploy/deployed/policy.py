@@ -23,9 +23,9 @@ def run(inputs):
         clip = NETWORK["normalize_clip"]
         x = x if clip is None else np.clip(x, -clip, clip)
     x, outputs = x.astype(np.float64), {}
-    if NETWORK["pictures"]:
-        x = _convolve_pictures(x)
-    if NETWORK["cells"]:
+    if NETWORK["images"]:
+        x = _convolve_images(x)
+    if NETWORK["lstm_sizes"]:
         hidden, cells = [], []
         for layer, (h, c) in enumerate(zip(inputs["h_in"], inputs["c_in"], strict=True)):
             gates = x @ _W[f"in{layer}"].T + h.astype(np.float64) @ _W[f"rec{layer}"].T + _W[f"bias{layer}"]
@@ -73,17 +73,17 @@ class Episode:
         return out["action"][0], out["command"][0]
 
 
-def _convolve_pictures(x):
-    """Apply the convolutions to the pictures, (channels, rows, columns) each; the other columns follow unchanged."""
+def _convolve_images(x):
+    """Apply the convolutions to the images, (channels, rows, columns) each; the other columns follow unchanged."""
     features, others, end = [], [], 0
-    for number, (start, steps, *shape) in enumerate(NETWORK["pictures"]):
+    for number, (start, steps, *shape) in enumerate(NETWORK["images"]):
         stop = start + int(np.prod(shape))
         pixels, (c, h, w) = x[:, start:stop], shape
         if NETWORK["motion"] is not None and steps > 1:
             frames = pixels.reshape(len(x), steps, -1)
             change = NETWORK["motion"] * (frames[:, -1:] - frames[:, :-1])
             pixels = np.concatenate([change, frames[:, -1:]], axis=1).reshape(len(x), -1)
-        for layer, (edge, step) in enumerate(NETWORK["windows"]):
+        for layer, (edge, step) in enumerate(NETWORK["kernels_and_strides"]):
             down, right = (step * np.arange((size - edge) // step + 1) for size in (h, w))
             # convolution as a matrix product: each row of `index` has the pixels below one kernel position
             window = (np.arange(c)[:, None, None] * h + np.arange(edge)[:, None]) * w + np.arange(edge)

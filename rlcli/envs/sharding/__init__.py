@@ -1,1 +1,1 @@
-"""Environments in shards: each worker process steps a part of them, and the results are bit-identical."""
+"""Environments in shards: each worker process steps a part of them; results are bit-identical to one process."""

@@ -1,4 +1,4 @@
-"""Engine of a sharded environment: the worlds of all shards, for observers, recordings and reports."""
+"""View of the engines of all shards as one engine, for observers, recordings and reports."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Shards(Protocol):
 
 
 class ShardedEngine:
-    """Engine with the worlds of all shards, one per environment. Their state is copied from the processes at each call.
+    """View of the worlds of all shards, one for each environment. Each call copies their state from the processes.
 
     Args:
         shards: the shards.
@@ -57,12 +57,12 @@ class ShardedEngine:
 
     @property
     def replayable(self) -> ShardedEngine:
-        """This engine, whose calls can be stepped again bit for bit."""
+        """This engine: its steps can be repeated bit for bit."""
         return self
 
     @property
     def step_stage(self) -> int:
-        """Stage (mjtStage) that is computed after the last substep."""
+        """Stage (mjtStage) up to which a call recomputes the derived fields in use after its last physics step."""
         return self._local.step_stage
 
     @property
@@ -113,7 +113,7 @@ class ShardedEngine:
         return states
 
     def own_model_fields(self, env: int) -> dict[str, NDArray[Any]]:
-        """Return copies of the model fields of one world."""
+        """Return copies of one world's values of the expanded model fields."""
         return dict(self._shards.call_one(env, _own_model_fields))
 
 

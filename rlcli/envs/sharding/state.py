@@ -1,4 +1,4 @@
-"""States of shards joined to the state of one environment object, and split again."""
+"""Join the states of shards into one environment state, and split an environment state into states of shards."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from rlcli.errors import TaskError
 def environment_dim(shapes: Sequence[torch.Size]) -> int | None:
     """Return the environment dimension of a tensor, from its shapes in the shards; None if no dimension differs.
 
-    `split` gives the first and the last shard different sizes, so the environment dimension is the only one in which
-    the shapes differ.
+    `rlcli.envs.shard_range.split` gives the first and the last shard different sizes. The environment dimension is
+    therefore the only one in which the shapes differ.
     """
     return next((dim for dim, sizes in enumerate(zip(*shapes, strict=True)) if len(set(sizes)) > 1), None)
 

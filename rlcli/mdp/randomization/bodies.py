@@ -63,7 +63,7 @@ class RandomizeBodyCom(AxisRandomization, BodyTerm):
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeBodyInertia(FieldRandomization, BodyTerm):
-    """Random factors of the principal moments of inertia of bodies [kg m^2], one factor for each body."""
+    """Random principal moments of inertia: the model's moments [kg m^2] times one random factor for each body."""
 
     model_field = "body_inertia"
     lowest = SMALLEST

@@ -75,7 +75,7 @@ def foot_slip_penalty(
 
     bodies: those of the sensor, in its order.
     """
-    speed = length(require_one_per_body(entity.data.body_lin_vel_of(bodies)[..., :2], sensor))
+    speed = length(require_one_per_body(entity.data.body_lin_vel_of(bodies)[..., :2], sensor, "bodies"))
     return (speed * (strongest_force(sensor) > threshold)).sum(dim=1)
 
 
@@ -93,7 +93,7 @@ def feet_slip(
     sites: one for each body of the sensor, in its order. 0 where the commanded speed is at most `command_threshold`
     [m/s]. mjlab: `feet_slip`.
     """
-    speed = require_one_per_body(entity.data.site_lin_vel_w[:, sites, :2], sensor).square().sum(dim=-1)
+    speed = require_one_per_body(entity.data.site_lin_vel_w[:, sites, :2], sensor, "sites").square().sum(dim=-1)
     return (speed * sensor.found).sum(dim=1) * (commanded_speed(command) > command_threshold)
 
 
@@ -146,7 +146,7 @@ class FeetSwingHeight(EntityTerm, TensorState):
 
     def __call__(self) -> Tensor:
         """Return the sum. (num_envs,)"""
-        z = require_one_per_body(self.entity.data.site_pos_w[:, self.sites, 2], self.sensor)
+        z = require_one_per_body(self.entity.data.site_pos_w[:, self.sites, 2], self.sensor, "sites")
         height = z - self.env.origins[:, 2:3]
         torch.maximum(self._peak, height, out=self._peak)
         error = (self._peak / self.target_height - 1.0).square_() * self.sensor.first_contact

@@ -101,7 +101,8 @@ class PowerConsumption(JointTerm):
         """Return the sum. (num_envs,)"""
         action, velocity = self.env.action_manager.action, self.entity.data.joint_vel_of(self.joints)
         if action.shape != velocity.shape:
-            raise ValueError(f"selects {velocity.shape[1]} joints; select {action.shape[1]}, one per action")
+            found, wanted = velocity.shape[1], action.shape[1]
+            raise ValueError(f"`joints` selects {found} joints; select {wanted}, one for each column of the action")
         power: Tensor = (action * velocity * self._ratio).abs().sum(dim=1)
         return power
 

@@ -116,7 +116,7 @@ def track_pos_l2(env: ManagedEnv, *, object: Entity = "object", command: Command
 def track_orientation_inv_l2(
     env: ManagedEnv, *, object: Entity = "object", command: Command, rot_eps: float = 1e-3
 ) -> Tensor:
-    """1 / (angle + rot_eps), the angle between an object's orientation and the goal's [1/rad]. (num_envs,)
+    """1 / (angle + rot_eps) [1/rad], where angle is that between the object's orientation and the goal's. (num_envs,)
 
     The goal is in columns 3 to 6 of the command, world frame. rot_eps [rad].
     """

@@ -40,7 +40,10 @@ def compile_update(
             warm_up(compiled)
     except (RuntimeError, ImportError, OSError) as error:
         reason = next(iter(str(error).strip().splitlines()), "")
-        _log.warning(f"the update cannot be compiled; set compile: false: {type(error).__name__}: {reason[:200]}")
+        _log.warning(
+            f"the update cannot be compiled and runs uncompiled ({type(error).__name__}: {reason[:200]});"
+            " `compile: false` avoids this warning"
+        )
         return functions
     return compiled
 

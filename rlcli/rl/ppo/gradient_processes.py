@@ -1,7 +1,7 @@
 """Gradients of the layers, computed by the processes that step the environment: between two rollouts they are idle.
 
 Python runs one thread at a time, so that more than about eight threads of one process slow each other down. The parts
-of a minibatch and their sum are those of `rlcli.rl.mlp_gradients.MlpGradients`: the bits of the result are the same.
+of a minibatch and their sum are those of `rlcli.rl.mlp_gradients.MlpGradients`, so the results are bit-identical.
 """
 
 from __future__ import annotations
@@ -104,8 +104,8 @@ class _Share:
         rows = len(batch.target)
         objective = Objective(self._config, batch, tensors["advantage"][:rows], tensors["std"], tensors["mean"][:rows])
         for task in self._memory.tasks(rows)[self._first :: self._step]:
-            inputs, losses = (batch.obs, batch.critic_obs), (objective.mean_gradient, objective.value_gradient)
-            self._parts.compute(task, inputs, losses)
+            inputs, gradients = (batch.obs, batch.critic_obs), (objective.mean_gradient, objective.value_gradient)
+            self._parts.compute(task, inputs, gradients)
 
 
 _shares: WeakKeyDictionary[VecEnv, _Share] = WeakKeyDictionary()

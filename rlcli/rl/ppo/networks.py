@@ -9,12 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from rlcli.envs.environment import Environment
-from rlcli.rl.cnn import Vision, VisionSpec
+from rlcli.rl.cnn import Cnn, CnnSpec
 from rlcli.rl.mlp import Mlp
 from rlcli.rl.optimizers import Adam
 from rlcli.rl.policy import ACTIVATIONS, Lstm, Normalizer
 from rlcli.rl.ppo.config import NetworkConfig, PpoConfig
-from rlcli.rl.ppo.setup import vision_spec
+from rlcli.rl.ppo.setup import cnn_spec
 
 _POLICY = ("memory.", "vision.", "actor.")
 """Prefixes of the weights that belong to the policy."""
@@ -38,7 +38,7 @@ class ActorCritic(nn.Module):
         layout, self.critic_groups = env.layout, groups
         obs_size, action_size = layout.size("policy"), layout.action_size
         critic_obs_size = sum(layout.size(group) for group in groups)
-        vision, critic_vision = vision_spec(env, config, ("policy",)), vision_spec(env, config, groups)
+        vision, critic_vision = cnn_spec(env, config, ("policy",)), cnn_spec(env, config, groups)
         cells = [config.rnn.hidden] * config.rnn.layers if config.rnn else []
         self.memory = Lstm(obs_size, cells) if cells else None
         self.vision, obs_size = _make_cnn(vision, obs_size, config.actor, config.init)
@@ -180,11 +180,11 @@ def _mlp(inputs: int, config: NetworkConfig, outputs: int, init: str, gain: floa
     return Mlp(*layers, _initialize(nn.Linear(inputs, outputs), init, gain))
 
 
-def _make_cnn(spec: VisionSpec | None, columns: int, config: NetworkConfig, init: str) -> tuple[Vision | None, int]:
+def _make_cnn(spec: CnnSpec | None, columns: int, config: NetworkConfig, init: str) -> tuple[Cnn | None, int]:
     """Return the CNN, or None without images, and the number of columns that the MLP behind it reads."""
     if spec is None:
         return None, columns
-    vision = Vision(spec, ACTIVATIONS[config.activation])
+    vision = Cnn(spec, ACTIVATIONS[config.activation])
     for layer in vision.modules():
         if isinstance(layer, nn.Conv2d):
             _initialize(layer, init, math.sqrt(2.0))

@@ -8,18 +8,18 @@ import torch
 from pydantic import ValidationError
 
 from rlcli.envs.environment import Environment
-from rlcli.rl.cnn import VisionSpec
+from rlcli.rl.cnn import CnnSpec
 from rlcli.rl.policy import PolicySpec
 from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.trainer_base import agent_error
 
 _WORTH_COMPILING = 40_000
-"""Number of minibatches in a run from which compiling saves time on a GPU (docs/explanation/benchmarks.md)."""
+"""Compiling saves time on a GPU from this number of minibatch updates in a run (docs/explanation/benchmarks.md)."""
 
 
 def policy_spec(env: Environment, config: PpoConfig) -> PolicySpec:
     """Return the structure of the trained policy."""
-    vision = vision_spec(env, config, ("policy",))
+    vision = cnn_spec(env, config, ("policy",))
     if config.cnn is not None and vision is None:
         message = "no term of the observation group 'policy' is an image"
         raise agent_error(env, ("cnn",), message, "add a term like `image`, or set cnn: null")
@@ -36,7 +36,7 @@ def policy_spec(env: Environment, config: PpoConfig) -> PolicySpec:
     )
 
 
-def vision_spec(env: Environment, config: PpoConfig, groups: tuple[str, ...]) -> VisionSpec | None:
+def cnn_spec(env: Environment, config: PpoConfig, groups: tuple[str, ...]) -> CnnSpec | None:
     """Return the CNN over the images in concatenated observation groups; None without images or without a CNN.
 
     Raises:
@@ -53,7 +53,7 @@ def vision_spec(env: Environment, config: PpoConfig, groups: tuple[str, ...]) ->
     if not pictures:
         return None
     try:
-        return VisionSpec.model_validate({"pictures": pictures, **config.cnn.model_dump()})
+        return CnnSpec.model_validate({"pictures": pictures, **config.cnn.model_dump()})
     except ValidationError as error:
         message = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
         hint = "use smaller kernels or strides, fewer layers, or larger images"

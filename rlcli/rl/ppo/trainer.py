@@ -139,7 +139,7 @@ class PpoTrainer(BaseTrainer):
         return {**env, **_copies(self._episode_tensors())}, rng, self.statistics.state()
 
     def load(self, state: TrainerState) -> None:
-        """Restore a state. On a CPU the next iteration gives the same bits as in the original run.
+        """Restore a saved state. On a CPU the next iteration is bit-identical to the one that followed the save.
 
         If the number of processes has changed, the learner continues and every environment starts a new episode.
         """

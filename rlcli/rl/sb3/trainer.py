@@ -158,7 +158,7 @@ class Sb3Trainer(BaseTrainer):
         return TrainerState(tensors, values, logs)
 
     def load(self, state: TrainerState) -> None:
-        """Restore a state; the next iteration gives the same bits as in the original run."""
+        """Restore a saved state. On a CPU the next iteration is bit-identical to the one that followed the save."""
         values, rest = state.values, state.tensors["trainer"]
         weights = {f"weights.{name}": value for name, value in self.model.policy.state_dict().items()}
         require_matching_tensors(rest, weights, "trainer")

@@ -18,11 +18,11 @@ UNBOUNDED = 1e6
 
 
 class Sb3VecEnv(Sb3Base):
-    """SB3 environment for the observation group `policy` of a `VecEnv`, with numpy arrays and one info dict each.
+    """SB3 environment for the observation group `policy` of a `VecEnv`: numpy arrays, one info dict per environment.
 
     Args:
         env: the environment.
-        action_bound: the action space is [-action_bound, action_bound]; None: unbounded.
+        action_bound: the action space is [-action_bound, action_bound]; None: a bound so large that it has no effect.
     """
 
     def __init__(self, env: Environment, action_bound: float | None = 1.0) -> None:

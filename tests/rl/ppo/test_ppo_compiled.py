@@ -75,7 +75,7 @@ def test_missing_compiler_runs_uncompiled_with_one_warning(make_trainer, tmp_pat
     assert trainer.learner.functions == UpdateFunctions()
     (warning,) = [record for record in caplog.records if record.name.startswith("rlcli")]
     assert warning.levelname == "WARNING"
-    assert "cannot be compiled; set compile: false" in warning.message
+    assert "cannot be compiled and runs uncompiled" in warning.message
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
-from rlcli.rl.cnn import Vision, VisionSpec, WideConv
+from rlcli.rl.cnn import Cnn, CnnSpec, WideConv
 from rlcli.rl.policy import PolicySpec
 from rlcli.rl.ppo.trainer import PpoTrainer
 from rlcli.runs.checkpoint_reader import open_checkpoint
@@ -102,8 +102,8 @@ def test_wide_conv_matches_torch_in_float64(channels, height, width, outputs, ed
 @pytest.mark.parametrize("wide", [False, True])
 def test_vision_outputs_image_features_then_other_columns(wide):
     pictures = [{"start": 1, "shape": [2, 3, 4]}, {"start": 27, "shape": [1, 2, 2]}]
-    spec = VisionSpec(pictures=pictures, channels=[3], kernels=[2], strides=[1])
-    vision, obs = Vision(spec, nn.ReLU, wide=wide), torch.randn(5, 33)
+    spec = CnnSpec(pictures=pictures, channels=[3], kernels=[2], strides=[1])
+    vision, obs = Cnn(spec, nn.ReLU, wide=wide), torch.randn(5, 33)
     seen = vision(obs)
     assert seen.shape == (5, spec.features(33)) == (5, 3 * 2 * 3 + 3 + 5)
     first = torch.relu(vision.pictures[0][0](obs[:, 1:25].reshape(5, 2, 3, 4))).flatten(1)
@@ -113,11 +113,11 @@ def test_vision_outputs_image_features_then_other_columns(wide):
 
 
 def test_motion_replaces_older_images_by_differences():
-    spec = VisionSpec(
+    spec = CnnSpec(
         pictures=[{"start": 0, "shape": [6, 2, 3], "steps": 3}], channels=[5], kernels=[2], strides=[1], motion=4.0
     )
-    vision, obs = Vision(spec, nn.Identity), torch.randn(4, 36)
-    plain = Vision(spec.model_copy(update={"motion": None}), nn.Identity)
+    vision, obs = Cnn(spec, nn.Identity), torch.randn(4, 36)
+    plain = Cnn(spec.model_copy(update={"motion": None}), nn.Identity)
     plain.load_state_dict(vision.state_dict())
     first, second, now = obs.view(4, 3, 12).unbind(1)
     torch.testing.assert_close(vision(obs), plain(torch.cat([4.0 * (now - first), 4.0 * (now - second), now], dim=1)))
