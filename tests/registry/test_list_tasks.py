@@ -207,7 +207,7 @@ def test_broken_plugin_exits_with_4_without_traceback(plugins, cli, source):
     done = cli("show", "odd-task", "--json")
     error = json.loads(done.stdout)["error"]
     assert (done.returncode, error["exit_code"], error["kind"]) == (4, 4, "task")
-    assert "plugin odd 1.0 is broken" in error["message"]
+    assert "plugin odd 1.0: entry point 'odd-task' = odd:SPEC " in error["message"]
     assert "Traceback" not in done.stderr
     assert cli("show", "cartpole").returncode == 0
 

@@ -114,7 +114,7 @@ def test_error_of_plugin_has_file_and_line(plugins):
 
 def test_entry_point_without_object_is_broken(plugins):
     plugins("half", entry_points="[rlcli.tasks]\nhalf = half\n")
-    assert "plugin half 1.0 is broken" in failure("half")
+    assert "plugin half 1.0: entry point 'half' = half cannot be imported" in failure("half")
 
 
 @pytest.mark.parametrize(
@@ -247,5 +247,5 @@ def test_trainer_plugin_has_own_settings(plugins):
 )
 def test_broken_trainer_plugin_is_reported(plugins, algorithm, said):
     plugins("mine", TRAINER, entry_points="[rlcli.trainers]\nmine = mine:SPEC\n")
-    with pytest.raises(TaskError, match=f"plugin mine 1.0 is broken: .*{said}"):
+    with pytest.raises(TaskError, match=f"plugin mine 1.0.*: .*{said}"):
         with_algorithm(algorithm)

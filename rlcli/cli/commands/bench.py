@@ -48,8 +48,6 @@ def command(
         profile: Instead show where the time of an environment step goes: by stage, term and reset.
 
     Examples:
-        rlcli bench cartpole --quick
-            Get a first impression of the speed.
         rlcli bench cartpole --save-preset fast.yaml
             Write the recommended settings, for: rlcli train --config fast.yaml
         rlcli bench quadruped-flat --profile --num-envs 1024
@@ -70,9 +68,7 @@ def command(
 
     present = resolved({})
     if profile:
-        if file is not None:
-            raise UsageError("--profile measures no sizes, so there is no preset to save", hint="leave one of them out")
-        return _profile(present, _PROFILED / 5 if quick else _PROFILED)
+        return _profile(present, file, _PROFILED / 5 if quick else _PROFILED)
     present.require_agent()
     log_notes(present.notes)
 
@@ -87,12 +83,12 @@ def command(
         except KeyboardInterrupt:
             stopped = True
     _report(bench, present, machine, file, f"rlcli train {task}", names_agent=agent is not None, stopped=stopped)
-    if stopped:
-        raise Stopped("stopped; the measurements until now are shown, and no preset was written", exit_code=130)
 
 
-def _profile(resolved: Resolved, seconds: float) -> None:
+def _profile(resolved: Resolved, preset: Path | None, seconds: float) -> None:
     """Print where the time of an environment step goes."""
+    if preset is not None:
+        raise UsageError("--profile measures no sizes, so there is no preset to save", hint="leave one of them out")
     import torch
 
     from rlcli.tuning.step_profile import profile_step
@@ -120,7 +116,11 @@ def _report(
     names_agent: bool,
     stopped: bool,
 ) -> None:
-    """Print the measurements and the recommendation, and write the preset."""
+    """Print the measurements and the recommendation, and write the preset.
+
+    Raises:
+        Stopped: if the user stopped the measurements.
+    """
     from rlcli.runs.atomic_io import write_atomic
     from rlcli.tuning.bench_preset import bench_preset, explanation
 
@@ -147,6 +147,8 @@ def _report(
         why=explanation(findings),
         preset=file if changes is not None else None,
     )
+    if stopped:
+        raise Stopped("stopped; the measurements until now are shown, and no preset was written", exit_code=130)
 
 
 def _preset_file(name: str, overwrite: bool) -> Path:

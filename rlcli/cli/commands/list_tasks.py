@@ -53,16 +53,20 @@ def command(
         console.info(f"no task's name or summary contains '{pattern}'; {near or 'rlcli list-tasks shows all'}")
     for bad in broken:
         console.warn(f"{bad.distribution}: {bad.reason}; its tasks are not listed; see `rlcli doctor`")
-    for name in unknown_wanted():
-        console.warn(
-            f"{plugins_chosen_by()} names '{name}', but no installed distribution of that name has tasks or trainers;"
-            " correct the name"
-        )
+    _warn_of_unknown_plugins()
     console.document(
         "list-tasks",
         tasks=[_record(entry, known, ambiguous=entry.name in shared - built_in) for entry, known in rows],
         broken=[{"distribution": bad.distribution, "reason": bad.reason} for bad in broken],
     )
+
+
+def _warn_of_unknown_plugins() -> None:
+    for name in unknown_wanted():
+        console.warn(
+            f"{plugins_chosen_by()} names '{name}', but no installed distribution of that name has tasks or trainers;"
+            " correct the name"
+        )
 
 
 def _record(entry: Entry, known: Details, *, ambiguous: bool) -> dict[str, Any]:
