@@ -212,7 +212,10 @@ def test_find_class_chooses_matching_class(tmp_path, files, expected):
 
 def test_ambiguous_classes_are_listed(tmp_path):
     (tmp_path / "a.py").write_text("class ReachTask(RLTask): pass\nclass PushTask(RLTask): pass\n")
-    with pytest.raises(LookupError, match=r"several task classes in any Python file of the folder: ReachTask, PushTask; rename the right one to 'ArmTask'"):
+    with pytest.raises(
+        LookupError,
+        match=r"several task classes in any Python file .*: ReachTask, PushTask; rename the right one to 'ArmTask'",
+    ):
         find_class(tmp_path, "Arm")
 
 
