@@ -1,1 +1,1 @@
-"""Managers of manager-based tasks. Each runs the terms of one section of the YAML."""
+"""Managers of manager-based tasks. Each calls the terms of one section of the task's YAML file."""

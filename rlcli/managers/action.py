@@ -1,4 +1,4 @@
-"""Actions: the policy's action is split into the columns of the terms. Each term turns its columns into controls."""
+"""Manager of the action terms. Each term turns its columns of the policy's action into controls of actuators."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from rlcli.sim.selection import Selection, in_place
 
 @dataclass(frozen=True, slots=True)
 class CommandMap:
-    """Formula of a term's commands: raw x scale + offset, then `clip`, then the limits of the actuators."""
+    """Formula of an action term's commands: raw action x scale + offset, then `clip`, then the actuators' limits."""
 
     scale: tuple[float, ...]
-    """One for each column."""
+    """Factor of each column."""
     offset: tuple[float, ...]
-    """One for each column, in the command's unit."""
+    """Number that is added to each scaled column, in the command's unit."""
     clip: tuple[tuple[float, float], ...] | None
     """The term's own limits of each column, in the command's unit; None: no limits."""
     limits: tuple[tuple[float, float], ...]
@@ -38,14 +38,14 @@ class ActionTerm(Protocol):
     """
 
     size: int
-    """Number of columns of the policy's action."""
+    """Number of columns of the policy's action that the term uses."""
     elements: tuple[str, ...]
-    """Names of what the columns drive, in order."""
+    """What each column drives, such as a joint or an axis, by name."""
     unit: str
     """Unit of the command to the actuators."""
 
     def process(self, action: Tensor) -> None:
-        """Write the controls for this step's columns. action (num_envs, size)"""
+        """Write the actuator controls for the term's columns of this step's action. action (num_envs, size)"""
 
 
 class ActionManager(TensorState):
@@ -96,7 +96,7 @@ class ActionManager(TensorState):
             delay.empty(selection)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return both actions, and the memories of the delays."""
+        """Return the actions of this step and of the previous one, and the past values that the delays keep."""
         delays = self._delays.items()
         memories = {f"{name}.{key}": tensor for name, delay in delays for key, tensor in delay.tensors().items()}
         return {"action": self.action, "prev_action": self.prev_action, **memories}

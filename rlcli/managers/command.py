@@ -1,4 +1,4 @@
-"""Commands: goals for the policy. Each environment samples them at the start of an episode and at intervals."""
+"""Manager of the command terms: goals that each environment samples at the start of an episode and at intervals."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
 
 Select = Callable[[Tensor], Selection | None]
+"""Returns a selection of the environments where a mask (num_envs,) is true; None if it is known to be empty."""
 _COLUMNS = {"start": 3, "end": 3, "center": 3, "position": 3, "quat": 4}
 """Columns of a marker's fields that have one row for each environment."""
 
@@ -50,7 +51,7 @@ class CommandTerm(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Knob:
-    """A column of a command that a person may set."""
+    """Column of a command that a person may set: in a viewer, or with `--command`."""
 
     name: str
     """`ELEMENT`, or `TERM.ELEMENT` if several terms have an element of this name."""
@@ -129,7 +130,7 @@ class CommandManager(TensorState):
             self.held[knob.name], self._held_knobs[knob.name] = value, knob
 
     def value(self, knob: Knob, env_id: int) -> float:
-        """Return the command of one environment in a column."""
+        """Return the present value of a knob in one environment."""
         return float(self._by_name[knob.term].instance.command[env_id, knob.column])
 
     def markers(self) -> list[Marker]:
@@ -156,7 +157,7 @@ class CommandManager(TensorState):
         return term
 
     def measure(self) -> None:
-        """Add the metrics of this step to the sums, before commands are resampled."""
+        """Add the metrics of this step to the sums over the episode, before commands are resampled."""
         if not self._measured:
             return
         terms = {term.name: term for _, term, _ in self._measured}
@@ -189,7 +190,7 @@ class CommandManager(TensorState):
     def compute(self, select: Select, running: Tensor) -> None:
         """Count one step of the `running` episodes (1 or 0), resample commands that are due, and update all commands.
 
-        `select` selects environments; their random numbers depend on the current step.
+        `select` returns the environments of a mask; their random numbers depend on the current step.
         """
         for number, term in enumerate(self.terms):
             left = self._steps_left[number]
@@ -202,7 +203,7 @@ class CommandManager(TensorState):
             self._by_name[knob.term].instance.command[:, knob.column] = self.held[name]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return timers, sums and commands."""
+        """Return the resampling timers, the sums of the metrics and the commands."""
         commands = {f"command.{term.name}": term.instance.command for term in self.terms}
         return {"steps_left": self._steps_left, "sums": self._sums, "steps": self._steps, **commands}
 

@@ -1,4 +1,4 @@
-"""Curriculum: settings that change during training, by training step or by the episodes that end."""
+"""Manager of the curriculum terms, which change settings during training, by training step or by ended episodes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class CurriculumManager(TensorState):
         self._values = {term.name: torch.full((context.num_envs,), torch.nan, device=context.device) for term in terms}
 
     def advance(self, step: Tensor) -> None:
-        """Advance the schedules to a step. step () int64"""
+        """Call the scheduled terms (those with `advance`) with the training step. step () int64"""
         for term in self._scheduled:
             self._store(term, term.instance.advance(step))
 
@@ -39,15 +39,15 @@ class CurriculumManager(TensorState):
             self._store(term, term.call(ended.stream(term.stream)))
 
     def values(self) -> dict[str, Tensor]:
-        """Return the last values of each term, by its metric name. (num_envs,)"""
+        """Return the last value that each term returned, by the name of its metric. (num_envs,) each"""
         return {f"Curriculum/{name}": value for name, value in self._values.items()}
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tunable values."""
+        """Return the settings that the curriculum changes."""
         return {f"live.{path}": value for path, value in self._tunable.tensors().items()}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the tunable values, and the means of the logged values."""
+        """Return copies of the settings that the curriculum changes, and the means of the logged values."""
         return {**super().state_dict(), **{f"value.{name}": mean_of(value) for name, value in self._values.items()}}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:

@@ -1,4 +1,4 @@
-"""Events: changes of some environments at startup, at each reset, or at intervals."""
+"""Manager of the event terms, which change some environments at startup, at each reset, or at intervals."""
 
 from __future__ import annotations
 
@@ -13,19 +13,14 @@ from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
 
 Select = Callable[[Tensor], Selection | None]
+"""Returns a selection of the environments where a mask (num_envs,) is true; None if it is known to be empty."""
 Callback = Callable[[Selection], None]
 
 
 class EventManager(TensorState):
-    """Manager of the event terms. Each environment has its own interval timers, unless the event is global.
+    """Manager of the event terms. Each environment has its own interval timers, unless `global_time` is true.
 
-    Args:
-        terms: the events.
-        num_envs: number of environments.
-        step_dt: control period [s].
-        device: device of the timers.
-        set_constants: recomputes the constants that the engine derives from the model; called after events that change
-            masses, inertias or the like.
+    After events that change masses, inertias or the like, the engine recomputes the constants that derive from them.
     """
 
     def __init__(self, terms: list[BoundTerm], context: EnvContext) -> None:
@@ -63,7 +58,7 @@ class EventManager(TensorState):
         self._derive_constants(self._startup, all_envs)
 
     def before_full_reset(self, all_envs: Selection) -> None:
-        """Forget when reset events fired, and draw the global timers, before all environments are reset.
+        """Clear the steps at which reset events fired, and draw the global timers, before all environments are reset.
 
         The random numbers of `all_envs` depend on the current step.
         """
@@ -92,8 +87,8 @@ class EventManager(TensorState):
     def interval(self, select: Select, running: Tensor, fired: Callback) -> None:
         """Count one step of the `running` episodes (1 or 0), and fire the events that are due.
 
-        `select` selects environments; their random numbers depend on the current step. `fired` is called after each
-        event with its environments. Global timers also run where no episode does.
+        `select` returns the environments of a mask; their random numbers depend on the current step. `fired` is called
+        after each event with its environments. Global timers also count steps in which no episode is running.
         """
         for instance in self._updating:
             instance.update(select, running)
@@ -127,6 +122,7 @@ class EventManager(TensorState):
 
 
 def _derives(term: BoundTerm) -> bool:
+    """Return whether an event changes model fields from which the engine derives constants."""
     return bool(getattr(term.instance, "derives", False))
 
 
@@ -135,5 +131,6 @@ def _is_global(term: BoundTerm) -> bool:
 
 
 _NEVER = -(1 << 62)
+"""Step at which a reset event fired that has not fired yet."""
 # Two random streams: the first interval of an episode depends on the episode's index, later ones on the step's.
 _FIRST, _NEXT = np.uint64(0x5449_4D45_5231), np.uint64(0x5449_4D45_5232)

@@ -1,4 +1,4 @@
-"""Observations: groups of terms. Each term runs through its pipeline of noise, clip, scale, delay and history."""
+"""Manager of the observation groups. The value of each term passes through a pipeline of noise, scale, delay ..."""
 
 from __future__ import annotations
 
@@ -20,14 +20,17 @@ from rlcli.sim.state_cache import is_finite
 
 @dataclass(slots=True)
 class _Group:
+    """Pipelines of a group's terms, the group's buffers, and the columns of each term in each buffer."""
+
     pipelines: list[Pipeline]
     buffers: list[Tensor]
     views: list[list[Tensor]]
     next: int = 0
+    """Index of the buffer with the last observations."""
 
 
 _FINAL = np.uint64(0x46494E414C)
-"""Stream of the last observation of an episode: the first one of the next episode has other noise."""
+"""Salt of the random streams for the last observation of an episode: its noise differs from that of the next one."""
 
 
 class ObservationManager(TensorState):
@@ -36,7 +39,8 @@ class ObservationManager(TensorState):
     Args:
         groups: the bound terms of each group.
         configs: the settings of the groups.
-        context: the environment. A GPU engine notes values that are not finite; else they are checked at once.
+        context: parts of the environment. A GPU engine records values that are not finite, and the environment raises
+            the error later (`check`); on a CPU the error is raised at once.
     """
 
     def __init__(
@@ -64,7 +68,7 @@ class ObservationManager(TensorState):
         return result
 
     def compute_final(self, rows: Selection | None = None) -> dict[str, Tensor]:
-        """Return the observations in separate buffers; histories, delays and filters do not advance.
+        """Return the last observations of episodes, in separate buffers; histories, delays and filters do not advance.
 
         rows: the environments whose observations are read; None: all. Random numbers depend on the current step.
         """
@@ -98,7 +102,7 @@ class ObservationManager(TensorState):
         return self.groups[group].pipelines
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the state of the pipelines, and the last observations of the groups that have one."""
+        """Return the state of the pipelines, and the last observations of groups that depend on earlier steps."""
         tensors = {
             f"{name}.{pipeline.term.name}.{key}": tensor
             for name, group in self.groups.items()

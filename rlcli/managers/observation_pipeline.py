@@ -24,19 +24,19 @@ Sampler = Callable[[Selection], Tensor]
 """Draws one row for each environment of a selection."""
 
 _BIAS, _LAG, _REDRAW, _REDRAWN = (np.uint64(0x4F42_5330 + i) for i in range(4))
-"""Further streams of a term; they are combined with its own by xor."""
+"""Salts of a term's further random streams, for its bias and its delay; a salt is combined with the stream by xor."""
 
 
 class Stage:
-    """Base class of the operations on a term's value."""
+    """Base class of the operations on an observation term's value."""
 
     def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         """Change the value (num_envs, k) in place.
 
         Args:
-            value: of all environments.
-            draws: gives random streams.
-            fresh: environments whose episode has just begun; None: none, as far as the host can see.
+            value: values of all environments.
+            draws: returns a selection of all environments for a random stream.
+            fresh: environments whose episode has just begun; None: there are none.
             advance: whether histories, delays and filters advance by a step.
         """
         raise NotImplementedError
@@ -50,7 +50,7 @@ class Stage:
 
 
 class Pipeline:
-    """The stages of one term, and its columns in the group."""
+    """Operations (stages) on the value of one observation term, and its history."""
 
     def __init__(
         self, term: BoundTerm, shape: tuple[int, ...], group: schema.ObservationGroupConfig, context: EnvContext
@@ -135,7 +135,7 @@ class Pipeline:
         return found if self._frames is None else {**found, "history": self._frames}
 
     def _setting(self, key: str, value: object) -> Any:
-        """Return a setting, or its tensor if a curriculum changes it."""
+        """Return a setting of the term, or the tensor from which it is read if a curriculum changes it."""
         return self._context.tunable.get((*self.term.path, *key.split(".")), value)
 
     def _columns(self, key: str, value: float | list[float]) -> Tensor:
@@ -277,7 +277,7 @@ class Delay(Stage):
         self._lag = torch.full((len(frames),), self._low, dtype=torch.int64, device=frames.device)
 
     def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
-        """Replace the value by that of some steps ago."""
+        """Replace the value by the one of some steps ago."""
         frames = torch.cat([self._frames[:, 1:], value[:, None]], dim=1)
         if fresh is not None:
             fresh.write(frames, fresh.read_view(value)[:, None].expand(-1, frames.shape[1], -1))
@@ -298,7 +298,7 @@ class Delay(Stage):
         selection.write(self._lag, self._sample(selection.stream(self._stream ^ _LAG)))
 
     def empty(self, selection: Selection) -> None:
-        """Start new episodes with values of 0 in the past."""
+        """Start new episodes: draw their delays, and set the past values to 0."""
         self.reset(selection)
         selection.write(self._frames, 0.0)
 

@@ -98,7 +98,7 @@ class RewardManager(TensorState):
         return {term.name: row for term, row in zip(self.terms, self._rows, strict=True)}
 
     def replace_diverged(self, diverged: Tensor, total: Tensor) -> None:
-        """Replace this step's terms of diverged environments by the `divergence_reward`, if configured."""
+        """Replace this step's reward `total`, and its terms, by the `divergence_reward` in diverged environments."""
         if self._divergence_reward is None:
             return
         self._sums -= torch.where(diverged, self._values, 0.0)
@@ -106,7 +106,7 @@ class RewardManager(TensorState):
         total.masked_fill_(diverged, self._divergence_reward)
 
     def episode(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the returns of the selected episodes, and the share of each term. (n,) each"""
+        """Return the returns of the episodes that end, and the share of each term in them. (n,) each"""
         sums = ended.read(self._sums_by_env).contiguous()  # so that rounding does not depend on the number of rows
         shares = {term.name: column for term, column in zip(self.terms, sums.unbind(1), strict=True)}
         returns = sums.sum(dim=1)

@@ -1,4 +1,4 @@
-"""Binding of terms: names in the YAML become objects and indices once, when the environment is built."""
+"""Binding of terms: the names in their parameters are replaced by objects and indices when the environment is built."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class BoundTerm:
         return self.call
 
     def error(self, message: str, *keys: str) -> ShapeError:
-        """Return a ShapeError for what the term returned; with `keys`, for the setting under these keys."""
+        """Return a ShapeError about the term's result; with `keys`, about the setting under these keys of the term."""
         return ShapeError([self.resolved.problem((*self.path, *keys), message)])
 
     def require_finite(self, values: Tensor, what: str) -> None:
@@ -66,8 +66,8 @@ class BoundTerm:
         bad = ~values.isfinite().flatten(1).all(dim=1) if values.dim() > 1 else ~values.isfinite()
         if bool(bad.any()):
             raise DivergedError(
-                f"{what} ({self.config.func}) is not finite in {int(bad.sum())} environments, first in environment"
-                f" {int(bad.nonzero()[0, 0])}; look for divisions by 0, roots and logarithms"
+                f"{what} ({self.config.func}) is not finite in {int(bad.sum())} of {len(bad)} environments, first in"
+                f" environment {int(bad.nonzero()[0, 0])}; look for divisions by 0, roots and logarithms"
             )
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -148,7 +148,7 @@ class Binder:
     def signature(self, section: str, config: TermConfig) -> Signature:
         """Return the signature of a configured term."""
         signature = self.resolved.vocabulary.find(section, config.func)
-        assert signature is not None  # phase 1 has looked it up
+        assert signature is not None  # the validation of the configuration has already looked it up
         return signature
 
     def bind_all(self, section: str) -> list[BoundTerm]:
@@ -250,7 +250,7 @@ class Binder:
         return None
 
     def _open_addresses(self) -> None:
-        """Make the tensors that the curriculum changes, before any term is bound to them."""
+        """Make the tensors of the settings that the curriculum changes, before the terms that read them are bound."""
         self._opened: dict[Path, Tensor] = {}
         for name, config in self.resolved.task.curriculum.items():
             signature = self.resolved.vocabulary.find("curriculum", config.func) if config is not None else None
@@ -282,7 +282,7 @@ def first_value(term: BoundTerm) -> Any:
     """Call a term for the first time, when the environment is built.
 
     Raises:
-        ShapeError: if the term raises a ValueError about its parameters.
+        ShapeError: if the term raises a ValueError; its message becomes that of the ShapeError.
     """
     try:
         return term.call()

@@ -1,4 +1,4 @@
-"""Terminations: which episodes end, by failure or by time-out, and which terms fired."""
+"""Manager of the termination terms: which episodes end, by failure or by time-out, and which terms fired."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rlcli.managers.term import BoundTerm, EnvContext, check_shape, first_value,
 from rlcli.sim.selection import Selection
 
 DIVERGED = "diverged"
-"""Name of a diverged simulation among the logged causes."""
+"""Cause that is logged for an episode whose simulation diverged."""
 
 
 class TerminationManager:

@@ -21,11 +21,11 @@ _FIXED = {
     *("min_steps_between", "axes", "func", "mode", "time_out", "while_alive", "history", "delay", "modifiers"),
     *("interval_range_s", "resampling_time_s"),
 }
-"""Settings of terms that are read only once."""
+"""Settings of terms that a curriculum cannot change, because they are read only once."""
 
 
 class TunableValues:
-    """Tensors of the changing settings, by the path of the setting."""
+    """Tensors of the settings that a curriculum changes, by the path of the setting."""
 
     def __init__(self, task: TaskConfig, device: torch.device) -> None:
         self._task, self._device = task, device
@@ -60,15 +60,15 @@ class TunableValues:
                 near = did_you_mean(key, names)
                 have = f"settings that may change there: {listing(names)}" if names else None
                 hint = f"{near}; {have}" if near and have else near or have
-                raise NameProblem(f"address '{address}' does not exist: {where} no '{key}'", hint)
+                raise NameProblem(f"a curriculum cannot change '{address}': {where} no changeable '{key}'", hint)
             value = _member(value, key)
             if _is_number(value):
                 try:
                     return self._opened(path[: depth + 1], value)[tuple(int(index) for index in path[depth + 1 :])]
                 except (ValueError, IndexError):
                     rest = ".".join(path[depth + 1 :])
-                    raise NameProblem(f"address '{address}' does not exist: '{rest}' is not an index") from None
-        raise NameProblem(f"address '{address}' must name a number or a list of numbers")
+                    raise NameProblem(f"a curriculum cannot change '{address}': no element '{rest}' there") from None
+        raise NameProblem(f"a curriculum cannot change '{address}': it must name a number or a list of numbers")
 
     def _opened(self, path: Path, value: object) -> Tensor:
         if path not in self._tensors:

@@ -107,7 +107,7 @@ class _AffineJointAction(_ScaledJointAction):
             self.command += self._offset
 
     def _each(self, value: float | Tensor) -> tuple[float, ...]:
-        """Return one value for each column; all environments have the same."""
+        """Return the value of each column, which is the same in all environments."""
         if isinstance(value, Tensor):
             return tuple((value[0] if value.dim() == 2 else value).tolist())
         return (value,) * self.size
@@ -118,7 +118,7 @@ class _AffineAboutDefault(_AffineJointAction):
     """Base class of the actions raw x scale + offset + default; `use_default_offset: false` omits the default."""
 
     default: ClassVar[str]
-    """Name of the defaults in the entity's data."""
+    """Attribute of `entity.data` that holds the default values."""
 
     use_default_offset: bool = True
 
@@ -188,8 +188,8 @@ class JointPositionToLimits(_ScaledJointAction):
         finite = self.entity.data.soft_joint_pos_limits[self.joints].isfinite().all(dim=-1)
         if self.rescale_to_limits and not bool(finite.all()):
             unlimited = self.elements[int((~finite).nonzero()[0, 0])]
-            message = f"joint '{unlimited}' has no limits to stretch over"
-            raise NameProblem(message, "give it a range, or another action")
+            message = f"joint '{unlimited}' has no limits, to which the action could be mapped"
+            raise NameProblem(message, "give the joint a range in the MJCF, or use joint_position")
 
     def _compute_command(self, action: Tensor) -> None:
         self.command.copy_(self._limited(action))

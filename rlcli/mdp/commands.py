@@ -35,7 +35,10 @@ class NullCommand(Term):
 
 @dataclass(kw_only=True, eq=False)
 class _VelocityCommand(EntityTerm, TensorState):
-    """Base class of velocity commands: `_drawn` holds the samples, `command` the values after heading and standing."""
+    """Base class of velocity commands: `_drawn` has the samples, `command` the values after heading and standing.
+
+    rel_standing: fraction of the commands that are zero, so that the robot is to stand.
+    """
 
     elements = ("vx", "vy", "wz")
     units = ("m/s", "m/s", "rad/s")
@@ -58,7 +61,7 @@ class _VelocityCommand(EntityTerm, TensorState):
         self.command.mul_(~self._stands[:, None])
 
     def _control_heading(self) -> None:
-        """Replace the yaw rate where a heading is commanded."""
+        """Replace the yaw rate in the environments in which a heading is commanded."""
 
     def metrics(self) -> dict[str, Tensor]:
         """Return the errors of the root's velocity in its own frame [m/s, rad/s]. (num_envs,) each"""
@@ -72,8 +75,8 @@ class _VelocityCommand(EntityTerm, TensorState):
     def markers(self) -> list[Marker]:
         """Return arrows above the root: green for the command, blue for the actual velocity.
 
-        An arrow at the root shows the way of one second. An arrow ahead of the root shows the yaw rate, as the sideways
-        way of that point in one second.
+        An arrow above the root shows how far the root moves in one second. An arrow ahead of it shows the yaw rate: how
+        far its start point moves sideways in one second.
         """
         data = self.entity.data
         actual = torch.cat([data.root_lin_vel_b[:, :2], data.root_ang_vel_b[:, 2:]], dim=1)
@@ -95,7 +98,7 @@ class _VelocityCommand(EntityTerm, TensorState):
         return [Arrow(start, end, color, label=label) for start, end in ways]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the samples."""
+        """Return the sampled velocities, and a mask of the environments in which the robot is to stand."""
         return {"drawn": self._drawn, "stands": self._stands}
 
 

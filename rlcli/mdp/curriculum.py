@@ -74,7 +74,7 @@ class TerrainLevels(EntityTerm):
 
     A robot moves up one level if its episode ends more than half a patch (along x) from the environment's origin. It
     moves down if it covers less than half of the distance of `command` (a velocity, x and y first); without a command,
-    less than `least` [m]. After the last level a random level follows. Isaac Lab: terrain_levels_vel.
+    less than `least` [m]. A robot that moves up from the last level gets a random level. Isaac Lab: terrain_levels_vel.
     """
 
     command: Command | None = None
@@ -102,7 +102,7 @@ class TerrainLevels(EntityTerm):
 
 def _require_shape(what: str, shape: torch.Size, address: Tensor) -> None:
     if shape != address.shape:
-        raise ValueError(f"{what} has shape {tuple(shape)}, expected that of the address, {tuple(address.shape)}")
+        raise ValueError(f"{what} has shape {tuple(shape)}; the setting at `address` has shape {tuple(address.shape)}")
 
 
 def _length_xy(vector: Tensor) -> Tensor:

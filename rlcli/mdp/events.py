@@ -1,4 +1,7 @@
-"""Event terms. Each acts on a `Selection` of environments; samples depend only on seed, term, environment, episode."""
+"""Event terms. Each acts on a `Selection` of environments.
+
+Samples depend only on the seed, the term, the environment, and its episode (interval events: the training step).
+"""
 
 from __future__ import annotations
 
@@ -90,7 +93,7 @@ class ResetJointsWithinLimits(JointTerm):
         names = element_names(self.entity, "Joints", self.joints)
         if not all(finite):
             unlimited = [name for name, limited in zip(names, finite, strict=True) if not limited]
-            raise NameProblem(f"{listing(unlimited)}: no limits to reset within", "choose joints that have a range")
+            raise NameProblem(f"joints without limits: {listing(unlimited)}", "choose joints that have a range")
         self._count = len(names)
 
     def __call__(self, selection: Selection) -> None:
@@ -115,10 +118,11 @@ def reset_root_state_uniform(
     linear_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006 (read, never written)
     angular_velocity: list[Range] = [(0.0, 0.0), (0.0, 0.0), (0.0, 0.0)],  # noqa: B006
 ) -> None:
-    """Reset the root to its default state plus uniform offsets, world frame.
+    """Reset the root to its default state plus uniform offsets.
 
-    The position is relative to the environment's origin. x, y, z [m], roll, pitch, yaw [rad], linear_velocity [m/s] and
-    angular_velocity [rad/s] are ranges, the velocities one for each axis.
+    x, y, z [m], linear_velocity [m/s] and angular_velocity [rad/s] are ranges in the world frame, the velocities one
+    for each axis. roll, pitch, yaw [rad] are ranges of a rotation in the root's default frame. The position is relative
+    to the environment's origin.
     """
     default = selection.read(entity.data.default_root_state)
     offset = selection.uniform(*_bounds(env, x, y, z), (3, 1)).squeeze(2)
@@ -232,7 +236,7 @@ class ApplyBodyImpulse(BodyTerm, TensorState):
         self._steps_left = torch.zeros(self.env.num_envs, dtype=torch.int64, device=self.env.device)
 
     def __call__(self, selection: Selection) -> None:
-        """Start to push the selected environments."""
+        """Apply a sampled wrench in the selected environments, and start its timer."""
         drawn = _drawn_wrench(self.env, selection, len(self._columns) // 6, self.force, self.torque)
         selection.write(self._wrench, drawn, self._columns)
         low, high = _bounds(self.env, self.duration_s)

@@ -1,4 +1,4 @@
-"""Observation terms. (num_envs, k) each."""
+"""Observation terms. Each returns a tensor (num_envs, k); `image` returns (num_envs, c, h, w)."""
 
 from __future__ import annotations
 
@@ -264,12 +264,12 @@ def foot_height(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> T
 
 
 def foot_air_time(env: ManagedEnv, *, sensor: ContactSensor) -> Tensor:
-    """Time for which each body of the sensor has been in the air [s]. (num_envs, k)  mjlab: `foot_air_time`."""
+    """Time since each body of the sensor left the ground; 0 in contact [s]. (num_envs, k)  mjlab: `foot_air_time`."""
     return sensor.air_time
 
 
 def foot_contact(env: ManagedEnv, *, sensor: ContactSensor) -> Tensor:
-    """1 for each body of the sensor that is in contact. (num_envs, k)  mjlab: `foot_contact`."""
+    """1 for each body of the sensor that is in contact, else 0. (num_envs, k)  mjlab: `foot_contact`."""
     return sensor.found.float()
 
 

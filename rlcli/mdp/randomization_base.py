@@ -23,11 +23,11 @@ from rlcli.sim.selection import Columns, Selection
 SMALLEST = 1e-9
 """Lower bound of quantities that must be positive."""
 Pair: TypeAlias = Sequence[float] | Tensor
-"""A range at run time: two numbers, or the tensor (2,) that a curriculum writes to."""
+"""Range of a term: two numbers, or the tensor (2,) to which a curriculum writes them."""
 
 
 class Ranges:
-    """Lower and upper ends of several ranges: fixed ones are made once, those of a curriculum are read each time."""
+    """Lower and upper ends of several ranges; the ends that a curriculum changes are read at each call of `now`."""
 
     def __init__(self, device: torch.device, *pairs: Pair) -> None:
         self._fixed = _table(device, *((0.0, 0.0) if isinstance(pair, Tensor) else tuple(pair) for pair in pairs))
@@ -53,13 +53,13 @@ class Draw:
     """Sampler of new values: a distribution, and how a sample combines with the original value.
 
     Args:
-        term: gives the keys `distribution`, `operation` and `shared`.
+        term: the term that has the keys `distribution`, `operation` and `shared`.
         range: one pair for all axes, or one pair for each: [low, high], or [mean, std] of a gaussian.
-        shape: elements and axes of the values.
+        shape: number of elements, and number of axes of each.
         lowest: lower bound of the new values.
 
     Raises:
-        ValueError: for a range that does not fit the distribution.
+        NameProblem: for a range that does not fit the distribution, or another number of ranges than axes.
     """
 
     def __init__(
@@ -216,6 +216,8 @@ def require_supported(
 ) -> None:
     """Check that every selected element can be randomised.
 
+    The message is the kind of element, `problem` (as in `without kp`) and the names.
+
     Raises:
         NameProblem: with the names of the elements that cannot, and of those that can.
     """
@@ -223,8 +225,8 @@ def require_supported(
     bad = [name for name in element_names(entity, kind, index) if not able[name]]
     if bad:
         can = [name for name, fine in able.items() if fine]
-        message = f"{listing(bad)} {problem}"
-        raise NameProblem(message, f"{hint}; elements of '{entity.name}' that work: {listing(can) or 'none'}")
+        message = f"{kind.lower()} {problem}: {listing(bad)}"
+        raise NameProblem(message, f"{hint}; {kind.lower()} of '{entity.name}' that work: {listing(can)}")
 
 
 def _check(pairs: list[Pair], distribution: str) -> None:

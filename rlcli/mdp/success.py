@@ -1,4 +1,4 @@
-"""Values that conditions of success compare with `at_most` or `at_least`. (num_envs,) each."""
+"""Terms of `success:`, whose values are compared with `at_most` or `at_least`. (num_envs,) each."""
 
 from __future__ import annotations
 

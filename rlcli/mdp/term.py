@@ -1,6 +1,6 @@
 """Base classes of dataclass terms. Their fields are the keys of the YAML, in the order of the fields.
 
-A dataclass takes the fields of its last base first, so the base that selects elements comes last.
+A dataclass takes the fields of its last base first, so the base that has `entity` and the selected elements comes last.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Term:
     env: ManagedEnv
 
     def selected(self) -> Columns | None:
-        """Return the index of the selected elements, or None for a term that selects none."""
+        """Return the index of the selected elements (joints, bodies, ...); None for a term that selects no elements."""
         return next((getattr(self, key) for key in _ELEMENT_KEYS if hasattr(self, key)), None)
 
 

@@ -18,7 +18,7 @@ from rlcli.task import ContactSensor, Entity, Sites
 
 
 def constant(values: Sequence[float] | Tensor, device: torch.device) -> Tensor:
-    """Return numbers of the configuration as a tensor that is made once: a captured step makes no new tensors."""
+    """Return numbers of the configuration as a tensor, made once, because a captured CUDA graph cannot make tensors."""
     return values if isinstance(values, Tensor) else _constant(tuple(values), device)
 
 
@@ -52,7 +52,7 @@ def single(values: Tensor, kind: str) -> Tensor:
         ValueError: if there is not exactly one element.
     """
     if values.shape[1] != 1:
-        raise ValueError(f"needs exactly one {kind}, found {values.shape[1]}; select one")
+        raise ValueError(f"the term needs exactly one {kind}; {values.shape[1]} are selected")
     return values[:, 0]
 
 

@@ -98,7 +98,7 @@ def object_reached_goal(
 ) -> Tensor:
     """End the episode where an object is within `threshold` [m] of the goal of a pose command. (num_envs,)
 
-    The command is one of `entity`.
+    The command gives the goal in the frame of the root of `entity`.
     """
     return length(goal_in_world(entity, command) - object.data.root_pos_w) < threshold
 

@@ -220,13 +220,13 @@ def test_state_dict_restores_curriculum(tmp_path):
 @pytest.mark.parametrize(
     ("address", "message"),
     [
-        ("rewards.alife.weight", "'rewards' has no 'alife'"),
+        ("rewards.alife.weight", "'rewards' has no changeable 'alife'"),
         ("reward.alive.weight", "did you mean 'rewards'"),
-        ("rewards.alive.func", "'rewards.alive' has no 'func'"),
+        ("rewards.alive.func", "'rewards.alive' has no changeable 'func'"),
         ("rewards.alive", "must name a number"),
-        ("rewards.alive.weight.0", "does not exist"),
-        ("sim.dt", "the task has no 'sim'"),
-        ("terminations.time_out.time_out", "has no 'time_out'"),
+        ("rewards.alive.weight.0", "no element '0' there"),
+        ("sim.dt", "the task has no changeable 'sim'"),
+        ("terminations.time_out.time_out", "has no changeable 'time_out'"),
     ],
 )
 def test_curriculum_rejects_unknown_address(tmp_path, address, message):

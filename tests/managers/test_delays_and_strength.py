@@ -110,7 +110,7 @@ def test_effort_limits_of_every_actuator(kind):
 def test_strength_refuses_second_change_of_same_fields():
     weak = "{func: randomize_actuator_strength, mode: reset, range: [0.5, 0.9]}"
     limit = "{func: randomize_effort_limit, mode: reset, range: [0.5, 0.9]}"
-    with pytest.raises(ConfigError, match=r"events\.b change the same fields"):
+    with pytest.raises(ConfigError, match=r"events\.b changes the same fields"):
         make("quadruped-flat", f"events.a={weak}", f"events.b={limit}")
 
 

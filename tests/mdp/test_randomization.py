@@ -527,13 +527,13 @@ BAD = [
     ({"func": "randomize_body_mass", "range": [1.0, -1.0], "distribution": "gaussian"}, "deviation -1 is negative"),
     ({"func": "randomize_body_com", "range": [U, U]}, "2 pairs for 3 axes"),
     ({"func": "randomize_geom_friction", "axes": [3], "range": U}, "geom_friction has no axis 3"),
-    ({"func": "randomize_joint_range", "joints": "slide", "upper": U}, "slide has no limits"),
-    ({"func": "randomize_actuator_gains", "actuators": ["push", "servo"], "kp": U}, "push has no kp"),
+    ({"func": "randomize_joint_range", "joints": "slide", "upper": U}, "joints without limits: slide"),
+    ({"func": "randomize_actuator_gains", "actuators": ["push", "servo"], "kp": U}, "actuators without kp: push"),
     ({"func": "randomize_actuator_gains"}, "no gain is given"),
-    ({"func": "randomize_pd_gains", "stiffness": U}, "has no actuator model"),
-    ({"func": "randomize_effort_limit", "actuators": "spin", "range": U}, "spin has no effort limit"),
+    ({"func": "randomize_pd_gains", "stiffness": U}, "joints without an actuator model: "),
+    ({"func": "randomize_effort_limit", "actuators": "spin", "range": U}, "actuators without an effort limit: spin"),
     ({"func": "randomize_pair_friction", "pairs": "none", "range": U}, "no pair matches 'none'"),
-    ({"func": "reset_joints_within_limits", "joints": ["slide"]}, "no limits to reset within"),
+    ({"func": "reset_joints_within_limits", "joints": ["slide"]}, "joints without limits: slide"),
 ]
 
 

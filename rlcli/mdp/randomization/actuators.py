@@ -48,10 +48,10 @@ class RandomizeActuatorGains(DrawKeys, ActuatorTerm):
         has_kv = [kind in ("position", "velocity") for kind in kinds]
         if self.kp is not None:
             hint = "only position actuators have kp"
-            require_supported(self.entity, "Actuators", self.actuators, has_kp, "has no kp", hint)
+            require_supported(self.entity, "Actuators", self.actuators, has_kp, "without kp", hint)
         if self.kv is not None:
             hint = "only position and velocity actuators have kv"
-            require_supported(self.entity, "Actuators", self.actuators, has_kv, "has no kv", hint)
+            require_supported(self.entity, "Actuators", self.actuators, has_kv, "without kv", hint)
         self._gain = ModelField(self.entity, "actuator_gainprm", self.actuators, [0])
         self._bias = ModelField(self.entity, "actuator_biasprm", self.actuators, [1, 2])
         is_position = torch.tensor(has_kp)[on_host(self.actuators)]
@@ -91,13 +91,13 @@ class RandomizePdGains(DrawKeys, JointTerm):
     def __post_init__(self) -> None:
         pairs = {"stiffness": self.stiffness, "damping": self.damping, "effort_limit": self.effort_limit}
         if not any(pair is not None for pair in pairs.values()):
-            raise NameProblem("the term changes nothing", "give stiffness, damping or effort_limit")
+            raise NameProblem("no range is given, so nothing changes", "give stiffness, damping or effort_limit")
         driven = {
             joint: (model, column) for model in self.entity.actuators for column, joint in enumerate(model.joints)
         }
         supported = [joint in driven for joint in range(len(self.entity.joint_names))]
         hint = "randomize_actuator_gains changes MuJoCo's own actuators"
-        require_supported(self.entity, "Joints", self.joints, supported, "has no actuator model", hint)
+        require_supported(self.entity, "Joints", self.joints, supported, "without an actuator model", hint)
         chosen = column_numbers(self.joints, len(supported))
         self._parts = [(*driven[joint], number) for number, joint in enumerate(chosen)]
         self._draws = []
@@ -135,7 +135,7 @@ class RandomizeEffortLimit(RangeKeys, ActuatorTerm):
             for id, place in zip(ids, modelled, strict=True)
         ]
         hint = "give its joint an effort_limit"
-        require_supported(entity, "Actuators", self.actuators, limited, "has no effort limit", hint)
+        require_supported(entity, "Actuators", self.actuators, limited, "without an effort limit", hint)
         chosen = column_numbers(self.actuators, len(ids))
         own = [row for row, number in enumerate(chosen) if modelled[number] is None]
         self._own = as_index(own, self.env.device)
@@ -179,11 +179,11 @@ class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
         gain, bias = model.actuator_gaintype[ids], model.actuator_biastype[ids]
         is_linear = (gain <= int(mujoco.mjtGain.mjGAIN_AFFINE)) & (bias <= int(mujoco.mjtBias.mjBIAS_AFFINE))
         linear = is_linear.tolist()
-        require_supported(self.entity, "Actuators", self.actuators, linear, "is not linear", "leave out muscles")
+        require_supported(self.entity, "Actuators", self.actuators, linear, "with nonlinear force", "leave out muscles")
         events = getattr(self.env, "config").events.items()  # noqa: B009 (events exist in managed environments only)
         others = [name for name, event in events if event is not None and _changes_actuators(event)]
         if others:
-            raise NameProblem(f"it and events.{others[0]} change the same fields", "remove one of the two")
+            raise NameProblem(f"events.{others[0]} changes the same fields", "remove one of the two events")
         fields = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
         self._fields = [ModelField(self.entity, name, self.actuators, _AXES.get(name)) for name in fields]
         self._draw = Draw(self, self.range, (self._fields[0].shape[0], 1), lowest=0.0)
@@ -197,6 +197,7 @@ class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
 
 
 _AXES = {"actuator_gainprm": [0, 1, 2], "actuator_biasprm": [0, 1, 2]}
+"""Columns of a linear force (constant, length, velocity); the further columns belong to muscles."""
 
 
 def _changes_actuators(event: Any) -> bool:
@@ -230,6 +231,6 @@ class RandomizeModelField(DrawKeys, FieldRandomization):
 
     @staticmethod
     def prepare(spec: mujoco.MjSpec, params: dict[str, Any]) -> None:
-        """Clear the `simple` flag of bodies whose inertial frame changes: it fixes that frame to the body's."""
+        """Clear the `simple` flag of bodies whose inertial frame changes: MuJoCo takes it to be the body's frame."""
         if params["field"] in ("body_ipos", "body_iquat"):
             unset_simple(spec, params, "names")

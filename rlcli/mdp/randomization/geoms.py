@@ -37,7 +37,7 @@ class RandomizeGeomFriction(AxisRandomization, GeomTerm):
 
     @staticmethod
     def prepare(spec: mujoco.MjSpec, params: dict[str, Any]) -> None:
-        """Raise the priority of the chosen geoms above that of all others."""
+        """Raise the priority of the chosen geoms above that of all other geoms."""
         if params["prevail"]:
             chosen = matching_elements(spec.geoms, params, "geoms", "geom")
             names = {geom.name for geom in chosen}
@@ -111,4 +111,4 @@ def _require_sized(entity: Entity, geoms: Columns) -> None:
     types = entity.engine.model.geom_type[entity.geom_ids]
     sized = [int(kind) not in map(int, shapeless) for kind in types]
     hint = "choose boxes, spheres, capsules, ellipsoids or cylinders"
-    require_supported(entity, "Geoms", geoms, sized, "cannot change its size", hint)
+    require_supported(entity, "Geoms", geoms, sized, "whose size cannot change", hint)

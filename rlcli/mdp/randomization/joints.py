@@ -61,8 +61,8 @@ class RandomizeJointRange(DrawKeys, JointTerm):
 
     def __post_init__(self) -> None:
         limited = self.env.engine.model.jnt_limited[self.entity.joint_ids].astype(bool).tolist()
-        hint = "give it a range in scene.entities"
-        require_supported(self.entity, "Joints", self.joints, limited, "has no limits", hint)
+        hint = "give the joint a range in scene.entities"
+        require_supported(self.entity, "Joints", self.joints, limited, "without limits", hint)
         self._field = ModelField(self.entity, "jnt_range", self.joints)
         shape = (self._field.shape[0], 1)
         self._draws = [None if pair is None else Draw(self, pair, shape) for pair in (self.lower, self.upper)]

@@ -120,6 +120,7 @@ def action_l2(env: ManagedEnv) -> Tensor:
 class ActionAccL2:
     """Sum of the squared second differences a - 2 a' + a'' of the policy's action. (num_envs,)
 
+    a: action of this step, a': of the step before, a'': of the step before that; zero before the episode.
     mjlab: `action_acc_l2`.
     """
 
@@ -142,7 +143,7 @@ class ActionAccL2:
             selection.write(self._before, 0.0)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the action before the previous one."""
+        """Return the action that is a'' in the next step."""
         return {"before": self._before.clone()} if self._before is not None else {}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -262,7 +263,7 @@ class VariablePosture(JointTerm):
     """`posture` with different `std` for standing, walking and running. (num_envs,)  mjlab: `variable_posture`.
 
     The commanded speed decides: the horizontal speed [m/s] plus the yaw rate [rad/s] of a velocity command. Below
-    `walking_threshold` the robot stands, from `running_threshold` on it runs. std: as of `posture` [rad].
+    `walking_threshold` the robot stands, from `running_threshold` on it runs. The std values are as in `posture` [rad].
     """
 
     command: Command
@@ -289,9 +290,13 @@ def _deviation(entity: Entity, joints: Joints) -> Tensor:
 
 
 def _per_joint(term: JointTerm, value: float | list[float] | Tensor, key: str = "std") -> Tensor:
-    """Return one value for all joints, or one for each. (1,) or (k,)"""
+    """Return a setting as a tensor: one value for all joints, or one for each. (1,) or (k,)
+
+    Raises:
+        ValueError: for another number of values than joints.
+    """
     count = len(term.entity.data.joint_vel_limits[term.joints])
     values = value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float32, device=term.env.device)
     if values.dim() and len(values) != count:
-        raise ValueError(f"{key} has {len(values)} values; give one, or {count} (one per joint)")
+        raise ValueError(f"{key} has {len(values)} values; give one number, or a list of {count} (one per joint)")
     return values.view(-1)
