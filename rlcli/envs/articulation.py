@@ -19,7 +19,7 @@ class ArticulationView:
     """View of one entity in all environments. Register it with `scene.add`; it works once the simulation runs.
 
     Columns are the hinge and slide joints of the entity, in the order of the model. `indices` selects environments;
-    values then have one row for each. Positions are relative to each environment's origin frame. Unlike in
+    values then have one row for each. Positions are in the world frame of each environment's own simulation. Unlike in
     OmniIsaacGymEnvs, a setter may be called several times in a step, and getters always return current values.
 
     Args:
@@ -89,7 +89,7 @@ class ArticulationView:
         return self._entity.data.joint_pos_limits.expand(self.count, -1, -1)
 
     def get_world_poses(self, indices: Tensor | None = None, clone: bool = True) -> tuple[Tensor, Tensor]:
-        """Return root positions [m] and orientations (w, x, y, z), in each environment's frame. (n, 3), (n, 4)"""
+        """Return root positions [m] and orientations (w, x, y, z), world frame. (n, 3), (n, 4)"""
         data = self._entity.data
         return _rows(data.root_pos_w, indices, clone), _rows(data.root_quat_w, indices, clone)
 
@@ -114,7 +114,7 @@ class ArticulationView:
         Each motor's limit still applies.
 
         Raises:
-            TaskError: for an effort on a joint without a motor.
+            TaskError: for an effort other than 0 on a joint without a motor.
         """
         if self._without_motor and bool(efforts[:, self._without_motor].any()):
             names = listing(self._entity.joint_names[j] for j in self._without_motor)
@@ -131,7 +131,7 @@ class ArticulationView:
         self._command("velocity", velocities, indices)
 
     def set_world_poses(self, positions: Tensor, orientations: Tensor, indices: Tensor | None = None) -> None:
-        """Set root poses of a floating robot, in each environment's frame. (n, 3) [m], (n, 4) w, x, y, z"""
+        """Set root poses of a floating robot, world frame. (n, 3) [m], (n, 4) w, x, y, z"""
         root, _ = self._entity.floating()
         self._set("qpos", torch.cat([positions, orientations], dim=1), indices, slice(root, root + 7))
 

@@ -24,7 +24,7 @@ from rlcli.sim.selection import Selection
 from rlcli.sim.state_cache import SimData
 
 __all__ = ["grid"]
-"""Public names; the others are for `VecEnv`."""
+"""Public names of this module; only `VecEnv` uses the other ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
         streams: index of the random stream of each environment. (num_envs,) int64
 
     Raises:
-        ConfigError: if there is no model in which further names could be looked up.
+        ConfigError: if a model is missing or does not compile, so that further names cannot be looked up.
     """
     task = binder.resolved.task
     for problem in scene.problems:
@@ -100,7 +100,7 @@ def grid(num_envs: int, spacing: float) -> Tensor:
 
 def _make_entities(scene: Scene, binder: Binder, engine: Engine, data: SimData) -> dict[str, Entity]:
     entities = {}
-    for name, config in scene.config.entities.items():  # with those that a direct task has added
+    for name, config in scene.config.entities.items():  # including entities that a direct task has added
         try:
             entities[name] = Entity(name, config, engine, data)
         except NameProblem as problem:
@@ -133,7 +133,7 @@ def _default_state(engine: Engine, entities: dict[str, Entity]) -> dict[str, Ten
         if entity.is_floating:
             _, dof = entity.floating()
             root = entity.data.default_root_state[:1].double().cpu()
-            local = rotate_inverse(root[:, 3:7], root[:, 10:])  # MuJoCo: in the body frame for a free joint
+            local = rotate_inverse(root[:, 3:7], root[:, 10:])  # a free joint's is in the body frame
             linear = root[:, 7:10]
             if entity.config.velocity_point == "com":
                 state = entity.data.default_root_state[:1]

@@ -19,7 +19,7 @@ from rlcli.sim.selection import Field, Selection, in_place
 
 
 class SuccessCondition:
-    """A condition of success, with its value in the newest step and the number of steps since it began to hold."""
+    """Condition of success, with its value in the newest step and the number of steps for which it has held."""
 
     def __init__(self, term: BoundTerm, lengths: Tensor, as_field: Callable[[Tensor], Field], step_dt: float) -> None:
         config, first = term.config, first_value(term)
@@ -32,19 +32,19 @@ class SuccessCondition:
             what = "a truth value; remove at_most and at_least"
             what = what if self.bounded else "a number; add at_most or at_least"
             raise term.error(f"'{config.func}' returns {what}")
-        self.hold_steps = math.ceil(config.hold_s / step_dt - 1e-6)
+        self.hold_steps = math.ceil(config.hold_s / step_dt - 1e-6)  # the slack absorbs rounding
         self.steps = torch.zeros_like(lengths, dtype=torch.float32)
         """Number of consecutive steps in which the condition holds. (num_envs,)"""
         self.field = as_field(self.steps)
         self.value: Field = self.field
 
     def holds(self) -> Field:
-        """Return where the condition holds in the current state, and keep the value. (num_envs,) bool"""
+        """Return where the condition holds in the current state, and store its value. (num_envs,) bool"""
         self.value = self._as_field(self.term.call())
         return self._within(self.value)
 
     def holds_for_tensors(self) -> Tensor:
-        """Return where the condition holds in the current state. (num_envs,) bool"""
+        """Return where the condition holds in the current state, without storing its value. (num_envs,) bool"""
         held: Tensor = self._within(self.term.call())
         return held
 
@@ -57,10 +57,10 @@ class SuccessCondition:
         """Return name, newest value, bound and how long the condition has held."""
         bound = f" {float(self.value[env_id]):.3g}, {bound_text(self.term.config.model_dump())}" if self.bounded else ""
         held = float(self.steps[env_id]) * step_dt
-        return f"{self.name}{bound}: " + (f"holds since {held:.1f} s" if held else "fails")
+        return f"{self.name}{bound}: " + (f"has held for {held:.1f} s" if held else "fails")
 
     def count(self) -> None:
-        """Count a step."""
+        """Count a step where the condition holds, and set the count to 0 where it does not."""
         self.field += 1.0
         self.field *= self.holds()
 
@@ -82,7 +82,7 @@ class EpisodeCounters(TensorState):
         self.conditions: list[SuccessCondition] = []
 
     def attach(self, engine: Engine) -> None:
-        """Make the fields, once the engine exists."""
+        """Make the fields (the form in which the engine's selections access tensors), once the engine exists."""
         self._as_field = engine.as_field
         self.id_field, self.length_field = engine.as_field(self.ids), engine.as_field(self.lengths)
         self.index_field = engine.as_field(self.indices)
@@ -102,17 +102,17 @@ class EpisodeCounters(TensorState):
         }
 
     def advance(self) -> None:
-        """Count a step."""
+        """Count a step in every environment."""
         self.length_field += 1
         self._common_step += 1
 
     def count_success(self) -> None:
-        """Count a step where a condition of success holds, and restart its count where it does not."""
+        """Count a step for each condition of success where it holds, and set its count to 0 where it does not."""
         for condition in self.conditions:
             condition.count()
 
     def succeeded(self, ended: Selection, timed_out: Tensor) -> dict[str, Any]:
-        """Return `success`, `conditions` and `condition_values` of the ended episodes. timed_out (n,)"""
+        """Return the fields `success`, `conditions` and `condition_values` of `Episodes`. timed_out (n,) bool"""
         if not self.conditions:
             return {"success": None}
         held = {each.name: ended.read_view(each.field) >= each.hold_steps for each in self.conditions}

@@ -1,5 +1,6 @@
-"""`python -m rlcli.envs.describe_plugins GROUP FILE NAME...`: build tasks and write their descriptions.
+"""`python -m rlcli.envs.describe_plugins GROUP FILE NAME...`: load tasks, trainers or formats, and describe them.
 
+One line of JSON per name is appended to FILE.
 `--index DISTRIBUTION` prints the `index.json` that a distribution ships for `list-tasks`.
 """
 
@@ -42,7 +43,7 @@ def describe(name: str) -> Details:
 
 
 def try_trainer(name: str) -> Details:
-    """Load a trainer's spec, the models of its settings and its class.
+    """Load a trainer's spec, the models of its settings and its class, and return its description.
 
     Raises:
         RlcliError: if one of them cannot be loaded.
@@ -55,7 +56,7 @@ def try_trainer(name: str) -> Details:
 
 
 def try_format(name: str) -> Details:
-    """Load a format's spec, and every part that it names.
+    """Load a format's spec and every part that it names, and return its description.
 
     Raises:
         RlcliError: if one of them cannot be loaded.
@@ -72,7 +73,7 @@ _LOADERS = {registry.TASKS: describe, registry.TRAINERS: try_trainer, registry.F
 
 
 def main(arguments: list[str]) -> None:
-    """Append one line of JSON to a file for each name, or print the index of a distribution."""
+    """Append a description of each named plugin to a file, or print the index of a distribution."""
     parser = argparse.ArgumentParser(prog="python -m rlcli.envs.describe_plugins", description=__doc__)
     parser.add_argument("--index", metavar="DISTRIBUTION", help="print the index.json of this distribution")
     parser.add_argument("group", nargs="?", choices=_LOADERS)

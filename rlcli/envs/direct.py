@@ -29,12 +29,13 @@ class DirectTask:
     """Base class of a direct task. The framework owns the buffers; the hooks fill them.
 
     Order of a step: `pre_physics_step`, physics, `progress_buf += 1`, `get_observations`, `get_states`,
-    `calculate_metrics`, `is_done`. Then `reset` (or `reset_idx`) runs for the environments whose episode ended, and
-    `get_observations` and `get_states` run again for them.
+    `calculate_metrics`, `is_done`. If episodes ended, `reset` (or `reset_idx`) runs for their environments. Then
+    `get_observations` and `get_states` run again, for all environments, but only the rows of those environments are
+    used.
     """
 
     num_observations: ClassVar[int]
-    """Number of columns of obs_buf."""
+    """Number of columns of obs_buf, the observations of the policy."""
     num_actions: ClassVar[int]
     """Number of columns of the action."""
     num_states: ClassVar[int] = 0
@@ -44,9 +45,9 @@ class DirectTask:
     observation_units: ClassVar[tuple[str, ...]] = ()
     """Units of the columns of obs_buf."""
     action_names: ClassVar[tuple[str, ...]] = ()
-    """Names of what the columns of the action drive, for messages and exports."""
+    """What each column of the action drives, by name, for messages and exports."""
     action_limits: tuple[tuple[float, float], ...] = ()
-    """Lowest and highest value of each column: the action space for other libraries; empty: +-1."""
+    """Lowest and highest value of each column of the action: the action space for other libraries; empty: +-1."""
     motors: ClassVar[bool] = True
     """Whether every joint without an actuator gets a motor, so that the task can set any effort."""
     Params: type[StrictModel] = StrictModel
@@ -62,11 +63,11 @@ class DirectTask:
         self.max_episode_length = env.max_episode_length
         n = self.num_envs
         self.obs_buf = torch.zeros(n, self.num_observations, device=self.device)
-        """(num_envs, num_observations)"""
+        """Observations of the policy. (num_envs, num_observations)"""
         self.states_buf = torch.zeros(n, self.num_states, device=self.device)
-        """(num_envs, num_states)"""
+        """Observations of the critic. (num_envs, num_states)"""
         self.rew_buf = torch.zeros(n, device=self.device)
-        """(num_envs,)"""
+        """Rewards of this step. (num_envs,)"""
         self.reset_buf = torch.ones(n, dtype=torch.int64, device=self.device)
         """1 where an episode ends, from `is_done` to the end of the next `pre_physics_step`. (num_envs,) int64"""
         self.progress_buf = torch.zeros(n, dtype=torch.int64, device=self.device)
@@ -94,8 +95,8 @@ class DirectTask:
         """Write start states; the selected environments are in their default state.
 
         Take random numbers from the selection and write through it: `entity.write_joint_positions(selection, ...)`,
-        `selection.write(...)`. A GPU captures this hook as part of the step. A task defines this hook or `reset_idx`,
-        not both.
+        `selection.write(...)`. On a GPU this hook is captured in the CUDA graph of the step. A task defines this hook
+        or `reset_idx`, not both.
         """
 
     def reset_idx(self, env_ids: Tensor) -> None:
@@ -145,8 +146,9 @@ class DirectTask:
     def selection(self, mask: Tensor, name: str) -> Selection | None:
         """Return a selection of the environments where `mask` (num_envs,) is true, for random numbers in an episode.
 
-        Return None if there is no such environment. They depend only on the seed, the environment, its episode, the
-        step in that episode and `name`. A GPU never returns None, because a test of the mask would force a host sync.
+        Return None if there is no such environment. The random numbers depend only on the seed, the environment, its
+        episode, the step in that episode and `name`. A GPU never returns None, because a test of the mask would force a
+        host sync.
         """
         env = self.env
         counters = env.episode_index * (self.max_episode_length + 1) + env.episode_length_buf
@@ -158,7 +160,7 @@ class DirectEnv(VecEnv):
     """Environment of a `DirectTask`."""
 
     not_recorded: ClassVar[str | None] = None
-    """Reason why a GPU cannot capture the steps of this class; None: it can."""
+    """Reason why a step of this class cannot be captured in a CUDA graph; None: it can be captured."""
 
     def _prepare_scene(self, scene: Scene) -> None:
         task_class = self._task_class()
@@ -210,7 +212,7 @@ class DirectEnv(VecEnv):
         self._final_obs = torch.zeros_like(task.obs_buf)
         self._final_states = torch.zeros_like(task.states_buf)
         self._obs_current = False
-        self._obs_restored = False  # a loaded state has the observations after resets already
+        self._obs_restored = False  # after a load, the buffers already have the observations after resets
         self._episode_causes: dict[str, Tensor] = {}
         self._observation_columns = [f"obs_buf[{i}]" for i in range(task.num_observations)]
         if len(task.observation_names) == task.num_observations:
@@ -250,7 +252,7 @@ class DirectEnv(VecEnv):
                 yield name, value
 
     def metric_values(self) -> dict[str, Tensor]:
-        """Return the task's `extras`: values and tensors."""
+        """Return the numbers and the tensors of the task's `extras`, by the name of their metric."""
         return {f"Task/{name}": value for name, value in self._extra_tensors()}
 
     def step_metrics(self) -> dict[str, Tensor]:
@@ -409,7 +411,7 @@ class DirectEnv(VecEnv):
 
 
 _BUFFERS = ("obs_buf", "states_buf", "rew_buf", "reset_buf", "progress_buf")
-"""Buffers that the loop reads. Only their shapes are checked on load: other attributes may change their shapes."""
+"""Buffers that the environment loop reads. Their shapes are checked on load; those of other attributes may change."""
 
 
 def _symmetric(bound: float | None) -> tuple[float, float] | None:

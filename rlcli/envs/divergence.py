@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class DivergenceGuard:
-    """Checks and recovery of one vectorised environment."""
+    """Checks of one vectorised environment for divergence and values that are not finite, and recovery."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
@@ -52,10 +52,11 @@ class DivergenceGuard:
         self._any_quarantined = bool(self.quarantined.any())
 
     def check(self) -> None:
-        """Raise an error that a device has found in the steps since the last call; a CPU raises it in the step.
+        """Raise the error that a GPU has recorded in the steps since the last call; on a CPU the step itself raises it.
 
         Raises:
-            DivergedError: as `VecEnv.step`, or if the device had no memory left for contacts.
+            DivergedError: for an action, observation or reward that was not finite, or for more contacts or constraints
+                than the GPU engine has room for.
         """
         engine = self._env.engine
         not_finite = engine.report_nonfinite()

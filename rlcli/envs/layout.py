@@ -44,7 +44,9 @@ class Layout:
     observations: dict[str, tuple[TermLayout, ...]]
     actions: tuple[TermLayout, ...]
     step_dt: float
+    """Control period [s]."""
     dt: float
+    """Period of a physics step [s]."""
     decimation: int
 
     def size(self, group: str = "policy") -> int:

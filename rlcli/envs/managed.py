@@ -1,4 +1,4 @@
-"""Manager-based workflow: each part of the MDP is a list of small terms, run by a manager."""
+"""Manager-based workflow: each part of the MDP is a list of small terms, which a manager calls."""
 
 from __future__ import annotations
 
@@ -33,7 +33,10 @@ from rlcli.sim.saved_tensors import require_matching_tensors, substate
 from rlcli.sim.selection import Field, Selection
 
 _STATELESS = ("functools", "rlcli.mdp.")
-"""Modules of terms whose episodes do not depend on earlier ones."""
+"""Prefixes of the modules of terms that do not make an episode depend on earlier ones.
+
+Function terms are objects of `functools`: `partial(function, env, ...)`.
+"""
 _UNIT = re.compile(r"\[([^\]]+)\]")
 """Pattern of the unit in the first line of a term's docstring."""
 

@@ -26,7 +26,7 @@ class StepObserver:
         """Run on the state from which rewards and terminations are computed, before any reset."""
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
-        """Run when simulations have diverged, while `engine.trace` still has their last calls.
+        """Run when simulations have diverged, while `engine.recorded_calls` still returns the calls before that.
 
         Args:
             found: the first divergences.

@@ -1,4 +1,4 @@
-"""Part of the environments of a task that one process steps."""
+"""Shards: parts of the environments of a task, each of which one process steps."""
 
 from __future__ import annotations
 

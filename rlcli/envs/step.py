@@ -34,9 +34,9 @@ class Episodes:
     metrics: dict[str, Tensor] = field(default_factory=dict)
     """`command/metric` -> its mean over the episode. (n,) each"""
     mask: Tensor | None = None
-    """Rows that are valid, on a GPU, which gives a row for every environment; None: all rows. (num_envs,) bool
+    """Which rows are valid, on a GPU, whose tensors have a row for every environment; None: all. (num_envs,) bool
 
-    The rows hold until the next step.
+    The tensors are overwritten by the next step.
     """
 
     def ended(self) -> Episodes:
@@ -59,7 +59,7 @@ class StepResult:
     obs: dict[str, Tensor]
     """Group -> observations; of the new episode where one has just begun. (num_envs, d) float32"""
     reward: Tensor
-    """(num_envs,) float32"""
+    """Reward of the step. (num_envs,) float32"""
     terminated: Tensor
     """Where the task ended the episode: the value of its last state is 0. (num_envs,) bool"""
     truncated: Tensor
@@ -67,8 +67,8 @@ class StepResult:
     final_obs: dict[str, Tensor] | None
     """Last observations of the episodes that end, for all environments; None if there is certainly no valid row.
 
-    A row is valid where an episode ended (with `final_obs_of = "truncated"`: where it timed out). The tensors hold
-    until the next step.
+    A row is valid where an episode ended (with `final_obs_of = "truncated"`: where it timed out). The tensors
+    are overwritten by the next step.
     """
     episodes: Episodes | None
     """Episodes that ended; None if certainly none did."""
@@ -81,9 +81,9 @@ class StepRecord:
     obs: Mapping[str, Tensor]
     """Group -> observations from which the action was computed. (num_envs, d) float32"""
     action: Tensor
-    """(num_envs, a) float32"""
+    """Action of the policy. (num_envs, a) float32"""
     reward: Tensor
-    """(num_envs,) float32"""
+    """Reward of the step. (num_envs,) float32"""
     reward_terms: Tensor
     """Weighted value of each term of `reward_names`. (terms, num_envs) float32"""
     episodes: Episodes | None

@@ -106,6 +106,7 @@ class VecEnv(Workflow):
         self.origins = built.origins
         """Start position of each environment in its world: zeros without a terrain. (num_envs, 3) [m]"""
         self.env_origins = grid(distinct, self.config.scene.env_spacing).to(self.device)[streams]
+        """Position of each environment on a grid, for plugins whose tasks expect one common world. (num_envs, 3) [m]"""
         self._counters.attach(self.engine)
         self._bind_terms()
         success = self._binder.bind_all("success")
@@ -202,7 +203,7 @@ class VecEnv(Workflow):
     def _end_episodes(
         self, terminated: Tensor, truncated: Tensor
     ) -> tuple[Selection | None, dict[str, Tensor] | None, Episodes | None]:
-        """End episodes; return None for each of the three if none ends.
+        """End the episodes that are terminated or truncated; return None three times if none ends.
 
         Returns:
             A selection of the environments whose episode ends, their last observations (None if not wanted), and a
@@ -254,7 +255,7 @@ class VecEnv(Workflow):
             sensor.reset(selection)
 
     def on_moved(self, selection: Selection) -> None:
-        """Note that a state was written between two steps: what derives from it is computed again."""
+        """Update what derives from the state of the selected environments, after a write to it between two steps."""
         self.sim.on_moved(selection)
         for sensor in self.sensors.values():
             sensor.on_moved(selection)
@@ -281,7 +282,7 @@ class VecEnv(Workflow):
         return self
 
     def success_conditions(self, env_id: int) -> list[str]:
-        """Return each condition of success in one environment, as in `speed 0.21, at most 0.3: holds since 0.4 s`."""
+        """Return each condition of success in one environment, as in `speed 0.21, at most 0.3: has held for 0.4 s`."""
         return [condition.describe(env_id, self.step_dt) for condition in self._counters.conditions]
 
     def compute_success(self) -> Tensor | None:

@@ -29,14 +29,14 @@ class Workflow(Environment):
 
     @abstractmethod
     def _prepare_scene(self, scene: Scene) -> None:
-        """Complete the scene before it is compiled."""
+        """Add what the workflow needs, such as actuators, to the scene before it is compiled."""
 
     def _bind_terms(self) -> None:
         """Resolve the names of the configuration, once entities exist."""
 
     @abstractmethod
     def _build_workflow(self) -> None:
-        """Build the managers, or start the task."""
+        """Build the managers of a manager-based task, or finish the setup of a direct task."""
 
     @abstractmethod
     def _make_layout(self) -> Layout:

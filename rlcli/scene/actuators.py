@@ -52,12 +52,12 @@ class ActuatorModel(TensorState):
         self._controls = as_index(controls, device)
         k = len(self.joints)
         self.stiffness = values_by_joint(config.stiffness, names).to(device).expand(n, -1).clone()
-        """(num_envs, k) [N/m or N m/rad]"""
+        """Stiffness of each joint's controller. (num_envs, k) [N/m or N m/rad]"""
         self.damping = values_by_joint(config.damping, names).to(device).expand(n, -1).clone()
-        """(num_envs, k) [N s/m or N m s/rad]"""
+        """Damping of each joint's controller. (num_envs, k) [N s/m or N m s/rad]"""
         limit = torch.inf if config.effort_limit is None else config.effort_limit
         self.effort_limit = values_by_joint(limit, names).to(device).expand(n, -1).clone()
-        """(num_envs, k) [N or N m]"""
+        """Effort limit of each joint. (num_envs, k) [N or N m]"""
         self._saturation_effort, speed = config.saturation_effort, config.velocity_limit
         self._velocity_limit = values_by_joint(speed, names).to(device) if isinstance(speed, Mapping) else speed
         self.targets = torch.zeros(n, 3, k, device=device)
@@ -132,7 +132,7 @@ class ActuatorModel(TensorState):
 
 
 class JointCommand:
-    """Writer of commands of one kind to some joints, which MuJoCo's actuators or actuator models drive.
+    """Writer of commands of one kind to joints that MuJoCo's own actuators or actuator models drive.
 
     Args:
         entity: the robot.
@@ -149,11 +149,11 @@ class JointCommand:
         native = dict(entity.actuators_of(kind))
         missing = [entity.joint_names[c] for c in columns if c not in modelled and c not in native]
         if missing:
-            raise NameProblem(f"no {kind} actuator drives {', '.join(missing)}; set actuator: {kind}")
+            raise NameProblem(f"no {kind} actuator drives {', '.join(missing)}; set actuator: {kind} in scene.entities")
         self.actuators = [None if c in modelled else native[c] for c in columns]
         """Id of the MuJoCo actuator of each column; None where an actuator model drives the joint."""
         self.sinks = [f"{entity.name}/{entity.joint_names[c]} {kind}" if c in modelled else native[c] for c in columns]
-        """Target of each column, by which two terms that write to the same joint are detected."""
+        """Actuator or joint to which each column writes; two terms must not have the same entry."""
         sources = [i for i, c in enumerate(columns) if c not in modelled]
         controls = [native[columns[i]] for i in sources]
         gear = torch.tensor(model.actuator_gear[controls, 0], dtype=torch.float32, device=device)

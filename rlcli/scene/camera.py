@@ -31,6 +31,7 @@ _DISABLED_EFFECTS = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_HAZE", "mjRND_FO
 _VISIBLE_CATEGORIES = int(mujoco.mjtCatBit.mjCAT_STATIC | mujoco.mjtCatBit.mjCAT_DYNAMIC)
 _INTEGRATION_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _MAX_GEOMS = 10_000
+"""Largest number of geoms in an image."""
 _JOIN_TIMEOUT = 5.0
 """Longest time to wait for a thread to end [s]."""
 
@@ -252,10 +253,11 @@ def make_cameras(specs: Mapping[str, CameraSensorSpec], engine: Engine) -> dict[
 
 
 _Orders = queue.SimpleQueue[tuple[Callable[[CameraRenderer], None], Future[None]] | None]
+"""Functions that a rendering thread calls, each with the future of its result; None ends the thread."""
 
 
 def _render_orders(model: mujoco.MjModel, width: int, height: int, orders: _Orders, ready: Future[None]) -> None:
-    """Run the main loop of a thread: OpenGL requires that one thread makes, uses and frees a context."""
+    """Run the orders in a thread of their own: OpenGL requires that one thread makes, uses and frees a context."""
     try:
         renderer = CameraRenderer(model, width, height)
     except BaseException as error:

@@ -68,7 +68,7 @@ class Entity:
         self._targets: dict[tuple[int, ...], tuple[Columns, Field, Columns]] = {}
         self.data = EntityData(self, sim)
         self.actuators: list[ActuatorModel] = []
-        """Actuator models of its joints; they are made after the entity."""
+        """Actuator models of its joints; they are added after the entity is made."""
 
     @property
     def is_floating(self) -> bool:
@@ -174,7 +174,9 @@ class Entity:
             TaskError: if the root is fixed to the world.
         """
         if self.root_qpos is None or self.root_dof is None:
-            raise TaskError(f"entity '{self.name}' is fixed to the world; add a <freejoint/> to its MJCF")
+            raise TaskError(
+                f"entity '{self.name}' has no free root; add a <freejoint/> to its MJCF (shape: `free: true`)"
+            )
         return self.root_qpos, self.root_dof
 
     def _index(self, positions: Sequence[int]) -> Columns:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class EntityData:
-    """State of an entity in every environment, in float32; positions are in the environment's frame.
+    """State of an entity in every environment, in float32. The world frame is that of the environment's own simulation.
 
     Do not write to the attributes: most are live views of the state. Set the state with the methods of `Entity`.
     """
@@ -71,7 +71,7 @@ class EntityData:
         self.default_joint_vel = velocity.expand(num_envs, -1).clone()
         """Default joint velocities. (num_envs, k) [m/s or rad/s]"""
         self.default_root_state = default_root_state(entity).to(device).expand(num_envs, -1).clone()
-        """Default root pose and velocity: position, quat (w, x, y, z), linear, angular. (num_envs, 13)"""
+        """Default root pose and velocity, world frame: position, quat (w, x, y, z), linear, angular. (num_envs, 13)"""
         self.joint_vel_limits = joint_speed_limits(entity).to(device)
         """Speed limit of each joint, `velocity_limit`; infinite for a joint without one. (k,) [m/s or rad/s]"""
         self.has_speed_limits = bool(self.joint_vel_limits.isfinite().any())
@@ -161,14 +161,14 @@ class EntityData:
 
     @property
     def root_pos_w(self) -> Tensor:
-        """Root position. (num_envs, 3) [m]"""
+        """Root position, world frame. (num_envs, 3) [m]"""
         if self._entity.mocap >= 0:
             return self._sim.derived_field("mocap_pos")[:, self._entity.mocap]
         return self.default_root_state[:, :3] if self._free_root is None else self._free_root[0]
 
     @property
     def root_quat_w(self) -> Tensor:
-        """Root orientation (w, x, y, z). (num_envs, 4)"""
+        """Root orientation (w, x, y, z), world frame. (num_envs, 4)"""
         if self._entity.mocap >= 0:
             return self._sim.derived_field("mocap_quat")[:, self._entity.mocap]
         return self.default_root_state[:, 3:7] if self._free_root is None else self._free_root[1]
@@ -218,13 +218,13 @@ class EntityData:
 
     @property
     def gravity_w(self) -> Tensor:
-        """Gravity, with its randomisation. (num_envs, 3) [m/s^2]"""
+        """Gravity, with its randomisation, world frame. (num_envs, 3) [m/s^2]"""
         own = self._entity.engine.expanded("opt.gravity")
         return self._gravity if own is None else self._once("gravity_w", lambda: own.float().view(-1, 3))
 
     @property
     def down_w(self) -> Tensor:
-        """Direction of gravity, length 1; -z where gravity is 0. (num_envs, 3)"""
+        """Direction of gravity, world frame, length 1; -z where gravity is 0. (num_envs, 3)"""
         if self._entity.engine.expanded("opt.gravity") is None:
             return self._down
         return self._once("down_w", lambda: _direction(self.gravity_w))
@@ -273,17 +273,17 @@ class EntityData:
 
     @property
     def body_pos_w(self) -> Tensor:
-        """Body positions. (num_envs, bodies, 3) [m]"""
+        """Body positions, world frame. (num_envs, bodies, 3) [m]"""
         return self._sim.derived_field("xpos")[:, self._body_index]
 
     @property
     def body_quat_w(self) -> Tensor:
-        """Body orientations (w, x, y, z). (num_envs, bodies, 4)"""
+        """Body orientations (w, x, y, z), world frame. (num_envs, bodies, 4)"""
         return self._sim.derived_field("xquat")[:, self._body_index]
 
     @property
     def body_com_pos_w(self) -> Tensor:
-        """Centres of mass of the bodies. (num_envs, bodies, 3) [m]"""
+        """Centres of mass of the bodies, world frame. (num_envs, bodies, 3) [m]"""
         return self._sim.derived_field("xipos")[:, self._body_index]
 
     @property
@@ -368,12 +368,12 @@ class EntityData:
 
     @property
     def site_pos_w(self) -> Tensor:
-        """Site positions. (num_envs, sites, 3) [m]"""
+        """Site positions, world frame. (num_envs, sites, 3) [m]"""
         return self._sim.derived_field("site_xpos")[:, self._site_index]
 
     @property
     def site_quat_w(self) -> Tensor:
-        """Site orientations (w, x, y, z). (num_envs, sites, 4)"""
+        """Site orientations (w, x, y, z), world frame. (num_envs, sites, 4)"""
         return self._once(
             "site_quat_w",
             lambda: multiply(self._sim.derived_field("xquat")[:, self._site_body], self._site_quat),
@@ -425,8 +425,8 @@ class EntityData:
     def _body_force(self, name: str) -> Tensor:
         if not self._computes_body_forces:
             raise ValueError(
-                "reads accelerations or forces of bodies, which MuJoCo computes only if a sensor needs them: mark the"
-                " term with rlcli.task.reads_body_forces, or add an accelerometer, force or torque sensor to the MJCF"
+                "the term reads accelerations or forces of bodies, which MuJoCo computes only if a sensor needs them;"
+                " mark it with rlcli.task.reads_body_forces, or add an accelerometer, force or torque sensor to the MJCF"
             )
         return self._sim.derived_field(name)
 

@@ -31,7 +31,7 @@ def add_materials(spec: mujoco.MjSpec) -> None:
 
 
 def add_lights(spec: mujoco.MjSpec, lights: LightsConfig) -> None:
-    """Add ambient light (dome) and directional light (distant)."""
+    """Add ambient light (dome) and directional light (distant); the full strength is an intensity of 1000."""
     headlight = spec.visual.headlight
     if lights.dome is not None:
         strength = min(1.0, lights.dome.intensity / 1000.0)

@@ -64,7 +64,7 @@ def default_root_state(entity: Entity) -> Tensor:
     """Return the default root pose and velocity, from the MJCF and the entity's configuration. (13,)
 
     Raises:
-        NameProblem: if `init` has a velocity and the root is fixed.
+        NameProblem: if `init` has a velocity of the root, but the root has no free joint.
     """
     model = entity.engine.model
     if entity.root_qpos is not None:
@@ -76,5 +76,5 @@ def default_root_state(entity: Entity) -> Tensor:
         pose = np.concatenate([model.body_pos[body], model.body_quat[body]])
     velocity = [*entity.config.init.lin_vel, *entity.config.init.ang_vel]
     if entity.root_qpos is None and any(velocity):
-        raise NameProblem(f"entity '{entity.name}' has no free joint at its root", "remove lin_vel and ang_vel")
+        raise NameProblem(f"entity '{entity.name}' has no free joint at its root", "remove lin_vel and ang_vel of init")
     return torch.tensor([*pose, *velocity], dtype=torch.float32)

@@ -28,7 +28,7 @@ class ActuatorNeed:
 
 
 class SceneJoints:
-    """Hinges and slides of the entities that have been attached to a scene.
+    """Writer of joint settings and actuators into a scene, for the hinges and slides of its entities.
 
     Args:
         spec: specification of the scene.
@@ -42,7 +42,7 @@ class SceneJoints:
         self._problems = problems
 
     def add_actuators(self, needs: Iterable[ActuatorNeed]) -> None:
-        """Add the required actuators that the MJCF does not have."""
+        """Add the actuators that action terms need and the MJCF does not have."""
         for need in needs:
             if need.entity not in self._entities:
                 continue  # binding the term reports an unknown entity
@@ -86,7 +86,9 @@ class SceneJoints:
             path = ("scene", "entities", name, "actuators", key, "joints")
             for joint in [names[position] for position in self._match(path, config.joints, names)]:
                 if joint in owner:
-                    self._problems.append(SceneProblem(path, f"joint '{joint}' is also in '{owner[joint]}'; keep one"))
+                    self._problems.append(
+                        SceneProblem(path, f"joint '{joint}' is in '{owner[joint]}', too; remove one")
+                    )
                     continue
                 owner[joint] = key
                 target = f"{name}/{joint}"
@@ -172,7 +174,7 @@ def _actuator_kind(actuator: Any) -> str:
         return "other"
     if bias == int(mujoco.mjtBias.mjBIAS_NONE):
         return "motor"
-    if bias == int(mujoco.mjtBias.mjBIAS_AFFINE):
+    if bias == int(mujoco.mjtBias.mjBIAS_AFFINE):  # biasprm: 0, -kp, -kv (position); 0, 0, -kv (velocity)
         if biases[1] == -gain != 0:
             return "position"
         if biases[1] == 0 and biases[2] == -gain != 0:
@@ -191,7 +193,7 @@ def _override(joint: mujoco.MjsJoint, change: JointConfig, *, degrees: bool) -> 
             else:
                 setattr(joint, attribute, value)
     if change.range is not None:
-        # a spec keeps angles in the unit of its MJCF; ours are in radians
+        # an MjSpec keeps angles in the unit of its MJCF; those of the configuration are in radians
         unit = 180.0 / np.pi if degrees and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
         joint.range = [unit * end for end in change.range]
         joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE

@@ -54,7 +54,7 @@ class JointEfforts:
         self._clamped = (self._control_limited & ~self._is_motor)[:, None]
 
     def without_limits(self) -> Tensor:
-        """Return the efforts before limits. (num_envs, k)"""
+        """Return the effort of the actuators on each joint before limits. (num_envs, k) [N or N m]"""
         entity = self._entity
         gear, q, v = self._gear, entity.data.joint_pos[:, self._columns], entity.data.joint_vel[:, self._columns]
         gain, bias = self._current("actuator_gainprm"), self._current("actuator_biasprm")
@@ -67,7 +67,7 @@ class JointEfforts:
         return efforts
 
     def removed_by_limits(self) -> Tensor:
-        """Return by how much the limits reduce the efforts. (num_envs, k)"""
+        """Return by how much the limits reduce each joint's effort, >= 0. (num_envs, k) [N or N m]"""
         data = self._entity.data
         excess = (data.computed_effort.abs() - data.joint_effort_limits).clamp_(min=0.0)
         for model in self._entity.actuators:
@@ -75,7 +75,7 @@ class JointEfforts:
         return excess
 
     def limits(self) -> Tensor:
-        """Return the largest efforts. (1 or num_envs, k)"""
+        """Return the largest effort on each joint; infinite without a limit. (1 or num_envs, k) [N or N m]"""
         gain, force = self._current("actuator_gainprm")[..., 0], self._current("actuator_forcerange")
         largest = torch.where(self._force_limited, force.abs().amax(dim=-1), math.inf)
         control = (gain[..., None] * self._current("actuator_ctrlrange")).abs().amax(dim=-1)

@@ -7,7 +7,7 @@ import math
 from rlcli.safe_text import float_or_nan
 
 ENDLESS = 1e18
-"""Largest number of copies and of cost that is counted: products of a few of them stay finite."""
+"""Upper bound of counts of copies and of costs, so that products of a few of them stay finite."""
 
 
 def element_cost(name: str, attributes: dict[str, str]) -> float:

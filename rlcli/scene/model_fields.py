@@ -61,6 +61,7 @@ class ModelField:
         engine = entity.engine
         self.name = name
         self.derives = name in DERIVED_FROM
+        """Whether MuJoCo derives constants from the field."""
         ids = [0] if elements is None else element_ids(entity, name, elements)
         rows = model_rows(engine, name)
         self.width = rows.shape[1]

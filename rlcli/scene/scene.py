@@ -1,4 +1,4 @@
-"""Scene under construction: from its configuration to a compiled MuJoCo model."""
+"""Construction of a scene: from its configuration to a compiled MuJoCo model."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Scene:
     """Scene under construction; a direct task's `set_up_scene` may change `spec` until it is compiled."""
 
     def __init__(self, config: SceneConfig, sim: SimConfig, root: Path, *, installed: bool = False) -> None:
-        quiet_mujoco()  # attaching a model whose options differ from the scene's logs each of them
+        quiet_mujoco()  # when a model is attached, MuJoCo logs each option that differs from the scene's
         self.config = config.model_copy(update={"entities": dict(config.entities)})
         self.sim = sim
         self.root = root.resolve()

@@ -82,8 +82,8 @@ class SensorBuilder:
             solid = [body for body in self._bodies(config.entity, ".*", path, "bodies") if self._can_touch(body)]
             allowed = listing([b.removeprefix(prefix) for b in solid]) if solid else "none"
             found = listing([body.removeprefix(prefix) for body in bodies])
-            message = f"no geom of {found} can touch anything"
-            raise SceneProblem((*path, "bodies"), message, f"bodies with such a geom: {allowed}")
+            message = f"no geom of {found} can have contacts"
+            raise SceneProblem((*path, "bodies"), message, f"bodies whose geoms can have contacts: {allowed}")
         sensors: list[list[str]] = []
         for slot, body in enumerate(bodies):
             sensors.append([])
@@ -93,7 +93,7 @@ class SensorBuilder:
                     sensor.objtype, sensor.objname = other
                 # the force of a contact sensor acts on the second of its two elements
                 sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, body
-                sensor.intprm[:3] = [_FOUND_AND_FORCE, _NET_FORCE, 1]
+                sensor.intprm[:3] = [_FOUND_AND_FORCE, _NET_FORCE, 1]  # data, reduction, number of contacts
                 sensors[-1].append(sensor.name)
         return ContactSensorSpec(config, [body.removeprefix(prefix) for body in bodies], sensors)
 

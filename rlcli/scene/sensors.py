@@ -104,7 +104,7 @@ class ContactSensor(TensorState):
 
     def _measure(self, sensordata: Tensor) -> tuple[Tensor, Tensor]:
         """Return net forces (rows, k, 3), and whether each body is in contact (rows, k)."""
-        values = torch.unflatten(sensordata[:, self._columns], 1, (-1, self._others, 4))
+        values = torch.unflatten(sensordata[:, self._columns], 1, (-1, self._others, 4))  # count, force
         total = values[:, :, 0]
         for other in range(1, self._others):
             total = total + values[:, :, other]

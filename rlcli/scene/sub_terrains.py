@@ -39,6 +39,7 @@ class PatchSite:
     difficulty: float
     """Difficulty in [0, 1]."""
     random: np.random.Generator
+    """Generator of the patch's random numbers."""
 
     def flat(self) -> Heights:
         """Return heights of 0."""
@@ -58,7 +59,7 @@ class PatchSite:
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """Finished patch."""
+    """Heights and blocks of a generated patch."""
 
     heights: Heights
     """Heights of its surface, blocks included; 0 along the edges [m]."""
@@ -73,7 +74,7 @@ def make_patch(config: schema.PatchConfig, site: PatchSite) -> Patch:
         return Patch(_with_zero_edges(heights_or_blocks))
     heights = site.flat()
     for block in heights_or_blocks:
-        _raise_to_block(heights, site, block)
+        _cover_with_block(heights, site, block)
     return Patch(_with_zero_edges(heights), tuple(heights_or_blocks) if config.boxes else ())  # type: ignore[attr-defined]
 
 
@@ -119,8 +120,8 @@ def _obstacles(config: schema.ObstaclesPatchConfig, site: PatchSite) -> Heights:
         edges = draw.uniform(*config.width, 2)
         low = draw.uniform(0.0, 1.0, 2) * (np.array(site.size) - edges)
         top = site.at_difficulty(config.height) * draw.choice([-1.0, -0.5, 0.5, 1.0])
-        _raise_to_block(heights, site, Block(tuple(low), tuple(low + edges), top))
-    _raise_to_block(heights, site, _platform_block(config.platform, site))
+        _cover_with_block(heights, site, Block(tuple(low), tuple(low + edges), top))
+    _cover_with_block(heights, site, _platform_block(config.platform, site))
     return heights
 
 
@@ -132,15 +133,15 @@ def _stones(config: schema.StonesPatchConfig, site: PatchSite) -> Heights:
     while x < site.size[0] - _EPS:
         y = -site.random.uniform(0.0, width)
         while y < site.size[1] - _EPS:
-            _raise_to_block(heights, site, Block((x, y), (x + width, y + width), 0.0))
+            _cover_with_block(heights, site, Block((x, y), (x + width, y + width), 0.0))
             y += width + gap
         x += width + gap
-    _raise_to_block(heights, site, _platform_block(config.platform, site))
+    _cover_with_block(heights, site, _platform_block(config.platform, site))
     return heights
 
 
 def _stairs(config: schema.StairsPatchConfig, site: PatchSite) -> list[Block]:
-    """Return rings of four blocks each, from the outside inwards, and the platform."""
+    """Return the steps as rings of four blocks each, from the outside inwards, and the platform."""
     rise = site.at_difficulty(config.step_height) * (-1.0 if config.inverted else 1.0)
     steps = int((min(site.size) - config.platform) / 2 / config.step_width + _EPS)
 
@@ -191,7 +192,7 @@ def _platform_block(platform: float, site: PatchSite) -> Block:
     return Block(low, high, 0.0)  # type: ignore[arg-type]
 
 
-def _raise_to_block(heights: Heights, site: PatchSite, block: Block) -> None:
+def _cover_with_block(heights: Heights, site: PatchSite, block: Block) -> None:
     """Set the heights that a block covers to the height of its top."""
     x, y = site.axes()
     inside_x = (x[:, 0] >= block.low[0] - _EPS) & (x[:, 0] <= block.high[0] + _EPS)

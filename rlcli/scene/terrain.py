@@ -27,6 +27,7 @@ from rlcli.sim.selection import Selection
 TERRAIN_BODY = "terrain"
 """Body that has the geoms of the terrain."""
 _MAX_HEIGHTS = 1 << 24
+"""Largest number of heights of a height field."""
 _MAX_HEADER = 10_000
 """Largest header of a NumPy file [bytes]."""
 _START, _MOVE = random.stream("terrain.start"), random.stream("terrain.move")
@@ -77,7 +78,7 @@ def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProbl
         hint = "set fewer or smaller patches, or a larger resolution"
         yield ("resolution",), f"the height field has {count:,} heights, more than {_MAX_HEIGHTS:,}", hint
     if config.max_start_level is not None and config.max_start_level >= config.rows:
-        yield ("max_start_level",), f"no level {config.max_start_level}", f"levels: 0 to {config.rows - 1}"
+        yield ("max_start_level",), f"level {config.max_start_level} does not exist", f"levels: 0 to {config.rows - 1}"
     for name, patch in config.sub_terrains.items():
         for key, text, advice in _patch_problems(patch, min(config.patch), config.resolution):
             yield ("sub_terrains", name, key), text, advice
@@ -131,7 +132,7 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, material: str) -> None:
 
 
 class Terrain:
-    """Start position of each environment. A level is a row of patches, a type is a column.
+    """Start positions of the environments on a terrain. A level is a row of patches, a type is a column.
 
     Args:
         ground: the terrain in the model.
@@ -237,7 +238,7 @@ def _heights_below_blocks(patch: Patch) -> Heights:
     """Return heights that stay below the blocks of a patch [m]."""
     lowest = min(block.top for block in patch.blocks)
     inside = np.zeros_like(patch.heights)
-    inside[1:-1, 1:-1] = lowest - 0.05 if lowest < 0.0 else 0.0
+    inside[1:-1, 1:-1] = lowest - 0.05 if lowest < 0.0 else 0.0  # 5 cm lower, so that no two surfaces coincide
     return inside
 
 
@@ -261,7 +262,11 @@ def _patch_problems(patch: schema.PatchConfig, edge: float, resolution: float) -
         yield "platform", f"a platform of {platform:g} m does not fit in a patch of {edge:g} m", "make it smaller"
     fine = "set a smaller resolution, or boxes: true"
     if isinstance(patch, schema.StairsPatchConfig) and not patch.boxes and patch.step_width < 2 * resolution:
-        yield "step_width", f"steps of {patch.step_width:g} m need cells of half that, not {resolution:g} m", fine
+        yield (
+            "step_width",
+            f"steps of {patch.step_width:g} m need a resolution of half that, not {resolution:g} m",
+            fine,
+        )
     if isinstance(patch, schema.GridPatchConfig) and not patch.boxes and patch.cell < 2 * resolution:
         yield "cell", f"cells of {patch.cell:g} m need a resolution of half that, not {resolution:g} m", fine
     if isinstance(patch, schema.ObstaclesPatchConfig | schema.StonesPatchConfig):

@@ -1,4 +1,4 @@
-"""Height of the ground below points, looked up in the heights of a terrain."""
+"""Lookup of the height of points above the ground, in the heights of a terrain."""
 
 from __future__ import annotations
 

@@ -29,26 +29,33 @@ from rlcli.scene.mjcf_cost import ENDLESS, element_cost, number_of
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 _MAX_TEXT = 16 * 1024 * 1024
+"""Largest MJCF file [bytes]."""
 _MAX_ASSET = 256 * 1024 * 1024
+"""Largest mesh or image file [bytes]."""
 _MAX_FILES = 1000
 _MAX_DEPTH = 200
+"""Largest depth of nested elements."""
 _MAX_LEVELS = 50
-"""Files that are included in each other."""
+"""Largest depth of nested includes."""
 _MAX_MEMORY = 2 * 1024**3
+"""Limit of the memory that a model may ask for, and of the compiling subprocess [bytes]."""
 SUBPROCESS_COST, _MAX_COST = 5_000, 1_000_000
-"""Elements after replication; `element_cost` counts an expensive element as several."""
+"""Costs above which a model is first compiled in a subprocess, and above which it is refused; unit: one element."""
 TIME_S = 10
+"""Limit of the CPU time of the compiling subprocess [s]; it is killed after twice this time at the latest."""
 _MAX_ITERATIONS = 100_000
 _TEXT = (".xml", ".mjcf", ".urdf")
 _NOT_FINITE = re.compile(r"[-+]?(nan|inf)|[eE]\+?\d{3}", re.IGNORECASE)
+"""Parts of numbers that may not be finite: nan, inf, an exponent of three digits."""
 _NAMES = {
     *("name", "class", "childclass", "prefix", "model", "frame", "target", "instance", "plugin", "key", "material"),
     *("mesh", "hfield", "texture", "camera", "actuator", "tendon", "tendon1", "tendon2", "flex", "node", "objname"),
     *("refname", "body", "body1", "body2", "subtree1", "subtree2", "joint", "joint1", "joint2", "jointinparent"),
     *("geom", "geom1", "geom2", "site", "site1", "site2", "sidesite", "cranksite", "slidersite", "refsite"),
 }
-"""Attributes with names, which may be those of numbers."""
+"""Attributes that contain names, which may look like numbers, as `inf` does."""
 _FREE_SENSORS = ("clock", "e_potential", "e_kinetic", "user", "plugin")
+"""Sensors that may have no object."""
 MUJOCO_ERRORS = (ValueError, RuntimeError, MemoryError, mujoco.FatalError, mujoco.UnexpectedError)
 """Exceptions that MuJoCo raises for a model that it cannot read or compile."""
 
@@ -129,12 +136,13 @@ class _Text:
     elements: float = 0.0
     """Number of elements after replication."""
     stored: float = 0.0
-    """Numbers that `size` stores with each element of the model."""
+    """Sum of the `nuser_...` and `nkey` attributes of `size`: numbers that MuJoCo stores with elements of the model."""
     replicas: float = 0.0
     """Sum of the counts of the elements `replicate`."""
     free_sensors: int = 0
     """Sensors of no object, which MuJoCo doubles with every replica."""
     includes: list[tuple[float, Path]] = field(default_factory=list)
+    """Number of copies, and file, of each include."""
     models: list[tuple[int, str, Path]] = field(default_factory=list)
     """Line and name of each model that elements `attach` may copy, and its file."""
     attached: dict[str, float] = field(default_factory=dict)
@@ -151,7 +159,7 @@ class _MjcfScan:
     _max_cost: float = 0.0
     _texts: dict[Path, _Text] = field(default_factory=dict)
     _costs: dict[Path, float] = field(default_factory=dict)
-    """Cost of each model of which the files are known."""
+    """Cost of each model for which it has been computed."""
     _asset_folders: set[str] = field(default_factory=lambda: {""})
     _assets: list[tuple[Path, int, str, str]] = field(default_factory=list)
     """File, line, element and file name of each asset to load."""
@@ -217,7 +225,7 @@ class _MjcfScan:
         return self._costs[file]
 
     def _included(self, file: Path, copies: float, parents: tuple[Path, ...]) -> list[tuple[Path, float, _Text]]:
-        """Return the text of a file and those that it includes, each with the number of its copies."""
+        """Return a file and those that it includes: path, number of copies, text."""
         if file in parents:
             raise BadModel(f"{file}: the file includes itself; remove this include")
         text = self._texts[file]

@@ -456,7 +456,7 @@ def test_origins_without_terrain_are_0(tmp_path):
         ({"sub_terrains": {"a": {"kind": "obstacles", "width": [0.05, 1]}}}, "a.width: 0.05 m is less", "smaller"),
         ({"patch": [4.05, 6.0]}, "terrain.patch: a patch of 4.05 x 6 m is not a whole number of cells", "resolution"),
         ({"resolution": 0.001}, "terrain.resolution: the height field has", "larger resolution"),
-        ({"max_start_level": 3}, "terrain.max_start_level: no level 3", "levels: 0 to 2"),
+        ({"max_start_level": 3}, "terrain.max_start_level: level 3 does not exist", "levels: 0 to 2"),
         ({"difficulty": [0.0, 1.5]}, "terrain.difficulty.1: expected a number <= 1", None),
         ({"difficulty": [0.5, 0.1]}, "terrain.difficulty: the lower end 0.5 is above", None),
         ({"rows": 0}, "terrain.rows: expected a whole number >= 1", None),

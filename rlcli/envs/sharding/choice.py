@@ -11,9 +11,9 @@ from rlcli.errors import ConfigError
 from rlcli.machine import available_cores, available_memory
 
 ENVS_PER_WORKER = 512
-"""Number of environments for which a further process pays: below it, the fixed cost of its step outweighs it."""
+"""Fewest environments per process that `auto` allows: with fewer, the fixed cost of a process outweighs its gain."""
 FEWEST_WORKERS = 4
-"""Fewest processes that `auto` uses: two or three are not faster than one whose engine uses all cores."""
+"""Fewest processes that `auto` uses instead of one: two or three are not faster than one with all cores."""
 
 FREE_MEMORY_PER_WORKER = 1 << 30
 """Free memory for each process that `auto` starts [bytes]; a process takes about a quarter of it."""
@@ -58,8 +58,8 @@ def _reason_for_one(resolved: Resolved, device: str) -> str | None:
     if device.partition(":")[0] != "cpu" or task.sim.engine == "warp":
         return "a GPU steps all environments at once"
     if os.name == "nt":
-        return "it needs Linux or macOS"
+        return "worker processes need Linux or macOS"
     for name, term in task.curriculum.items():
         if term is not None and term.func in resolved.vocabulary.own:
-            return f"curriculum '{name}' is a function of the task, and may use all environments"
+            return f"the task's own code for curriculum '{name}' may use all environments"
     return None

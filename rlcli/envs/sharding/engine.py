@@ -20,7 +20,7 @@ N = TypeVar("N", int, float)
 
 
 class Shards(Protocol):
-    """Calls of functions in the processes that have the shards."""
+    """Interface for calls of functions in the processes of the shards."""
 
     @property
     def local(self) -> VecEnv:
@@ -118,7 +118,7 @@ class ShardedEngine:
 
 
 def sums(counts: Sequence[Mapping[str, N]]) -> dict[str, N]:
-    """Return the sums by name."""
+    """Return the sum of the counts of all shards, by name."""
     names = dict.fromkeys(name for count in counts for name in count)
     return {name: sum(count.get(name, 0) for count in counts) for name in names}
 

@@ -51,7 +51,7 @@ class ShardedEnv(Environment):
 
     Args:
         resolved: a validated configuration.
-        workers: number of processes that step environments, with this one.
+        workers: number of processes that step environments, including this one.
         seed: seed of all random numbers of the environment.
         shared_streams: see `VecEnv`.
 
@@ -93,9 +93,9 @@ class ShardedEnv(Environment):
         self._slot = 0
         self._episodes: Episodes | None = None
         self._waiting: dict[Worker, tuple[Stage, Any]] = {}
-        """Workers that wait for the others at a stage of the step, and what they sent."""
+        """Workers that wait for the others: the stage of the step that they have reached, and what they sent."""
         self._stage: Stage | None = None
-        """Stage whose observers run."""
+        """Stage whose observers are running; None: no observers are running."""
         self._is_broken = False
         self.resolved, self.config, self.seed = resolved, resolved.task, seed
         self.num_envs, self.device = total, self.local.device
@@ -129,7 +129,7 @@ class ShardedEnv(Environment):
     def step(self, action: Tensor, restart: Tensor | None = None) -> StepResult:
         """Apply one action in every environment; see `Environment.step`."""
         if not self._playing:
-            raise RuntimeError("the environment is paused")
+            raise RuntimeError("the environment is paused; call pause(False) before step()")
         for before_step in self.observers.before_step:
             before_step()
         start = time.perf_counter()
@@ -179,7 +179,7 @@ class ShardedEnv(Environment):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of everything that the next steps depend on; the same as that of one process."""
-        # the means that curriculum terms log are the only values of all environments
+        # of all saved values, only the means that curriculum terms log are computed over all environments
         logged = {name.removeprefix("Curriculum/"): value for name, value in self._metric_values().items()}
         averages = {f"workflow.curriculum.value.{name}": mean_of(value) for name, value in logged.items()}
         states = self.call_all(_state)
@@ -245,7 +245,7 @@ class ShardedEnv(Environment):
         return self.local.shard.shared
 
     def call_all(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
-        """Return `function(env, *arguments)` of every shard, in order. The function is one of a module."""
+        """Return `function(env, *arguments)` of every shard, in order. It is pickled: a module must define it."""
         self._require_whole()
         self._workers.request(worker.CALL, (function, arguments))
         try:
@@ -282,10 +282,10 @@ class ShardedEnv(Environment):
 
     def _require_whole(self) -> None:
         if self._is_broken and not self._stage:
-            raise RuntimeError("a step was interrupted, so that the environment cannot be used any more")
+            raise RuntimeError("a step was interrupted, and the environment cannot be used any more; create a new one")
 
     def _reach(self, stage: Stage, content: Any) -> None:
-        """Let all shards reach a stage at which the first shard is; run the observers of it and of earlier stages."""
+        """Wait until all shards reach the stage of the first shard; run the observers of this and of earlier stages."""
         while True:
             for process in self._workers:
                 if process not in self._waiting:
@@ -307,7 +307,7 @@ class ShardedEnv(Environment):
                 return
 
     def _observe(self, stage: Stage, contents: Sequence[Any]) -> None:
-        """Run the observers of a stage. `contents` has what each shard sent; None for a shard that is not there."""
+        """Run the observers of a stage. `contents`: what each shard sent; None for a shard at another stage."""
         if stage in (Stage.ON_STEP, Stage.DONE):
             for number, columns in enumerate(contents):
                 self._columns[number] = columns or self._columns[number]
@@ -364,13 +364,13 @@ def _pickled(resolved: Resolved) -> bytes:
     """Return a configuration in the form in which a worker receives it.
 
     Raises:
-        ConfigError: if the configuration has functions or classes that no module has.
+        ConfigError: if the configuration has functions or classes that no module defines.
     """
     try:
         return pickle.dumps(resolved)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         message = f"the configuration cannot be sent to worker processes: {one_line(error)}"
-        hint = "set it to 1, or define the functions and classes of the task in a module"
+        hint = "set scene.workers: 1, or define the functions and classes of the task in a module"
         raise ConfigError([resolved.problem(("scene", "workers"), message, hint)]) from None
 
 

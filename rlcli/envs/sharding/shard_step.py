@@ -24,7 +24,7 @@ from rlcli.errors import RlcliError
 from rlcli.sim.divergence_report import Divergence
 
 SLOTS = 3
-"""Number of results that are kept: those of a step hold until the step after the next one."""
+"""Number of shared buffers for results: the result of a step stays valid until the step after the next one."""
 _FIXED_COLUMNS = 4
 """Columns of a finished episode before its named ones: environment, return, length, truncated."""
 _MAX_COLUMNS = 256
@@ -44,7 +44,7 @@ class Stage(enum.IntEnum):
 
 
 class Needs(enum.Flag):
-    """Observers of the main process that a step of a shard must stop for."""
+    """Kinds of observers of the main process for which a shard must stop in its step."""
 
     AFTER_PHYSICS = enum.auto()
     ON_DIVERGENCE = enum.auto()
@@ -52,7 +52,7 @@ class Needs(enum.Flag):
 
     @staticmethod
     def of(observers: Observers) -> Needs:
-        """Return what some observers need."""
+        """Return the kinds of observers that are registered."""
         needs = Needs(0)
         needs |= Needs.AFTER_PHYSICS if observers.after_physics else needs
         needs |= Needs.ON_DIVERGENCE if observers.on_divergence else needs
@@ -61,7 +61,7 @@ class Needs(enum.Flag):
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Names of the columns of finished episodes."""
+    """Names of the columns (the values) of finished episodes in shared memory."""
 
     terms: tuple[str, ...]
     causes: tuple[str, ...]
@@ -83,18 +83,18 @@ class Columns:
 
 
 def counter_specs(total: int) -> dict[str, ArraySpec]:
-    """Return the shared tensors that an environment needs while it is built; they come first in the shared file."""
+    """Return shapes and types of the shared tensors that an environment needs while it is built; they are the first."""
     return {"counters": ArraySpec((2, total), torch.int64)}
 
 
 def array_specs(env: VecEnv, total: int, shards: int) -> dict[str, ArraySpec]:
-    """Return the shared tensors of an environment with `total` environments in `shards` shards."""
+    """Return shapes and types of the shared tensors for `total` environments in `shards` shards."""
     layout, terms = env.layout, len(env.reward_names)
     sizes = {group: layout.size(group) for group in layout.observations}
     floats, flags = torch.float32, torch.bool
     return {
         **counter_specs(total),
-        "command": ArraySpec((8,), torch.int64),
+        "command": ArraySpec((8,), torch.int64),  # slot, Needs, final_obs_of is truncated, some env restarts; unused
         "action": ArraySpec((total, layout.action_size), floats),
         "restart": ArraySpec((total,), flags),
         **{f"obs.{group}": ArraySpec((SLOTS, total, size), floats) for group, size in sizes.items()},
@@ -104,8 +104,8 @@ def array_specs(env: VecEnv, total: int, shards: int) -> dict[str, ArraySpec]:
         "truncated": ArraySpec((SLOTS, total), flags),
         "reward_terms": ArraySpec((terms, total), floats),
         "episodes": ArraySpec((_MAX_COLUMNS + terms, total), torch.float64),
-        "counts": ArraySpec((shards, 8), torch.int64),
-        "seconds": ArraySpec((shards, 8), torch.float64),
+        "counts": ArraySpec((shards, 8), torch.int64),  # finished episodes, final_obs is valid; unused
+        "seconds": ArraySpec((shards, 8), torch.float64),  # physics, step; unused
     }
 
 
@@ -151,7 +151,7 @@ class ShardRunner:
         self._slot = 0
 
     def step(self) -> None:
-        """Step the shard with its actions, and publish the result."""
+        """Step the shard with its actions, and write the result to shared memory."""
         self._slot, needs, only_truncated, restarts = self._command[:4].tolist()
         self._observe(Needs(needs))
         self.env.final_obs_of = "truncated" if only_truncated else "finished"
@@ -168,19 +168,19 @@ class ShardRunner:
         self._end(result.obs)
 
     def reset(self, seed: int | None, episode: int) -> None:
-        """Start a new episode in every environment of the shard, and publish the observations."""
+        """Start a new episode in every environment of the shard, and write the observations to shared memory."""
         self._slot, needs = self._command[:2].tolist()
         self._observe(Needs(needs))
         self._end(self.env.reset(seed, episode=episode))
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Restore a state of the shard, and publish the observations."""
+        """Restore a state of the shard, and write the observations to shared memory."""
         self._slot, needs = self._command[:2].tolist()
         self._observe(Needs(needs))
         self._end(self.env.load_state_dict(state))
 
     def publish_record(self, record: StepRecord) -> Columns | None:
-        """Publish what observers read. Return the names of the columns of finished episodes if they have changed."""
+        """Write what observers read to shared memory. Return the columns of finished episodes if they have changed."""
         self._reward[self._slot].copy_(record.reward)
         self._reward_terms.copy_(record.reward_terms)
         self._publish_episodes(record.episodes)
@@ -208,8 +208,8 @@ class ShardRunner:
         if columns != self._columns:
             if columns.count > len(self._episodes):
                 raise RlcliError(
-                    f"the task has {columns.count} metrics, causes and reward terms of episodes; several workers allow"
-                    f" {len(self._episodes)}",
+                    f"the task has {columns.count} values per episode (reward terms, causes, metrics, conditions of"
+                    f" success); several workers allow {len(self._episodes)}",
                     hint="set scene.workers: 1",
                 )
             self._columns = self._new_columns = columns

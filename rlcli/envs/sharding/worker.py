@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from rlcli.envs.vec_env import VecEnv
 
 BUILD, MAP, SHARE, STEP, RESET, LOAD, CALL, CONTINUE = b"b", b"m", b"h", b"s", b"r", b"l", b"c", b"g"
-"""Messages of the main process."""
+"""Kinds of the messages that the main process sends."""
 READY, STOPPED, VALUE, ERROR = b"y", b"t", b"v", b"e"
-"""Messages of a worker: the shard is built; it stopped at a stage; the value of a call; an error."""
+"""Kinds of the messages that a worker sends: its shard is built; it stopped at a stage; value of a call; an error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +41,7 @@ class Job:
     shared_streams: int
     shard: Shard
     number: int
+    """Index of the shard."""
     files: list[tuple[Path, str]]
     """Task files that the main process has imported; `resolved` may contain their functions and classes."""
     has_own_code: bool
@@ -50,7 +51,7 @@ class Job:
 
 
 def main(connection: int, arrays: int) -> None:
-    """Serve the main process through two file descriptors: a socket, and the file of the shared tensors."""
+    """Answer the main process through two file descriptors: a socket, and the file of the shared tensors."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1"):  # the main process decides when its workers end
         signal.signal(getattr(signal, name), signal.SIG_IGN)
     channel = Channel(socket.socket(fileno=connection), SPIN_S)
@@ -155,7 +156,7 @@ class _Worker:
 
 
 class _GlobalGenerators:
-    """Check that a task does not use the global random generators: each process has its own."""
+    """Detector of a task's use of the global random generators, of which each process has its own."""
 
     def __init__(self) -> None:
         self._states = self._read()
@@ -169,8 +170,8 @@ class _GlobalGenerators:
         used = [name for name, state in self._read().items() if state != self._states[name]]
         if used:
             raise TaskError(
-                f"the task uses the global random generator of {used[0]}; with several workers its results would"
-                " depend on their number",
+                f"the task uses the global random generator of {used[0]}; with several workers the"
+                " results would depend on the number of workers",
                 hint="set scene.workers: 1, or use the selection's random numbers (`selection.uniform`, `self.draws`)",
             )
 

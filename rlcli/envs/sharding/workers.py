@@ -1,4 +1,4 @@
-"""Worker processes of an environment, as the main process sees them."""
+"""Start, use and end the worker processes of an environment from the main process."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class Worker:
 
 
 class Workers:
-    """All worker processes of an environment; they end with this object.
+    """All worker processes of an environment; they end when this object is closed or deleted.
 
     Args:
         count: number of processes; each starts now and imports its modules before `build` sends its job.
@@ -165,17 +165,17 @@ class Workers:
 
 
 _early: list[Workers] = []
-"""Processes that were started before the environment of which they step a part."""
+"""Worker processes that were started before their environment is built."""
 
 
 def start_early(count: int) -> None:
-    """Start processes for the next environment, before this process imports torch: both then import at once."""
+    """Start workers for the next environment, before this process imports torch: all then import at the same time."""
     if count:
         _early.append(Workers(count))
 
 
 def take_workers(count: int) -> Workers:
-    """Return the processes that were started early, if there are as many; else start them."""
+    """Return the `count` processes that were started early; start them if another number or none was started."""
     if _early and len(_early[-1]) == count:
         return _early.pop()
     close_early()
