@@ -262,13 +262,9 @@ def _patch_problems(patch: schema.PatchConfig, edge: float, resolution: float) -
         yield "platform", f"a platform of {platform:g} m does not fit in a patch of {edge:g} m", "make it smaller"
     fine = "set a smaller resolution, or boxes: true"
     if isinstance(patch, schema.StairsPatchConfig) and not patch.boxes and patch.step_width < 2 * resolution:
-        yield (
-            "step_width",
-            f"steps of {patch.step_width:g} m need a resolution of half that, not {resolution:g} m",
-            fine,
-        )
+        yield "step_width", f"{patch.step_width:g} m needs a resolution of half that, not {resolution:g} m", fine
     if isinstance(patch, schema.GridPatchConfig) and not patch.boxes and patch.cell < 2 * resolution:
-        yield "cell", f"cells of {patch.cell:g} m need a resolution of half that, not {resolution:g} m", fine
+        yield "cell", f"{patch.cell:g} m needs a resolution of half that, not {resolution:g} m", fine
     if isinstance(patch, schema.ObstaclesPatchConfig | schema.StonesPatchConfig):
         if patch.width[1] > edge:
             yield "width", f"{patch.width[1]:g} m does not fit in a patch of {edge:g} m", "make it smaller"

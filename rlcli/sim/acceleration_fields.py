@@ -27,7 +27,7 @@ def add_body_forces(spec: mujoco.MjSpec) -> None:
     spec.add_sensor(name="body_forces", type=kind, objtype=body, objname="world")
 
 
-def force_sensors(model: mujoco.MjModel) -> list[int]:
+def force_sensor_columns(model: mujoco.MjModel) -> list[int]:
     """Return the columns of `sensordata` that the acceleration stage computes."""
     acceleration = int(mujoco.mjtStage.mjSTAGE_ACC)
     return sensor_columns(model, np.flatnonzero(model.sensor_needstage == acceleration).tolist())

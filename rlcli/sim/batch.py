@@ -18,7 +18,7 @@ from rlcli.config.schema import SimConfig
 from rlcli.errors import did_you_mean
 from rlcli.machine import available_cores
 from rlcli.sim import divergence_report as report
-from rlcli.sim.acceleration_fields import ACCELERATION_FIELDS, force_sensors
+from rlcli.sim.acceleration_fields import ACCELERATION_FIELDS, force_sensor_columns
 from rlcli.sim.batch_worlds import BatchWorlds, engine_call
 from rlcli.sim.mujoco_private import STATE_FIELDS, forward_of, without_profiler
 from rlcli.sim.saved_tensors import substate
@@ -82,7 +82,7 @@ class BatchEngine(BatchWorlds):
             self._data = mujoco.MjData(model)
         self.forces_after_reset = config.forces_after_reset
         self._reset_stage = _ACC if config.forces_after_reset else _VEL
-        self._force_sensors = force_sensors(model)
+        self._force_sensors = force_sensor_columns(model)
 
     @property
     def replayable(self) -> Self:
@@ -132,7 +132,7 @@ class BatchEngine(BatchWorlds):
             with without_profiler:
                 self._batch.step(nstep=nstep, stage=self.step_stage if derive else _NONE)
         except SimulationError:
-            self._failed |= self._batch.status != 0  # failed worlds have their old state; the others have stepped
+            self._failed |= self._batch.status != 0  # failed worlds keep their old state; the others have stepped
             self._error = " ".join(self._batch.error(int(self._failed.argmax())).split()) or self._error
         if self._external is not None and derive:
             self._compute_external_forces(self._external.numpy())
@@ -235,7 +235,7 @@ class BatchEngine(BatchWorlds):
                 field[index] = 0.0
 
     def as_field(self, tensor: Tensor) -> NDArray[Any]:
-        """Return an array of the same memory."""
+        """Return the tensor's memory as a NumPy array."""
         return tensor.numpy()
 
     def select(self, mask: Field, seed: int, counters: Field) -> IdSelection | None:

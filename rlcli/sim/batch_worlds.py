@@ -27,7 +27,7 @@ from rlcli.sim.mujoco_private import (
     without_profiler,
 )
 from rlcli.sim.quiet_mujoco import quiet_mujoco
-from rlcli.sim.saved_tensors import substate
+from rlcli.sim.saved_tensors import require_matching_tensors, substate
 from rlcli.sim.selection import Selection, ids_of
 from rlcli.sim.skippable_work import skippable_flags
 
@@ -79,7 +79,7 @@ class BatchWorlds:
         return name in MODEL_FIELDS
 
     def expand(self, name: str) -> Tensor:
-        """Return a model field with a value for every world."""
+        """Return a model field with values of its own for every world, live and writable. (num_envs, ...)"""
         if name not in MODEL_FIELDS:
             hint = did_you_mean(name, MODEL_FIELDS) or f"fields that can: {listing(sorted(MODEL_FIELDS))}"
             raise ValueError(f"'{name}' cannot differ between environments; {hint}")
@@ -103,7 +103,7 @@ class BatchWorlds:
         self.own_constants = True
 
     def own_model_fields(self, env: int) -> dict[str, NDArray[Any]]:
-        """Return copies of the model fields of one world."""
+        """Return copies of one world's values of the expanded model fields."""
         return {name: np.array(values[env]) for name, values in self._expanded.items()}
 
     def load_model_field(self, name: str, values: Tensor) -> None:
@@ -113,8 +113,7 @@ class BatchWorlds:
             ValueError: for values of another shape or type, or that could make MuJoCo read outside of its arrays.
         """
         target = self.expand(name)
-        if target.shape != values.shape or target.dtype != values.dtype:
-            raise ValueError(f"model field '{name}' has shape {tuple(values.shape)}, expected {tuple(target.shape)}")
+        require_matching_tensors({name: values}, {name: target}, "model field")
         if not target.dtype.is_floating_point and name not in _FLAGS and not torch.equal(target, values):
             raise ValueError(f"model field '{name}' is part of the model's structure and must not change")
         target.copy_(values)

@@ -1,4 +1,4 @@
-"""Divergence of a simulation: its cause, and the engine calls before it."""
+"""Divergences of simulations: their causes, and the engine calls before them."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ ENGINE_ERROR = "engine error"
 TOO_FAST = "qvel out of bounds"
 """Cause: a velocity is above the limit of the task."""
 HISTORY_MEMORY = 64 * 2**20
-"""Default memory limit of a history [bytes]."""
+"""Default memory limit of a `StateHistory` [bytes]."""
 MORE_MEMORY = "if the contact arena is full, set a larger <size memory=...> in the MJCF"
 """Hint for an engine error."""
 WARNING_FIELDS = {"BADCTRL": "ctrl", "BADQPOS": "qpos", "BADQVEL": "qvel", "BADQACC": "qacc"}
-"""Warning of a divergence -> the field of the index that MuJoCo stores with it."""
+"""Warning of a divergence -> field into which the index points that MuJoCo stores with the warning."""
 DIVERGENCE_WARNINGS = {name: int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in WARNING_FIELDS}
 """Warnings after which MuJoCo resets a world or ignores its controls; the first of several is the cause."""
 OTHER_WARNINGS = {
@@ -36,7 +36,7 @@ _INPUTS_FIRST = (
     *("mocap_pos", "mocap_quat", "ctrl", "xfrc_applied", "qfrc_applied", "act", "eq_active", "userdata", "history"),
     *("plugin_state", "plastic", "qpos", "qvel", "qacc_warmstart", "time"),
 )
-"""Fields of the integration state: inputs of the simulation first, then its results."""
+"""Fields of the integration state in the order in which a bad one is looked for: the simulation's inputs first."""
 
 States = NDArray[np.float64]
 """Integration states, with a row for each environment; or one of them."""
@@ -51,9 +51,9 @@ class Divergence:
     cause: str
     """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, `FIELD out of bounds`, or `engine error`."""
     detail: str = ""
-    """Element of the model in which it was detected, if known."""
+    """Element of the model in which the divergence was detected, and its source, if known; or the engine's error message."""
     index: int = -1
-    """For a warning: the index in its field; else -1."""
+    """Index of the bad value in the field of the warning or in `qvel`; -1 if unknown."""
 
     def __str__(self) -> str:
         """Return a text such as `environment 3: BADQACC (joint 'swing')`."""

@@ -173,7 +173,7 @@ class Engine(EngineView, Protocol):
         """
 
     def check_finite(self, values: Tensor, what: str) -> None:
-        """Check on the device, without waiting for it, whether all values are finite; `what` is their name."""
+        """Start a check of whether all values are finite, without waiting for its result; `what` names the values."""
 
     def report_nonfinite(self) -> list[str]:
         """Return the names of the values for which `check_finite` failed since the last call."""
@@ -195,7 +195,7 @@ class ReplayableEngine(Engine, ReplayableView, Protocol):
     """Engine with integration states on the CPU: steps from a stored state can be repeated bit for bit."""
 
     stream_ids: NDArray[np.int64] | None
-    """Number of each world in the keys of random numbers; None: the index of the world. (num_envs,)"""
+    """Index of each world's random stream; None: the index of the world. (num_envs,)"""
 
     def set_state_row(self, env: int, row: NDArray[np.float64]) -> None:
         """Set the integration state of a world; derived fields keep their values."""
@@ -229,7 +229,7 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
     engine = config.engine if config.engine != "auto" else "batch" if on_cpu else "warp"
     if engine == "batch" and not on_cpu:
         message = f"sim.engine 'batch' runs on a CPU, not on '{device}'"
-        raise ConfigError([Problem("sim", "sim.engine", message, "set it to auto, or give --device cpu")])
+        raise ConfigError([Problem("sim", "sim.engine", message, "set sim.engine: auto, or give --device cpu")])
     if engine == "batch":
         return open_cpu_engine(model, num_envs, config)
     require_device(device)

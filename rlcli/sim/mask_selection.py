@@ -103,7 +103,7 @@ class MaskSelection:
         return self.mask.nonzero()[:, 0]
 
     def union(self, other: MaskSelection) -> MaskSelection:
-        """Return a selection of the rows that are in either selection, or in both."""
+        """Return a selection of the rows of this selection and of another one."""
         return MaskSelection(self.mask | other.mask, self.seed, self.counters, shared_streams=self.shared_streams)
 
     def stream(self, stream: np.uint64) -> MaskSelection:
@@ -114,7 +114,7 @@ class MaskSelection:
         return self._draw(warp_kernels.draw_uniform, shape, 1, low, high - low)
 
     def _draw(self, kernel: wp.Kernel, shape: tuple[int, ...], words: int, *parameters: float) -> Tensor:
-        """Launch a kernel that makes each number from some random words. (num_envs, *shape)"""
+        """Launch a kernel that computes each number from `words` random 64-bit words. (num_envs, *shape)"""
         num_envs, count, device = len(self.mask), math.prod(shape), self.mask.device
         out = torch.empty(num_envs, count, device=device)
         index, self._drawn = self._drawn, self._drawn + words * count

@@ -85,7 +85,7 @@ def axes(quat: Tensor) -> Tensor:
 @functools.lru_cache
 @torch.inference_mode(False)  # tensors that can be used in both modes
 def _axis_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what the sums of two products in `axes` consist of.
+    """Return the constants of `axes`, in which each element of the axes is s1 a b + s2 c d + offset.
 
     They are the columns of the quaternion (36,): the left factors of the first and of the second products, then the
     right factors; the scales of the products (18,); and the offsets of the sums (9,).

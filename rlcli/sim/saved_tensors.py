@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class TensorState:
-    """Base class of objects whose state is a few tensors, which are restored in place."""
+    """Base class of objects whose state consists of tensors, which are restored in place."""
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors themselves, by their keys in `state_dict`."""
@@ -46,7 +46,7 @@ def require_matching_tensors(saved: Mapping[str, Tensor], own: Mapping[str, Tens
 
     Args:
         saved: tensors of the file.
-        own: their targets; names that are in only one of the two are ignored.
+        own: tensors to which they are copied; names that are in only one of the two are ignored.
         what: the part of the file, for the message.
 
     Raises:
@@ -65,7 +65,7 @@ def require_in_range(value: Tensor, low: int, high: int, what: str) -> None:
         ValueError: with their smallest and largest value.
     """
     if value.numel() and not bool(((value >= low) & (value <= high)).all()):
-        raise ValueError(f"'{what}' is {int(value.min())} to {int(value.max())}, allowed is {low} to {high}")
+        raise ValueError(f"'{what}' has values {int(value.min())} to {int(value.max())}; allowed are {low} to {high}")
 
 
 def _text(value: Tensor) -> str:

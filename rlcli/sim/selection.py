@@ -18,12 +18,14 @@ from torch import Tensor
 from rlcli import random
 
 Columns: TypeAlias = slice | Tensor
+"""Index of some columns."""
 Field: TypeAlias = Any
 """A (num_envs, ...) tensor, or the result of the engine's `as_field` for it. `as_field` takes as long as reading a few
 rows, so a term that reads in every step calls it once."""
 Groups: TypeAlias = tuple[int, ...] | None
 """Geom groups; None: all."""
 ALL = slice(None)
+"""Index of all columns."""
 DEFAULT_STREAM = np.uint64(0)
 
 
@@ -85,7 +87,7 @@ class Selection(Protocol):
         """Return a selection of the rows where `mask` (num_envs,) is true; None if it is known to be empty."""
 
     def union(self, other: Any) -> Selection:
-        """Return a selection of the rows that are in one of two selections of the same engine."""
+        """Return a selection of the rows of this selection and of another one of the same engine."""
 
     def env_ids(self) -> Tensor:
         """Return the indices of the environments; on a GPU this forces a host sync. (rows,) int64"""
@@ -132,8 +134,8 @@ class IdSelection:
         counters: index of each row's random sequence, usually its episode. (rows,)
         stream_key: key of the purpose of the random numbers (for example a term), a result of `rlcli.random.stream`.
         device: device of the random numbers; None: the CPU.
-        stream_ids: number of each environment in the keys of random numbers: environments with the same number draw
-            the same random numbers; None: the id of the environment. (num_envs,)
+        stream_ids: index of each environment's random stream: environments with the same index draw the same random
+            numbers; None: the id of the environment. (num_envs,)
     """
 
     ids: NDArray[np.int64]
@@ -198,7 +200,7 @@ class IdSelection:
         return self._with(self.ids[chosen], self.counters[chosen], self.stream_key)
 
     def union(self, other: IdSelection) -> IdSelection:
-        """Return a selection of the rows in one of two selections; a row in both has the stream that it has here."""
+        """Return a selection of the rows of this selection and of another one; a row in both keeps its counter here."""
         ids, first = np.unique(np.concatenate([self.ids, other.ids]), return_index=True)
         counters = np.concatenate([self.counters, other.counters])[first]
         return self._with(ids, counters, self.stream_key)

@@ -34,8 +34,8 @@ class SimData:
         own = self._copies[0] is self._sources[0]
         # an engine in float64 is on the CPU, where numpy copies small arrays in half the time of torch
         pairs = [] if own else zip(self._copies, self._sources, strict=True)
-        self._stale = [(copy.numpy(), source.numpy()) for copy, source in pairs]
-        self._saved = [copy.copy() for copy, _ in self._stale]
+        self._copied = [(copy.numpy(), source.numpy()) for copy, source in pairs]
+        self._saved = [copy.copy() for copy, _ in self._copied]
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
@@ -66,13 +66,13 @@ class SimData:
 
     def refresh(self) -> None:
         """Copy the state of every world."""
-        for copy, source in self._stale:
+        for copy, source in self._copied:
             copy[...] = source
         self.stamp += 1
 
     def refresh_rows(self, selection: Selection) -> None:
         """Copy the state of the selected worlds, and drop the values computed from it."""
-        for copy, source in self._stale:
+        for copy, source in self._copied:
             rows = ids_of(selection)
             copy[rows] = source[rows]
         self.stamp += 1
@@ -82,12 +82,12 @@ class SimData:
         if self._saved_at == self.stamp:
             return
         self._saved_at = self.stamp
-        for saved, (copy, _) in zip(self._saved, self._stale, strict=True):
+        for saved, (copy, _) in zip(self._saved, self._copied, strict=True):
             saved[...] = copy
 
     def restore_rows(self, selection: Selection) -> None:
         """Write the last saved state of the selected worlds back to the engine."""
-        for saved, (_, source) in zip(self._saved, self._stale, strict=True):
+        for saved, (_, source) in zip(self._saved, self._copied, strict=True):
             rows = ids_of(selection)
             source[rows] = saved[rows]
 

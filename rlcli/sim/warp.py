@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rlcli.config.schema import SimConfig
 from rlcli.sim import warp_kernels
-from rlcli.sim.acceleration_fields import force_sensors
+from rlcli.sim.acceleration_fields import force_sensor_columns
 from rlcli.sim.column_views import as_index
 from rlcli.sim.divergence_report import STATE_LIMIT, Divergence, StateLayout
 from rlcli.sim.mask_selection import MaskSelection
@@ -55,7 +55,7 @@ class WarpEngine(WarpWorlds):
         self.forces_after_reset = config.forces_after_reset
         self._external_forces = config.external_forces
         self._max_velocity = config.max_velocity or STATE_LIMIT
-        self._force_columns = as_index(force_sensors(model), self.device)
+        self._force_columns = as_index(force_sensor_columns(model), self.device)
         self._ray_buffers: dict[tuple[int, int], tuple[wp.array, wp.array, wp.array]] = {}
         """Excluded body of each ray, and buffers for the geoms and normals at the hits; by number of rays and body."""
         self._checked: list[str] = []

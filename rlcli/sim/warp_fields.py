@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mujoco
 
-from rlcli.sim.acceleration_fields import ACCELERATION_FIELDS, force_sensors
+from rlcli.sim.acceleration_fields import ACCELERATION_FIELDS, force_sensor_columns
 
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
 """Fields of the state, which every reset restores."""
@@ -34,7 +34,7 @@ class FieldStages:
     """Stages that compute the fields of a model's worlds."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        force_columns = force_sensors(model)
+        force_columns = force_sensor_columns(model)
         self._sensor_stages = {FORCE} if force_columns else set()
         if len(force_columns) < model.nsensordata:
             self._sensor_stages.add(VELOCITY)

@@ -12,11 +12,12 @@ wp.init()
 # without code for gradients, which are not needed, kernels compile in half the time
 wp.set_module_options({"enable_backward": False})
 
+# constants of SplitMix64, as in `rlcli.random`
 _GOLDEN = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
 _MIX1 = wp.constant(wp.uint64(0xBF58476D1CE4E5B9))
 _MIX2 = wp.constant(wp.uint64(0x94D049BB133111EB))
 _TO_UNIT = wp.constant(wp.float32(2.0**-24))
-_TOO_LARGE = wp.constant(wp.float32(1e10))
+_TOO_LARGE = wp.constant(wp.float32(1e10))  # mjMAXVAL
 CAUSES = ("qpos not finite", "qpos out of bounds", "qvel not finite", "qvel out of bounds")
 """Causes of a divergence; `check_bounds` counts each by its index."""
 

@@ -19,7 +19,7 @@ OVERFLOW_SETTINGS = {
     **dict.fromkeys((_BIT.NEFC, _BIT.NJMAX_NNZ), "constraints_per_env"),
     **dict.fromkeys((_BIT.BROADPHASE, _BIT.NARROWPHASE, _BIT.CCD, _BIT.HFIELD, _BIT.EPA_HORIZON), "contacts_per_env"),
 }
-"""Capacity that a step may exceed -> setting that raises it. Overflows of solver iterations are not included."""
+"""Kind of overflow that MuJoCo Warp reports -> setting that raises the exceeded capacity."""
 
 
 def put_on_device(

@@ -83,7 +83,7 @@ class WarpWorlds:
         return attribute in _batched_fields(owner) and getattr(owner, attribute, None) is not None
 
     def expand(self, name: str) -> Tensor:
-        """Return a model field with a value for every world."""
+        """Return a model field with values of its own for every world, live and writable. (num_envs, ...)"""
         if name not in self._expanded:
             owner, attribute = self._owner(name)
             if not self.can_expand(name):

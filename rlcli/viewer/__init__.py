@@ -1,1 +1,1 @@
-"""Pictures of environments: a native window, the browser, and offscreen videos."""
+"""Viewers of environments (a native window, the browser), and offscreen videos."""

@@ -47,24 +47,24 @@ def refusal_reason(port: int, path: str, request_headers: Mapping[str, Sequence[
     """
     host = [value.lower() for value in request_headers.get("host", ())]
     if len(host) != 1 or host[0] not in allowed_hosts(port):
-        return "not a name of this machine"
+        return "the Host header does not name this machine"
     route = path.partition("?")[0]
     if not path.startswith("/") or ".." in route or "\\" in route or "%" in route:
         return "no such path"
     upgrades = any("upgrade" in value.lower() for value in request_headers.get("connection", ()))
     is_websocket = upgrades or "upgrade" in request_headers
     if is_websocket and route not in SOCKETS:
-        return "no such socket"
+        return "no WebSocket has this path"
     origin = [value.lower() for value in request_headers.get("origin", ())]
     own = f"http://{host[0]}"
     # browsers always send Origin with a WebSocket, but not with every request for a page
     if (is_websocket and not origin) or any(value != own for value in origin) or len(origin) > 1:
-        return "another page"
+        return "another page sent the request"
     site, mode, target = (
         (*request_headers.get(f"sec-fetch-{name}", ()), "")[0].lower() for name in ("site", "mode", "dest")
     )
     # a link on another page may lead to ours: that request opens a new document and reveals nothing to the other page
     is_link = mode == "navigate" and target == "document" and route in ("/", "/index.html") and not is_websocket
     if site not in ("", "same-origin", "none") and not is_link:
-        return "another page"
+        return "another page sent the request"
     return None

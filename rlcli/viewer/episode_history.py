@@ -12,9 +12,9 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.reward import RewardManager
 
 _SHOWN_S = 5.0
-"""Time of which rewards are kept [s]."""
+"""Time span of the reward curves [s]."""
 _MAX_POINTS = 150
-"""Largest number of points of a curve; they travel to the browser in every frame."""
+"""Largest number of points of a curve; all points are sent to the browser in every frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,15 +45,15 @@ class EpisodeHistory:
         self._last: dict[int, str] = {}
 
     def add(self, result: StepResult, shown: int) -> None:
-        """Record a step."""
+        """Record the result of a step; `shown` is the environment whose rewards are kept."""
         self._steps += 1
         self.returns += result.reward.cpu()
         if self._steps % self._every == 0:
             terms = [] if self._terms is None else self._terms.step_terms[:, shown].tolist()
             self._rows.append((float(result.reward[shown]), *terms))
-        over = (result.terminated | result.truncated).cpu()
-        self.ended += over
-        self.returns[over] = 0.0
+        done = (result.terminated | result.truncated).cpu()
+        self.ended += done
+        self.returns[done] = 0.0
         episodes = result.episodes.ended() if result.episodes is not None else None
         if episodes is None:
             return
@@ -69,11 +69,11 @@ class EpisodeHistory:
         return self._last.get(env_id, "")
 
     def clear_curves(self) -> None:
-        """Remove the rewards: another environment is shown."""
+        """Clear the curves: another environment is shown."""
         self._rows.clear()
 
     def clear_returns(self) -> None:
-        """Start new episodes in every environment."""
+        """Clear returns and curves: every environment starts a new episode."""
         self.returns.zero_()
         self.clear_curves()
 

@@ -17,7 +17,7 @@ from rlcli.viewer.playback import Playback, run_in_real_time
 from rlcli.viewer.protocol import REQUEST_KEYS, Ready, View
 
 KEYS = (
-    "Space: pause, go on. Right: one step. Backspace: new episodes. - and =: speed. Up, Down: environment."
+    "Space: pause, resume. Right: one step. Backspace: new episodes. - and =: speed. Up, Down: environment."
     " PageUp, PageDown: newer, older checkpoint. Home, End: choose a command; Insert, Delete: raise, lower it."
     " Double click, then Ctrl and drag: push a body"
 )

@@ -26,7 +26,7 @@ from rlcli.viewer.protocol import View
 
 _log = logging.getLogger(__name__)
 SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""Multiples of real time."""
+"""Speeds of a playback, as multiples of real time."""
 _LAG = 0.25
 """Longest real time that one call of `advance` catches up with [s]."""
 _FRAME_S = 1.0 / 60.0
@@ -207,7 +207,7 @@ class Playback:
         try:
             self.act = self.checkpoint_source.load(step)
         except CheckpointError as error:
-            self._report(f"step {step} cannot be played, step {self.checkpoint} continues: {error.message}")
+            self._report(f"step {step} cannot be played, the current policy continues: {error.message}")
             self._checkpoints = tuple(self.checkpoint_source.steps())
             return
         self.checkpoint = step
@@ -313,7 +313,7 @@ def hold_command(env: VecEnv, name: str, value: float | None) -> None:
     """Hold a command at a value; see `CommandManager.hold`.
 
     Raises:
-        UsageError: for a name that does not exist.
+        UsageError: for an unknown name, or a value that is not finite.
     """
     manager = _commands(env)
     if manager is None:

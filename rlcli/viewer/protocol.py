@@ -63,6 +63,7 @@ class View:
     paused: bool
     speed: float
     shown: int
+    """Index of the shown environment."""
     num_envs: int
     episode_s: float
     """Time since the shown episode began [s]."""
@@ -77,16 +78,20 @@ class View:
     succeeded: int
     """Episodes of the shown environment that have ended with success."""
     last_episode: str
-    """How the last of them ended: return, length and causes."""
+    """How the last episode of the shown environment ended: return, length and causes."""
     curves: RewardCurves
     checkpoint: int | None
     """Step of the policy's checkpoint; None: the policy has no checkpoint."""
     checkpoints: tuple[int, ...]
+    """Steps of the run's checkpoints."""
     follow: bool
+    """Whether each new checkpoint is played as soon as it appears."""
     knobs: tuple[Knob, ...]
+    """Columns of commands that the user can set."""
     commands: tuple[float, ...]
-    """Value of each of them in the shown environment."""
+    """Value of each knob in the shown environment."""
     held: Mapping[str, float]
+    """Values that the user holds, by the name of the knob."""
     knob: int
-    """Index of the command that the keys change."""
+    """Index of the knob that the keys change."""
     message: str

@@ -1,4 +1,4 @@
-"""Videos of an episode: of a policy, of a recording, of a failure case."""
+"""Videos of one episode: from a policy, a recording or a failure case."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator

@@ -1,4 +1,4 @@
-"""MuJoCo's web viewer with access control: only on the loopback interface, only for its own page, without output.
+"""MuJoCo's web viewer with access control: it serves only its own page, on the loopback interface, and prints nothing.
 
 MuJoCo's web viewer (`mujoco.studio`, private and new in 4.0) listens on every interface, answers requests of any page
 and loads models from them. The files of that package stay unchanged: while a viewer runs, this module replaces the few
@@ -99,7 +99,7 @@ def listen(port: int, socket_class: type[socket.socket] = socket.socket) -> sock
 
 @contextlib.contextmanager
 def secured_server(studio: SimpleNamespace, listener: socket.socket) -> Iterator[None]:
-    """Make viewers created in this context use a socket, refuse requests of other pages, and print nothing."""
+    """Context in which created viewers listen on `listener`, refuse requests of other pages, and print nothing."""
     server, viewer = studio.web_server, studio.web_viewer
     port = listener.getsockname()[1]
     replacements: list[tuple[Any, str, Any]] = [
@@ -116,21 +116,21 @@ def secured_server(studio: SimpleNamespace, listener: socket.socket) -> Iterator
 
 
 def verify_refusals(port: int) -> None:
-    """Request the page of the running server, and send requests that it must refuse.
+    """Check the running server: it must answer a request for its page, and refuse requests of other pages.
 
     Raises:
         DependencyError: if the server answers with another status than expected.
     """
     own = f"127.0.0.1:{port}"
     requests = {
-        "its page": ({"Host": own}, 200),
-        "a foreign Host": ({"Host": f"rlcli.invalid:{port}"}, 403),
-        "a foreign Origin": ({"Host": own, "Origin": "http://rlcli.invalid"}, 403),
+        "for its page": ({"Host": own}, 200),
+        "with a foreign Host": ({"Host": f"rlcli.invalid:{port}"}, 403),
+        "with a foreign Origin": ({"Host": own, "Origin": "http://rlcli.invalid"}, 403),
     }
     for name, (headers, expected) in requests.items():
         status = _status(port, headers)
         if status != expected:
-            raise incompatible_viewer(f"its server answers a request with {name} by {status}, expected {expected}")
+            raise incompatible_viewer(f"its server answers a request {name} with status {status}, expected {expected}")
 
 
 def _status(port: int, headers: dict[str, str]) -> int:

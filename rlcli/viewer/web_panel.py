@@ -26,7 +26,7 @@ _SPEEDS = ["1/8 x", "1/4 x", "1/2 x", "real time", "2 x", "4 x", "8 x"]
 _WIDTH = 310.0
 """Width of the panel [pixels]; on a narrow page less."""
 _LAST = 0
-"""Priority of handlers that run after those of MuJoCo."""
+"""Priority of event handlers that run after those of MuJoCo."""
 
 Method = TypeVar("Method", bound=Callable[..., None])
 
@@ -103,7 +103,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         imgui.Begin(TITLE)
         self._widen()
         imgui.TextWrapped(self._title)
-        for label, request in (("Go on" if view.paused else "Pause", "pause"), ("Step", "step"), ("Reset", "reset")):
+        for label, request in (("Resume" if view.paused else "Pause", "pause"), ("Step", "step"), ("Reset", "reset")):
             if imgui.Button(label):
                 playback.submit(playback.requests()[request])
             imgui.SameLine()
@@ -129,7 +129,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         ux.view_gizmo_gui(self.viewer.model, self.viewer.data, self.viewer.camera, self._ux, area)
 
     def _widen(self) -> None:
-        """Give the docked panel its width, when the page has opened."""
+        """Set the width of the docked panel when the page has opened or changed its width."""
         node, page = imgui.GetWindowDockID(), imgui.GetIO().DisplaySize
         if node and page.x != self._page_width:
             self._page_width = page.x
@@ -255,6 +255,6 @@ def _legend(markers: Sequence[Marker]) -> list[tuple[str, Sequence[float] | None
 
 _SWATCH = int(imgui.ColorEditFlags.NoTooltip)
 KEYS = (
-    "Space: pause, go on. Right: one step. Backspace: new episodes. - and =: speed. Up, Down: environment."
+    "Space: pause, resume. Right: one step. Backspace: new episodes. - and =: speed. Up, Down: environment."
     " PageUp, PageDown: newer, older checkpoint. Escape: free camera. Double click, then Ctrl and drag: push a body."
 )

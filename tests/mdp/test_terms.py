@@ -200,7 +200,7 @@ def test_root_events_reject_fixed_robot(tmp_path, event):
     from support.worlds import PENDULUM_TASK, pendulum
 
     env = build(pendulum(tmp_path, edited(PENDULUM_TASK, events={"move": event})))
-    with pytest.raises(TaskError, match="'robot' has no free root"):  # noqa: PT012
+    with pytest.raises(TaskError, match="'robot' is fixed to the world"):  # noqa: PT012
         env.reset()
         env.step(torch.zeros(3, 1))
 

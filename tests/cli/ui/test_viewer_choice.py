@@ -250,7 +250,7 @@ def test_server_without_access_checks_is_stopped():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 7
-    assert "answers a request with a foreign Host by 200, expected 403" in done.stderr
+    assert "answers a request with a foreign Host with status 200, expected 403" in done.stderr
     assert done.stdout == ""
 
 
