@@ -51,7 +51,7 @@ class DirectTask:
     motors: ClassVar[bool] = True
     """Whether every joint without an actuator gets a motor, so that the task can set any effort."""
     Params: type[StrictModel] = StrictModel
-    """Model of `params:` in the YAML."""
+    """Pydantic model of the section `params:` in the YAML."""
 
     def __init__(self, env: DirectEnv, params: StrictModel) -> None:
         self.env = env
@@ -89,7 +89,7 @@ class DirectTask:
         """Register views with `scene.add`. `scene.spec` is the MjSpec before compilation."""
 
     def post_reset(self) -> None:
-        """Look up indices; called once, when the simulation runs."""
+        """Look up indices and make buffers; called once, after the simulation is built."""
 
     def reset(self, selection: Selection) -> None:
         """Write start states; the selected environments are in their default state.
@@ -110,14 +110,14 @@ class DirectTask:
         raise NotImplementedError
 
     def get_observations(self) -> Any:
-        """Fill obs_buf."""
+        """Write the observations of the policy to obs_buf."""
         raise NotImplementedError
 
     def get_states(self) -> Any:
-        """Fill states_buf, if the task has states."""
+        """Write the observations of the critic to states_buf, if the task has any."""
 
     def calculate_metrics(self) -> None:
-        """Fill rew_buf."""
+        """Write the rewards of this step to rew_buf."""
         raise NotImplementedError
 
     def is_done(self) -> None:
@@ -236,7 +236,7 @@ class DirectEnv(VecEnv):
         return Layout(groups, actions, self.step_dt, self.physics_dt, self.config.decimation)
 
     def stateful_objects(self) -> list[Any]:
-        """Return the task."""
+        """Return the direct task, whose attributes a step may change."""
         return [self.task]
 
     def _extras(self) -> dict[str, Any]:
@@ -299,7 +299,7 @@ class DirectEnv(VecEnv):
         return reward, failed, truncated
 
     def _run_hooks(self) -> None:
-        """Call the task's hooks that follow physics."""
+        """Call the hooks of the task that run after physics."""
         self.task.progress_buf += 1
         self._fill_buffers()
         self.task.calculate_metrics()

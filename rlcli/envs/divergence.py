@@ -47,7 +47,7 @@ class DivergenceGuard:
         return {f"Sim/diverged/{cause.replace(' ', '_')}": float(count) for cause, count in new.items()}
 
     def load_quarantined(self, quarantined: Tensor | None) -> None:
-        """Restore `quarantined`; None: no environment is quarantined."""
+        """Restore the mask of quarantined environments; None: no environment is quarantined."""
         self.quarantined.zero_() if quarantined is None else self.quarantined.copy_(quarantined)
         self._any_quarantined = bool(self.quarantined.any())
 

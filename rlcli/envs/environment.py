@@ -143,7 +143,7 @@ class Environment(Protocol):
         """Return the parts of the configuration that make an episode depend on earlier ones; empty: none is known."""
 
     def is_playing(self) -> bool:
-        """Return False while paused; then no step can run."""
+        """Return False while the environment is paused; `step` then raises an error."""
         return self._playing
 
     def pause(self, paused: bool = True) -> None:

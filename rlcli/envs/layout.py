@@ -39,7 +39,7 @@ class TermLayout:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Contract between a policy and its environment; a checkpoint contains it."""
+    """Layout of the observation and action columns for which a policy is trained; a checkpoint contains it."""
 
     observations: dict[str, tuple[TermLayout, ...]]
     actions: tuple[TermLayout, ...]

@@ -45,7 +45,7 @@ class AttributeState:
         self._changed: set[str] = set()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the current values."""
+        """Return copies of the attributes' current values, as tensors by their path."""
         tensors = (found for attribute, value in self._attributes() for found in _tensors(attribute, value))
         state = {path: tensor.clone() for path, tensor in tensors}
         values = dict(self._plain())

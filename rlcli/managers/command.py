@@ -152,7 +152,7 @@ class CommandManager(TensorState):
         return self.get_term(name).command
 
     def get_term(self, name: str) -> CommandTerm:
-        """Return a command term."""
+        """Return the command term of a name."""
         term: CommandTerm = self._by_name[name].instance
         return term
 
@@ -178,7 +178,7 @@ class CommandManager(TensorState):
         return self._sums[:, column] / self._steps.clamp(min=1.0)
 
     def reset(self, selection: Selection) -> None:
-        """Draw the first commands of new episodes."""
+        """Reset the terms and draw the first commands of new episodes."""
         if self._measured:
             selection.write(self._sums, 0.0)
             selection.write(self._steps, 0.0)

@@ -42,7 +42,7 @@ class Stage:
         raise NotImplementedError
 
     def reset(self, selection: Selection) -> None:
-        """Start new episodes."""
+        """Clear what the stage keeps from earlier episodes of the selected environments."""
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors that the stage keeps from step to step; they are written in place."""
@@ -80,12 +80,12 @@ class Pipeline:
 
     @property
     def size(self) -> int:
-        """Number of columns in the group."""
+        """Number of columns that the term has in its observation group."""
         return self.width * self.history
 
     @property
     def has_memory(self) -> bool:
-        """Whether the result depends on earlier steps."""
+        """Whether the term's observation depends on earlier steps."""
         return bool(self.tensors())
 
     def write(self, view: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:

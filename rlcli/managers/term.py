@@ -184,7 +184,7 @@ class Binder:
         return getattr(importlib.import_module(signature.module), signature.attribute)
 
     def add_problem(self, path: Path, message: str, hint: str | None = None) -> None:
-        """Add a problem at a path of the configuration."""
+        """Collect a problem at a path of the configuration; `raise_problems` raises all of them."""
         self.problems.append(self.resolved.problem(path, message, hint))
 
     def raise_problems(self) -> None:

@@ -76,7 +76,7 @@ class TunableValues:
         return self._tensors[path]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors by their dotted path."""
+        """Return the tensors of the changeable settings, by the dotted path of the setting."""
         return {".".join(map(str, path)): tensor for path, tensor in self._tensors.items()}
 
 

@@ -53,7 +53,7 @@ class _JointAction(JointTerm):
         self._drive.write(self.command)
 
     def _compute_command(self, action: Tensor) -> None:
-        """Fill `command`."""
+        """Compute the commands of all joints from the action and write them to `command`."""
         raise NotImplementedError
 
     def _per_joint(self, mapping: dict[str, float], default: float) -> Tensor:

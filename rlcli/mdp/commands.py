@@ -203,7 +203,7 @@ class UniformPose(EntityTerm):
         self.command[:, 3] = 1.0
 
     def resample(self, selection: Selection) -> None:
-        """Draw poses."""
+        """Draw goal poses for the selected environments."""
         x, y, z, roll, pitch, yaw = (selection.uniform(*bounds) for bounds in self._ranges)
         quat = from_euler(roll, pitch, yaw)
         quat = unique(quat) if self.make_quat_unique else quat
@@ -268,7 +268,7 @@ class UniformPose2d(EntityTerm, TensorState):
         self._target = torch.zeros(self.env.num_envs, 4, device=self.env.device)
 
     def resample(self, selection: Selection) -> None:
-        """Draw positions and headings."""
+        """Draw goal positions and headings for the selected environments."""
         data = self.entity.data
         x, y, turn = (selection.uniform(*bounds) for bounds in self._ranges)
         height = selection.read_view(data.default_root_state)[:, 2]

@@ -34,7 +34,7 @@ class Stages(Term):
         self._values = torch.cat([self.address[None].clone(), table])
 
     def advance(self, step: Tensor) -> Tensor:
-        """Set and return the value at this step. step () int64"""
+        """Set the setting at `address` to its value at this training step, and return the value. step () int64"""
         number = torch.bucketize(step, self._steps, right=True)
         # index_select: indexing with a tensor would read the number on the host
         self.address.copy_(self._values.index_select(0, number[None])[0])
@@ -62,7 +62,7 @@ class Interpolate(Term):
         _require_shape("'to'", self._to.shape, self.address)
 
     def advance(self, step: Tensor) -> Tensor:
-        """Set and return the value at this step. step () int64"""
+        """Set the setting at `address` to its value at this training step, and return the value. step () int64"""
         fraction = ((step - self.begin).float() / (self.end - self.begin)).clamp(0.0, 1.0)
         self.address.copy_(self._from + fraction * (self._to - self._from))
         return self.address

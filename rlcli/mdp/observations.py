@@ -342,7 +342,7 @@ class RelEeDrawerDistance(HandleTerm):
     """Vector from a site of `entity` to the site `handle` of `cabinet`, world frame [m]. (num_envs, 3)"""
 
     def __call__(self) -> Tensor:
-        """Return the vector. (num_envs, 3)"""
+        """Return the vector from the site to the handle, world frame [m]. (num_envs, 3)"""
         return self.offset_to_handle()
 
 

@@ -35,7 +35,7 @@ class Ranges:
         self._any_tunable = any(pair is not None for pair in self._tunable)
 
     def now(self) -> tuple[Tensor, Tensor]:
-        """Return the current ends. (ranges,) float32 each"""
+        """Return the current lower and upper ends. (ranges,) float32 each"""
         ends = self._fixed
         if self._any_tunable:
             rows = zip(self._fixed, self._tunable, strict=True)
@@ -206,7 +206,7 @@ def unset_simple(spec: mujoco.MjSpec, params: dict[str, Any], key: str) -> None:
 
 
 def element_names(entity: Any, kind: str, index: Columns) -> list[str]:
-    """Return the names of the selected elements."""
+    """Return the names of an entity's elements (joints, bodies, ...) that an index selects."""
     names = entity.names[kind]
     return [names[number] for number in column_numbers(index, len(names))]
 

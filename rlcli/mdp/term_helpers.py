@@ -74,7 +74,7 @@ def on_host(index: Columns) -> Columns:
 
 
 def column_numbers(index: Columns, count: int) -> list[int]:
-    """Return the numbers of the selected elements out of `count`."""
+    """Return the positions that an index into `count` elements selects."""
     numbers: list[int] = torch.arange(count)[on_host(index)].tolist()
     return numbers
 

@@ -77,7 +77,7 @@ class ActuatorModel(TensorState):
         self._is_first_step = torch.ones(n, dtype=torch.bool, device=device)
 
     def compute(self) -> None:
-        """Write the efforts of the next physics step."""
+        """Compute the efforts for the next physics step and write them to the motors' controls."""
         position, velocity = self._qpos[:, self._qpos_columns].float(), self._qvel[:, self._dof_columns].float()
         target = self.targets if self._target_history is None else self._delayed_targets(self._target_history)
         torch.mul(self.stiffness, target[:, POSITION] - position, out=self.computed_effort)

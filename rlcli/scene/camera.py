@@ -122,7 +122,7 @@ class CameraRenderer:
         self._option = mujoco.MjvOption()
 
     def load_state(self, engine: ReplayableEngine, env: int) -> None:
-        """Load the visible part of a world's state and model."""
+        """Load the part of a world's state and model that affects its image."""
         if engine.expanded_fields():
             if self._model is self._shared_model:
                 self._model = copy.copy(self._shared_model)
@@ -160,7 +160,7 @@ class CameraRenderer:
         out[:] = _downsample(depths[..., None], config.samples)
 
     def free(self) -> None:
-        """Free the context."""
+        """Free the OpenGL context and its buffers."""
         self._mjr.free()
         self._context.free()
 

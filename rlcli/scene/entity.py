@@ -50,12 +50,12 @@ class Entity:
         self.sim = sim
         model = engine.model
         self.ids = {alias: _ids(model, name, kind, getattr(model, count)) for alias, (kind, count) in KINDS.items()}
-        """Ids in the model, by kind: Joints, Bodies, ..."""
+        """Ids of the entity's elements in the model, by kind: Joints, Bodies, ..."""
         self.ids["Joints"] = self.ids["Joints"][np.isin(model.jnt_type[self.ids["Joints"]], _SCALAR)]
         self.joint_ids, self.body_ids, self.site_ids = self.ids["Joints"], self.ids["Bodies"], self.ids["Sites"]
         self.actuator_ids, self.geom_ids = self.ids["Actuators"], self.ids["Geoms"]
         self.names = {alias: _names(model, name, kind, self.ids[alias]) for alias, (kind, _) in KINDS.items()}
-        """Names without the entity's prefix, by kind."""
+        """Names of the entity's elements, without its prefix, by kind."""
         self.joint_names = self.names["Joints"]
         self.qpos_columns = id_tensor(model.jnt_qposadr[self.joint_ids], engine.device)
         self.dof_columns = id_tensor(model.jnt_dofadr[self.joint_ids], engine.device)
@@ -72,7 +72,7 @@ class Entity:
 
     @property
     def is_floating(self) -> bool:
-        """Whether the root is a free joint."""
+        """Whether the root body has a free joint."""
         return self.root_qpos is not None
 
     def select(self, alias: str, patterns: str | Sequence[str]) -> tuple[Columns, list[str]]:

@@ -431,7 +431,7 @@ class EntityData:
         return self._sim.derived_field(name)
 
     def _once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
-        """Return a value that is computed once per step."""
+        """Return a value derived from the state, and compute it only if the state has changed since the last call."""
         stamp, value = self._cache.get(name, (-1, None))
         if stamp != self._sim.stamp or value is None:
             value = compute()

@@ -93,7 +93,7 @@ def _orientation(element: Any) -> FloatArray:
 
 
 def _product(pos: FloatArray, quat: FloatArray, pos2: FloatArray, quat2: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the product of two poses."""
+    """Return the composition of two poses: the second one, given in the frame of the first."""
     product = np.empty(3), np.empty(4)
     mujoco.mju_mulPose(*product, pos, quat, pos2, quat2)
     return product

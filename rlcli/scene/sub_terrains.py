@@ -42,7 +42,7 @@ class PatchSite:
     """Generator of the patch's random numbers."""
 
     def flat(self) -> Heights:
-        """Return heights of 0."""
+        """Return the heights of a flat patch, all 0 [m]."""
         nx, ny = (round(edge / self.resolution) + 1 for edge in self.size)
         return np.zeros((nx, ny))
 
@@ -68,7 +68,7 @@ class Patch:
 
 
 def make_patch(config: schema.PatchConfig, site: PatchSite) -> Patch:
-    """Make a sub-terrain of the site's difficulty."""
+    """Return a patch of a kind of sub-terrain, of the size and the difficulty of `site`."""
     heights_or_blocks = _MAKERS[type(config)](config, site)
     if isinstance(heights_or_blocks, np.ndarray):
         return Patch(_with_zero_edges(heights_or_blocks))

@@ -25,7 +25,7 @@ from rlcli.sim.saved_tensors import require_in_range
 from rlcli.sim.selection import Selection
 
 TERRAIN_BODY = "terrain"
-"""Body that has the geoms of the terrain."""
+"""Name of the MuJoCo body that has the geoms of the terrain."""
 _MAX_HEIGHTS = 1 << 24
 """Largest number of heights of a height field."""
 _MAX_HEADER = 10_000
@@ -39,7 +39,7 @@ _THICKNESS = 0.5
 _BOX, _HFIELD = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_HFIELD
 
 TerrainProblem = tuple[tuple[str, ...], str, str | None]
-"""Key below scene.terrain, message, hint."""
+"""Problem of a terrain's configuration: its key below scene.terrain, message, hint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,9 +150,9 @@ class Terrain:
         """Start position on each patch. (rows, columns, 3) [m]"""
         self._streams = streams
         self.types = torch.from_numpy(streams).to(device) % self.origins.shape[1]
-        """Column of each environment. (num_envs,) int64"""
+        """Terrain type (column of patches) of each environment. (num_envs,) int64"""
         self.levels = torch.zeros(count, dtype=torch.int64, device=device)
-        """Row of each environment. (num_envs,) int64"""
+        """Terrain level (row of patches) of each environment. (num_envs,) int64"""
         self.patch = ground.patch
         """Extent of a patch along x and y [m]."""
         rows = len(self.origins)
@@ -201,7 +201,7 @@ class Terrain:
                 entity.write_root_pose(selection, position, default[:, 3:7])
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return a copy of the levels."""
+        """Return a copy of the terrain level of each environment."""
         return {"levels": self.levels.clone()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:

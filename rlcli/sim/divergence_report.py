@@ -51,7 +51,7 @@ class Divergence:
     cause: str
     """MuJoCo's warning without its prefix (`BADQACC`), `FIELD not finite`, `FIELD out of bounds`, or `engine error`."""
     detail: str = ""
-    """Element of the model in which the divergence was detected, and its source, if known; or the engine's error message."""
+    """Element of the model in which the divergence was detected, and its source; or the engine's error message."""
     index: int = -1
     """Index of the bad value in the field of the warning or in `qvel`; -1 if unknown."""
 
@@ -67,7 +67,7 @@ class Call:
     state: States
     """Integration state before the call. (nstate,)"""
     nstep: int
-    """Number of physics steps."""
+    """Number of physics steps of the call."""
 
 
 class StateHistory:
@@ -152,11 +152,11 @@ class StateLayout:
         self._columns = {name: slice(start, start + size) for name, (start, size) in columns.items()}
 
     def columns(self, name: str) -> slice:
-        """Return the columns of a field."""
+        """Return the columns of a field in the integration state."""
         return self._columns[name]
 
     def fields(self) -> list[tuple[str, slice]]:
-        """Return every field with its columns."""
+        """Return every field of the integration state with its columns."""
         return list(self._columns.items())
 
     def nonfinite_fields(self, state: States) -> list[str]:

@@ -22,9 +22,9 @@ class Arrow(NamedTuple):
     """Arrow, which is not shown if its length is at most its radius."""
 
     start: Tensor
-    """Start point. (num_envs, 3) [m]"""
+    """Start point of the arrow. (num_envs, 3) [m]"""
     end: Tensor
-    """Tip. (num_envs, 3) [m]"""
+    """Tip of the arrow. (num_envs, 3) [m]"""
     color: Color = COMMANDED
     radius: float = 0.015
     """Radius of the shaft [m]."""
@@ -33,13 +33,13 @@ class Arrow(NamedTuple):
 
 
 class Sphere(NamedTuple):
-    """Sphere."""
+    """Sphere, such as a goal position."""
 
     center: Tensor
-    """Centre. (num_envs, 3) [m]"""
+    """Centre of the sphere. (num_envs, 3) [m]"""
     color: Color = COMMANDED
     radius: float = 0.02
-    """Radius [m]."""
+    """Radius of the sphere [m]."""
     label: str = ""
     """Meaning of the marker, for the legend of viewers."""
 
@@ -48,9 +48,9 @@ class Frame(NamedTuple):
     """Axes of a pose: x red, y green, z blue."""
 
     position: Tensor
-    """Origin. (num_envs, 3) [m]"""
+    """Origin of the axes. (num_envs, 3) [m]"""
     quat: Tensor
-    """Orientation (w, x, y, z), of length 1. (num_envs, 4)"""
+    """Orientation of the axes, unit quaternion (w, x, y, z). (num_envs, 4)"""
     length: float = 0.1
     """Length of each axis [m]."""
     label: str = ""
@@ -58,4 +58,4 @@ class Frame(NamedTuple):
 
 
 Marker: TypeAlias = Arrow | Sphere | Frame
-"""One shape in each environment."""
+"""Shape that a viewer shows in each environment."""

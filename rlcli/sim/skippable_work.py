@@ -16,7 +16,7 @@ _D = mujoco.mjtDisableBit
 FIELDS_OF_SKIPPED_WORK = frozenset(
     ["nisland", "nidof", "solver_niter", "solver_nnz", "solver_fwdinv", "bvh_active", "bvh_aabb_dyn"]
 )
-"""Fields of MjData that the skipped work writes."""
+"""Fields of MjData that only the skipped work writes: a task that reads one turns the skipping off."""
 
 
 def skippable_flags(model: mujoco.MjModel) -> int:

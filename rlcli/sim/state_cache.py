@@ -65,7 +65,7 @@ class SimData:
             self.engine.forward(selection)
 
     def refresh(self) -> None:
-        """Copy the state of every world."""
+        """Copy the joint state of every world from the engine."""
         for copy, source in self._copied:
             copy[...] = source
         self.stamp += 1

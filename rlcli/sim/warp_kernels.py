@@ -148,7 +148,7 @@ def restore_diverged(diverged: wp.array(dtype=wp.bool), now: _Rows, last: _Rows)
 
 @wp.kernel
 def save_rows(mask: wp.array(dtype=wp.bool), now: _Rows, last: _Rows):
-    """Save the masked rows as their last values."""
+    """Copy the masked rows of `now` to `last`, the values that `restore_diverged` restores."""
     world, column = wp.tid()
     if mask[world]:
         last[world, column] = now[world, column]

@@ -39,9 +39,9 @@ class EpisodeHistory:
         self.returns = torch.zeros(env.num_envs)
         """Return of each running episode. (num_envs,)"""
         self.ended = torch.zeros(env.num_envs, dtype=torch.int64)
-        """Episodes that have ended. (num_envs,)"""
+        """Number of episodes that have ended in each environment. (num_envs,)"""
         self.succeeded = torch.zeros(env.num_envs, dtype=torch.int64)
-        """Episodes that have ended with success. (num_envs,)"""
+        """Number of episodes that have ended with success in each environment. (num_envs,)"""
         self._last: dict[int, str] = {}
 
     def add(self, result: StepResult, shown: int) -> None:

@@ -83,7 +83,7 @@ class Playback:
 
     @property
     def view(self) -> View:
-        """Current state for the viewer."""
+        """Snapshot of the playback for the viewer, after the last `advance`."""
         return self._view
 
     def submit(self, request: Callable[[], None]) -> None:
@@ -146,7 +146,7 @@ class Playback:
         self.speed = min(SPEEDS, key=lambda available: abs(np.log(available / max(speed, 1e-9))))
 
     def change_speed(self, change: int = 1) -> None:
-        """Move up or down in `SPEEDS`."""
+        """Change the speed to a faster (1) or slower (-1) one of `SPEEDS`."""
         position = SPEEDS.index(self.speed) + change
         self.speed = SPEEDS[max(0, min(position, len(SPEEDS) - 1))]
 

@@ -15,7 +15,7 @@ _log = logging.getLogger(__name__)
 
 
 class VideoAborted(Exception):
-    """Raised to abort a video when training is stopped."""
+    """Signal that training is being stopped, which aborts the video."""
 
 
 class TrainingVideos(StepObserver):

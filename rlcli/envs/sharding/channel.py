@@ -55,7 +55,7 @@ class Channel:
         return kind.rstrip(b"\0"), pickle.loads(self._read(size)) if size else None
 
     def close(self) -> None:
-        """Close this end."""
+        """Close this end of the connection."""
         self._socket.close()
 
     def _first_bytes(self, size: int) -> bytes:

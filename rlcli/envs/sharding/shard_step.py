@@ -37,10 +37,13 @@ class Stage(enum.IntEnum):
     DIVERGED = 1
     """`on_divergence` after physics."""
     AFTER_PHYSICS = 2
+    """`after_physics`."""
     ON_STEP = 3
+    """`on_step`."""
     QUARANTINED = 4
     """`on_divergence` for environments that an event or a reset put out of bounds."""
     DONE = 5
+    """The step, reset or load is complete."""
 
 
 class Needs(enum.Flag):
@@ -71,13 +74,13 @@ class Columns:
 
     @staticmethod
     def of(episodes: Episodes) -> Columns:
-        """Return the names of some episodes' columns."""
+        """Return the names of the values that these episodes have."""
         named = (episodes.reward_terms, episodes.causes, episodes.metrics)
         return Columns(*(tuple(part) for part in (*named, episodes.conditions, episodes.condition_values)))
 
     @property
     def count(self) -> int:
-        """Number of columns."""
+        """Number of columns in shared memory, with those that every episode has."""
         named = (self.terms, self.causes, self.metrics, self.conditions, self.condition_values)
         return _FIXED_COLUMNS + sum(len(part) for part in named) + bool(self.conditions)
 

@@ -36,7 +36,7 @@ class Job:
     """Everything from which a worker builds its shard."""
 
     resolved: bytes
-    """The configuration, pickled."""
+    """Configuration of the shard, pickled."""
     seed: int
     shared_streams: int
     shard: Shard
@@ -87,7 +87,7 @@ class _Worker:
         self._check: Callable[[], None] = lambda: None
 
     def do(self, kind: bytes, content: Any) -> None:
-        """Do what a message requests, and reply."""
+        """Execute the request of a message (step, reset, call, ...), and reply."""
         if kind == STEP:
             self._runner.step()
         elif kind == RESET:

@@ -76,7 +76,7 @@ class ProgressReward(EntityTerm, TensorState):
         self._position = self.entity.data.root_pos_w[:, :2].clone()
 
     def __call__(self) -> Tensor:
-        """Return the speed. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         position = self.entity.data.root_pos_w[:, :2]
         ahead, ahead_before = self._target_from(position), self._target_from(self._position)
         # |b| - |a| = (b - a) (b + a) / (|b| + |a|), with b - a computed from the short way of one step
@@ -117,7 +117,7 @@ class IsTerminatedTerm(Term):
         self._names = [known[position] for position in match(self.terms, known, "termination")]
 
     def __call__(self) -> Tensor:
-        """Return the number of terminations. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         manager = self.env.termination_manager
         fired = torch.zeros_like(manager.terminated, dtype=torch.float32)
         for name in self._names:

@@ -145,7 +145,7 @@ class FeetSwingHeight(EntityTerm, TensorState):
         self._peak = torch.zeros_like(self.sensor.air_time)
 
     def __call__(self) -> Tensor:
-        """Return the sum. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         z = require_one_per_body(self.entity.data.site_pos_w[:, self.sites, 2], self.sensor, "sites")
         height = z - self.env.origins[:, 2:3]
         torch.maximum(self._peak, height, out=self._peak)
@@ -154,7 +154,7 @@ class FeetSwingHeight(EntityTerm, TensorState):
         return error.sum(dim=1) * (commanded_speed(self.command) > self.command_threshold)
 
     def reset(self, selection: Selection) -> None:
-        """Clear the peaks of new episodes."""
+        """Set the largest heights of the swings to 0 in new episodes."""
         selection.write(self._peak, 0.0)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -229,7 +229,7 @@ class GaitReward(EntityTerm):
         self._out_of_phase = ((a, c), (b, d), (a, d), (c, b))
 
     def __call__(self) -> Tensor:
-        """Return the product. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         air, contact = self.sensor.air_time, self.sensor.contact_time
         error = torch.zeros_like(air[:, 0])
         for one, other in self._in_phase:

@@ -64,7 +64,7 @@ class JointPosLimitsPenaltyRatio(JointTerm):
         self._ratio = _per_joint(self, self.gear_ratio, "gear_ratio")
 
     def __call__(self) -> Tensor:
-        """Return the sum. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         data, soft = self.entity.data, self.entity.config.soft_joint_pos_limit_factor < 1.0
         low, high = (limit[:, self.joints] for limit in data.joint_limits(soft))  # at 1.0 soft limits are the limits
         scaled = ((2.0 * data.joint_pos_of(self.joints) - low - high) / (high - low)).abs()
@@ -98,7 +98,7 @@ class PowerConsumption(JointTerm):
         self._ratio = _per_joint(self, self.gear_ratio, "gear_ratio")
 
     def __call__(self) -> Tensor:
-        """Return the sum. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         action, velocity = self.env.action_manager.action, self.entity.data.joint_vel_of(self.joints)
         if action.shape != velocity.shape:
             found, wanted = velocity.shape[1], action.shape[1]
@@ -129,7 +129,7 @@ class ActionAccL2:
         self._before: Tensor | None = None
 
     def __call__(self) -> Tensor:
-        """Return the sum. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         action, previous = self._env.action_manager.action, self._env.action_manager.prev_action
         if self._before is None:
             self._before = torch.zeros_like(action)
@@ -138,7 +138,7 @@ class ActionAccL2:
         return change.square_().sum(dim=1)
 
     def reset(self, selection: Selection) -> None:
-        """Clear the past actions of new episodes."""
+        """Set the past actions to 0 in new episodes."""
         if self._before is not None:
             selection.write(self._before, 0.0)
 
@@ -254,7 +254,7 @@ class Posture(JointTerm):
         self._std = _per_joint(self, self.std)
 
     def __call__(self) -> Tensor:
-        """Return the exponential. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         return (_deviation(self.entity, self.joints) / self._std).square_().mean(dim=1).neg_().exp_()
 
 
@@ -278,7 +278,7 @@ class VariablePosture(JointTerm):
         self._standing, self._walking, self._running = (_per_joint(self, std) for std in stds)
 
     def __call__(self) -> Tensor:
-        """Return the exponential. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         speed = (commanded_speed(self.command) + self.command.command[:, 2].abs())[:, None]
         std = torch.where(speed < self.walking_threshold, self._standing, self._walking)
         std = torch.where(speed < self.running_threshold, std, self._running)

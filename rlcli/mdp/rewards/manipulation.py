@@ -130,7 +130,7 @@ class ApproachEeHandle(HandleTerm):
     threshold: float
 
     def __call__(self) -> Tensor:
-        """Return the value. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         distance = length(self.offset_to_handle())
         near = (1.0 / (1.0 + distance.square())).square_()
         return torch.where(distance <= self.threshold, 2.0 * near, near)
@@ -144,7 +144,7 @@ class AlignEeHandle(HandleTerm):
     """
 
     def __call__(self) -> Tensor:
-        """Return the alignment. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         site, handle = self.orientations()
         grip = -(axis_z(site) * axis_x(handle)).sum(dim=1)
         turn = -(axis_x(site) * axis_y(handle)).sum(dim=1)
@@ -163,7 +163,7 @@ class GraspHandle(HandleTerm):
     open_joint_pos: float
 
     def __call__(self) -> Tensor:
-        """Return the sum. (num_envs,)"""
+        """Return the value of the reward term. (num_envs,)"""
         closed: Tensor = (self.open_joint_pos - self.entity.data.joint_pos_of(self.joints)).sum(dim=1)
         return closed * (length(self.offset_to_handle()) <= self.threshold)
 
