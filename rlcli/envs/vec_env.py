@@ -278,7 +278,7 @@ class VecEnv(Workflow):
 
     @property
     def local(self) -> VecEnv:
-        """The environment of this process, with terms and managers: this object, if no other process steps a part."""
+        """The environments that this process steps, with their terms and managers: this object."""
         return self
 
     def success_conditions(self, env_id: int) -> list[str]:

@@ -46,7 +46,7 @@ class CommandTerm(Protocol):
         """Draw new commands for the selected environments."""
 
     def update(self) -> None:
-        """Update the command from the state (a heading, a frame); called once a step, after resampling."""
+        """Update the command from the state (a yaw rate from a heading error ...); called once a step, after resampling."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class Knob:
     """Column of a command that a person may set: in a viewer, or with `--command`."""
 
     name: str
-    """`ELEMENT`, or `TERM.ELEMENT` if several terms have an element of this name."""
+    """Name of the knob: `ELEMENT`, or `TERM.ELEMENT` if several terms have an element of this name."""
     term: str
     column: int
     low: float

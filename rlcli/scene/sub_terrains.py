@@ -62,7 +62,7 @@ class Patch:
     """Heights and blocks of a generated patch."""
 
     heights: Heights
-    """Heights of its surface, blocks included; 0 along the edges [m]."""
+    """Heights of the patch's surface, blocks included; 0 along the edges [m]."""
     blocks: tuple[Block, ...] = ()
     """Blocks that become boxes instead of a part of the height field."""
 

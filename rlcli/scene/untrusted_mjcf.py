@@ -65,7 +65,7 @@ class BadModel(ValueError):
 
 
 def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False, compiled: bool = False) -> mujoco.MjSpec:
-    """Check a model and read it.
+    """Check an untrusted MJCF, and return it as an MjSpec.
 
     Args:
         file: MJCF of the model.

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rlcli.errors import DependencyError
 
 _VERSION = "4.0"
-"""Version of MuJoCo that has all names of this module."""
+"""Version of MuJoCo that has all private names that this module uses."""
 
 
 def _private(owner: object, name: str) -> Any:

@@ -41,7 +41,7 @@ class SimData:
         self.stamp = 0
         """Number of updates; a cached value with an older stamp is out of date."""
         self.command_stamp = 0
-        """Number of updates of the commands."""
+        """Number of updates of the commands; a cached goal with an older stamp is out of date."""
         self._goals: dict[tuple[object, ...], tuple[tuple[int, int, int], Tensor]] = {}
         self._saved_at, self._summed = -1, (-1, 0.0)
         self._moved: Selection | None = None
@@ -59,7 +59,7 @@ class SimData:
         self.refresh_rows(selection)
 
     def forward_moved(self) -> None:
-        """Compute the derived fields of worlds for which `on_moved` has postponed it."""
+        """Compute the derived fields of the worlds for which `on_moved` has postponed the computation."""
         if self._moved is not None:
             selection, self._moved = self._moved, None
             self.engine.forward(selection)

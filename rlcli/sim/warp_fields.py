@@ -31,7 +31,7 @@ KINEMATICS, VELOCITY, FORCE = range(3)
 
 
 class FieldStages:
-    """Stages that compute the fields of a model's worlds."""
+    """Lookup of the stages of a step that compute each field of a model's worlds."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         force_columns = force_sensor_columns(model)

@@ -20,7 +20,7 @@ class ChannelClosedError(Exception):
 
 
 class Channel:
-    """One end of a connection. A message has a kind, one or two bytes, and a content that is pickled unless it is None.
+    """One end of a connection. A message has a kind (one or two bytes) and a content, pickled unless it is None.
 
     Both ends belong to the same user and the same command: nothing else can connect.
 

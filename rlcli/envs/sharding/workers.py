@@ -79,7 +79,7 @@ class Worker:
 
     @property
     def pid(self) -> int:
-        """Process id."""
+        """Process id of the worker."""
         return self._process.pid
 
     def has_ended(self) -> bool:
