@@ -92,7 +92,7 @@ class Environment(Protocol):
 
     @property
     def common_step(self) -> int:
-        """Number of steps since the start, the same in all environments."""
+        """Number of steps since the start or the last reset with a seed, the same in all environments."""
 
     @property
     def causes(self) -> dict[str, int]:

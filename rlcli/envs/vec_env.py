@@ -296,7 +296,7 @@ class VecEnv(Workflow):
 
     @property
     def common_step(self) -> int:
-        """Number of steps since the start, the same in all environments."""
+        """Number of steps since the start or the last reset with a seed, the same in all environments."""
         return int(self._counters.common_step)
 
     @property

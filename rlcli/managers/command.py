@@ -46,7 +46,7 @@ class CommandTerm(Protocol):
         """Draw new commands for the selected environments."""
 
     def update(self) -> None:
-        """Update the command from the state (a yaw rate from a heading error ...); called once a step, after resampling."""
+        """Update the command from the state, as a yaw rate from a heading; called once a step, after resampling."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -202,7 +202,7 @@ class ShardedEnv(Environment):
 
     @property
     def common_step(self) -> int:
-        """Number of steps since the start, the same in all environments."""
+        """Number of steps since the start or the last reset with a seed, the same in all environments."""
         return self.local.common_step
 
     @property

@@ -86,7 +86,7 @@ class Columns:
 
 
 def counter_specs(total: int) -> dict[str, ArraySpec]:
-    """Return shapes and types of the shared tensors that are needed while environments are built: the first in the file."""
+    """Return shapes and types of the shared tensors that are needed first, while environments are built."""
     return {"counters": ArraySpec((2, total), torch.int64)}
 
 
