@@ -231,6 +231,6 @@ class RandomizeModelField(DrawKeys, FieldRandomization):
 
     @staticmethod
     def prepare(spec: mujoco.MjSpec, params: dict[str, Any]) -> None:
-        """Clear the `simple` flag of bodies whose inertial frame changes: with the flag, MuJoCo uses the body's frame."""
+        """Clear the `simple` flag of bodies whose inertial frame changes: with it, MuJoCo uses the body's frame."""
         if params["field"] in ("body_ipos", "body_iquat"):
             unset_simple(spec, params, "names")
