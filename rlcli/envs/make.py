@@ -1,4 +1,4 @@
-"""`make_env`: the environment of a task."""
+"""`make_env`, which builds the environment of a task."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ class ManagedEnv(VecEnv):
         self.curriculum_manager = CurriculumManager(bound["curriculum"], context)
 
     def stateful_objects(self) -> list[Any]:
-        """Return the class terms."""
+        """Return the terms that are objects of classes, whose attributes a step may change."""
         return [term.instance for term in self._terms() if not isinstance(term.instance, functools.partial)]
 
     def _terms(self) -> list[BoundTerm]:

@@ -94,7 +94,7 @@ class CommandManager(TensorState):
         self._held_knobs: dict[str, Knob] = {}
 
     def knobs(self) -> list[Knob]:
-        """Return the columns that a person may set."""
+        """Return the columns of all commands that a person may set."""
         found = []
         for term in self.terms:
             width = term.instance.command.shape[1]

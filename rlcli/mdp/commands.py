@@ -143,7 +143,7 @@ class UniformVelocity(_VelocityCommand):
 
     @property
     def limits(self) -> list[Range]:
-        """Ranges of the samples. [m/s, m/s, rad/s]"""
+        """Ranges of the sampled velocities. [m/s, m/s, rad/s]"""
         return [(low, high) for low, high in self._ranges]
 
     def tensors(self) -> dict[str, Tensor]:

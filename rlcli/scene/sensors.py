@@ -40,7 +40,7 @@ class ContactSensor(TensorState):
         engine = sim.engine
         n, k, device = engine.num_envs, len(spec.bodies), engine.device
         self.names = spec.bodies
-        """Names of the k bodies."""
+        """Names of the sensor's k bodies."""
         self._threshold = spec.config.force_threshold
         self._others = len(spec.sensors[0])
         sensors = [engine.model.sensor(name).id for names in spec.sensors for name in names]
@@ -54,9 +54,9 @@ class ContactSensor(TensorState):
         self.force = self.force_history[:, 0]
         """Net contact force on each body in the last substep, world frame. (num_envs, k, 3) [N]"""
         self.air_time = times[0]
-        """Time since each body has been in the air; 0 in contact. (num_envs, k) [s]"""
+        """Time for which each body has been in the air; 0 in contact. (num_envs, k) [s]"""
         self.contact_time = times[1]
-        """Time since each body has been in contact; 0 in the air. (num_envs, k) [s]"""
+        """Time for which each body has been in contact; 0 in the air. (num_envs, k) [s]"""
         self.last_air_time = times[2]
         """Time that each body was in the air before its last contact. (num_envs, k) [s]"""
         self.last_contact_time = times[3]
@@ -132,7 +132,7 @@ class RaySensor(LazySensor):
         self._unit = torch.eye(3, device=engine.device)
         n, r = engine.num_envs, len(self._starts)
         self.names = [f"ray_{i}" for i in range(r)]
-        """Names of the r rays."""
+        """Names of the sensor's r rays."""
         self._distance = torch.zeros(n, r, device=engine.device)
         self._missed = torch.zeros(n, r, dtype=torch.bool, device=engine.device)
         # x, y and z of all hits are one plane each: terms read the heights

@@ -214,7 +214,7 @@ class WarpEngine(WarpWorlds):
             self._derive()
 
     def _check_bounds(self) -> None:
-        """Restore diverged worlds before fields are derived from their state."""
+        """Find diverged worlds and restore their last good state, before fields are derived from it."""
         state = [self._arrays[name] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl", "act")]
         inputs = [*state, self._data.overflow, self._max_velocity]
         results = (self._last_qpos, self._last_qvel, self._diverged, self._counts, self._first, self._overflowed)

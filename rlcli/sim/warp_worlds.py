@@ -250,7 +250,7 @@ class WarpWorlds:
 
     @contextlib.contextmanager
     def _setting_up(self) -> Iterator[None]:
-        """Launch on the engine's device and, on a GPU, on torch's stream."""
+        """Context in which Warp launches on the engine's device and, on a GPU, on torch's stream."""
         is_gpu = self.device.type == "cuda"
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.device)) if is_gpu else None
         with self._launching(), wp.ScopedStream(stream):

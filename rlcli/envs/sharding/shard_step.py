@@ -35,13 +35,13 @@ class Stage(enum.IntEnum):
     """Points of a step at which a shard can wait for the observers of the main process, in their order."""
 
     DIVERGED = 1
-    """`on_divergence` after physics."""
+    """After physics: `on_divergence` of the observers runs, for simulations that diverged."""
     AFTER_PHYSICS = 2
-    """`after_physics`."""
+    """After physics: `after_physics` of the observers runs."""
     ON_STEP = 3
-    """`on_step`."""
+    """After rewards and terminations: `on_step` of the observers runs."""
     QUARANTINED = 4
-    """`on_divergence` for environments that an event or a reset put out of bounds."""
+    """After resets: `on_divergence` runs, for environments that an event or a reset put out of bounds."""
     DONE = 5
     """The step, reset or load is complete."""
 

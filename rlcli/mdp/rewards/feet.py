@@ -30,7 +30,7 @@ def desired_contacts(env: ManagedEnv, *, sensor: ContactSensor, threshold: float
 
 
 def contact_forces(env: ManagedEnv, *, sensor: ContactSensor, threshold: float) -> Tensor:
-    """Sum of the contact forces above `threshold`, each the largest within the sensor's history [N]. (num_envs,)"""
+    """Sum of the excess of contact forces over `threshold`, the largest in the sensor's history [N]. (num_envs,)"""
     return (strongest_force(sensor) - threshold).clamp_(min=0.0).sum(dim=1)
 
 
