@@ -74,9 +74,9 @@ class View:
     episode_return: float
     """Sum of the rewards of the shown episode so far."""
     episodes: int
-    """Episodes of the shown environment that have ended."""
+    """Number of episodes of the shown environment that have ended."""
     succeeded: int
-    """Episodes of the shown environment that have ended with success."""
+    """Number of episodes of the shown environment that have ended with success."""
     last_episode: str
     """How the last episode of the shown environment ended: return, length and causes."""
     curves: RewardCurves

@@ -245,7 +245,7 @@ class ShardedEnv(Environment):
         return self.local.shard.shared
 
     def call_all(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
-        """Return `function(env, *arguments)` of every shard, in order. It is pickled: a module must define it."""
+        """Return `function(env, *arguments)` of every shard, in order; `function` must be defined in a module."""
         self._require_whole()
         self._workers.request(worker.CALL, (function, arguments))
         try:
