@@ -84,7 +84,7 @@ class ContactSensor(TensorState):
         self.contact_time *= found
 
     def reset(self, selection: Selection) -> None:
-        """Clear times and history of new episodes; with `sim.forces_after_reset`, read the forces of their start state."""
+        """Clear times and history of new episodes; read the start forces if `sim.forces_after_reset`."""
         for values in (self._times, self._flags, self.force_history):
             selection.write(values, 0)
         if self._sim.engine.forces_after_reset:
