@@ -453,7 +453,7 @@ def test_invalid_sensor_raises_config_error_with_key(tmp_path, sensor, message, 
 
 def test_contact_sensor_on_body_without_contacts_is_refused(tmp_path):
     with pytest.raises(
-        ConfigError, match=r"scene.sensors.x.bodies: no geom of tag can have contacts; bodies whose geoms can have contacts: box$"
+        ConfigError, match=r"x.bodies: no geom of tag can have contacts; bodies whose geoms can have contacts: box$"
     ):
         boxes(tmp_path, {"x": contact(entity="low", bodies=["tag"])})
 
