@@ -42,8 +42,8 @@ class FormatSpec:
             Typer's annotations.
         hint: `(error: BaseException) -> str | None`. Return what to do about an error of a task's code.
         agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration.
-        models: the key of a task's data where `--model NAME=FILE` sets a model, with `{name}`; empty: configurations in
-            this format get the models when they are read, `__rlcli_task__(root, models)`.
+        models: dotted key in a task's data that `--model NAME=FILE` sets, with `{name}` in the place of NAME; empty: a
+            configuration in this format receives the models as an argument, `__rlcli_task__(root, models)`.
         agent_file: `(file: Path, library: str, notes: list[Note]) -> dict | None`. Return the settings of an agent
             that a registration names by a file; None if the format does not read the library's files.
         agent_order: libraries of agents, best first; the first one that a registration names is the default agent.
@@ -79,7 +79,7 @@ class Translation:
     """Path in `data` -> origin of that value in the source."""
     notes: list[Note]
     agents: dict[str, Any] = field(default_factory=dict)
-    """Agents that were read from a separate file."""
+    """Agents that were read from a separate file: name -> settings."""
     agents_origin: Callable[[tuple[str | int, ...]], Origin] | None = None
 
 

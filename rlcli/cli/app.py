@@ -152,7 +152,8 @@ def _run(arguments: list[str]) -> int:
 
 def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
     """Return the error to print for any exception."""
-    if not isinstance(error, CheckpointError) and (too_little := memory_error(error)):  # a file may claim any size
+    # a corrupt checkpoint may claim any size: its error names the file, which helps more than "too little memory"
+    if not isinstance(error, CheckpointError) and (too_little := memory_error(error)):
         return too_little
     if isinstance(error, RlcliError):
         return error
@@ -260,3 +261,4 @@ _FOREIGN_OPTIONS = {
 }
 """Option of another program -> what to write for rlcli."""
 _SHORT_FOR = {"lr": "learning_rate"}
+"""Usual abbreviation -> key of the agent's settings."""

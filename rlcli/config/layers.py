@@ -19,7 +19,11 @@ _OVERRIDE = re.compile(rf"\s*((?:{_KEY.pattern})(?:\.(?:{_KEY.pattern}))*)\s*=(.
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Origin of a value. `layer` is task, agent, play, config, override or flag; `where` is `file:line:column`."""
+    """Origin of a value.
+
+    `layer` is task, agent, play, config, override, flag or settings. `where` is `file:line:column`, the text of an
+    override, or a flag.
+    """
 
     layer: str
     where: str

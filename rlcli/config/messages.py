@@ -49,7 +49,7 @@ def problems(
         error: the error that pydantic raised.
         model: the model that validated the data.
         data: the data that was validated.
-        place: returns the location in which a path was written.
+        place: returns the location of the value at a path, such as `file:line:column`.
         prefix: path of the data in the whole configuration.
         locations: where each key belongs in the whole schema, for hints about misplaced keys.
     """

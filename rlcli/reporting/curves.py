@@ -30,17 +30,20 @@ AXES = {"steps": "environment steps", "iterations": "iterations", "time": "train
 """Name of an x axis -> its label. Time is the sum of the times of rollouts and updates."""
 
 RESAMPLES = 2000
+"""Number of bootstrap draws."""
 _LEVEL = 95.0
+"""Level of the bootstrap interval [%]."""
 _TRIM = 0.25
+"""Share of the values that the interquartile mean leaves out at each end."""
 FEWEST_FOR_IQM = 4
-"""With fewer runs nothing is cut off, and the interquartile mean is the mean."""
+"""Smallest number of runs for which the interquartile mean leaves values out; for fewer runs it is the mean."""
 _MAX_POINTS = 1000
 """Most points of a curve over several runs."""
 _MAX_METRICS = 1000
 _NAMED = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-((?!\d+$).+)")
-"""Name of the folder of a run with a `--name`."""
+"""Folder name of a run with a `--name`; group 1 is that name."""
 _MAX_DIFFERENCES = 3
-"""Most settings in a label."""
+"""Most settings in the label of a curve."""
 
 
 @dataclass(frozen=True, slots=True)

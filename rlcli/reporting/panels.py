@@ -15,11 +15,11 @@ GROUPS = {"rewards": REWARDS, "terminations": TERMINATIONS}
 DEFAULT = (*METRICS, *GROUPS)
 
 _TITLES = {
-    "Train/mean_reward": ("Return", "reward an episode"),
+    "Train/mean_reward": ("Return", "reward per episode"),
     "Train/success_rate": ("Success", "share of episodes"),
     "Train/mean_episode_length": ("Episode length", "environment steps"),
 }
-_REWARD_UNIT = "mean, reward a second"
+_REWARD_UNIT = "mean reward per second"
 _ENDS_UNIT = "share of episodes"
 _SHARES = ("success_rate",)
 
@@ -45,7 +45,7 @@ class Panel:
     share: bool = False
     """Whether the y axis is a share from 0 to 1."""
     by_curve: bool = False
-    """Whether its lines are the picture's curves. All such panels have one common legend."""
+    """Whether there is one line for each `Curve` of the picture. All such panels share one legend."""
     subtitle: str = ""
 
 

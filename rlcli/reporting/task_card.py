@@ -31,7 +31,7 @@ from rlcli.registry import TaskSource
 from rlcli.reporting.card_text import columns_text, modifier_text, noise_text, number, span, text_of, when_text
 
 CODE, NUMBER, TEXT = "code", "number", "text"
-"""Kinds of columns."""
+"""Kinds of a table's columns: names in code, numbers, sentences."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Checkpoints: folders of safetensors and JSON files, which are verified before use and never unpickled."""
+"""Reader of checkpoints: folders of safetensors and JSON files; hashes are checked, and nothing is unpickled."""
 
 import hashlib
 from dataclasses import dataclass
@@ -128,7 +128,7 @@ class _Statistics(FileModel):
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A verified checkpoint folder."""
+    """A checkpoint folder with a checked manifest; each file is checked when it is read."""
 
     folder: Path
     manifest: dict[str, Any]

@@ -26,7 +26,7 @@ _MAX_SEARCH_BYTES = 64 * 1024**2
 """Bytes of the metrics that are searched for one row."""
 _MAX_FILES = 20_000
 _STARTING_S = 5.0
-"""A younger run may not have its lock yet [s]."""
+"""Age up to which a run counts as running without a lock, because it may not have its lock yet [s]."""
 
 
 @dataclass(slots=True)
@@ -38,7 +38,7 @@ class Overview:
     state: str
     """running, waiting, finished, stopped, interrupted, diverged, failed, or broken."""
     reason: str | None = None
-    """Why the run failed, diverged or is broken, if known."""
+    """Why the run failed, diverged, was interrupted or is broken, if known."""
     resumable: bool = False
     iteration: int | None = None
     iterations: int | None = None
@@ -122,7 +122,7 @@ def overview_of(run: Run) -> Overview:
 
 
 def state_of(run: Run) -> tuple[str, str | None]:
-    """Return the state of a run, and the reason where it failed or diverged."""
+    """Return the state of a run, and the reason if it failed, diverged, was interrupted or is broken."""
     recorded = run.record.get("state", "")
     why = run.record.get("reason")
     reason = why if isinstance(why, str) and recorded in ("diverged", "failed") else None

@@ -23,7 +23,7 @@ class Choice:
     folder: Path
     why: str
     run: Run | None
-    """The run of a checkpoint; None for a bundle."""
+    """The run of a checkpoint; None for a bundle, and for a checkpoint folder outside a run."""
     bundle: Checkpoint | None
     """The bundle; None for a checkpoint of a run."""
 

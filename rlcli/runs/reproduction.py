@@ -11,7 +11,7 @@ from rlcli.runs.run import Run, create_run
 from rlcli.runs.run_diff import last_iteration
 
 IRRELEVANT = ("engine_threads",)
-"""Entries that do not affect the results: physics is the same for any number of threads."""
+"""Entries of run.json that do not affect the results: physics is the same for any number of engine threads."""
 
 
 def require_reproducible(run: Run) -> None:

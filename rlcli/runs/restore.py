@@ -184,7 +184,7 @@ def _text(term: Mapping[str, Any] | None) -> str:
 
 
 def _rounded(value: object) -> Any:
-    """Return numbers with six digits: the last bits of a model's values depend on the machine that compiled it."""
+    """Return numbers with six significant digits: the last bits of a model's values depend on the compiling machine."""
     if isinstance(value, list):
         return "[" + ", ".join(str(_rounded(item)) for item in value) + "]"
     return f"{value:.6g}" if isinstance(value, float) else value

@@ -27,7 +27,7 @@ _ROWS = 4096
 
 
 def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until: int | None = None) -> list[Section]:
-    """Compare two runs: return the first difference of metrics, weights and policy, and all others.
+    """Compare two runs: find all differences of configuration and environment, and the first one of each other part.
 
     Args:
         left: a run.

@@ -77,12 +77,12 @@ def command(
     elif case < len(cases):
         _print_case(found, cases[case], case, steps, video, named)
     else:
-        hint = f"the run has {len(cases)} cases, counted from 0" if cases else why_no_cases(found)
+        hint = f"give a case from 0 to {len(cases) - 1}" if cases else why_no_cases(found)
         raise UsageError(f"no case {case} in {found.folder}", hint=hint)
 
 
 def _refuse_bundle(folder: str, case: int | None) -> None:
-    """Explain that a bundle has no recorded episodes, because it has no training."""
+    """Print that a bundle has no recorded episodes; raise a UsageError if one of them was chosen."""
     from rlcli.runs.bundle import open_bundle
 
     open_bundle(Path(folder))
@@ -108,7 +108,7 @@ def _print_list(run: Run, cases: list[FailureCase], sort: str) -> None:
         _print_no_cases(str(run.folder), why_no_cases(run))
         return
     rows = sorted(enumerate(cases), key=lambda row: _SORT_KEYS[sort](row[1]))
-    columns = ["CASE", "ITERATION", "STEP", "ENV", "EPISODE", "LENGTH", "RETURN", "KEPT FOR", "ENDED BY", "HELD"]
+    columns = ["CASE", "ITERATION", "STEP", "ENV", "EPISODE", "LENGTH", "RETURN", "KEPT FOR", "ENDED BY", "RECORDED"]
     console.table(columns, [[str(number), *_row(case)] for number, case in rows])
     listed = [{"case": number, **case.record()} for number, case in rows]
     console.document("autopsy", run=str(run.folder), cases=listed, why_none=None)
@@ -169,7 +169,7 @@ def _print_facts(case: FailureCase, number: int) -> None:
         f"case {number}: environment {episode.env}, episode {episode.index}, ended in iteration {failure.iteration}"
         f" (step {failure.step}) after {episode.length} steps, {episode.length * step_dt:.3g} s"
     )
-    others = "" if usual is None else f"; middle half of other episodes: {usual[0]:.6g} .. {usual[1]:.6g}"
+    others = "" if usual is None else f"; interquartile range of earlier episodes: {usual[0]:.6g} .. {usual[1]:.6g}"
     console.data(f"return {episode.total_reward:.6g}{others}")
     console.data(f"kept for: {failure.kind}; ended by: {case.ended_by}")
     if case.world.diverged_at is not None:

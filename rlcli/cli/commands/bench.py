@@ -116,7 +116,7 @@ def _report(
     names_agent: bool,
     stopped: bool,
 ) -> None:
-    """Print the measurements and the recommendation, and write the preset.
+    """Print the measurements and the recommendation, and write the preset (a YAML file for `train --config`).
 
     Raises:
         Stopped: if the user stopped the measurements.
@@ -176,7 +176,7 @@ def _preset_file(name: str, overwrite: bool) -> Path:
 
 
 def _machine(resolved: Resolved) -> dict[str, Any]:
-    """Return the facts of the machine, and warn if it is busy."""
+    """Return the machine's processor, cores, memory, load and versions, as JSON data; warn if the machine is busy."""
     import rlcli
     from rlcli.machine import available_cores, available_memory, core_quota, processor
     from rlcli.runs.provenance import versions

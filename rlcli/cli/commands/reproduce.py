@@ -37,7 +37,7 @@ def command(
         rlcli reproduce latest
             Train the newest run again and compare.
         rlcli reproduce latest --iterations 5 --force
-            Compare five iterations, also in a changed environment.
+            Compare five iterations, also if software or machine have changed.
     """
     from rlcli.cli.ui.difference_table import report_differences
     from rlcli.machine import limit_openmp_spinning
@@ -107,7 +107,7 @@ def _require(rows: list[Row], force: bool) -> None:
 
     if not rows:
         return
-    console.table(["ENVIRONMENT", "THEN", "NOW"], [[cell(name), cell(was), cell(now)] for name, was, now in rows])
+    console.table(["SOFTWARE, MACHINE", "THEN", "NOW"], [[cell(name), cell(was), cell(now)] for name, was, now in rows])
     if force:
         console.warn("software or machine have changed since the training: the weights may differ in their last bits")
         return

@@ -117,7 +117,7 @@ def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
 
 
 def _resolve_run(request: PolicyRequest) -> PolicyRequest:
-    """Return the request; a run that is given as the argument becomes the checkpoint."""
+    """Return the request; if the first argument names a run, move it from the task to the checkpoint."""
     from rlcli.evaluation.session import is_run_name
 
     task = request.task

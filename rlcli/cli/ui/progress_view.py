@@ -61,7 +61,7 @@ class LiveView:
 
 
 class WorkView:
-    """View of `rlcli.progress`: what, how far, time left. A line on a terminal, else a new line every ten seconds."""
+    """View of the work in `rlcli.progress`: one line on a terminal, else a new line every ten seconds."""
 
     def __init__(self, running: list[Work]) -> None:
         self._running = running
@@ -103,7 +103,7 @@ class WorkView:
 
 
 def work_line(running: Sequence[Work]) -> str:
-    """Return one line about nested work, the outermost first: what, how far, time left."""
+    """Return one line about nested work, the outermost first: names with counts, the done share, the time left."""
     works = list(running)
     counts = [f"{work.what} {work.done:,}/{work.total:,}" if work.total else work.what for work in works]
     counted = [work for work in works if work.total]

@@ -43,7 +43,10 @@ class TermConfig(StrictModel):
 
 
 class RewardConfig(TermConfig):
-    """A reward term. It adds weight x value x step_dt to the reward of each step."""
+    """A reward term. It adds weight x value x step_dt to the reward of each step.
+
+    With `reward_dt_scaling: false` it adds weight x value.
+    """
 
     weight: Number
     """Weight; negative for a penalty."""

@@ -62,7 +62,7 @@ def test_list_has_step_environment_and_reason(trained, cli):
     shown = cli("autopsy", trained)
     assert shown.code == 0
     lines = shown.out.splitlines()
-    assert lines[0].split() == ["CASE", "ITERATION", "STEP", "ENV", "EPISODE", "LENGTH", "RETURN", "KEPT", "FOR", "ENDED", "BY", "HELD"]  # fmt: skip # noqa: E501
+    assert lines[0].split() == ["CASE", "ITERATION", "STEP", "ENV", "EPISODE", "LENGTH", "RETURN", "KEPT", "FOR", "ENDED", "BY", "RECORDED"]  # fmt: skip # noqa: E501
     document = cli("autopsy", trained, "--json").json
     assert document["command"] == "autopsy"
     cases = document["cases"]
