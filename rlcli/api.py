@@ -204,7 +204,7 @@ class _ProgressCallback:
         self._function = function
 
     def show(self, progress: Progress) -> None:
-        """Pass the progress of one iteration on."""
+        """Call the function with the progress after one iteration."""
         if self._function is not None:
             self._function(progress)
 

@@ -72,11 +72,11 @@ class FormatSpec:
 
 @dataclass(slots=True)
 class Translation:
-    """A task of another format, translated into the data of a task."""
+    """Result of a format's `read`: a task file of another framework, translated into the data of an rlcli task."""
 
     data: dict[str, Any]
     origin: Callable[[tuple[str | int, ...]], Origin]
-    """Path in `data` -> origin of that value in the source."""
+    """Function from a path in `data` to the place in the source file from which the value comes."""
     notes: list[Note]
     agents: dict[str, Any] = field(default_factory=dict)
     """Agents that were read from a separate file: name -> settings."""
@@ -91,7 +91,7 @@ class Imported:
     files: list[Path]
     notes: list[Note]
     messages: list[str] = field(default_factory=list)
-    """What the user still has to do."""
+    """Messages to print: what the user still has to do by hand."""
 
 
 @dataclass(frozen=True, slots=True)

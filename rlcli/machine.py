@@ -162,7 +162,7 @@ _NO_MEMORY = re.compile(
     r"|out of memory",
     re.IGNORECASE,
 )
-"""Messages of MuJoCo, torch, the dynamic linker and Python, which raise different classes."""
+"""Messages about too little memory of MuJoCo, torch, the dynamic linker and Python; their classes differ."""
 _UNDER_A_LIMIT = re.compile(r"failed to load the shared library|framebuffer is not complete", re.IGNORECASE)
 """Messages of Warp and OpenGL that can have other causes; with a limit on the memory they mean too little memory."""
 

@@ -29,7 +29,7 @@ class Work:
     """Start of the work, by `time.monotonic` [s]."""
 
     def advance(self, count: int = 1) -> None:
-        """Count parts that are done."""
+        """Add `count` to the number of parts that are done."""
         self.done += count
 
     def fraction(self) -> float:

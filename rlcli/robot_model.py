@@ -128,7 +128,7 @@ class Robot:
         return high
 
     def _touching(self, height: float, *, absolute: bool = False) -> list[int]:
-        """Return the bodies with a colliding geom below z = 0, with the root raised by (`absolute`: at) `height` [m]."""
+        """Return the bodies with a colliding geom below z = 0, with the root raised by (`absolute`: to) `height`."""
         model, data = self.model, mujoco.MjData(self.model)
         data.qpos[:] = self.data.qpos
         place = model.jnt_qposadr[self.free[0]] + 2

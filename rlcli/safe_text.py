@@ -25,7 +25,7 @@ _given: list[str] = []
 
 
 def remember_given(words: Iterable[str]) -> None:
-    """Store the words of the command line and its environment that messages must not repeat as they are."""
+    """Store long and unprintable words of the command line and of its environment variables; messages shorten them."""
     parts = {part for word in map(str, words) for part in (word, str(Path(word)), *word.split("=", 1))}
     parts |= set(map(_printable, parts))
     _given[:] = sorted((part for part in parts if len(part) > 200 or not part.isprintable()), key=len, reverse=True)

@@ -27,10 +27,10 @@ _AGENT = {
 
 @dataclass(slots=True)
 class RobotTask:
-    """The files of a task for one robot, and what was found in its MJCF."""
+    """Task for one robot: the content of its files, and the names of the elements in the robot's MJCF."""
 
     kind: str
-    """velocity, reach or balance."""
+    """Kind of the task: velocity, reach or balance."""
     model: str
     """The MJCF of the task."""
     assets: dict[str, Path]
@@ -38,7 +38,7 @@ class RobotTask:
     task: dict[str, Any]
     """The task as data of its YAML."""
     found: dict[str, list[str]]
-    """joints, actuators, sensors and keyframes -> their names."""
+    """Elements of the MJCF: joints, actuators, sensors and keyframes -> their names."""
 
 
 def read_robot(file: Path, name: str) -> RobotTask:

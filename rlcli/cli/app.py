@@ -40,7 +40,7 @@ PANELS = {
 GROUPS = {"import": "import_"}
 """Command with subcommands -> module of `rlcli.cli.commands` with their `app`."""
 COMMANDS = tuple(name for names in PANELS.values() for name in names if name not in GROUPS)
-"""Other commands: each has a module of `rlcli.cli.commands` of its name with a function `command`."""
+"""Commands without subcommands. Each has its own module in `rlcli.cli.commands`, with a function `command`."""
 
 _HELP_FLAGS = frozenset(("-h", "--help", "--version", "--install-completion", "--show-completion"))
 _COMPLETION_VARIABLE = "_RLCLI_COMPLETE"
@@ -113,7 +113,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _with_values(arguments: list[str]) -> list[str]:
-    """Insert CHOOSE after a `--video` without FILE, because the parser has no optional values."""
+    """Insert the value `auto` (CHOOSE) after a `--video` without FILE: the parser needs a value for this option."""
     filled = []
     for position, word in enumerate(arguments):
         filled.append(word)

@@ -31,7 +31,7 @@ class Origin:
 
 @dataclass(slots=True)
 class Layers:
-    """Merged data, and the origin of the value at every path."""
+    """Configuration merged from several layers: the data, and the origin of the value at every path."""
 
     data: dict[str, Any] = field(default_factory=dict)
     origins: dict[Path, Origin] = field(default_factory=dict)

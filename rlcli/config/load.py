@@ -48,7 +48,7 @@ class Resolved:
         return self.layers.place(path)
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> Problem:
-        """Return a problem at a path of this configuration."""
+        """Return a `Problem` for the value at a path of this configuration, with its location."""
         return Problem(self.place(path), messages.dotted(path), message, hint)
 
     def with_num_envs(self, count: int) -> Self:

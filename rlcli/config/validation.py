@@ -31,7 +31,7 @@ from rlcli.registry.imports import load_spec
 from rlcli.trainers import TrainerSpec
 
 PATCHES = ("agents", "play")
-"""Keys of a task file whose values patch the task.
+"""Keys of a task file whose values are patches, which change other keys of the task.
 
 Changes to these values from a --config file or an override are made first; then the patches are applied.
 """
@@ -102,7 +102,7 @@ class TaskCheck:
             raise ConfigError([Problem(self.source.label, "", text), *self.problems[:MAX_PROBLEMS]])
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
-        """Add a problem at a path."""
+        """Add a problem of the value at a path."""
         self.add(Problem(self.layers.place(path), messages.dotted(path), message, hint))
 
     def _is_mapping(self, value: object, path: Path) -> bool:

@@ -58,7 +58,7 @@ class KnownFormat:
     modules: Sequence[str] = ()
     """Modules that are imported only by tasks of this format."""
     files: Sequence[str] = ()
-    """Patterns of file names."""
+    """Glob patterns for the names of files that may be task files of this format."""
     all_of: Sequence[str] = ()
     """Regular expressions: a file of this format matches all of them."""
     none_of: Sequence[str] = ()

@@ -26,7 +26,7 @@ _SHARES = ("success_rate",)
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Line or band of a panel; `index` selects its colour."""
+    """Line or band in a panel of a figure; `index` selects its colour and line style."""
 
     label: str
     line: Line
@@ -35,7 +35,7 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Coordinate system with lines or bands."""
+    """Panel of a figure: a pair of axes with lines or stacked bands."""
 
     title: str
     unit: str

@@ -30,7 +30,7 @@ from rlcli.runs.restore import recorded_task, resolve_run
 from rlcli.runs.run import Run
 
 _MAX_CHARACTERS = 2000
-"""Most characters of a text on the page."""
+"""Most characters of an error message on the page."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +69,12 @@ class Page:
     video_of: str = ""
     """Caption of the video: the checkpoint that it shows."""
     settings: list[tuple[str, list[Setting]]] = field(default_factory=list)
-    """Section -> its values."""
+    """Sections of the configuration, each with its settings."""
     machine: list[tuple[str, str]] = field(default_factory=list)
     commands: list[tuple[str, str]] = field(default_factory=list)
     """(description, command) of each command."""
     missing: dict[str, str] = field(default_factory=dict)
-    """Part -> one sentence why it is missing."""
+    """Missing part of the page -> the reason, one sentence."""
 
 
 def gather_page(run: Run, checkpoint: Path | None) -> Page:

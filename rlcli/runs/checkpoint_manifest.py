@@ -174,7 +174,7 @@ class CommandRecord(_Record):
 
 
 class JointRecord(_Record):
-    """A hinge or slide joint, and the gains of its actuator; both are 0 without an actuator."""
+    """A hinge or slide joint, and the gains of its actuator; both are null without an actuator, and 0 for a motor."""
 
     name: Name
     entity: Name

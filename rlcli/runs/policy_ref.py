@@ -18,7 +18,7 @@ SHIPPED = "shipped"
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A checkpoint or a bundle, and the reason for its choice."""
+    """Chosen policy: the folder of a checkpoint or a bundle, and the reason for the choice."""
 
     folder: Path
     why: str

@@ -164,7 +164,7 @@ _CONTRACT = ("name", "size", "elements", "scale", "offset", "clip", "history", "
 
 
 def _differ(was: Mapping[str, Any] | None, now: Mapping[str, Any] | None) -> bool:
-    """Return whether a key that both sides have differs; older checkpoints lack some keys."""
+    """Return whether a term differs in a key that checkpoint and environment both have (older ones lack some keys)."""
     if was is None or now is None:
         return True
     common = [key for key in _CONTRACT if key in was and key in now]

@@ -192,7 +192,7 @@ def _first_unequal(left: Mapping[Any, Any], right: Mapping[Any, Any], keys: Iter
 
 
 def _presence(word: str, left: bool, right: bool) -> tuple[str | None, str | None]:
-    """Return the sides of a difference between an entry and a missing one."""
+    """Return both sides of a `Difference` of an entry that one side lacks: `word` if it exists, else None."""
     return word if left else None, word if right else None
 
 

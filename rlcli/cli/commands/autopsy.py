@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _BARS = "▁▂▃▄▅▆▇█"
 _WIDTH = 48
-"""Bars of one sparkline."""
+"""Number of bars in one sparkline."""
 _SORT_KEYS: dict[str, Callable[[FailureCase], Any]] = {
     "when": lambda case: 0,  # the cases are in the order of training; sorting is stable
     "return": lambda case: case.episode.total_reward,
@@ -30,7 +30,7 @@ _SORT_KEYS: dict[str, Callable[[FailureCase], Any]] = {
     "kind": lambda case: (case.failure.kind, case.ended_by),
 }
 _MAX_COLUMNS = 12
-"""Columns of observations, actions or reward terms that are printed."""
+"""Most columns of observations, actions or reward terms that are printed."""
 
 
 def command(
@@ -101,7 +101,7 @@ def _print_no_cases(folder: str, why: str) -> None:
 
 
 def _print_list(run: Run, cases: list[FailureCase], sort: str) -> None:
-    """Print a table of the cases."""
+    """Print a table of the recorded episodes."""
     from rlcli.replay.failure_cases import why_no_cases
 
     if not cases:
@@ -123,7 +123,7 @@ def _row(case: FailureCase) -> list[str]:
 def _print_case(
     run: Run, case: FailureCase, number: int, steps: int, video: Path | None, named: TaskSource | None
 ) -> None:
-    """Print one case; contacts and images need the task's code."""
+    """Print one recorded episode; its contacts and its video need the task's code."""
     from rlcli.replay.failure_cases import stage_case
 
     staged, error = None, None

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from rlcli.tuning.step_profile import Cost
 
 _PROFILED = 5.0
-"""Length of a profile [s]."""
+"""Duration of the measurement of `bench --profile` [s]."""
 _MAX_LOAD = 0.5
-"""Load per core before the measurements [processes] above which a warning is printed."""
+"""Load average per core before the measurements above which a warning is printed."""
 
 
 def command(
@@ -242,12 +242,12 @@ class _View(LiveView):
         self._rows: list[list[str]] = []
 
     def announce(self, current: str) -> None:
-        """Show what is measured next."""
+        """Show which setting is measured next."""
         self._current = current
         self._draw()
 
     def show(self, findings: Findings) -> None:
-        """Show the rows so far."""
+        """Show the measurements so far."""
         rows = [_step_parts(row) for row in findings.stepped]
         for row in findings.trained:
             setting, ms = row.setting, cell(row.milliseconds, ".4g", " ms")

@@ -140,7 +140,7 @@ class Filming:
     renderer: Renderer
     writer: VideoWriter
     ended: bool = False
-    """Whether rendering has ended."""
+    """Whether the video is complete, so that no more frames are rendered."""
 
     @property
     def length_s(self) -> float:
