@@ -235,8 +235,8 @@ def require_device(device: str) -> None:
 
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if int(index or 0) >= count:
-        found = f"{count} CUDA devices" if count else "no CUDA device"
-        message = f"device '{device}' is not available: torch {torch.__version__} sees {found}"
+        found = f"{count} CUDA device{'s' * (count > 1)}" if count else "no CUDA device"
+        message = f"device '{device}' is not available: torch {torch.__version__} finds {found}"
         raise DeviceError(message, hint="use --device cpu")
 
 

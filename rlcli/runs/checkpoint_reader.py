@@ -200,9 +200,9 @@ class Checkpoint:
         file = self.folder / "trainer.safetensors"  # `self.policy()` has checked the tensors of the policy
         for name, value in tensors["trainer"].items():
             if value.is_floating_point() and not bool(value.isfinite().all()):
-                raise CheckpointError(f"{file}: '{name}' is not finite; use an older one: RUN@step:N")
+                raise CheckpointError(f"{file}: '{name}' is not finite; use an older checkpoint: RUN@step:N")
             if name.endswith(("normalizer.var", "normalizer.count")) and bool((value < 0).any()):
-                raise CheckpointError(f"{file}: '{name}' is negative; use an older one: RUN@step:N")
+                raise CheckpointError(f"{file}: '{name}' is negative; use an older checkpoint: RUN@step:N")
         return TrainerState(tensors, values, {name: self._rows(name) for name in self.shards()})
 
     def verify(self, *, whole: bool) -> None:

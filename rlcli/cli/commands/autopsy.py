@@ -202,7 +202,7 @@ def _print_steps(case: FailureCase, steps: int) -> None:
     console.data("")
     console.table(["", "", *(f"{i - kept + 1}" for i in last)], rows)
     if hidden:
-        console.info(f"--json has {hidden} more columns")
+        console.info(f"further columns, shown with --json: {hidden}")
 
 
 def _print_contacts(contacts: Sequence[Contact]) -> None:
@@ -213,7 +213,7 @@ def _print_contacts(contacts: Sequence[Contact]) -> None:
     rows = [[*c.geoms, f"{1e3 * c.distance:.3f}", f"{c.force:.4g}"] for c in contacts[: 2 * _MAX_COLUMNS]]
     console.table(["CONTACT AT THE END", "", "DISTANCE [mm]", "FORCE [N]"], rows)
     if len(contacts) > 2 * _MAX_COLUMNS:
-        console.info(f"--json has {len(contacts) - 2 * _MAX_COLUMNS} more contacts")
+        console.info(f"further contacts, shown with --json: {len(contacts) - 2 * _MAX_COLUMNS}")
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:

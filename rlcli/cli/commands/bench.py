@@ -88,7 +88,7 @@ def command(
 def _profile(resolved: Resolved, preset: Path | None, seconds: float) -> None:
     """Print where the time of an environment step goes."""
     if preset is not None:
-        raise UsageError("--profile measures no sizes, so there is no preset to save", hint="leave one of them out")
+        raise UsageError("--profile measures no sizes for a preset", hint="leave out --profile or --save-preset")
     import torch
 
     from rlcli.tuning.step_profile import profile_step

@@ -124,7 +124,7 @@ def _resolve_run(request: PolicyRequest) -> PolicyRequest:
     if task is None or not is_run_name(task, request.runs_dir):
         return request
     if request.checkpoint is not None:
-        raise UsageError(f"{task} is a run, but --checkpoint names another one", hint="leave one of them out")
+        raise UsageError(f"{task} is a run, but --checkpoint names another", hint="leave out RUN or --checkpoint")
     return replace(request, task=None, checkpoint=task)
 
 
