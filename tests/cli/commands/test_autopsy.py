@@ -116,7 +116,7 @@ def test_replay_with_changed_model_differs(trained, cli):
 def test_unknown_case_is_usage_error(trained, cli):
     shown = cli("autopsy", trained, "99", "--json")
     assert shown.code == 2
-    assert f"the run has {len(files(trained))}" in shown.json["error"]["hint"]
+    assert f"give a case from 0 to {len(files(trained)) - 1}" in shown.json["error"]["hint"]
 
 
 @pytest.mark.parametrize(
