@@ -300,7 +300,7 @@ def native_stderr_discarded() -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         try:
             kept = os.dup(2)
-        except OSError:  # it is closed
+        except OSError:  # file descriptor 2 is closed
             kept = -1
         if kept >= 0:
             stack.callback(os.close, kept)

@@ -128,7 +128,10 @@ class Robot:
         return high
 
     def _touching(self, height: float, *, absolute: bool = False) -> list[int]:
-        """Return the bodies with a colliding geom below z = 0, with the root raised by (`absolute`: to) `height`."""
+        """Return the bodies with a colliding geom below z = 0 after the root is raised by a height [m].
+
+        If `absolute` is true, the root is placed at this height instead.
+        """
         model, data = self.model, mujoco.MjData(self.model)
         data.qpos[:] = self.data.qpos
         place = model.jnt_qposadr[self.free[0]] + 2

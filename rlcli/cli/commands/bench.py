@@ -94,7 +94,7 @@ def _profile(resolved: Resolved, preset: Path | None, seconds: float) -> None:
     from rlcli.tuning.step_profile import profile_step
 
     machine = _machine(resolved)
-    torch.set_num_threads(1)  # small tensors: waking threads would take longer than the work
+    torch.set_num_threads(1)  # the tensors are small: waking threads would take longer than the work
     costs = profile_step(resolved, seconds)
     rows = [[cost.section if cost.term is None else f"  {cost.term}", *_cost_cells(cost)] for cost in costs]
     console.table(["PART OF THE STEP", "MS", "SHARE"], rows, f"environment step, {resolved.task.scene.num_envs:,} envs")

@@ -43,7 +43,7 @@ def command(
     from rlcli.machine import limit_openmp_spinning
     from rlcli.runs.run_ref import default_runs_dir, find_run
 
-    limit_openmp_spinning()  # as in training
+    limit_openmp_spinning()  # as `rlcli train` does
     runs = runs_dir or default_runs_dir()
     original, why = find_run(reference, runs)
     console.info(f"reproducing {original.folder} ({why})")

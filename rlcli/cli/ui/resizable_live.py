@@ -1,4 +1,4 @@
-"""Live block of rich that stays complete on a terminal that is made narrower."""
+"""Version of rich's `Live` display that is drawn correctly after the terminal has been made narrower."""
 
 from __future__ import annotations
 

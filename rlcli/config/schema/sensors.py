@@ -105,7 +105,7 @@ class CameraSensorConfig(StrictModel):
     eye: Vec3 = (-3.0, 0.0, 1.0)
     """Position of the camera in the frame of the body, or of the environment [m]."""
     lookat: Vec3 = (0.0, 0.0, 0.0)
-    """The point in the centre of the image, in the same frame [m]. The frame's z axis points up in the image, or its x
+    """The point in the centre of the image, in the frame of `eye` [m]. The frame's z axis points up in the image, or its x
     axis if the camera looks along z."""
     fov: Annotated[float, Field(gt=0, lt=180)] = 45.0
     """Vertical field of view [degrees]."""
