@@ -217,7 +217,7 @@ def _print_contacts(contacts: Sequence[Contact]) -> None:
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
-    """Return values as at most `width` bars of eight heights (means of neighbours); `?` for a value that is not finite."""
+    """Return values as at most `width` bars of eight heights (means of neighbours), `?` for one that is not finite."""
     if len(values) > width:
         edges = [round(i * len(values) / width) for i in range(width + 1)]
         values = [sum(values[a:b]) / (b - a) for a, b in itertools.pairwise(edges)]
