@@ -105,8 +105,8 @@ class CameraSensorConfig(StrictModel):
     eye: Vec3 = (-3.0, 0.0, 1.0)
     """Position of the camera in the frame of the body, or of the environment [m]."""
     lookat: Vec3 = (0.0, 0.0, 0.0)
-    """The point in the centre of the image, in the frame of `eye` [m]. The z axis of the frame points up in the image, or
-    its x axis if the camera looks along z."""
+    """The point in the centre of the image, in the frame of `eye` [m]. The frame's z axis points up in the image,
+    or its x axis if the camera looks along z."""
     fov: Annotated[float, Field(gt=0, lt=180)] = 45.0
     """Vertical field of view [degrees]."""
     clip: tuple[Positive, Positive] = (0.01, 20.0)
