@@ -27,7 +27,7 @@ class NoisePatchConfig(PatchConfig):
     kind: Literal["noise"]
     """Kind of ground: always noise."""
     height: Range = (0.02, 0.1)
-    """Heights are drawn from +-`height` [m]."""
+    """Heights are drawn from +-`height` [m], which is [at difficulty 0, at difficulty 1]."""
     spacing: Positive = 0.2
     """Distance between two random heights [m]; heights between them are interpolated linearly."""
 
@@ -38,7 +38,7 @@ class SlopePatchConfig(PatchConfig):
     kind: Literal["slope"]
     """Kind of ground: always slope."""
     slope: Range = (0.0, 0.4)
-    """Rise divided by run."""
+    """Rise divided by run, [at difficulty 0, at difficulty 1]."""
     platform: NotNegative = 2.0
     """Edge length of the flat square in the middle [m]."""
     inverted: bool = False
@@ -51,7 +51,7 @@ class WavesPatchConfig(PatchConfig):
     kind: Literal["waves"]
     """Kind of ground: always waves."""
     amplitude: Range = (0.05, 0.2)
-    """Half of the height between trough and crest [m]."""
+    """Half of the height between trough and crest [m], [at difficulty 0, at difficulty 1]."""
     count: Count = 2
     """Number of waves along an edge."""
 
@@ -62,7 +62,7 @@ class ObstaclesPatchConfig(PatchConfig):
     kind: Literal["obstacles"]
     """Kind of ground: always obstacles."""
     height: Range = (0.05, 0.2)
-    """Height of blocks and depth of pits [m]."""
+    """Height of blocks and depth of pits [m], [at difficulty 0, at difficulty 1]."""
     width: Range = (0.25, 1.0)
     """[smallest, largest] edge length of an obstacle [m]."""
     count: Count = 40
@@ -79,7 +79,7 @@ class StonesPatchConfig(PatchConfig):
     width: Range = (0.25, 1.0)
     """[smallest, largest] edge length of a stone [m]; the stones of difficulty 0 are the largest."""
     gap: Range = (0.05, 0.3)
-    """Distance between stones [m]."""
+    """Distance between stones [m], [at difficulty 0, at difficulty 1]."""
     depth: Positive = 1.0
     """Depth of the pit [m]."""
     platform: NotNegative = 2.0
@@ -92,7 +92,7 @@ class StairsPatchConfig(PatchConfig):
     kind: Literal["stairs"]
     """Kind of ground: always stairs."""
     step_height: Range = (0.05, 0.2)
-    """Height of a step [m]."""
+    """Height of a step [m], [at difficulty 0, at difficulty 1]."""
     step_width: Positive = 0.3
     """Depth of a step [m]."""
     platform: NotNegative = 2.0
@@ -112,7 +112,7 @@ class GridPatchConfig(PatchConfig):
     cell: Positive = 0.5
     """Edge length of a cell [m]."""
     height: Range = (0.02, 0.15)
-    """Heights are drawn from +-`height` [m]."""
+    """Heights are drawn from +-`height` [m], which is [at difficulty 0, at difficulty 1]."""
     platform: NotNegative = 2.0
     """Edge length of the flat square in the middle [m]."""
     boxes: bool = False
