@@ -62,7 +62,7 @@ class ObstaclesPatchConfig(PatchConfig):
     kind: Literal["obstacles"]
     """Kind of ground: always obstacles."""
     height: Range = (0.05, 0.2)
-    """Height of blocks and depth of pits [m], [at difficulty 0, at difficulty 1]."""
+    """Height of blocks and depth of pits [m], [at difficulty 0, at difficulty 1]; an obstacle has all or half of it."""
     width: Range = (0.25, 1.0)
     """[smallest, largest] edge length of an obstacle [m]."""
     count: Count = 40
