@@ -153,7 +153,7 @@ def evaluate(
 def load_policy(
     env: VecEnv, checkpoint: Path | str | None = None, *, stochastic: bool = False, runs_dir: Path | str | None = None
 ) -> Callable[[Tensor], Tensor]:
-    """Return a function from observations (num_envs, d) to actions (num_envs, a), in an environment.
+    """Return a trained policy as a function: observations (num_envs, obs_size) -> actions (num_envs, action_size).
 
     The function keeps the hidden state of a recurrent policy and resets it with the episodes of `env`.
 
@@ -185,7 +185,8 @@ def export(
     Raises:
         UsageError: for an unknown format or a wrong suffix.
         DependencyError: if the library that writes the format is not installed.
-        VerdictError: if the file computes other actions; it is not kept.
+        CheckpointError: if there is no such checkpoint.
+        VerdictError: if the file computes other actions than the policy; the file is deleted.
     """
     check_target(format, Path(file))
     return write_export(open_checkpoint(_find(checkpoint, None, runs_dir)), Path(file), format)
@@ -197,13 +198,13 @@ def _find(checkpoint: Path | str | None, task: str | None, runs_dir: Path | str 
 
 
 class _ProgressCallback:
-    """View of a training that passes the progress to a function."""
+    """View of a training that calls a function with the progress after each iteration."""
 
     def __init__(self, function: Callable[[Progress], None] | None) -> None:
         self._function = function
 
     def show(self, progress: Progress) -> None:
-        """Pass the progress of one iteration on."""
+        """Call the function with the progress after one iteration."""
         if self._function is not None:
             self._function(progress)
 

@@ -11,7 +11,7 @@ from rlcli.safe_text import message_line
 INTERRUPTED, STOPPED = 130, 75
 """Exit codes after Ctrl-C, and after another signal that stops a run."""
 _UNPINNED = ("rlcli[trackio]",)
-"""Extras that do not fit the tested versions; trackio needs pillow < 13."""
+"""Extras that conflict with the versions in `constraints.txt`: trackio needs pillow < 13."""
 
 
 class RlcliError(Exception):
@@ -153,7 +153,7 @@ def pip_install(package: str) -> str:
     A plugin of the repository is installed from its folder if rlcli itself runs from a checkout.
     """
     root = Path(__file__).parents[1]
-    lists = (Path(__file__).with_name("constraints.txt"), root / "constraints.txt")  # of a wheel, of a checkout
+    lists = (Path(__file__).with_name("constraints.txt"), root / "constraints.txt")  # in a wheel, in a checkout
     pins = [str(file) for file in lists if file.is_file() and package not in _UNPINNED]
     source = root / "plugins" / package
     words = [*(["-c", pins[0]] if pins else []), *([str(source)] if source.is_dir() else package.split())]

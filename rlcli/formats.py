@@ -42,8 +42,8 @@ class FormatSpec:
             Typer's annotations.
         hint: `(error: BaseException) -> str | None`. Return what to do about an error of a task's code.
         agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration.
-        models: the key of a task's data where `--model NAME=FILE` sets a model, with `{name}`; empty: configurations in
-            this format get the models when they are read, `__rlcli_task__(root, models)`.
+        models: dotted key in a task's data that `--model NAME=FILE` sets, with `{name}` in the place of NAME; empty: a
+            configuration in this format receives the models as an argument, `__rlcli_task__(root, models)`.
         agent_file: `(file: Path, library: str, notes: list[Note]) -> dict | None`. Return the settings of an agent
             that a registration names by a file; None if the format does not read the library's files.
         agent_order: libraries of agents, best first; the first one that a registration names is the default agent.
@@ -72,14 +72,14 @@ class FormatSpec:
 
 @dataclass(slots=True)
 class Translation:
-    """A task of another format, translated into the data of a task."""
+    """Result of a format's `read`: a task file of another framework, translated into the data of an rlcli task."""
 
     data: dict[str, Any]
     origin: Callable[[tuple[str | int, ...]], Origin]
-    """Path in `data` -> origin of that value in the source."""
+    """Function from a path in `data` to the place in the source file from which the value comes."""
     notes: list[Note]
     agents: dict[str, Any] = field(default_factory=dict)
-    """Agents that were read from a separate file."""
+    """Agents that were read from a separate file: name -> settings."""
     agents_origin: Callable[[tuple[str | int, ...]], Origin] | None = None
 
 
@@ -91,7 +91,7 @@ class Imported:
     files: list[Path]
     notes: list[Note]
     messages: list[str] = field(default_factory=list)
-    """What the user still has to do."""
+    """Messages to print: what the user still has to do by hand."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,9 +89,9 @@ def read_plain(file: Path, most: int) -> bytes:
 
 
 def available_memory(report: Path = Path("/proc/meminfo")) -> int:
-    """Return the memory that this process may still allocate [bytes].
+    """Return the memory of the machine that is still available [bytes]; `memory_limit` returns limits of the process.
 
-    The value is `MemAvailable` of the system; else half of the machine's memory; else 8 GiB.
+    The value is `MemAvailable` of Linux; else half of the machine's memory; else 8 GiB.
     """
     try:
         lines = report.read_text(encoding="utf-8").splitlines()
@@ -105,7 +105,7 @@ def available_memory(report: Path = Path("/proc/meminfo")) -> int:
 
 
 def memory_error(error: BaseException | None) -> MachineError | None:
-    """Return the error to show if an exception, or one that it replaced, means too little memory; else None."""
+    """Return the error to show if an exception, or one in its chain of causes, means too little memory; else None."""
     limit = address_space()
     limited = f" (the process is limited to {limit >> 20} MiB)" if limit else ""
     while error is not None:
@@ -148,7 +148,7 @@ class AddressSpaceCheck:
 
     @staticmethod
     def find_spec(name: str, *_: object) -> None:
-        """Find nothing.
+        """Check the limit for a large library, and return None: the next finder of `sys.meta_path` finds the module.
 
         Raises:
             MachineError: if the limit is too low for this library.
@@ -162,7 +162,7 @@ _NO_MEMORY = re.compile(
     r"|out of memory",
     re.IGNORECASE,
 )
-"""Messages of MuJoCo, torch, the dynamic linker and Python, which raise different classes."""
+"""Messages about too little memory of MuJoCo, torch, the dynamic linker and Python; their classes differ."""
 _UNDER_A_LIMIT = re.compile(r"failed to load the shared library|framebuffer is not complete", re.IGNORECASE)
 """Messages of Warp and OpenGL that can have other causes; with a limit on the memory they mean too little memory."""
 
@@ -184,6 +184,7 @@ def limit_openmp_spinning() -> None:
 
 
 _SELDOM = (100_000, 10, 10)
+"""Thresholds of `gc.set_threshold` with which collections are rare."""
 _saved_thresholds: list[tuple[int, int, int]] = []
 
 
@@ -234,8 +235,8 @@ def require_device(device: str) -> None:
 
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if int(index or 0) >= count:
-        found = f"{count} CUDA devices" if count else "no CUDA device"
-        message = f"device '{device}' is not available: torch {torch.__version__} sees {found}"
+        found = f"{count} CUDA device{'s' * (count > 1)}" if count else "no CUDA device"
+        message = f"device '{device}' is not available: torch {torch.__version__} finds {found}"
         raise DeviceError(message, hint="use --device cpu")
 
 
@@ -295,11 +296,11 @@ def has_onednn() -> bool:
 
 @contextlib.contextmanager
 def native_stderr_discarded() -> Iterator[None]:
-    """Discard what libraries write to file descriptor 2 without Python, such as messages of their initialisation."""
+    """Discard what C code in libraries writes to file descriptor 2, such as messages of a library's initialisation."""
     with contextlib.ExitStack() as stack:
         try:
             kept = os.dup(2)
-        except OSError:  # it is closed
+        except OSError:  # file descriptor 2 is closed
             kept = -1
         if kept >= 0:
             stack.callback(os.close, kept)

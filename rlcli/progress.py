@@ -12,20 +12,24 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class Work:
-    """Some work in progress."""
+    """State of one piece of work, such as the episodes of an evaluation: its name, its size and how much is done."""
 
     what: str
+    """Name of the work, or of its parts, such as `episodes`."""
     total: int | None = None
-    """Number of its parts; None: unknown."""
+    """Number of parts; None: unknown."""
     done: int = 0
+    """Number of parts that are done."""
     share: float = 0.0
-    """Share of the work that is done, if it is more than `done` of `total` parts: parts may end together."""
+    """Second estimate of the done share, from 0 to 1; the larger one counts. It is set for parts that run at the same
+    time, such as episodes in parallel environments: `done` stays 0 until the first of them ends."""
     has_own_view: bool = False
-    """Whether this work shows its own progress."""
+    """Whether this work shows its own progress, so that nothing else may be drawn."""
     begin: float = field(default_factory=time.monotonic)
+    """Start of the work, by `time.monotonic` [s]."""
 
     def advance(self, count: int = 1) -> None:
-        """Count parts that are done."""
+        """Add `count` to the number of parts that are done."""
         self.done += count
 
     def fraction(self) -> float:
@@ -35,7 +39,7 @@ class Work:
 
 _running: list[Work] = []
 view: Callable[[list[Work]], AbstractContextManager[object]] | None = None
-"""Returns the context that shows a list of nested work, the outermost first; None: nothing is shown."""
+"""Function from a list of nested work, the outermost first, to a context that shows it; None: nothing is shown."""
 
 
 @contextlib.contextmanager

@@ -55,7 +55,7 @@ def bits(keys: Keys, stream: np.uint64, index: int, count: int) -> Keys:
 
 
 def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
-    """Return uniform numbers in [0, 1), multiples of 2**-24. (n, count)"""
+    """Return uniform random numbers in [0, 1), multiples of 2**-24. (n, count)"""
     unit = np.empty((len(keys), count), np.float32)
     rows = max(1, _BLOCK // max(1, count))
     for first in range(0, len(keys), rows):
@@ -67,7 +67,7 @@ def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np
 
 
 def normal(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
-    """Return standard normal numbers, each from two uniform numbers by the Box-Muller transform. (n, count)"""
+    """Return standard normal random numbers, each from two uniform ones by the Box-Muller transform. (n, count)"""
     u = uniform(keys, stream, index, 2 * count)
     # log1p(-u) with u in [0, 1) is finite; log(u) would be -inf at u = 0
     radius = np.sqrt(-2.0 * np.log1p(-u[:, :count].astype(np.float64)))
@@ -76,7 +76,7 @@ def normal(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.
 
 
 def integers(keys: Keys, stream: np.uint64, index: int, count: int, high: int) -> NDArray[np.int64]:
-    """Return whole numbers in [0, high). (n, count)"""
+    """Return uniform random integers in [0, high). (n, count)"""
     return (uniform(keys, stream, index, count).astype(np.float64) * high).astype(np.int64)
 
 

@@ -17,14 +17,15 @@ def shorten(value: object, limit: int, mark: str = "...") -> str:
 
 
 _LONG = re.compile(r"""\S{201,}|(?<!\w)'[^']{199,}'|"[^"]{199,}\"""")
+"""A word or a quoted text of over 200 characters."""
 _MAX_LINE = 2000
-
-
+"""Longest line of a message [characters]."""
 _given: list[str] = []
+"""Words of the command line that are long or have characters that are not printable, the longest first."""
 
 
 def remember_given(words: Iterable[str]) -> None:
-    """Store the words of the command line and its environment that messages must not repeat as they are."""
+    """Store long and unprintable words of the command line and of its environment variables; messages shorten them."""
     parts = {part for word in map(str, words) for part in (word, str(Path(word)), *word.split("=", 1))}
     parts |= set(map(_printable, parts))
     _given[:] = sorted((part for part in parts if len(part) > 200 or not part.isprintable()), key=len, reverse=True)
@@ -63,7 +64,7 @@ def _cut(text: str, limit: int) -> str:
 
 
 def float_or_nan(text: str) -> float:
-    """Return the number that a text spells; NaN for any other text."""
+    """Parse a number; return NaN for any other text."""
     try:
         return float(text)
     except ValueError:

@@ -36,7 +36,7 @@ _DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt"
 def create(
     name: str, flavour: str, folder: Path | None = None, robot: RobotTask | None = None
 ) -> tuple[Path, list[str]]:
-    """Write the package of a new task, completely or not at all; `robot` is the task of a robot's MJCF.
+    """Write the package of a new task, completely or not at all. With `robot`, its model and YAML are used.
 
     Returns:
         The folder of the package, and its files relative to that folder.

@@ -1,7 +1,7 @@
-"""Task of `rlcli new --robot`: reads an MJCF, chooses what its robot can do, and writes the model and the YAML.
+"""Task design for `rlcli new --robot`: read an MJCF, choose a kind of task, and return the model and the YAML data.
 
-A floating base with at least four driven joints follows velocity commands, a fixed base whose joints are all driven
-brings its last body to goals, and any other robot balances its passive joints at the default pose.
+velocity: a floating base with feet and at least four driven joints follows velocity commands. reach: a fixed base with
+two or more joints, all driven, brings its last body to goals. balance: any other robot keeps its default pose.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _AGENT = {
 
 @dataclass(slots=True)
 class RobotTask:
-    """The files of a task for one robot, and what was found in its MJCF."""
+    """Task for one robot: the content of its files, and the names of the elements in the robot's MJCF."""
 
     kind: str
-    """velocity, reach or balance."""
+    """Kind of the task: velocity, reach or balance."""
     model: str
     """The MJCF of the task."""
     assets: dict[str, Path]
@@ -38,7 +38,7 @@ class RobotTask:
     task: dict[str, Any]
     """The task as data of its YAML."""
     found: dict[str, list[str]]
-    """joints, actuators, sensors and keyframes -> their names."""
+    """Elements of the MJCF: joints, actuators, sensors and keyframes -> their names."""
 
 
 def read_robot(file: Path, name: str) -> RobotTask:
@@ -54,7 +54,7 @@ def read_robot(file: Path, name: str) -> RobotTask:
         spec = read_mjcf(file, [file.parent.resolve(), file.resolve().parent.parent])
         robot = Robot(spec, file)
     except (BadModel, ValueError) as error:
-        raise TaskError(f"{file} cannot be used: {error}", hint="MuJoCo must be able to compile it") from None
+        raise TaskError(f"{file} cannot be used: {error}", hint="correct this MJCF for MuJoCo") from None
     if not robot.driven:
         raise UsageError(
             f"{file}: no joint can be driven", hint="add hinges or slides, with motors or position actuators"

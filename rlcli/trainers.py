@@ -20,7 +20,7 @@ class TrainerSpec:
         trainer: `module:Class` of a `Trainer`, called as `Class(env, config, seed=, device=, torch_threads=)`.
         refused: algorithms that the library has and this trainer cannot run -> the reason.
         parallel: whether several processes can train one policy (`rlcli.rl.distributed`).
-        gpu: whether the trainer keeps all tensors on a GPU.
+        gpu: whether the trainer can train on a GPU, with all tensors on it; otherwise `--device auto` is the CPU.
         api: the `API_VERSION` that the trainer was written for.
     """
 

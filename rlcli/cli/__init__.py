@@ -1,1 +1,1 @@
-"""The command line: one thin module a command; `app` turns errors into exit codes, `console` alone prints."""
+"""The command line: one module for each command, `app` with main and exit codes, and `ui` for output and options."""

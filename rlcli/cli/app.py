@@ -40,7 +40,7 @@ PANELS = {
 GROUPS = {"import": "import_"}
 """Command with subcommands -> module of `rlcli.cli.commands` with their `app`."""
 COMMANDS = tuple(name for names in PANELS.values() for name in names if name not in GROUPS)
-"""Other commands: each has a module of `rlcli.cli.commands` of its name with a function `command`."""
+"""Commands without subcommands. Each has its own module in `rlcli.cli.commands`, with a function `command`."""
 
 _HELP_FLAGS = frozenset(("-h", "--help", "--version", "--install-completion", "--show-completion"))
 _COMPLETION_VARIABLE = "_RLCLI_COMPLETE"
@@ -113,7 +113,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _with_values(arguments: list[str]) -> list[str]:
-    """Insert CHOOSE after a `--video` without FILE, because the parser has no optional values."""
+    """Insert the value `auto` (CHOOSE) after a `--video` without FILE: the parser needs a value for this option."""
     filled = []
     for position, word in enumerate(arguments):
         filled.append(word)
@@ -152,7 +152,8 @@ def _run(arguments: list[str]) -> int:
 
 def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
     """Return the error to print for any exception."""
-    if not isinstance(error, CheckpointError) and (too_little := memory_error(error)):  # a file may claim any size
+    # a corrupt checkpoint may claim any size: its error names the file, which helps more than "too little memory"
+    if not isinstance(error, CheckpointError) and (too_little := memory_error(error)):
         return too_little
     if isinstance(error, RlcliError):
         return error
@@ -260,3 +261,4 @@ _FOREIGN_OPTIONS = {
 }
 """Option of another program -> what to write for rlcli."""
 _SHORT_FOR = {"lr": "learning_rate"}
+"""Usual abbreviation -> key of the agent's settings."""

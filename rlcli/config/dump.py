@@ -17,7 +17,7 @@ from rlcli.config.term_signatures import SECTIONS, SignatureError, Vocabulary, p
 from rlcli.errors import UsageError, did_you_mean, listing
 
 _ORIGIN_FILE = re.compile(r"  # (?:\w+: )?(\S*/\S*?):[0-9]+(?::[0-9]+)?$")
-"""The file in the comment that names the origin of a value."""
+"""Comment with the origin of a value, at the end of a line of YAML; group 1 is the file."""
 _TAGS = {type(None): "null", bool: "bool", int: "int", float: "float", str: "str"}
 
 
@@ -60,7 +60,7 @@ _Dumper.add_representer(list, _sequence)
 
 
 def to_data(resolved: Resolved) -> dict[str, Any]:
-    """Return the whole configuration as plain data: with patches, with defaults, with one agent."""
+    """Return the whole configuration as plain data: patches applied, with all defaults, with the chosen agent only."""
     data = resolved.task.model_dump(mode="json", exclude={"agents"})
     data |= data.pop("foreign")
     data["play"] = resolved.layers.data.get("play", {})
@@ -102,7 +102,7 @@ def select(data: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:
 def to_yaml_with_origins(resolved: Resolved, data: dict[str, Any] | None = None) -> str:
     """Return a part of the configuration as YAML with the origin of every value as a comment, and a list of the files.
 
-    In a comment a file has its name only, with as many folders as it takes to tell it from the others.
+    A comment has only the name of a file, with a parent folder where two files have the same name.
     """
     lines: list[str] = []
     _annotate(to_data(resolved) if data is None else data, (), resolved, lines)
@@ -134,7 +134,7 @@ def preset_of(resolved: Resolved, names_agent: bool) -> dict[str, Any]:
 
     Args:
         resolved: the configuration.
-        names_agent: whether the preset makes the chosen agent the default.
+        names_agent: whether the preset also sets `agents.default` to the chosen agent.
     """
     preset: dict[str, Any] = {}
     agent = ("agents", resolved.agent_name)

@@ -1,4 +1,4 @@
-"""Top-level keys of other frameworks in a task file: they move into `foreign`, by format."""
+"""Move top-level keys of a task file that belong to another framework's format into its key `foreign`."""
 
 from collections.abc import Mapping
 from typing import Any

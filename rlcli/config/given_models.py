@@ -54,9 +54,10 @@ def recorded_models(task: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def model_path(path: Path, form: Format | None, problems: list[Problem]) -> Path:
-    """Return the key of a task's data that an override `models.NAME` sets; empty if a configuration has read it.
+    """Return the path in a task's data that `--model NAME=FILE` sets; `path` is its override, `models.NAME`.
 
-    If the task is not in another framework's format, add a problem and return an empty path.
+    The path is empty for a format whose configurations receive the models when they are read, and for a task in rlcli's
+    own format, for which a problem is added.
     """
     name = ".".join(map(str, path[1:]))
     if form is None:

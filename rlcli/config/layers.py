@@ -19,7 +19,11 @@ _OVERRIDE = re.compile(rf"\s*((?:{_KEY.pattern})(?:\.(?:{_KEY.pattern}))*)\s*=(.
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Origin of a value. `layer` is task, agent, play, config, override or flag; `where` is `file:line:column`."""
+    """Origin of a value.
+
+    `layer` is task, agent, play, config, override, flag or settings. `where` is `file:line:column`, the text of an
+    override, or a flag.
+    """
 
     layer: str
     where: str
@@ -27,7 +31,7 @@ class Origin:
 
 @dataclass(slots=True)
 class Layers:
-    """Merged data, and the origin of the value at every path."""
+    """Configuration merged from several layers: the data, and the origin of the value at every path."""
 
     data: dict[str, Any] = field(default_factory=dict)
     origins: dict[Path, Origin] = field(default_factory=dict)

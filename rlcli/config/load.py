@@ -1,8 +1,8 @@
 """Loading of a configuration: read the task's files and the command line, merge them, validate the result.
 
 This is phase 1 of a command: it runs before any heavy import. Precedence: schema default < task < the agent's `task:`
-patch < the task's `play:` patch (play and eval only) < `--config` < overrides. All mistakes are reported at once, each
-with its file and line.
+patch < the task's `play:` patch (play and eval only) < `--config` < overrides < flags. All mistakes are reported at
+once, each with its file and line.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,7 +48,7 @@ class Resolved:
         return self.layers.place(path)
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> Problem:
-        """Return a problem at a path of this configuration."""
+        """Return a `Problem` for the value at a path of this configuration, with its location."""
         return Problem(self.place(path), messages.dotted(path), message, hint)
 
     def with_num_envs(self, count: int) -> Self:

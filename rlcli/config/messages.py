@@ -49,7 +49,7 @@ def problems(
         error: the error that pydantic raised.
         model: the model that validated the data.
         data: the data that was validated.
-        place: returns the location in which a path was written.
+        place: returns the location of the value at a path, such as `file:line:column`.
         prefix: path of the data in the whole configuration.
         locations: where each key belongs in the whole schema, for hints about misplaced keys.
     """
@@ -101,7 +101,7 @@ def _message(
         tag, expected = items[0]["ctx"]["tag"], items[0]["ctx"]["expected_tags"].replace(", ", " or ")
         similar = did_you_mean(tag, _tags(model, path))
         return f"expected {expected}, found {format_value(tag)}", similar, (*path, "kind")
-    refused = [item for item in items if item["type"] == "value_error"]  # one alternative has the right type
+    refused = [item for item in items if item["type"] == "value_error"]  # of a type that one alternative has
     if refused:
         return str(refused[0]["ctx"]["error"]), None, path
     if kind == "missing" and isinstance(items[0]["loc"][-1], str):

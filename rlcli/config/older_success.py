@@ -1,4 +1,4 @@
-"""The key `success` of runs that were saved before it had named conditions."""
+"""Conversion of `success` in runs of earlier versions, where it was one function, to named conditions."""
 
 from collections.abc import Mapping
 from pathlib import Path

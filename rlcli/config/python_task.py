@@ -56,7 +56,7 @@ def source_of(value: object, root: FilePath | None = None, name: str = "task") -
 
 
 def load(source: TaskSource, models: Mapping[str, Any] | None = None) -> PythonTask:
-    """Return the configuration of a task in Python, with the models that the user gives for names in it.
+    """Return the configuration of a task in Python. `models`: robot or object -> its model, from --model.
 
     Raises:
         TaskError: if the code of the task raises an error, or the object does not exist.
@@ -106,7 +106,7 @@ def to_task(value: Any, label: str, root: FilePath, models: Mapping[str, Any] | 
         task = PythonTask(value)
     if not isinstance(task.data, TaskConfig | Mapping):
         found = f"expected a TaskConfig, found a value of type {type(task.data).__name__}"
-        raise ConfigError([Problem(label, "", found, "a TaskConfig, or a function that returns one")])
+        raise ConfigError([Problem(label, "", found, "write a TaskConfig, or a function that returns one")])
     task.data = _PlainData(task.terms, label).read(task.data)
     return task
 
@@ -219,7 +219,7 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         value = getattr(value, part)
     if agents or not hasattr(value, "__rlcli_task__"):
         return value, agents
-    uses = [kwargs for kwargs in registrations.values() if _names(kwargs[CONFIGURATION], module.__name__, attribute)]
+    uses = [kwargs for kwargs in registrations.values() if _is_entry(kwargs[CONFIGURATION], module.__name__, attribute)]
     if uses:
         return _with_environment(value, uses[0]), _registered_agents(uses[0])
     folder, form = FilePath(file).parent, format_of_module(value.__rlcli_task__.__module__)
@@ -268,7 +268,7 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
 
 
 def _with_environment(value: Any, kwargs: Mapping[str, Any]) -> Any:
-    """Return a configuration that knows the environment class of its registration, if its format needs the class."""
+    """Return a configuration; if its format needs the environment class of the registration, pass the class to it."""
     value = value() if isinstance(value, type) else value
     if hasattr(value, "__rlcli_environment__"):
         value.__rlcli_environment__(kwargs[ENVIRONMENT])
@@ -284,8 +284,8 @@ def _registered_agents(kwargs: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _names(entry: object, module: str, attribute: str) -> bool:
-    """Return whether the entry of a registration is this object of a module."""
+def _is_entry(entry: object, module: str, attribute: str) -> bool:
+    """Return whether a registration's entry, `module:name` or an object, is the object `attribute` of a module."""
     if isinstance(entry, str):
         return entry == f"{module}:{attribute}"
     return getattr(entry, "__module__", "") == module and getattr(entry, "__qualname__", "") == attribute

@@ -118,7 +118,7 @@ def _parse_cached(text: str) -> tuple[Any, dict[Path, Mark]]:
 
 
 def _events(text: str) -> Iterator[events.Event]:
-    """Yield PyYAML's events."""
+    """Yield PyYAML's parsing events of a text."""
     loader = yaml.SafeLoader(text)
     try:
         while loader.check_event():

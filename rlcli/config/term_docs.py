@@ -39,7 +39,7 @@ _BOUNDS = (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("ex
 
 @dataclass(frozen=True, slots=True)
 class KeyEntry:
-    """One YAML key of a term."""
+    """Documentation of one YAML key of a term."""
 
     name: str
     type: str
@@ -50,7 +50,7 @@ class KeyEntry:
 
 @dataclass(frozen=True, slots=True)
 class TermEntry:
-    """One term, as the reference and `rlcli terms` show it."""
+    """Documentation of one term, as the reference pages and `rlcli terms` show it."""
 
     section: str
     name: str

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _RLCLI = Path(__file__).resolve().parents[1]
-MOST = 64
+MAX_CLASSES = 64
 """Largest number of classes in one search. The files may be untrusted, and may inherit from each other in a circle."""
 
 
@@ -43,7 +43,7 @@ def parse(file: Path) -> ast.Module:
 
 
 class ClassSearch:
-    """Search for classes in source files. It stops after `MOST` classes.
+    """Search for classes in source files. It stops after `MAX_CLASSES` classes.
 
     Base classes are found in the same file, in other files of the same package, and in `rlcli.mdp`. `trees` is a cache
     of the syntax trees of files; new files are added to it. Methods raise SyntaxError if a file is not Python.
@@ -51,7 +51,7 @@ class ClassSearch:
 
     def __init__(self, trees: dict[Path, ast.Module] | None = None) -> None:
         self._trees = {} if trees is None else trees
-        self._left = MOST
+        self._left = MAX_CLASSES
 
     def lineage(self, file: Path, name: str) -> list[SourceClass]:
         """Return a class and its base classes, depth first, each once; an empty list if the file has no such class."""
@@ -82,7 +82,7 @@ class ClassSearch:
                 yield from self.walk(base, seen)
 
     def bases(self, source: SourceClass) -> list[SourceClass]:
-        """Return the direct base classes of a class; none after `MOST` classes."""
+        """Return the direct base classes of a class; none after `MAX_CLASSES` classes."""
         if not self._left:
             return []
         self._left -= 1

@@ -31,7 +31,7 @@ from rlcli.registry.imports import load_spec
 from rlcli.trainers import TrainerSpec
 
 PATCHES = ("agents", "play")
-"""Keys of a task file whose values patch the task.
+"""Keys of a task file whose values are patches, which change other keys of the task.
 
 Changes to these values from a --config file or an override are made first; then the patches are applied.
 """
@@ -62,15 +62,17 @@ Change = tuple[Path, Any, Origin]
 
 @dataclass(slots=True)
 class TaskCheck:
-    """One check of a configuration: the layers that are merged so far, and every problem that was found."""
+    """Check of one configuration, step by step: the layers merged so far, and every problem found so far."""
 
     source: TaskSource
     layers: Layers = field(default_factory=Layers)
     vocabulary: Vocabulary = field(default_factory=Vocabulary)
     problems: list[Problem] = field(default_factory=list)
     missing: DependencyError | None = None
+    """Error for a trainer that is not installed; None: there is no such error."""
     locations: messages.KeyLocations = field(default_factory=dict)
     functions: dict[str, Signature] = field(default_factory=dict)
+    """Own terms of a configuration in Python, by name."""
     notes: list[Note] = field(default_factory=list)
     format: formats.Format | None = None
     place: str = ""
@@ -100,7 +102,7 @@ class TaskCheck:
             raise ConfigError([Problem(self.source.label, "", text), *self.problems[:MAX_PROBLEMS]])
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
-        """Add a problem at a path."""
+        """Add a problem of the value at a path."""
         self.add(Problem(self.layers.place(path), messages.dotted(path), message, hint))
 
     def _is_mapping(self, value: object, path: Path) -> bool:
@@ -287,7 +289,7 @@ class TaskCheck:
             return spec, _AnyAgent
         model = load_entry(replace(entry, value=spec.algorithms[algorithm]), type)
         if not issubclass(model, AgentConfig):
-            raise TaskError(f"plugin {entry.distribution} {entry.version} is broken: make {model} an AgentConfig")
+            raise TaskError(f"plugin {entry.distribution}: {model.__name__} must be a subclass of AgentConfig")
         return spec, model
 
     def task(self) -> TaskConfig | None:
@@ -374,7 +376,7 @@ class TaskCheck:
         if model is None:
             if values:
                 reason = "the task's class has no Params" if self.source.task else "only direct tasks have params"
-                self.problem(("params",), f"remove them: {reason}")
+                self.problem(("params",), f"{reason}; remove this block")
             return {}
         checked = self._validate(model, values, ("params",))
         return checked.model_dump() if checked is not None else None

@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of one check: its name, its state, what was found, and the hint that repairs it."""
+    """Result of one check: its name, its state, what was found, and how to repair it (`hint`)."""
 
     name: str
     state: str

@@ -57,7 +57,7 @@ def compute_checks(answer: dict[str, Any] | None, reason: str) -> list[Check]:
         text = f"the package has version {package}, but the loaded library has version {library}"
         checks.append(Check("mujoco", "broken", text, REINSTALL))
     else:
-        checks.append(Check("mujoco", "ok", f"{library}, the CPU engine steps"))
+        checks.append(Check("mujoco", "ok", f"{library}, a physics step works"))
     before, after = answer["cores"]
     if after < before:
         text = f"after torch has computed, its OpenMP keeps the process on {after} of {before} cores"
@@ -69,7 +69,7 @@ def compute_checks(answer: dict[str, Any] | None, reason: str) -> list[Check]:
 def gpu_checks(gpu: Answer | None) -> list[Check]:
     """Check that driver, torch and Warp fit together. `gpu` is None if there is no driver."""
     if gpu is None:
-        return [Check("gpu", "ok", "none; the CPU engine needs none")]
+        return [Check("gpu", "ok", "no GPU; the CPU engine needs none")]
     answer, reason = gpu
     if answer is None:
         return [Check("gpu", "warning", f"a driver is installed, but its check failed: {reason}", "run nvidia-smi")]

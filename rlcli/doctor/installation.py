@@ -15,7 +15,7 @@ from rlcli.registry.imports import release_numbers
 from rlcli.registry.probe import probe
 
 TRIPLE = ("mujoco", "mujoco-core", "mujoco-studio")
-"""The three packages of MuJoCo, which must have the same version."""
+"""The three PyPI packages of MuJoCo, which must have the same version."""
 _NO_EXTRAS = ("all", "dev", "docs")
 """Extras that are not checked: lists of other extras, and the tools that develop rlcli."""
 _REQUIREMENT = re.compile(r"\s*([\w.-]+)(?:\[[^]]*\])?\s*([^;]*)(?:;(.*))?")
@@ -195,6 +195,6 @@ def _remedy(entry: Entry, reason: str) -> str:
 
 
 def _other_owners(entry: Entry, entries: list[Entry]) -> str:
-    """Return the other distributions that have a task of this name; empty for a task of rlcli, which wins."""
+    """Return the other distributions that have a task of this name; empty for a task of rlcli, which has priority."""
     owners = [e.distribution for e in entries if e.name == entry.name and e.distribution != entry.distribution]
     return " and ".join(owners) if entry.distribution != "rlcli" else ""

@@ -43,7 +43,7 @@ def _compute() -> dict[str, Any]:
 
 
 def _cores() -> int:
-    """Return the number of cores that a thread started now may use."""
+    """Return the number of cores that a new thread may use. OpenMP may pin the main thread to fewer cores."""
     found: list[int] = []
     if not hasattr(os, "sched_getaffinity"):
         return os.cpu_count() or 1

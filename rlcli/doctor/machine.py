@@ -18,7 +18,7 @@ VARIABLES = (
     *("MUJOCO_GL", "DISPLAY", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OMP_THREAD_LIMIT"),
     *("OMP_WAIT_POLICY", "KMP_BLOCKTIME", "LOCAL_WORLD_SIZE", "PYTHONPATH", "NO_COLOR", "FORCE_COLOR"),
 )
-"""Environment variables that the check lists."""
+"""Environment variables that `rlcli doctor` lists, if they are set."""
 LOW_DISK_BYTES = 1e9
 LOW_MEMORY_BYTES = 1e9
 """Memory below which training gets a warning; torch and MuJoCo alone take about half of it."""
@@ -33,7 +33,7 @@ def memory_check(free: int, limit: int | None) -> Check:
     """Check that there is enough memory for training.
 
     Args:
-        free: memory that the process may still allocate [bytes].
+        free: memory of the machine that is still available [bytes].
         limit: memory limit of the process or its container [bytes]; None: no limit.
     """
     details = {"available_bytes": free, "limit_bytes": limit}
@@ -134,5 +134,5 @@ def harmful_variables(variables: dict[str, str], cores: int) -> dict[str, str]:
         if variables.get(name, "").strip().lower() == spinning:
             found[name] = "waiting OpenMP threads occupy cores that the engine needs; unset it"
     if variables.get("LOCAL_WORLD_SIZE", "1") not in ("", "1"):
-        found["LOCAL_WORLD_SIZE"] = "the cores are divided by this number, as a launcher of several processes needs it"
+        found["LOCAL_WORLD_SIZE"] = "rlcli divides the cores by this number, which launchers of several processes set"
     return found

@@ -88,7 +88,7 @@ def _entry_points_text(distribution: metadata.Distribution) -> str:
 
 
 def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
-    content = distribution.metadata  # parsed anew by each access
+    content = distribution.metadata  # each access parses the metadata again
     name, version = content["Name"], content["Version"]
     if not name or not version:
         raise ValueError("its METADATA has no Name or no Version; reinstall the package")

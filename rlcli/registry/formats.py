@@ -21,11 +21,12 @@ _KNOWN = Path(__file__).with_name("known_plugins.json")
 _LARGEST = 1024 * 1024
 """Files above this size [bytes] are not searched for the patterns of known formats."""
 _MOST_FILES = 100
+"""Most files of a folder that are searched for each pattern of file names."""
 
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """An installed format."""
+    """An installed format of task files: its entry point and its specification."""
 
     entry: Entry
     spec: FormatSpec
@@ -51,11 +52,13 @@ class KnownFormat:
     install: str
     """The arguments of `pip install`."""
     summary: str
+    """The tasks that the format describes, for messages, as in `FormatSpec`."""
     key: str = ""
+    """Top-level key of a task file that belongs to the format."""
     modules: Sequence[str] = ()
     """Modules that are imported only by tasks of this format."""
     files: Sequence[str] = ()
-    """Patterns of file names."""
+    """Glob patterns for the names of files that may be task files of this format."""
     all_of: Sequence[str] = ()
     """Regular expressions: a file of this format matches all of them."""
     none_of: Sequence[str] = ()

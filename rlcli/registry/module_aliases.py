@@ -1,4 +1,4 @@
-"""Imports of task files: modules of other frameworks come from installed formats, and of the task from its own folder.
+"""Import statements in task files. A module of another framework is replaced by one of an installed format.
 
 The files of a task are executed with their own `__import__`. No other module uses it, and `sys.modules` never has an
 entry for another framework: an installed original is neither imported for a task nor hidden from others. Functions of
@@ -20,6 +20,7 @@ from typing import Any
 from rlcli.registry.formats import Format, aliasing_formats
 
 _MOST_FILES = 200
+"""Most files of a task in which names of formats are counted."""
 _python_import = builtins.__import__
 _trees: dict[str, str] = {}
 """Module name of an imported package or folder -> name under which its own files import it."""
@@ -36,7 +37,7 @@ class TaskFileLoader(SourceFileLoader):
         super().exec_module(module)
 
 
-def package_tree(module: str, folder: Path, own_name: str) -> None:
+def register_package(module: str, folder: Path, own_name: str) -> None:
     """Register a folder of task files: its files import each other as `own_name`, and Python knows them as `module`."""
     _trees[module] = own_name
     if folder not in _roots:
@@ -49,7 +50,7 @@ def package_tree(module: str, folder: Path, own_name: str) -> None:
 def files_below(folder: Path) -> Iterator[None]:
     """Execute modules that are found in a folder as files of a task, inside the `with` block."""
     added = folder not in _roots
-    package_tree("", folder, "")
+    register_package("", folder, "")
     try:
         yield
     finally:

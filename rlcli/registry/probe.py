@@ -44,7 +44,7 @@ class Details:
     policy: bool = False
     """Whether a trained policy is shipped with the task."""
     broken: str | None = None
-    """Why the task cannot be loaded; None: it can, or nobody has tried."""
+    """Why the task cannot be loaded; None: it can be loaded, or it has not been probed."""
 
     @property
     def status(self) -> str:
@@ -160,7 +160,10 @@ def _probe_distribution(
 def _probe_names(
     names: list[str], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str]
 ) -> dict[str, Details]:
-    """Load entries in one process and return details of the first one and of all further ones that it reached."""
+    """Load entries in one process, in this order, and return the details of those that it reached: at least the first.
+
+    The entry at which the process crashed or exceeded the time limit is among them, as broken.
+    """
     with tempfile.TemporaryDirectory(prefix="rlcli-probe-", ignore_cleanup_errors=True) as folder:
         file, log = Path(folder) / "rows", Path(folder) / "stderr"
         with log.open("wb") as stderr:

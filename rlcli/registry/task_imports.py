@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.registry.imports import contain_side_effects
-from rlcli.registry.module_aliases import TaskFileLoader, files_below, import_by_name, is_alias, package_tree
+from rlcli.registry.module_aliases import TaskFileLoader, files_below, import_by_name, is_alias, register_package
 
 CONFIGURATION = "env_cfg_entry_point"
 """Argument of a registration with Gymnasium that names the configuration of a task."""
@@ -24,7 +24,7 @@ registrations: dict[str, dict[str, Any]] = {}
 """ID -> arguments of every task that imported files have registered with Gymnasium."""
 
 _imported: dict[tuple[Path, str], None] = {}
-"""Imported task files, in order, with the name of the function that imported them."""
+"""Keys: the imported task files, in order, each with the name of the function that imported it."""
 
 
 def load_object(reference: str) -> Any:
@@ -79,7 +79,7 @@ def import_file(file: Path) -> Any:
 def import_from(package: Path, inner: str, *, run_start: bool = True) -> Any:
     """Import a module of a package folder, for example `robots.arm`; an empty text is the package itself.
 
-    Without `run_start`, the package's `__init__.py` is not executed.
+    With `run_start` false, the package's `__init__.py` is not executed.
     """
     with contain_side_effects(), _registrations_kept():
         name = _package(package, run_start)
@@ -128,7 +128,7 @@ def _package(folder: Path, run_start: bool = True) -> str:
             name = folder.name
     if name in sys.modules:
         return name
-    package_tree(name, folder, folder.name)
+    register_package(name, folder, folder.name)
     start = folder / "__init__.py"
     if start.is_file() and run_start:
         loader = TaskFileLoader(name, str(start))

@@ -25,7 +25,7 @@ class TaskSource:
     task: str | None = None
     """Class of a direct task, `module:Class` or `file.py:Class`; None for a manager-based task."""
     task_file: Path | None = None
-    """File with that class."""
+    """File with the class of a direct task; None for a manager-based task."""
     python: str | None = None
     """A configuration in Python: `module:attribute`, `file.py:attribute` or the folder of a package; None: in YAML."""
     agents: tuple[tuple[str, str], ...] = ()

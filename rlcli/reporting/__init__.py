@@ -1,1 +1,1 @@
-"""Pages and pictures made from runs."""
+"""Reports about runs and tasks: learning curves, heat maps, task cards, and the HTML page of a run."""

@@ -9,7 +9,7 @@ from rlcli.config.schema import ConstantNoiseConfig, EventConfig, GaussianNoiseC
 
 
 def number(value: float) -> str:
-    """Return a number with up to six digits."""
+    """Return a number with up to six significant digits."""
     return f"{value:.6g}"
 
 

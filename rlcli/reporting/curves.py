@@ -1,4 +1,4 @@
-"""Learning curves of runs; runs that differ only in their seed are one curve.
+"""Learning curves of runs; runs that differ only in their seed share one curve.
 
 A curve of several seeds is their interquartile mean with a 95 % interval from a stratified percentile bootstrap, as
 Agarwal et al. recommend (Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021,
@@ -30,17 +30,20 @@ AXES = {"steps": "environment steps", "iterations": "iterations", "time": "train
 """Name of an x axis -> its label. Time is the sum of the times of rollouts and updates."""
 
 RESAMPLES = 2000
+"""Number of bootstrap draws."""
 _LEVEL = 95.0
+"""Level of the bootstrap interval [%]."""
 _TRIM = 0.25
+"""Share of the values that the interquartile mean leaves out at each end."""
 FEWEST_FOR_IQM = 4
-"""With fewer runs nothing is cut off, and the interquartile mean is the mean."""
+"""Smallest number of runs for which the interquartile mean leaves values out; for fewer runs it is the mean."""
 _MAX_POINTS = 1000
 """Most points of a curve over several runs."""
 _MAX_METRICS = 1000
 _NAMED = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-((?!\d+$).+)")
-"""Name of the folder of a run with a `--name`."""
+"""Folder name of a run with a `--name`; group 1 is that name."""
 _MAX_DIFFERENCES = 3
-"""Most settings in a label."""
+"""Most settings in the label of a curve."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +59,7 @@ class History:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A metric over an axis."""
+    """Metric over an x axis: the curve, and the ends of its interval."""
 
     x: Array
     middle: Array
@@ -65,26 +68,26 @@ class Line:
     high: Array | None = None
 
     def last(self) -> tuple[float | None, ...]:
-        """Return the last x, the last value, and both ends of its interval."""
+        """Return the last x, the last value, and both ends of its interval (None for a single run)."""
         return tuple(None if end is None else float(end[-1]) for end in (self.x, self.middle, self.low, self.high))
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Runs that differ only in their seed."""
+    """Learning curves of runs that differ only in their seed; together they are one curve of a figure."""
 
     label: str
     histories: list[History]
     settings: dict[str, Any] = field(default_factory=dict)
-    """Settings that all of its runs have: key -> value."""
+    """Settings that the runs of the curve have in common: key -> value."""
 
     @property
     def seeds(self) -> list[int]:
-        """The seeds of its runs."""
+        """The seeds of the curve's runs."""
         return [history.run.record["seed"] for history in self.histories]
 
     def names(self) -> list[str]:
-        """Return the metrics that all of its runs have."""
+        """Return the metrics that all runs of the curve have."""
         first, *others = self.histories
         return [name for name in first.metrics if all(name in other.metrics for other in others)]
 
@@ -105,7 +108,7 @@ class Curve:
         return None if aligned is None else Line(aligned[0], aligned[1].mean(axis=0))
 
     def _aligned(self, metric: str, axis: str) -> tuple[Array, Array] | None:
-        """Return x (p,) and values (runs, p)."""
+        """Return a metric of all runs at common values of the axis: x (p,) and values (runs, p); None if impossible."""
         if any(metric not in history.metrics for history in self.histories):
             return None
         lines = []

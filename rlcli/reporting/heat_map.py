@@ -27,7 +27,7 @@ class Axis(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class HeatMap:
-    """Map with a row for each value of the first sweep and a column for each value of the second.
+    """Heat map with a row for each value of the first sweep and a column for each value of the second.
 
     If there are further sweeps, a cell has the smallest value over all their values.
     """
@@ -49,7 +49,7 @@ class HeatMap:
 def heat_maps(
     sweeps: Sequence[Sweep], values: Sequence[tuple[str, Mapping[Point, float]]], metric: str
 ) -> list[HeatMap]:
-    """Return one map for each policy; all maps have the same colour scale.
+    """Return one heat map for each policy; all have the same colour scale.
 
     Args:
         sweeps: one or more sweeps.
@@ -64,7 +64,7 @@ def heat_maps(
 def heat_map(
     title: str, sweeps: Sequence[Sweep], values: Mapping[Point, float], scale: tuple[float, float] | None = None
 ) -> HeatMap:
-    """Return the map of one metric.
+    """Return the heat map of one metric.
 
     Args:
         title: metric and policy.
@@ -89,7 +89,7 @@ def _axis(sweep: Sweep) -> Axis:
 
 
 def draw(file: Path, maps: Sequence[HeatMap]) -> None:
-    """Plot maps side by side.
+    """Plot heat maps side by side in one file.
 
     Raises:
         MachineError: if the file cannot be written.

@@ -14,9 +14,11 @@ from rlcli.runs.safe_io import read_errors, read_file, require_inside
 _log = logging.getLogger(__name__)
 
 _EPISODES = 200
+"""Episodes of an evaluation that is made for a report."""
 _MAX_VIDEO_S = 20.0
 """Longest video that is made for a report [s]."""
 _MAX_VIDEO_BYTES = 24 * 2**20
+"""Largest video that a report contains."""
 
 
 class PageMedia:

@@ -25,7 +25,7 @@ _STYLES = ("-", "--", ":", "-.")
 """Line styles; the next one is used each time the colours are used up."""
 
 INK, FAINT, PAPER = "#1b1f24", "#d0d7de", "#fefefe"
-"""Colours of text, rules and the background of a legend, as in `curves.mplstyle`; an HTML page replaces them."""
+"""Colours of text, grid lines and the background of a legend, as in `curves.mplstyle`; an HTML page replaces them."""
 _WIDTH, _HEIGHT = 5.2, 3.2
 """Size of a panel [inches]."""
 _PAGE_SIZE = (4.1, 2.7)

@@ -15,18 +15,18 @@ GROUPS = {"rewards": REWARDS, "terminations": TERMINATIONS}
 DEFAULT = (*METRICS, *GROUPS)
 
 _TITLES = {
-    "Train/mean_reward": ("Return", "reward an episode"),
+    "Train/mean_reward": ("Return", "reward per episode"),
     "Train/success_rate": ("Success", "share of episodes"),
     "Train/mean_episode_length": ("Episode length", "environment steps"),
 }
-_REWARD_UNIT = "mean, reward a second"
+_REWARD_UNIT = "mean reward per second"
 _ENDS_UNIT = "share of episodes"
 _SHARES = ("success_rate",)
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Line or band of a panel; `index` selects its colour."""
+    """Line or band in a panel of a figure; `index` selects its colour and line style."""
 
     label: str
     line: Line
@@ -35,7 +35,7 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Coordinate system with lines or bands."""
+    """Panel of a figure: a pair of axes with lines or stacked bands."""
 
     title: str
     unit: str
@@ -45,7 +45,7 @@ class Panel:
     share: bool = False
     """Whether the y axis is a share from 0 to 1."""
     by_curve: bool = False
-    """Whether its lines are the picture's curves. All such panels have one common legend."""
+    """Whether there is one line for each `Curve` of the picture. All such panels share one legend."""
     subtitle: str = ""
 
 

@@ -30,7 +30,7 @@ from rlcli.runs.restore import recorded_task, resolve_run
 from rlcli.runs.run import Run
 
 _MAX_CHARACTERS = 2000
-"""Most characters of a text on the page."""
+"""Most characters of an error message on the page."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +67,14 @@ class Page:
     checkpoint: str | None = None
     video: bytes | None = None
     video_of: str = ""
+    """Caption of the video: the checkpoint that it shows."""
     settings: list[tuple[str, list[Setting]]] = field(default_factory=list)
-    """Section -> its values."""
+    """Sections of the configuration, each with its settings."""
     machine: list[tuple[str, str]] = field(default_factory=list)
     commands: list[tuple[str, str]] = field(default_factory=list)
     """(description, command) of each command."""
     missing: dict[str, str] = field(default_factory=dict)
-    """Part -> one sentence why it is missing."""
+    """Missing part of the page -> the reason, one sentence."""
 
 
 def gather_page(run: Run, checkpoint: Path | None) -> Page:
@@ -163,7 +164,7 @@ def _facts(run: Run, curve: Curve | None) -> Iterator[tuple[str, str]]:
     if record.get("init_from"):
         yield "Weights from", str(record["init_from"])
     if record.get("resumed"):
-        yield "Resumed", f"{len(record['resumed'])} times"
+        yield "Resumed", f"{len(record['resumed'])} time{'s' * (len(record['resumed']) != 1)}"
 
 
 # --- configuration and its origins ---
@@ -248,7 +249,7 @@ def _commands(run: Run, checkpoint: Path | None) -> Iterator[tuple[str, str]]:
     if checkpoint is not None:
         yield "Evaluate it", f"rlcli eval --checkpoint {folder}"
         yield "Watch it", f"rlcli play --checkpoint {folder}"
-        yield "Take it to a robot", f"rlcli export --checkpoint {folder}"
+        yield "Export it for a robot", f"rlcli export --checkpoint {folder}"
 
 
 # --- texts ---

@@ -31,7 +31,7 @@ from rlcli.registry import TaskSource
 from rlcli.reporting.card_text import columns_text, modifier_text, noise_text, number, span, text_of, when_text
 
 CODE, NUMBER, TEXT = "code", "number", "text"
-"""Kinds of columns."""
+"""Kinds of a table's columns: names in code, numbers, sentences."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """Description of a task."""
+    """Content of a task card: name, summary, facts and tables."""
 
     name: str
     summary: str
@@ -76,7 +76,7 @@ def card(
     source: TaskSource | None = None,
     layout: Mapping[str, Any] | None = None,
 ) -> Card:
-    """Return the card of a configuration.
+    """Return the task card of a configuration.
 
     Args:
         task: the configuration.
@@ -123,7 +123,7 @@ _KINDS = {
     **dict.fromkeys(("Term", "Of", "Name", "Drives", "Condition", "Hook"), CODE),
     **dict.fromkeys(("Size", "Scale", "Weight"), NUMBER),
 }
-"""Title of a column -> its kind; others are text."""
+"""Title of a column -> its kind; columns with other titles are text."""
 
 
 def _columns(*titles: str) -> tuple[Column, ...]:

@@ -81,7 +81,7 @@ def to_json(value: object) -> str:
 
 
 def finite_json(value: Any) -> Any:
-    """Return a copy in which numbers that are not finite are text, since JSON has none."""
+    """Return a copy in which numbers that are not finite are text, because JSON has only finite numbers."""
     if isinstance(value, dict):
         return {key: finite_json(inner) for key, inner in value.items()}
     if isinstance(value, list):

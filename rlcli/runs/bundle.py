@@ -27,7 +27,7 @@ BUNDLE = 1
 
 
 class _BundleRecord(FileModel):
-    """The entries of a manifest that only a bundle has."""
+    """The entries of a manifest that only the manifest of a bundle has."""
 
     task: TaskRecord
     agent: Annotated[PrintableText, Field(max_length=200)] | None = None

@@ -104,7 +104,10 @@ class ObservationColumns(_Columns):
 
 
 class ActionColumns(_Columns):
-    """Columns of `action` and of `command`. Without a scale the command is the action, limited to `clip`."""
+    """Columns of an action term: command = clip(scale x action + offset).
+
+    Without a scale the command is the action, limited to `clip`.
+    """
 
     offset: list[float] | None
     clip: list[tuple[float | None, float | None]] | None
@@ -112,7 +115,7 @@ class ActionColumns(_Columns):
 
 
 class LayoutRecord(_Record):
-    """The contract between a policy and its environment."""
+    """Columns of observations and actions, and time steps, that a policy needs its environment to have."""
 
     observations: dict[str, list[ObservationColumns]]
     actions: list[ActionColumns]
@@ -122,20 +125,25 @@ class LayoutRecord(_Record):
 
 
 class _Formula(_Record):
+    """Formula with a flag `closed`: whether `value` is computed from the simulation, without the task's own code."""
+
     @model_validator(mode="after")
     def _check_value(self) -> Self:
         value, closed = getattr(self, "value", None), getattr(self, "closed", False)
         if value is not None:
             check_formula(value)
         if closed and value is None:
-            raise ValueError("'closed' is true, so 'formula' must be given")
+            raise ValueError("'closed' is true, so 'value' must be a formula")
         if not closed and isinstance(self, ObservationFormula) and not _is_external_input(value):
-            raise ValueError("'closed' is false, so 'formula' must be null")
+            raise ValueError("'closed' is false, so 'value' must be {'given': 'observation/NAME'}")
         return self
 
 
 class ObservationFormula(_Formula):
-    """Formula of an observation term's columns. `value` computes the columns of one step."""
+    """Formula of an observation term's columns. `value` computes the columns of one step.
+
+    If `closed` is false, there is no formula, and `value` is an input that the task's own code computes.
+    """
 
     name: Name
     func: Name
@@ -147,7 +155,7 @@ class ObservationFormula(_Formula):
 
 
 class ControlFormula(_Formula):
-    """Formula that computes some controls of the model from `action` and `command`."""
+    """Formula that computes some controls of the model (`MjData.ctrl`) from `action` and `command`."""
 
     name: Name
     func: Name
@@ -166,7 +174,7 @@ class CommandRecord(_Record):
 
 
 class JointRecord(_Record):
-    """A hinge or slide joint, and the gains of its actuator; both are 0 without an actuator."""
+    """A hinge or slide joint, and the gains of its actuator; both are null without an actuator, and 0 for a motor."""
 
     name: Name
     entity: Name

@@ -1,4 +1,4 @@
-"""Checkpoints: folders of safetensors and JSON files, which are verified before use and never unpickled."""
+"""Reader of checkpoints: folders of safetensors and JSON files; hashes are checked, and nothing is unpickled."""
 
 import hashlib
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ PARTS = ("policy", "trainer", "env", "rng")
 """Tensor files of every checkpoint: the policy; critics and optimisers; environment; random generators. A trainer may
 add parts."""
 LOG_FOLDER = "logs"
-"""Folder beside the checkpoints with rows that several checkpoints share, such as those of a replay buffer. Its files
-never change."""
+"""Folder beside the checkpoints with logs: rows that several checkpoints share, such as those of a replay buffer. Its
+files never change."""
 _ROWS_AT_ONCE = 1000
 _MAX_SHARD_BYTES = 2**30
 _HEADER_LIMIT = 4 * 2**20
@@ -38,14 +38,14 @@ _MAX_FILES = 4096
 
 
 class FileEntry(FileModel):
-    """Size and hash of a file in the manifest."""
+    """Entry of a manifest for one file: its size [bytes] and its sha256."""
 
     size: Count
     sha256: Annotated[str, Field(max_length=64)]
 
 
 class Shard(FileModel):
-    """A file with the rows `start` to `stop` - 1 of a log."""
+    """Manifest entry of a file with the rows `start` to `stop` - 1 of a log, such as a replay buffer."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -62,12 +62,12 @@ class Shard(FileModel):
 
     @property
     def file(self) -> str:
-        """Name of the file."""
+        """Name of the file, `START-STOP.safetensors`."""
         return f"{self.start:012d}-{self.stop:012d}.safetensors"
 
 
 class _Log(FileModel):
-    """Rows `first` to `stop` - 1 of a log, and their files."""
+    """Manifest entry of a log, such as a replay buffer: its rows `first` to `stop` - 1, and their files."""
 
     first: Count
     stop: Count
@@ -128,7 +128,7 @@ class _Statistics(FileModel):
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A verified checkpoint folder."""
+    """A checkpoint folder with a checked manifest; each file is checked when it is read."""
 
     folder: Path
     manifest: dict[str, Any]
@@ -148,7 +148,7 @@ class Checkpoint:
         return parse_json(self._data(name, JSON_LIMIT), self.folder / name)
 
     def tensors(self, part: str, limit: int | None = None) -> dict[str, Tensor]:
-        """Read the tensors of a part.
+        """Read the tensors of a part of the checkpoint, such as `policy`.
 
         Args:
             part: the name of the part.
@@ -200,13 +200,13 @@ class Checkpoint:
         file = self.folder / "trainer.safetensors"  # `self.policy()` has checked the tensors of the policy
         for name, value in tensors["trainer"].items():
             if value.is_floating_point() and not bool(value.isfinite().all()):
-                raise CheckpointError(f"{file}: '{name}' is not finite; use an older one: RUN@step:N")
+                raise CheckpointError(f"{file}: '{name}' is not finite; use an older checkpoint: RUN@step:N")
             if name.endswith(("normalizer.var", "normalizer.count")) and bool((value < 0).any()):
-                raise CheckpointError(f"{file}: '{name}' is negative; use an older one: RUN@step:N")
+                raise CheckpointError(f"{file}: '{name}' is negative; use an older checkpoint: RUN@step:N")
         return TrainerState(tensors, values, {name: self._rows(name) for name in self.shards()})
 
     def verify(self, *, whole: bool) -> None:
-        """Read and check the policy alone, or with `whole` all files.
+        """Read and check the policy, or with `whole` everything that a resumed training needs.
 
         Raises:
             CheckpointError: at the first error.
@@ -219,7 +219,7 @@ class Checkpoint:
                 rows.read(start, min(start + _ROWS_AT_ONCE, rows.stop))
 
     def shards(self) -> dict[str, list[Shard]]:
-        """Return the files of each log, those with the oldest rows first.
+        """Return the files of each log (such as a replay buffer), those with the oldest rows first.
 
         Raises:
             CheckpointError: if the manifest's entry `logs` is malformed.

@@ -36,7 +36,7 @@ _COSMETIC_KEYS = frozenset(
 _NOT_PHYSICS = frozenset(("init", "soft_joint_pos_limit_factor"))
 """Keys of an entity that set the start of episodes, or a limit that only terms read."""
 _EMPTY: tuple[Any, ...] = (None, {})
-"""Values that equal a missing key."""
+"""Values that count as equal to a missing key."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,7 +42,7 @@ Name = Annotated[str, Field(max_length=500)]
 
 
 class _EvaluationRecord(FileModel):
-    """The entries that rlcli reads; the document may have more."""
+    """Entries of a saved evaluation that rlcli reads; the document may have more."""
 
     command: Literal["eval"]
     episodes: Annotated[int, Field(ge=1)]

@@ -20,13 +20,13 @@ ENDED = {"finished", "stopped", "diverged", "failed"}
 """Recorded states of runs that have ended. A run whose state is `running` and that is not locked was interrupted."""
 _TAIL_BYTES = 32 * 1024
 _MAX_ROWS = 20
-"""Number of newest rows that are read."""
+"""Number of newest rows of metrics, or of evaluations, that are read."""
 _MAX_ROW_BYTES = 1024**2
 _MAX_SEARCH_BYTES = 64 * 1024**2
 """Bytes of the metrics that are searched for one row."""
 _MAX_FILES = 20_000
 _STARTING_S = 5.0
-"""A younger run may not have its lock yet [s]."""
+"""Age up to which a run counts as running without a lock, because it may not have its lock yet [s]."""
 
 
 @dataclass(slots=True)
@@ -38,7 +38,7 @@ class Overview:
     state: str
     """running, waiting, finished, stopped, interrupted, diverged, failed, or broken."""
     reason: str | None = None
-    """Why the run failed, diverged or is broken, if known."""
+    """Why the run failed, diverged, was interrupted or is broken, if known."""
     resumable: bool = False
     iteration: int | None = None
     iterations: int | None = None
@@ -68,7 +68,7 @@ class Overview:
 
 
 def overviews(runs_dir: Path) -> list[Overview]:
-    """Return all runs under a folder, the newest first and broken ones last."""
+    """Return all runs under a folder, the newest first; those without a readable start time come last."""
     found = [overview(folder) for folder in run_folders(runs_dir)]
     return sorted(found, key=lambda run: (run.started or "", run.folder.name), reverse=True)
 
@@ -122,7 +122,7 @@ def overview_of(run: Run) -> Overview:
 
 
 def state_of(run: Run) -> tuple[str, str | None]:
-    """Return the state of a run, and the reason where it failed or diverged."""
+    """Return the state of a run, and the reason if it failed, diverged, was interrupted or is broken."""
     recorded = run.record.get("state", "")
     why = run.record.get("reason")
     reason = why if isinstance(why, str) and recorded in ("diverged", "failed") else None
@@ -175,7 +175,7 @@ def _row(line: bytes) -> dict[str, Any] | None:
 
 
 def _row_at(run: Run, step: int) -> dict[str, Any]:
-    """Return the row of one step; an empty one if there is none."""
+    """Return the row of metrics at an environment step; an empty mapping if there is none."""
     data, _ = _tail(run, _MAX_SEARCH_BYTES)
     at = data.find(f'"step": {step},'.encode())
     line = b"" if at < 0 else data[data.rfind(b"\n", 0, at) + 1 : data.find(b"\n", at)]

@@ -18,12 +18,12 @@ SHIPPED = "shipped"
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """A checkpoint or a bundle, and the reason for its choice."""
+    """Chosen policy: the folder of a checkpoint or a bundle, and the reason for the choice."""
 
     folder: Path
     why: str
     run: Run | None
-    """The run of a checkpoint; None for a bundle."""
+    """The run of a checkpoint; None for a bundle, and for a checkpoint folder outside a run."""
     bundle: Checkpoint | None
     """The bundle; None for a checkpoint of a run."""
 

@@ -52,7 +52,7 @@ def environment_record(resolved: Resolved, engine_threads: int, torch_threads: i
         "python": platform.python_version(),
         "platform": platform.platform(),
         "machine": platform.machine(),
-        "libc": " ".join(platform.libc_ver()).strip(),  # torch and MuJoCo call its mathematics
+        "libc": " ".join(platform.libc_ver()).strip(),  # torch and MuJoCo call its functions, such as sin
         "versions": versions(resolved),
         "sources": sources(resolved),
         "cpu": processor(),

@@ -11,7 +11,7 @@ from rlcli.runs.run import Run, create_run
 from rlcli.runs.run_diff import last_iteration
 
 IRRELEVANT = ("engine_threads",)
-"""Entries that do not affect the results: physics is the same for any number of threads."""
+"""Entries of run.json that do not affect the results: physics is the same for any number of engine threads."""
 
 
 def require_reproducible(run: Run) -> None:
@@ -38,7 +38,7 @@ def changed_entries(run: Run, now: Mapping[str, Any]) -> list[tuple[str, Any, An
 
 
 def milestones(run: Run, until: int) -> list[int]:
-    """Return the iterations before `until` at which a run was saved, and `until` itself."""
+    """Return the iterations up to `until` at which a run has a checkpoint, and `until` itself, for a comparison."""
     saved = [open_checkpoint(run.checkpoints / f"{step:012d}").manifest for step in steps(run.checkpoints)]
     iterations = [entry["iteration"] for entry in saved if isinstance(entry.get("iteration"), int)]
     return sorted({i for i in iterations if 0 < i < until} | {until})

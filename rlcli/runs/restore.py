@@ -164,7 +164,7 @@ _CONTRACT = ("name", "size", "elements", "scale", "offset", "clip", "history", "
 
 
 def _differ(was: Mapping[str, Any] | None, now: Mapping[str, Any] | None) -> bool:
-    """Return whether a key that both sides have differs; older checkpoints lack some keys."""
+    """Return whether a term differs in a key that checkpoint and environment both have (older ones lack some keys)."""
     if was is None or now is None:
         return True
     common = [key for key in _CONTRACT if key in was and key in now]
@@ -184,7 +184,7 @@ def _text(term: Mapping[str, Any] | None) -> str:
 
 
 def _rounded(value: object) -> Any:
-    """Return numbers with six digits: the last bits of a model's values depend on the machine that compiled it."""
+    """Return numbers with six significant digits: the last bits of a model's values depend on the compiling machine."""
     if isinstance(value, list):
         return "[" + ", ".join(str(_rounded(item)) for item in value) + "]"
     return f"{value:.6g}" if isinstance(value, float) else value

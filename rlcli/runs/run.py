@@ -31,7 +31,7 @@ MAX_SEED = 2**62
 _TASK = re.compile(r"(?!\.{1,2}$)[^/\\:]{1,255}")
 _MAX_FILES = 100_000
 _LOCK_TIMEOUT_S = 0.3
-"""Longer than `is_locked` holds the lock [s]."""
+"""Time to wait for the lock [s]; `is_locked` of another process holds it for a shorter time."""
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 
 

@@ -27,7 +27,7 @@ _ROWS = 4096
 
 
 def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until: int | None = None) -> list[Section]:
-    """Compare two runs: return the first difference of metrics, weights and policy, and all others.
+    """Compare two runs: find all differences of configuration and environment, and the first one of each other part.
 
     Args:
         left: a run.
@@ -192,7 +192,7 @@ def _first_unequal(left: Mapping[Any, Any], right: Mapping[Any, Any], keys: Iter
 
 
 def _presence(word: str, left: bool, right: bool) -> tuple[str | None, str | None]:
-    """Return the sides of a difference between an entry and a missing one."""
+    """Return both sides of a `Difference` of an entry that one side lacks: `word` if it exists, else None."""
     return word if left else None, word if right else None
 
 

@@ -71,7 +71,7 @@ def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
 
 
 def _opened(folders: Iterable[Path]) -> list[Run]:
-    """Return the runs in some folders, the oldest first."""
+    """Open the runs in some folders; return them, the oldest first, without broken ones."""
     runs = []
     for folder in folders:
         with contextlib.suppress(CheckpointError):

@@ -40,11 +40,11 @@ def _require_printable(text: str) -> str:
 
 Count = Annotated[int, Field(ge=0, lt=2**62)]
 PrintableText = Annotated[str, Field(max_length=4096), AfterValidator(_require_printable)]
-"""A name or a path."""
+"""Text of a JSON file with printable characters only, such as a name or a path."""
 
 
 def check_json(kind: type[Model], value: object, file: Path, *keys: str, hint: str | None = None) -> Model:
-    """Return a value of a JSON file as a model.
+    """Validate a value of a JSON file with a pydantic model, and return the model's object.
 
     Args:
         kind: the model's class.
@@ -211,7 +211,7 @@ def refuse_links(folder: Path) -> None:
 
 
 class _StrictError(ValueError):
-    """Valid JSON that strict parsing refuses."""
+    """Refusal of JSON that the standard parser accepts, such as a duplicate key."""
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def named_code(record: Mapping[str, Any]) -> str:
 
 
 def _key(record: Mapping[str, Any]) -> str:
-    """Return the real path of the folder or of the Python file, the latter with the attribute in it."""
+    """Return the text that identifies a task's code: the real path of its folder, or `FILE:ATTRIBUTE`."""
     if not record.get("python"):
         return str(Path(str(record["folder"])).resolve())
     path, attribute = python_place(str(record["python"]))  # resolved as the loader does it

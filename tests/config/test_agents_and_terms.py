@@ -264,7 +264,7 @@ def test_direct_params_are_checked_against_class(task, problems_of):
 def test_direct_task_refuses_terms_and_undeclared_params(task, problems_of):
     assert resolve(task(DIRECT, task=PLAIN)).task.params == {}
     (message,) = problems_of(f"{DIRECT}params: {{x: 1}}\n", files={"task": PLAIN})
-    assert "params: remove them: the task's class has no Params" in message
+    assert "params: the task's class has no Params; remove this block" in message
     (message,) = problems_of(f"{DIRECT}rewards: {{a: {{func: is_alive, weight: 1}}}}\n", files={"task": PLAIN})
     assert "rewards: a direct task has no rewards terms; its class implements them" in message
 

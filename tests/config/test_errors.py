@@ -69,7 +69,7 @@ TYPOS = [
         "events.e: interval_range_s and mode: interval need",
         None,
     ),
-    ("params.x=1", "params: remove them: only direct tasks have params", None),
+    ("params.x=1", "params: only direct tasks have params; remove this block", None),
     ("success={near: {func: joint_error, joints: [a], at_most: 1, hold_s: -1}}", "success.near.hold_s: expected", None),
     ("agent.gamma=2", "agents.one.gamma: expected a number <= 1, found 2", None),
     ("agent.gama=0.9", "agents.one.gama: unknown key 'gama'", "did you mean 'gamma'?"),

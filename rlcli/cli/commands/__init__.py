@@ -1,1 +1,1 @@
-"""Commands, one module each: options, one call into the library, and what is printed."""
+"""Commands of `rlcli`, one module each: it declares the options, calls the library, and prints the result."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _BARS = "▁▂▃▄▅▆▇█"
 _WIDTH = 48
-"""Bars of one sparkline."""
+"""Number of bars in one sparkline."""
 _SORT_KEYS: dict[str, Callable[[FailureCase], Any]] = {
     "when": lambda case: 0,  # the cases are in the order of training; sorting is stable
     "return": lambda case: case.episode.total_reward,
@@ -30,7 +30,7 @@ _SORT_KEYS: dict[str, Callable[[FailureCase], Any]] = {
     "kind": lambda case: (case.failure.kind, case.ended_by),
 }
 _MAX_COLUMNS = 12
-"""Columns of observations, actions or reward terms that are printed."""
+"""Most columns of observations, actions or reward terms that are printed."""
 
 
 def command(
@@ -77,12 +77,12 @@ def command(
     elif case < len(cases):
         _print_case(found, cases[case], case, steps, video, named)
     else:
-        hint = f"the run has {len(cases)} cases, counted from 0" if cases else why_no_cases(found)
+        hint = f"give a case from 0 to {len(cases) - 1}" if cases else why_no_cases(found)
         raise UsageError(f"no case {case} in {found.folder}", hint=hint)
 
 
 def _refuse_bundle(folder: str, case: int | None) -> None:
-    """Explain that a bundle has no recorded episodes, because it has no training."""
+    """Print that a bundle has no recorded episodes; raise a UsageError if one of them was chosen."""
     from rlcli.runs.bundle import open_bundle
 
     open_bundle(Path(folder))
@@ -101,14 +101,14 @@ def _print_no_cases(folder: str, why: str) -> None:
 
 
 def _print_list(run: Run, cases: list[FailureCase], sort: str) -> None:
-    """Print a table of the cases."""
+    """Print a table of the recorded episodes."""
     from rlcli.replay.failure_cases import why_no_cases
 
     if not cases:
         _print_no_cases(str(run.folder), why_no_cases(run))
         return
     rows = sorted(enumerate(cases), key=lambda row: _SORT_KEYS[sort](row[1]))
-    columns = ["CASE", "ITERATION", "STEP", "ENV", "EPISODE", "LENGTH", "RETURN", "KEPT FOR", "ENDED BY", "HELD"]
+    columns = ["CASE", "ITERATION", "STEP", "ENV", "EPISODE", "LENGTH", "RETURN", "KEPT FOR", "ENDED BY", "RECORDED"]
     console.table(columns, [[str(number), *_row(case)] for number, case in rows])
     listed = [{"case": number, **case.record()} for number, case in rows]
     console.document("autopsy", run=str(run.folder), cases=listed, why_none=None)
@@ -123,7 +123,7 @@ def _row(case: FailureCase) -> list[str]:
 def _print_case(
     run: Run, case: FailureCase, number: int, steps: int, video: Path | None, named: TaskSource | None
 ) -> None:
-    """Print one case; contacts and images need the task's code."""
+    """Print one recorded episode; its contacts and its video need the task's code."""
     from rlcli.replay.failure_cases import stage_case
 
     staged, error = None, None
@@ -169,7 +169,7 @@ def _print_facts(case: FailureCase, number: int) -> None:
         f"case {number}: environment {episode.env}, episode {episode.index}, ended in iteration {failure.iteration}"
         f" (step {failure.step}) after {episode.length} steps, {episode.length * step_dt:.3g} s"
     )
-    others = "" if usual is None else f"; middle half of other episodes: {usual[0]:.6g} .. {usual[1]:.6g}"
+    others = "" if usual is None else f"; interquartile range of earlier episodes: {usual[0]:.6g} .. {usual[1]:.6g}"
     console.data(f"return {episode.total_reward:.6g}{others}")
     console.data(f"kept for: {failure.kind}; ended by: {case.ended_by}")
     if case.world.diverged_at is not None:
@@ -202,7 +202,7 @@ def _print_steps(case: FailureCase, steps: int) -> None:
     console.data("")
     console.table(["", "", *(f"{i - kept + 1}" for i in last)], rows)
     if hidden:
-        console.info(f"--json has {hidden} more columns")
+        console.info(f"further columns, shown with --json: {hidden}")
 
 
 def _print_contacts(contacts: Sequence[Contact]) -> None:
@@ -213,11 +213,11 @@ def _print_contacts(contacts: Sequence[Contact]) -> None:
     rows = [[*c.geoms, f"{1e3 * c.distance:.3f}", f"{c.force:.4g}"] for c in contacts[: 2 * _MAX_COLUMNS]]
     console.table(["CONTACT AT THE END", "", "DISTANCE [mm]", "FORCE [N]"], rows)
     if len(contacts) > 2 * _MAX_COLUMNS:
-        console.info(f"--json has {len(contacts) - 2 * _MAX_COLUMNS} more contacts")
+        console.info(f"further contacts, shown with --json: {len(contacts) - 2 * _MAX_COLUMNS}")
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
-    """Return values as bars of eight heights; average neighbours if there are more than `width`; `?` is not finite."""
+    """Return values as at most `width` bars of eight heights (means of neighbours), `?` for one that is not finite."""
     if len(values) > width:
         edges = [round(i * len(values) / width) for i in range(width + 1)]
         values = [sum(values[a:b]) / (b - a) for a, b in itertools.pairwise(edges)]

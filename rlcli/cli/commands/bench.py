@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from rlcli.tuning.step_profile import Cost
 
 _PROFILED = 5.0
-"""Length of a profile [s]."""
+"""Duration of the measurement of `bench --profile` [s]."""
 _MAX_LOAD = 0.5
-"""Load per core before the measurements [processes] above which a warning is printed."""
+"""Load average per core before the measurements above which a warning is printed."""
 
 
 def command(
@@ -88,13 +88,13 @@ def command(
 def _profile(resolved: Resolved, preset: Path | None, seconds: float) -> None:
     """Print where the time of an environment step goes."""
     if preset is not None:
-        raise UsageError("--profile measures no sizes, so there is no preset to save", hint="leave one of them out")
+        raise UsageError("--profile measures no sizes for a preset", hint="leave out --profile or --save-preset")
     import torch
 
     from rlcli.tuning.step_profile import profile_step
 
     machine = _machine(resolved)
-    torch.set_num_threads(1)  # small tensors: waking threads would take longer than the work
+    torch.set_num_threads(1)  # the tensors are small: waking threads would take longer than the work
     costs = profile_step(resolved, seconds)
     rows = [[cost.section if cost.term is None else f"  {cost.term}", *_cost_cells(cost)] for cost in costs]
     console.table(["PART OF THE STEP", "MS", "SHARE"], rows, f"environment step, {resolved.task.scene.num_envs:,} envs")
@@ -116,7 +116,7 @@ def _report(
     names_agent: bool,
     stopped: bool,
 ) -> None:
-    """Print the measurements and the recommendation, and write the preset.
+    """Print the measurements and the recommendation, and write the preset (a YAML file for `train --config`).
 
     Raises:
         Stopped: if the user stopped the measurements.
@@ -176,7 +176,7 @@ def _preset_file(name: str, overwrite: bool) -> Path:
 
 
 def _machine(resolved: Resolved) -> dict[str, Any]:
-    """Return the facts of the machine, and warn if it is busy."""
+    """Return the machine's processor, cores, memory, load and versions, as JSON data; warn if the machine is busy."""
     import rlcli
     from rlcli.machine import available_cores, available_memory, core_quota, processor
     from rlcli.runs.provenance import versions
@@ -242,12 +242,12 @@ class _View(LiveView):
         self._rows: list[list[str]] = []
 
     def announce(self, current: str) -> None:
-        """Show what is measured next."""
+        """Show which setting is measured next."""
         self._current = current
         self._draw()
 
     def show(self, findings: Findings) -> None:
-        """Show the rows so far."""
+        """Show the measurements so far."""
         rows = [_step_parts(row) for row in findings.stepped]
         for row in findings.trained:
             setting, ms = row.setting, cell(row.milliseconds, ".4g", " ms")

@@ -1,4 +1,4 @@
-"""`rlcli check`: the contract tests of a task."""
+"""`rlcli check`: tests that a task keeps rlcli's rules for shapes, seeds, resets, rewards and devices."""
 
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated

@@ -24,7 +24,7 @@ def command(
     from rlcli.doctor import run_checks
     from rlcli.runs.run_ref import default_runs_dir
 
-    console.info(f"checking all plugins; one that does not answer takes {timeout:g} s")
+    console.info(f"checking all plugins; each may take up to {timeout:g} s")
     checks = run_checks(runs_dir or default_runs_dir(), timeout)
     console.table(["CHECK", "STATE", "FOUND"], [[check.name, check.state, check.found] for check in checks])
     for check in checks:

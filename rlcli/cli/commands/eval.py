@@ -40,8 +40,8 @@ def command(
     Options:
         compare: Compare several runs in the same episodes: eval --compare RUN1 RUN2. Further policies: shipped,
             lqr, zero, random. Limits apply to the first.
-        episodes: Number of episodes, by default in one environment each; else the first ones of each environment
-            count.
+        episodes: Number of episodes. By default each has its own environment (at most 8192 at a time); with --num-envs
+            N each environment runs its share of them.
         fail_under: Exit with code 9 if a mean is below X. Keys: success, return, length, reward_terms.NAME,
             terminations.NAME, a value of the task (speed); KEY.low is the lower end of the interval; repeatable.
         fail_over: Exit with code 9 if a mean is above X. The same keys; KEY.high is the upper end; repeatable.

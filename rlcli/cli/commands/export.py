@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rlcli.runs.run import Run
 
 _MAX_KEYS = 10
-"""Differing keys of the metadata that are printed."""
+"""Most keys that are printed in which the metadata of the file and the task differ."""
 
 
 def command(

@@ -144,12 +144,12 @@ def _importer(form: str, convert: Callable[..., Imported]) -> Callable[..., None
 
 
 def _report(form: str, imported: Imported) -> None:
-    """Print what became of each key of an imported task."""
+    """Print how each key of an imported task was translated, and the files that were written."""
     rows = [
-        [note.key, "the class's" if note.status == "task" else note.status, note.where, note.text]
+        [note.key, "read by the class" if note.status == "task" else note.status, note.where, note.text]
         for note in imported.notes
     ]
-    console.table(["KEY", "BECAME", "WHERE", "NOTE"], rows)
+    console.table(["KEY", "STATUS", "WHERE", "NOTE"], rows)
     for text in [*(str(note) for note in imported.notes if note.status == "to do"), *imported.messages]:
         console.info(text)
     console.info(f"wrote {', '.join(str(file) for file in imported.files)}; next: rlcli train {imported.folder}")

@@ -100,7 +100,7 @@ def _check_record(record: Path | None, mode: str, video: Path | None, commands: 
     if record is not None and video is not None:
         raise UsageError("--record and --video cannot be combined", hint="`rlcli replay FILE --video` renders FILE")
     if record is not None and commands:
-        raise UsageError("leave out --record or --command: `rlcli replay` cannot repeat commanded episodes")
+        raise UsageError("`rlcli replay` cannot repeat episodes with --command", hint="leave out --record or --command")
     check_record(record, mode)
 
 
@@ -108,7 +108,7 @@ def _prepare(session: Session, drawn: int, commands: dict[str, float]) -> None:
     """Check that there are enough environments to show, and hold the commands."""
     available = session.env.num_envs
     if drawn > available:
-        raise UsageError(f"--show {drawn}, but there are {available} environments", hint=f"--num-envs {drawn}")
+        raise UsageError(f"--show {drawn} is above the number of environments, {available}", hint=f"--num-envs {drawn}")
     if commands:
         from rlcli.viewer.playback import hold_command
 

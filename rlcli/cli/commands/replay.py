@@ -63,7 +63,7 @@ def command(
 def _print_episodes(trajectory: Trajectory, result: Replay, episodes: int, video: Path | None, frames: int) -> None:
     """Print the replay of a recording."""
     difference, values = result.difference, None
-    text = f"{episodes} episodes, {result.steps} steps: equal bit by bit"
+    text = f"episodes: {episodes}, steps: {result.steps}; equal bit by bit"
     if difference is not None:
         text = (
             f"episode {difference.episode} differs first at step {difference.step} in {_values(difference, 'recorded')}"
@@ -84,9 +84,7 @@ def _print_calls(trajectory: Trajectory, result: Replay) -> None:
         console.data(f"environment {world.env}: {world.ended_by}")
         if header.failure is not None and header.failure.kind != "diverged":
             episode = header.episodes[0]
-            console.data(
-                f"  the end of its episode {episode.index}, by {', '.join(episode.causes) or 'no named cause'}"
-            )
+            console.data(f"  its episode {episode.index} was ended by {', '.join(episode.causes) or 'no named cause'}")
         else:
             console.data(f"  {point or 'the replay of this environment does not diverge: the file lacks the cause'}")
         where = None if point is None else finite_json(point.model_dump())
@@ -126,7 +124,7 @@ def _print_result(trajectory: Trajectory, text: str, difference: dict[str, Any] 
 
 
 def _values(difference: Difference, word: str) -> str:
-    """Return the field that differs, with the first values of both sides."""
+    """Return the field that differs with the first values of both sides; `word` names the side of the file."""
     sides = []
     for values in (difference.recorded, difference.replayed):
         text = ", ".join(repr(value) for value in values[:6])

@@ -72,7 +72,7 @@ def command(
 
 
 def _add_media(page: Page, run: Run, checkpoint: Path | None, *, no_eval: bool, no_video: bool) -> tuple[str, str]:
-    """Add the evaluation and the video to the page; return the source of each."""
+    """Add the evaluation and the video to the page; return the origin of each (see `PageMedia`), empty if missing."""
     from rlcli.reporting.page_media import PageMedia
 
     if checkpoint is None:

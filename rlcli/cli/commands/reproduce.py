@@ -37,13 +37,13 @@ def command(
         rlcli reproduce latest
             Train the newest run again and compare.
         rlcli reproduce latest --iterations 5 --force
-            Compare five iterations, also in a changed environment.
+            Compare five iterations, also if software or machine have changed.
     """
     from rlcli.cli.ui.difference_table import report_differences
     from rlcli.machine import limit_openmp_spinning
     from rlcli.runs.run_ref import default_runs_dir, find_run
 
-    limit_openmp_spinning()  # as in training
+    limit_openmp_spinning()  # as `rlcli train` does
     runs = runs_dir or default_runs_dir()
     original, why = find_run(reference, runs)
     console.info(f"reproducing {original.folder} ({why})")
@@ -107,7 +107,7 @@ def _require(rows: list[Row], force: bool) -> None:
 
     if not rows:
         return
-    console.table(["ENVIRONMENT", "THEN", "NOW"], [[cell(name), cell(was), cell(now)] for name, was, now in rows])
+    console.table(["SOFTWARE, MACHINE", "THEN", "NOW"], [[cell(name), cell(was), cell(now)] for name, was, now in rows])
     if force:
         console.warn("software or machine have changed since the training: the weights may differ in their last bits")
         return

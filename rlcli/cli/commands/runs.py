@@ -58,7 +58,7 @@ def command(
         return
     console.table(_COLUMNS, [_row(run, folder) for run in listed])
     if len(listed) < len(chosen):
-        console.info(f"{len(chosen) - len(listed)} older runs are not shown")
+        console.info(f"older runs that are not shown: {len(chosen) - len(listed)}")
 
 
 def _row(run: Overview, runs_dir: Path) -> list[str]:

@@ -117,14 +117,14 @@ def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
 
 
 def _resolve_run(request: PolicyRequest) -> PolicyRequest:
-    """Return the request; a run that is given as the argument becomes the checkpoint."""
+    """Return the request; if the first argument names a run, move it from the task to the checkpoint."""
     from rlcli.evaluation.session import is_run_name
 
     task = request.task
     if task is None or not is_run_name(task, request.runs_dir):
         return request
     if request.checkpoint is not None:
-        raise UsageError(f"{task} is a run, but --checkpoint names another one", hint="leave one of them out")
+        raise UsageError(f"{task} is a run, but --checkpoint names another", hint="leave out RUN or --checkpoint")
     return replace(request, task=None, checkpoint=task)
 
 

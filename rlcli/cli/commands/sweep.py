@@ -1,4 +1,4 @@
-"""`rlcli sweep`: search of settings in trials, which any number of processes with the same command share."""
+"""`rlcli sweep`: hyperparameter search in trials; several processes with the same command share the trials."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def _check_options(ctx: typer.Context, task: str | None) -> None:
     """Check that the given options belong to a new sweep, `sweep show` or `sweep compare`.
 
     Raises:
-        UsageError: naming the first option that does not.
+        UsageError: with the first option that does not.
     """
     sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
     given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]

@@ -1,1 +1,1 @@
-"""What commands share: terminal output, tables, options and completion."""
+"""Modules that several commands share: terminal output, tables, options and shell completion."""

@@ -88,6 +88,6 @@ def _cells(entry: Mapping[str, Any]) -> list[str]:
 
 
 def _labels(names: Sequence[str]) -> Sequence[str]:
-    """Return the names of columns: the last part of each path, if these parts differ."""
+    """Return short names of the compared policies: the last part of each path, if these parts differ."""
     short = [Path(name).name or name for name in names]
     return short if len(set(short)) == len(set(names)) else names

@@ -27,7 +27,7 @@ OPTION_PANELS = {
 _MAX_UNGROUPED = 8
 """A command with at most this many options, besides those of "Output", has them all in the panel "Options"."""
 _UNBOUNDED = 10**9
-"""A range that ends above this number is not shown."""
+"""The help does not show the range of an option that ends above this number."""
 _METAVARS = {int: "INTEGER", float: "FLOAT", Path: "PATH"}
 
 
@@ -40,7 +40,7 @@ def read_docstring(function: Callable[..., Any]) -> tuple[str, dict[str, str], s
 
 
 class _PanelHelp:
-    """Help in panels, mixed into the commands and groups of typer."""
+    """Mix-in for typer's commands and groups: prints the help in panels."""
 
     def collect_usage_pieces(self: Any, ctx: Any) -> list[str]:
         """Return the usage line after the name of the command."""
@@ -91,7 +91,7 @@ def _panel(parameter: Any) -> str:
 
 
 def _name(parameter: Any) -> str:
-    """Return the first column: a metavar, after the spellings of an option."""
+    """Return the first column of the help: the metavar of an argument, or the flags of an option and its metavar."""
     if parameter.param_type_name == "argument":
         return str(parameter.metavar or parameter.name.upper())
     metavar = parameter.metavar or _METAVARS.get(parameter.type_descriptor.annotation, "TEXT")
@@ -100,7 +100,7 @@ def _name(parameter: Any) -> str:
 
 
 def _description(parameter: Any) -> str:
-    """Return the second column: the help, the range and the default, which the help may name itself."""
+    """Return the second column of the help: the text, the range and the default (also if the text names it)."""
     found = re.fullmatch(r"(.*?)(?: \[default: (.+)\])?", parameter.help or "", re.DOTALL)
     assert found is not None
     default = found[2] or (None if isinstance(parameter.default, bool) else parameter.default)

@@ -73,7 +73,7 @@ Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Accepte
 
 
 def _set_verbosity(option: typer.CallbackParam, is_set: bool) -> bool:
-    """Print as -q or -v says; the last of both on the command line counts."""
+    """Set the verbosity of the console for -q or -v; the last one on the command line counts."""
     if is_set:
         console.quiet, console.verbose = option.name == "quiet", option.name == "verbose"
     return is_set
@@ -148,7 +148,7 @@ def budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
 
 
 def until(text: str | None) -> dict[str, Any]:
-    """Return the bar of --until as a setting of the agent; empty without one."""
+    """Return the threshold of --until as a setting of the agent; an empty mapping without --until."""
     from rlcli.training.time_to_threshold import read_threshold
 
     if text is None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rlcli.viewer.video_writer import VideoWriter
 
 _MAX_REASONS = 6
-"""Reasons in a message for running the earlier episodes."""
+"""Most reasons for running the earlier episodes that a message lists."""
 
 
 def check_choice(
@@ -38,7 +38,7 @@ def check_choice(
         raise UsageError(f"{given} needs {missing} too", hint="as in --env 317 --episode 12, both counted from 0")
     if num_envs is not None and num_envs <= env:
         raise UsageError(
-            f"--env {env}: only {num_envs} environments, counted from 0",
+            f"--env {env} does not exist: --num-envs is {num_envs}, and environments are counted from 0",
             hint=f"give --num-envs {env + 1}, or leave it out",
         )
     if record_mode != "all":
@@ -108,9 +108,9 @@ def _print_origin(session: Session, start: EpisodeStart, env_id: int, episode: i
         causes = f"{names} and {more} more" if more > 0 else names
         count = start.episodes_before
         earlier, affect = (
-            (f"{count} earlier episodes", "they affect") if count > 1 else ("episode before", "it affects")
+            (f"{count} earlier episodes", "they affect") if count > 1 else ("1 earlier episode", "it affects")
         )
-        console.info(f"first ran the {earlier} of this environment, because {affect} this episode through {causes}")
+        console.info(f"first ran {earlier} of this environment, because {affect} this episode through {causes}")
 
 
 def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) -> dict[str, Any]:
@@ -140,7 +140,7 @@ class Filming:
     renderer: Renderer
     writer: VideoWriter
     ended: bool = False
-    """Whether rendering has ended."""
+    """Whether the video is complete, so that no more frames are rendered."""
 
     @property
     def length_s(self) -> float:

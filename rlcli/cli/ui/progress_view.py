@@ -16,7 +16,7 @@ from rlcli.training.progress import PARTS, Progress
 LINE_EVERY_S = 5.0
 _WORK_LINE_EVERY_S = 10.0
 _WORK_AFTER_S = 2.0
-"""Shorter work is not shown on a terminal [s]."""
+"""Time after which running work is shown on a terminal [s]; shorter work is not shown."""
 _REDRAW_EVERY_S = 0.25
 _MAX_ROWS = 100
 """Rows of one table; an untrusted run may have any number of metrics."""
@@ -54,14 +54,14 @@ class LiveView:
                 self._live.__exit__(*error)
 
     def update(self, lines: Sequence[str], *, refresh: bool = False) -> None:
-        """Replace the lines of the block."""
+        """Replace the lines of the live block."""
         from rich.text import Text
 
         self._live.update(Text("\n".join(lines)), refresh=refresh)
 
 
 class WorkView:
-    """View of `rlcli.progress`: what, how far, time left. A line on a terminal, else a new line every ten seconds."""
+    """View of the work in `rlcli.progress`: one line on a terminal, else a new line every ten seconds."""
 
     def __init__(self, running: list[Work]) -> None:
         self._running = running
@@ -91,7 +91,7 @@ class WorkView:
             console.info(work_line(self._running))
 
     def _redraw(self, stream: Any) -> None:
-        """Write the line again and again, over itself."""
+        """Redraw the line of progress in place, until the work has ended."""
         while not self._ended.is_set():
             if not any(work.has_own_view for work in list(self._running)):
                 console.clear_line()
@@ -103,7 +103,7 @@ class WorkView:
 
 
 def work_line(running: Sequence[Work]) -> str:
-    """Return one line about nested work, the outermost first: what, how far, time left."""
+    """Return one line about nested work, the outermost first: names with counts, the done share, the time left."""
     works = list(running)
     counts = [f"{work.what} {work.done:,}/{work.total:,}" if work.total else work.what for work in works]
     counted = [work for work in works if work.total]
@@ -133,7 +133,7 @@ class TrainingView(LiveView):
             console.info(_line(self._last))
 
     def show(self, progress: Progress) -> None:
-        """Show one iteration."""
+        """Show the progress after one iteration."""
         self._last = progress
         if self._live is not None:
             self._live.update(self._table(progress))

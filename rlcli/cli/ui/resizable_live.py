@@ -1,4 +1,4 @@
-"""Live block of rich that stays complete on a terminal that is made narrower."""
+"""Version of rich's `Live` display that is drawn correctly after the terminal has been made narrower."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class ResizableLive(Live):
     """rich's `Live`; it also erases the rows into which a narrower terminal has wrapped the lines of the last block."""
 
     _drawn: tuple[Any, Any] | None = None
-    """Options and content of the last block."""
+    """Console options and content with which the block was drawn last; None: it was not drawn yet."""
 
     def process_renderables(self, renderables: list[Any]) -> list[Any]:
         """Move the cursor to the start of the last block, and draw the block again."""

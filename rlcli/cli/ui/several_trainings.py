@@ -1,4 +1,4 @@
-"""Views and tables of several trainings: of a study of seeds, and of a sweep."""
+"""Views and tables of several trainings: of a study (one run for each seed), and of a sweep."""
 
 import time
 from collections.abc import Sequence
@@ -120,7 +120,7 @@ def print_sweep(sweep: Sweep) -> None:
 
 
 def print_comparison(comparison: Comparison) -> None:
-    """Print the times of all trainings, as a table and as a JSON document.
+    """Print the training times of `sweep compare`, as a table and as a JSON document.
 
     Raises:
         Stopped: after the table, if a signal stopped the comparison.

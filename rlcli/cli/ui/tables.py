@@ -78,7 +78,7 @@ def draw_map(
 
 
 def _block(columns: Sequence[str], row: Sequence[str], width: int) -> list[Any]:
-    """Return the lines of one row: its first cell, then the other cells that are not empty, with their columns."""
+    """Return a row of a table as a block of lines: the first cell, then `COLUMN cell` for other cells with content."""
     from rich.text import Text
 
     first, *others = (f"{name} {cell}".strip() for name, cell in zip(columns, row, strict=True))

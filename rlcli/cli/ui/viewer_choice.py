@@ -33,7 +33,7 @@ def require_viewer(viewer: str | None, port: int | None, *, drawn: bool) -> None
         require_known(viewer, CHOICES, "viewer", "viewers")
     if drawn and viewer in VIEWERS:
         raise UsageError(
-            f"--viewer {viewer} opens a viewer, but --video and --record only write files", hint="leave one out"
+            f"--viewer {viewer} opens a viewer, but --video and --record only write files", hint="leave out --viewer"
         )
     if port is not None and (drawn or viewer not in (None, "auto", "web")):
         raise UsageError("--port is an option of the web viewer", hint="add --viewer web")

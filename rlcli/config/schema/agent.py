@@ -56,9 +56,9 @@ class AgentConfig(StrictModel):
     eval_episodes: Count = 100
     """Number of episodes of each of these evaluations."""
     until: Annotated[str, AfterValidator(_check_threshold)] | None = None
-    """Bar at which training ends before its budget: success=X, return=X or length=X. It is reached when the lower end
-    of an evaluation's 95 % interval is at least X. The bar sets `eval_interval` to a twentieth of the budget if it is
-    null, and raises `eval_episodes` to the number that the interval of a success rate needs."""
+    """Threshold at which training ends before its budget: success=X, return=X or length=X. It is reached when the lower
+    end of an evaluation's 95 % interval is at least X. With a threshold, `eval_interval: null` means a twentieth of the
+    budget, and `eval_episodes` is raised to the number that the interval of a success rate needs."""
     autopsy: AutopsyConfig | None = AutopsyConfig()
     """Recording of failed and unusual episodes during training on a CPU; null: no recording."""
     torch_threads: Threads | None = None

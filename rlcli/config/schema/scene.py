@@ -40,7 +40,7 @@ class DomeLightConfig(StrictModel):
     color: Color = (0.9, 0.9, 0.9)
     """Red, green, blue in [0, 1]."""
     intensity: NotNegative = 500.0
-    """Strength; at 1000 a white surface is fully white."""
+    """Strength, from 0 to 1000; a larger number has no further effect. At 1000 a white surface is fully white."""
 
 
 class DistantLightConfig(DomeLightConfig):
@@ -224,7 +224,8 @@ class SceneConfig(StrictModel):
     """Number of environments that are simulated in parallel."""
     workers: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = "auto"
     """Number of processes that step the environments of a training on a CPU. No result depends on it. auto: as many as
-    pay for this number of environments and cores, and one for a task with code of its own."""
+    make the steps of this number of environments faster on these cores; one for a task with cameras or with code of its
+    own."""
     env_spacing: NotNegative = 4.0
     """Distance between environments in viewers [m]. In the physics each environment is a world with its own origin."""
     ground: GroundConfig | None = GroundConfig()

@@ -20,7 +20,7 @@ class ContactSensorConfig(StrictModel):
     """Contact sensor of bodies of an entity: net contact force, and time in contact and in the air."""
 
     kind: Literal["contact"]
-    """Always contact."""
+    """Kind of sensor: always contact."""
     entity: str = "robot"
     """Name of an entity."""
     bodies: Names
@@ -49,7 +49,7 @@ class RaySensorConfig(StrictModel):
     """Ray sensor: distances along rays from a body, like those of a height scanner or a lidar."""
 
     kind: Literal["rays"]
-    """Always rays."""
+    """Kind of sensor: always rays."""
     entity: str = "robot"
     """Name of an entity."""
     body: str | None = None
@@ -88,7 +88,7 @@ class CameraSensorConfig(StrictModel):
     """Camera sensor: images of every environment, rendered offscreen once in each environment step."""
 
     kind: Literal["camera"]
-    """Always camera."""
+    """Kind of sensor: always camera."""
     data: Literal["rgb", "depth", "distance"] = "rgb"
     """rgb: red, green and blue in 0 to 255; depth: distance along the camera's axis [m]; distance: distance from the
     camera's position [m]."""
@@ -105,8 +105,8 @@ class CameraSensorConfig(StrictModel):
     eye: Vec3 = (-3.0, 0.0, 1.0)
     """Position of the camera in the frame of the body, or of the environment [m]."""
     lookat: Vec3 = (0.0, 0.0, 0.0)
-    """The point in the centre of the image, in the same frame [m]. The frame's z axis points up in the image, or its x
-    axis if the camera looks along z."""
+    """The point in the centre of the image, in the frame of `eye` [m]. The frame's z axis points up in the image,
+    or its x axis if the camera looks along z."""
     fov: Annotated[float, Field(gt=0, lt=180)] = 45.0
     """Vertical field of view [degrees]."""
     clip: tuple[Positive, Positive] = (0.01, 20.0)

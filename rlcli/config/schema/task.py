@@ -65,7 +65,7 @@ class ViewerConfig(StrictModel):
     eye: Vec3 = (4.0, 4.0, 3.0)
     """Position of the camera [m], world frame of the environment that is shown."""
     lookat: Vec3 = (0.0, 0.0, 0.0)
-    """Point at which the camera looks [m], in the same frame."""
+    """Point at which the camera looks [m], in the frame of `eye`."""
     follow: str | None = None
     """Entity that the camera of images and videos follows: the camera moves by the displacement of the entity's root
     from its default position. null: the camera does not move."""

@@ -43,7 +43,10 @@ class TermConfig(StrictModel):
 
 
 class RewardConfig(TermConfig):
-    """A reward term. It adds weight x value x step_dt to the reward of each step."""
+    """A reward term. It adds weight x value x step_dt to the reward of each step.
+
+    With `reward_dt_scaling: false` it adds weight x value.
+    """
 
     weight: Number
     """Weight; negative for a penalty."""
@@ -95,7 +98,7 @@ class UniformNoiseConfig(_NoiseConfig):
     low: Columns = -1.0
     """Lower end of the samples, in the unit of the term (for `operation: scale` a factor)."""
     high: Columns = 1.0
-    """Upper end of the samples, in the same unit."""
+    """Upper end of the samples, in the unit of `low`."""
 
 
 class GaussianNoiseConfig(_NoiseConfig):
@@ -105,7 +108,7 @@ class GaussianNoiseConfig(_NoiseConfig):
     mean: Columns = 0.0
     """Mean of the samples, in the unit of the term (for `operation: scale` a factor)."""
     std: Columns = 1.0
-    """Standard deviation of the samples, in the same unit."""
+    """Standard deviation of the samples, in the unit of `mean`."""
 
 
 class ConstantNoiseConfig(_NoiseConfig):

@@ -18,16 +18,16 @@ class FlatPatchConfig(PatchConfig):
     """Flat ground."""
 
     kind: Literal["flat"]
-    """Always flat."""
+    """Kind of ground: always flat."""
 
 
 class NoisePatchConfig(PatchConfig):
     """Uneven ground with uniform random heights."""
 
     kind: Literal["noise"]
-    """Always noise."""
+    """Kind of ground: always noise."""
     height: Range = (0.02, 0.1)
-    """Heights are drawn from +-`height` [m]."""
+    """Heights are drawn from +-`height` [m], which is [at difficulty 0, at difficulty 1]."""
     spacing: Positive = 0.2
     """Distance between two random heights [m]; heights between them are interpolated linearly."""
 
@@ -36,9 +36,9 @@ class SlopePatchConfig(PatchConfig):
     """A pyramid of four slopes."""
 
     kind: Literal["slope"]
-    """Always slope."""
+    """Kind of ground: always slope."""
     slope: Range = (0.0, 0.4)
-    """Rise divided by run."""
+    """Rise divided by run, [at difficulty 0, at difficulty 1]."""
     platform: NotNegative = 2.0
     """Edge length of the flat square in the middle [m]."""
     inverted: bool = False
@@ -49,9 +49,9 @@ class WavesPatchConfig(PatchConfig):
     """Sine waves along x and y."""
 
     kind: Literal["waves"]
-    """Always waves."""
+    """Kind of ground: always waves."""
     amplitude: Range = (0.05, 0.2)
-    """Half of the height between trough and crest [m]."""
+    """Half of the height between trough and crest [m], [at difficulty 0, at difficulty 1]."""
     count: Count = 2
     """Number of waves along an edge."""
 
@@ -60,9 +60,9 @@ class ObstaclesPatchConfig(PatchConfig):
     """Low blocks and pits at random positions."""
 
     kind: Literal["obstacles"]
-    """Always obstacles."""
+    """Kind of ground: always obstacles."""
     height: Range = (0.05, 0.2)
-    """Height of blocks and depth of pits [m]."""
+    """Height of blocks and depth of pits [m], [at difficulty 0, at difficulty 1]; an obstacle has all or half of it."""
     width: Range = (0.25, 1.0)
     """[smallest, largest] edge length of an obstacle [m]."""
     count: Count = 40
@@ -75,11 +75,11 @@ class StonesPatchConfig(PatchConfig):
     """Stepping stones over a pit."""
 
     kind: Literal["stones"]
-    """Always stones."""
+    """Kind of ground: always stones."""
     width: Range = (0.25, 1.0)
     """[smallest, largest] edge length of a stone [m]; the stones of difficulty 0 are the largest."""
     gap: Range = (0.05, 0.3)
-    """Distance between stones [m]."""
+    """Distance between stones [m], [at difficulty 0, at difficulty 1]."""
     depth: Positive = 1.0
     """Depth of the pit [m]."""
     platform: NotNegative = 2.0
@@ -90,9 +90,9 @@ class StairsPatchConfig(PatchConfig):
     """Stairs on four sides."""
 
     kind: Literal["stairs"]
-    """Always stairs."""
+    """Kind of ground: always stairs."""
     step_height: Range = (0.05, 0.2)
-    """Height of a step [m]."""
+    """Height of a step [m], [at difficulty 0, at difficulty 1]."""
     step_width: Positive = 0.3
     """Depth of a step [m]."""
     platform: NotNegative = 2.0
@@ -108,11 +108,11 @@ class GridPatchConfig(PatchConfig):
     """A grid of square cells with random heights."""
 
     kind: Literal["grid"]
-    """Always grid."""
+    """Kind of ground: always grid."""
     cell: Positive = 0.5
     """Edge length of a cell [m]."""
     height: Range = (0.02, 0.15)
-    """Heights are drawn from +-`height` [m]."""
+    """Heights are drawn from +-`height` [m], which is [at difficulty 0, at difficulty 1]."""
     platform: NotNegative = 2.0
     """Edge length of the flat square in the middle [m]."""
     boxes: bool = False
@@ -140,7 +140,7 @@ class TerrainGeneratorConfig(StrictModel):
     """
 
     kind: Literal["generator"]
-    """Always generator."""
+    """Kind of terrain: always generator."""
     rows: Count = 10
     """Number of rows along x, which are the levels of difficulty."""
     columns: Count = 10
@@ -176,7 +176,7 @@ class TerrainHeightsConfig(StrictModel):
     """Terrain from a file: a height field. All environments start in its middle."""
 
     kind: Literal["heights"]
-    """Always heights."""
+    """Kind of terrain: always heights."""
     file: str
     """A NumPy file (.npy) in the task's folder: heights [m], an array (x, y)."""
     resolution: Positive

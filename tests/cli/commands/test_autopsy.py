@@ -62,7 +62,7 @@ def test_list_has_step_environment_and_reason(trained, cli):
     shown = cli("autopsy", trained)
     assert shown.code == 0
     lines = shown.out.splitlines()
-    assert lines[0].split() == ["CASE", "ITERATION", "STEP", "ENV", "EPISODE", "LENGTH", "RETURN", "KEPT", "FOR", "ENDED", "BY", "HELD"]  # fmt: skip # noqa: E501
+    assert lines[0].split() == ["CASE", "ITERATION", "STEP", "ENV", "EPISODE", "LENGTH", "RETURN", "KEPT", "FOR", "ENDED", "BY", "RECORDED"]  # fmt: skip # noqa: E501
     document = cli("autopsy", trained, "--json").json
     assert document["command"] == "autopsy"
     cases = document["cases"]
@@ -116,7 +116,7 @@ def test_replay_with_changed_model_differs(trained, cli):
 def test_unknown_case_is_usage_error(trained, cli):
     shown = cli("autopsy", trained, "99", "--json")
     assert shown.code == 2
-    assert f"the run has {len(files(trained))}" in shown.json["error"]["hint"]
+    assert f"give a case from 0 to {len(files(trained)) - 1}" in shown.json["error"]["hint"]
 
 
 @pytest.mark.parametrize(

@@ -114,9 +114,9 @@ def test_play_prints_viewer_and_reason(cli):
             if name != "web"
         ),
         (("--viewer", "web", "--port", "70000"), "'--port'"),
-        (("--viewer", "web", "--video", "x.gif"), "leave one out"),
+        (("--viewer", "web", "--video", "x.gif"), "leave out --viewer"),
         (("--port", "0", "--video", "x.gif"), "--port is an option of the web viewer"),
-        (("--show", "3"), "there are 2 environments; hint: --num-envs 3"),
+        (("--show", "3"), "above the number of environments, 2; hint: --num-envs 3"),
         (("--show", "0"), "'--show'"),
         (("--command", "vx"), "--command 'vx' is not NAME=NUMBER"),
         (("--command", "vx=fast"), "--command 'vx=fast' is not NAME=NUMBER"),
