@@ -96,6 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
     print_log_records()
     console.owns_process = arguments is None
     if console.owns_process:
+        os.environ.setdefault("PYTHONSAFEPATH", "1")  # MuJoCo's GLFW starts Python, which imports from this folder
         delay_garbage_collection()
         sys.meta_path.insert(0, AddressSpaceCheck)
     arguments = sys.argv[1:] if arguments is None else arguments

@@ -53,7 +53,7 @@ def _install_hint(model: str) -> str:
     if kind == "models":
         return f"set {MODELS} to a folder that holds {file}"
     if kind == "package":
-        return f"install the package {file.partition('/')[0]}, which contains it"
+        return f"install the distribution that has the package {file.partition('/')[0]}"
     return f"install the package of the task {kind}"
 
 
@@ -112,7 +112,8 @@ def _package_file(model: str) -> Path:
     package, _, file = model.partition("/")
     folders = package_folders(package)
     if not folders:
-        raise TaskError(f"no Python package '{package}' is installed", hint=f"pip install {package}")
+        hint = f"if you trust its authors, install the distribution that has the package '{package}'"
+        raise TaskError(f"no Python package '{package}' is installed", hint=hint if package.isidentifier() else None)
     folder = next((folder for folder in folders if (folder / file).is_file()), folders[0])
     path = _inside(folder, file, f"the package '{package}' in {folder}")
     if not path.is_file():

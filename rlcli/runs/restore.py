@@ -63,7 +63,8 @@ def recorded_task(
         file = Path(str(record.get("file") or "task.yaml")).name
         return folder_task(Path(str(record["folder"])), file)
     except TaskError as error:
-        hint = f"install {owner} {record.get('version')}" if owner else error.hint
+        version = f" {record['version']}" if record.get("version") else ""
+        hint = f"if you trust its authors, install {owner}{version}" if owner else error.hint
         raise TaskError(f"{what} is not installed: {error.message}", hint=hint) from None
 
 

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+import math
 import re
+import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
 from rlcli.errors import did_you_mean, listing
 
 Value = TypeVar("Value")
+
+_MAX_PATTERN = 1_000
+"""Largest length of a regular expression [characters]."""
+_MAX_STEPS = 1e7
+"""Largest estimated number of steps in which a regular expression may be compared with one name; about a second."""
+_TOKEN = re.compile(
+    r"\\.|\[\^?\]?(?:\\.|[^\]\\])*\]|\{\d+(?:,\d*)?\}|\{,\d+\}|\((?:\?(?:P?<\w+>|P=\w+|[a-zA-Z-]*:|<?[=!]|>|[a-z]+))?|.",
+    re.DOTALL,
+)
+"""An escape, a set, a count in braces, the start of a group, or any other character."""
 
 
 class NameProblem(ValueError):
@@ -71,9 +84,12 @@ def match_values(values: Mapping[str, Value], names: Sequence[str], what: str) -
 
 
 def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
+    _require_cheap(pattern, max(map(len, names), default=0))
     try:
-        regex = re.compile(pattern)
-    except re.error as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # a set in which another one seems to begin
+            regex = re.compile(pattern)
+    except (re.error, OverflowError, RecursionError, FutureWarning) as error:
         raise NameProblem(f"'{pattern}' is neither a {what} nor a regular expression ({error}); correct it") from None
     found = [position for position, name in enumerate(names) if regex.fullmatch(name)]
     if not found:
@@ -81,3 +97,67 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
         existing = f"{'bodies' if what == 'body' else f'{what}s'}: {listing(names)}"
         raise NameProblem(f"no {what} matches '{pattern}'", f"{suggestion} {existing}" if suggestion else existing)
     return found
+
+
+@dataclass(slots=True)
+class _Part:
+    """A regular expression or one group of it, as far as it has been read."""
+
+    repeats: int = 0
+    """Number of quantifiers * + {m,n} in the present alternative."""
+    options: int = 0
+    """Number of quantifiers ? in the present alternative."""
+    varies: bool = False
+    """Whether the part can match texts of several lengths, or has alternatives."""
+    last_varies: bool = False
+    """Whether the element that was read last does."""
+    _most: tuple[int, int] = (0, 0)
+
+    def most(self) -> tuple[int, int]:
+        """Return the largest `repeats` and the largest `options` of an alternative."""
+        return max(self._most[0], self.repeats), max(self._most[1], self.options)
+
+    def next_alternative(self) -> None:
+        """Begin to read the next alternative."""
+        self._most = self.most()
+        self.repeats = self.options = 0
+        self.varies, self.last_varies = True, False
+
+
+def _require_cheap(pattern: str, length: int) -> None:
+    """Refuse a regular expression whose comparison with a name of some length could take more than a second.
+
+    Python's `re` tries all ways in which k repetitions can share the characters of a name: binomial(length + k, k). If
+    a repeated part is variable itself, the number grows exponentially with the length.
+
+    Raises:
+        NameProblem: if the pattern is too long or too costly.
+    """
+    if len(pattern) > _MAX_PATTERN:
+        raise NameProblem(f"a pattern has {len(pattern):,} characters; at most {_MAX_PATTERN:,} are allowed")
+    parts = [_Part()]
+    for token in _TOKEN.findall(pattern):
+        part = parts[-1]
+        if token[0] == "(":
+            parts.append(_Part())
+        elif token == ")" and len(parts) > 1:
+            inner = parts.pop()
+            repeats, options = inner.most()
+            parts[-1].repeats += repeats
+            parts[-1].options += options
+            parts[-1].last_varies = inner.varies
+            parts[-1].varies |= inner.varies
+        elif token == "|":
+            part.next_alternative()
+        elif token == "?":
+            part.options, part.varies = part.options + 1, True
+        elif token in "*+" or (token[0] == "{" and len(token) > 1):
+            if part.last_varies:
+                raise NameProblem(f"'{pattern}' repeats a part that is variable itself; write it without nesting")
+            if token in "*+" or "," in token:
+                part.repeats, part.varies, part.last_varies = part.repeats + 1, True, True
+        else:
+            part.last_varies = False
+    repeats, options = parts[0].most()
+    if min(math.comb(length + repeats, repeats), 10**9) * 2.0 ** min(options, 100) > _MAX_STEPS:
+        raise NameProblem(f"'{pattern}' has {repeats + options} of the quantifiers * + ? {{m,n}}; use fewer")

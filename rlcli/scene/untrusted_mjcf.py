@@ -8,6 +8,7 @@ robots are below the first threshold and are compiled at once: parsing takes mil
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import subprocess
@@ -161,6 +162,8 @@ class _MjcfScan:
     _costs: dict[Path, float] = field(default_factory=dict)
     """Cost of each model for which it has been computed."""
     _asset_folders: set[str] = field(default_factory=lambda: {""})
+    _strips_paths: bool = False
+    """Whether MuJoCo may look for assets without their folders (`strippath`)."""
     _assets: list[tuple[Path, int, str, str]] = field(default_factory=list)
     """File, line, element and file name of each asset to load."""
 
@@ -260,7 +263,8 @@ class _MjcfScan:
             if len(copies) > _MAX_DEPTH:
                 raise BadModel(f"{file}:{line}: nested deeper than {_MAX_DEPTH} elements; use fewer levels")
             _check_numbers(file, line, name, attributes)
-            cost = min(copies[-1] * element_cost(name, attributes), ENDLESS)
+            count = max(1.0, number_of(attributes.get("count"))) if name == "replicate" else 1.0
+            cost = min(copies[-1] * count * element_cost(name, attributes), ENDLESS)
             self._note_cost(cost, f"{name} at {file}:{line}")
             text.cost += cost
             text.elements += copies[-1]
@@ -271,16 +275,17 @@ class _MjcfScan:
             if name == "attach":
                 model = attributes.get("model", "")
                 text.attached[model] = text.attached.get(model, 0.0) + copies[-1]
-            count = max(1.0, number_of(attributes.get("count"))) if name == "replicate" else 1.0
             copies.append(min(copies[-1] * count, ENDLESS))
             text.replicas += count if name == "replicate" else 0.0
             text.free_sensors += name in _FREE_SENSORS and "objname" not in attributes
+            self._strips_paths |= attributes.get("strippath", "false") != "false"
             for key in ("meshdir", "texturedir", "assetdir"):
                 if key in attributes:
-                    self._asset_folders.add(attributes[key])
+                    self._asset_folders.add(attributes[key].replace("\\", "/"))
             for key, value in attributes.items():
                 if not key.startswith("file") or not value:
                     continue
+                value = value.replace("\\", "/")  # as MuJoCo does on every system
                 if value.lower().endswith((".mjb", ".mjz", ".zip")):
                     raise BadModel(f"{file}:{line}: {name}: '{value}' is a compiled model; give its MJCF text")
                 if name in ("include", "model") or "xml" in attributes.get("content_type", ""):
@@ -320,13 +325,15 @@ class _MjcfScan:
             raise BadModel(f"{file}:{line}: {element}: '{name}' is not a file name; correct it")
         seen: set[Path] = set()
         # MuJoCo looks in the folder of the main file and of the including one, with and without an asset folder
-        for folder in [base / inner for base in (self.main.parent, file.parent) for inner in self._asset_folders]:
+        folders = [base / inner for base in (self.main.parent, file.parent) for inner in self._asset_folders]
+        names = [name, name.rpartition("/")[2]] if self._strips_paths else [name]
+        for folder, part in itertools.product(folders, names):
             try:
-                path = (folder / name).resolve()
+                path = (folder / part).resolve()
                 inside = any(path.is_relative_to(root) for root in self.roots)
                 if path in seen or (inside and not path.exists()):
                     continue
-                if not inside and (Path(name).is_absolute() or path.exists()):
+                if not inside and (Path(part).is_absolute() or path.exists()):
                     where = " and ".join(str(root) for root in dict.fromkeys(self.roots))
                     raise BadModel(f"{file}:{line}: {element}: '{name}' lies outside of {where}; move it inside")
             except (OSError, RuntimeError) as error:

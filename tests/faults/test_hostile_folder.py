@@ -14,7 +14,8 @@ from support.fault_sizes import chosen
 
 import rlcli
 
-MODULES = ("json", "numpy", "torch", "rlcli", "rlcli_tasks", "mujoco", "yaml", "typing", "multiprocessing", "optuna")
+MODULES = ("json", "numpy", "torch", "rlcli", "rlcli_tasks", "mujoco", "yaml", "typing", "multiprocessing", "optuna",
+    "ctypes", "types", "glfw", "textwrap", "sitecustomize", "usercustomize")  # fmt: skip
 TRAIN = ("train", "cartpole", *SMALL, "--max-iterations", "1", "--logger", "none")
 MIB = 1 << 20
 

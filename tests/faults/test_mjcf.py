@@ -58,6 +58,16 @@ def linked(folder, name, target):
 NAMED = {
     "an include of a user's file": (model('<include file="/etc/passwd"/>'), "lies outside"),
     "an include of a folder above": (model('<include file="../outside.xml"/>'), "lies outside"),
+    "an include with backslashes": (model('<include file="..\\outside.xml"/>'), "lies outside"),
+    "a mesh with backslashes": (model(asset='<mesh name="m" file=".\\..\\outside.obj"/>'), "lies outside"),
+    "a mesh folder with backslashes": (
+        model('<compiler meshdir="..\\"/>', asset='<mesh name="m" file="outside.obj"/>'),
+        "lies outside",
+    ),
+    "a mesh whose folder is stripped": (
+        model('<compiler meshdir=".." strippath="true"/>', asset='<mesh name="m" file="no/outside.obj"/>'),
+        "lies outside",
+    ),
     "an include far above": (model(f'<include file="{"../" * 30}etc/passwd"/>'), "lies outside"),
     "an include behind an asset folder": (
         model('<compiler assetdir=".."/><include file="outside.xml"/>'),
@@ -101,6 +111,10 @@ NAMED = {
     ),
     "a thousand million copies": (
         model(body='<replicate count="1000000000"><geom size="1"/></replicate>'),
+        "the model is too large: its cost is",
+    ),
+    "a hundred million copies of nothing": (
+        model(body='<replicate count="100000000"/>'),
         "the model is too large: its cost is",
     ),
     "copies of copies of copies": (
@@ -147,6 +161,10 @@ NAMED = {
     "an unknown element": (model("<evil/>"), "evil"),
     "a model that attaches itself": (
         model(asset='<model name="m" file="model.xml"/>', body=ATTACH),
+        "the model attaches itself",
+    ),
+    "a model that attaches itself by a backslash": (
+        model(asset='<model name="m" file=".\\model.xml"/>', body=ATTACH),
         "the model attaches itself",
     ),
     "two models that attach each other": (

@@ -87,7 +87,7 @@ TEXTS = [
     "part.xml", "model.xml", "other.xml", "../x.xml", "/etc/passwd", "/dev/zero", "part", "free", "plugin", "sdf",
     "\u202e", "\U0001f916", "%s%n", "grid", "builtin", "composite", "muscle", "user", "contact",
 ]  # fmt: skip
-FILES = ["model.xml", "part.xml", "other.xml", "missing.xml"]
+FILES = ["model.xml", "part.xml", "other.xml", "missing.xml", ".\\model.xml", ".\\part.xml", "..\\x.xml"]
 SECONDS = 10
 MEMORY = 2 * 1024**3
 
