@@ -6,9 +6,10 @@ exceptions of `rlcli.errors`.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, SupportsIndex
 
 from torch import Tensor
 
@@ -18,13 +19,16 @@ from rlcli.deploy.export import Exported, check_target
 from rlcli.deploy.export import export as write_export
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import UsageError
 from rlcli.evaluation.session import PolicyRequest, open_session, run_episodes
 from rlcli.registry.find import find_task
 from rlcli.rl.acting import trained_policy
 from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.policy_ref import choose
 from rlcli.runs.restore import require_fit
+from rlcli.runs.run import MAX_SEED
 from rlcli.runs.run_ref import default_runs_dir
+from rlcli.safe_text import shorten
 from rlcli.training.job import Job, TrainingResult
 from rlcli.training.launch import TrainingRequest, broadcast_job, process_device, setup_job
 from rlcli.training.runner import run_training
@@ -49,7 +53,9 @@ def make(
     Raises:
         TaskError: if the task is not found.
         ConfigError: if an override or the task is wrong.
+        UsageError: if `seed` is not an integer from 0 to 2^62, or `overrides` is one text.
     """
+    _check(seed, overrides)
     resolved = resolve(find_task(task), overrides=list(overrides), flags=flags(scene__num_envs=num_envs))
     return make_env(resolved, seed=seed, device=device)
 
@@ -88,6 +94,9 @@ def train(
     Raises:
         RlcliError: in every case in which `rlcli train` would end with an error.
     """
+    _check(seed, overrides)
+    if task is None and resume is None:
+        raise UsageError("train() needs a task, or a run to resume", hint='as in train("cartpole")')
     request = TrainingRequest(
         Path(runs_dir or default_runs_dir()),
         source=None if task is None else find_task(task),
@@ -136,7 +145,11 @@ def evaluate(
 
     Raises:
         CheckpointError: if there is no such checkpoint.
+        UsageError: if `episodes` is below 1, `seed` is not an integer from 0 to 2^62, or `overrides` is one text.
     """
+    _check(seed, overrides)
+    if not isinstance(episodes, SupportsIndex) or operator.index(episodes) < 1:
+        raise UsageError(f"evaluate(): episodes is {episodes!r}; give an integer above 0")
     reference = None if checkpoint is None else str(checkpoint)
     folder = None if runs_dir is None else Path(runs_dir)
     request = PolicyRequest(
@@ -190,6 +203,13 @@ def export(
     """
     check_target(format, Path(file))
     return write_export(open_checkpoint(_find(checkpoint, None, runs_dir)), Path(file), format)
+
+
+def _check(seed: object, overrides: object) -> None:
+    if not isinstance(seed, SupportsIndex) or not 0 <= operator.index(seed) <= MAX_SEED:
+        raise UsageError(f"seed is {shorten(repr(seed), 40)}; give an integer from 0 to 2^62")
+    if isinstance(overrides, str):
+        raise UsageError(f"overrides is the text '{shorten(overrides, 40)}'", hint="give a list, as in overrides=[...]")
 
 
 def _find(checkpoint: Path | str | None, task: str | None, runs_dir: Path | str | None) -> Path:

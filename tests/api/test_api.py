@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from rlcli.api import evaluate, export, load_policy, make, train
-from rlcli.errors import ConfigError, TaskError
+from rlcli.errors import ConfigError, TaskError, UsageError
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -21,6 +21,22 @@ def test_make_raises_task_and_config_errors():
         make("cartpool")
     with pytest.raises(ConfigError, match="episode_lenght_s"):
         make("cartpole", overrides=["episode_lenght_s=1.0"])
+
+
+@pytest.mark.parametrize("seed", ["x", 1.5, None, -5, 2**70])
+def test_seed_is_an_integer_in_range(seed):
+    with pytest.raises(UsageError, match="give an integer from 0 to"):
+        make("cartpole", seed=seed)
+
+
+def test_wrong_arguments_are_usage_errors():
+    with pytest.raises(UsageError, match="needs a task, or a run to resume"):
+        train()
+    with pytest.raises(UsageError, match="overrides is the text 'rewards.alive.weight=2'"):
+        make("cartpole", overrides="rewards.alive.weight=2")
+    for episodes in (0, -1, 2.5, "x"):
+        with pytest.raises(UsageError, match="give an integer above 0"):
+            evaluate("shipped", task="cartpole", episodes=episodes)
 
 
 def test_train_evaluate_act_and_export_work_together(tmp_path):
