@@ -195,7 +195,7 @@ def index(zoo: Path, found: list[Any]) -> str:
         "| success | share of successful episodes; the page of a task defines its success |",
         "| error_vel_xy, error_vel_yaw | mean errors of the velocity command [m/s], [rad/s] |",
         "| speed | mean speed towards the target [m/s] |",
-        "| successes | mean number of goals reached in a row in an episode |",
+        "| successes | mean number of goals reached in an episode |",
         "",
         "*Manager-based* tasks are [lists of terms](../../tutorials/first-task.md), *direct* tasks are",
         '[one Python class](../../tutorials/direct-task.md). "Isaac Lab\'s parameters" means that the rewards, limits',
