@@ -106,10 +106,11 @@ def markdown(result: dict[str, Any]) -> str:
 
     heads = ["rlcli [us per environment step]", "bare `Batch` [us per environment step]", "bare / rlcli", "memory"]
     large = [row["us"] for row in result["num_envs"] if row["num_envs"] >= 1024]
+    spread = max(large) / min(large) - 1 if large else 0.0
     parts = [
         measured_on(result),
         table(["cartpoles", *heads], [[f"{row['num_envs']:,}", *cells(row)] for row in result["num_envs"]]),
-        f"From 1,024 environments on, rlcli's times differ by at most **{max(large) / min(large) - 1:.0%}**." if large else "",
+        f"From 1,024 environments on, rlcli's times differ by at most **{spread:.0%}**." if large else "",
         table(["threads", *heads], [[str(row["threads"]), *cells(row)] for row in result["threads"]]),
         table(
             ["task", "environments", *heads],

@@ -17,8 +17,8 @@ class Stages(Term):
     """Schedule that sets the number at `address` to the next of the `values` at each of the `steps`.
 
     Before the first step the setting keeps its value. `steps` are numbers of calls of `env.step` since the training
-    began, in rising order. Isaac Lab: modify_reward_weight, modify_env_param, modify_term_cfg; mjlab: reward_curriculum,
-    termination_curriculum, commands_vel.
+    began, in rising order. Isaac Lab: modify_reward_weight, modify_env_param, modify_term_cfg; mjlab:
+    reward_curriculum, termination_curriculum, commands_vel.
     """
 
     address: Address
