@@ -125,7 +125,7 @@ def markdown(result: dict[str, Any]) -> str:
         return f"{measured_on(result)}\n\nEnvPool: {result['failed']}"
     heads = ["task"]
     for num_envs in (64, 1024):
-        heads += [f"{num_envs:,}: of EnvPool", "min .. max", "limit", "environment steps/s", "EnvPool"]
+        heads += [f"ratio at {num_envs:,} environments", "min .. max", "limit", "rlcli [steps/s]", "EnvPool [steps/s]"]
     rows = []
     for row in result["rows"]:
         name = f"`{row['task']}`" + (" *" if row["task"] in FORCES else "")
@@ -141,7 +141,7 @@ def markdown(result: dict[str, Any]) -> str:
     for key in ("64", "1024"):
         last += [f"**{result['means'][key]:.2f}**", "", f"{result['limits'][key]:.2f}", "", ""]
     rows.append([*last, f"{result['means']['mujoco']:.2f}"])
-    return f"{measured_on(result, result['envpool'])}\n\n{table([*heads, 'of it MuJoCo'], rows)}"
+    return f"{measured_on(result, result['envpool'])}\n\n{table([*heads, 'ratio of MuJoCo'], rows)}"
 
 
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ def markdown(result: dict[str, Any]) -> str:
         cells = [f"**{times['ratio']:.1f}** ({spread(times)})" for times in row["times"].values()] or ["", ""]
         rows.append([names[row["name"]], f"{row['num_envs']:,}", rate(row["steps_per_s"]), *cells])
     rows += [[names[name], f"failed: {reason}", "", "", ""] for name, reason in result["failed"].items()]
-    heads = ["", "environments", "training steps/s", "`ppo` is so many times as fast", "`sb3` is"]
+    heads = ["", "environments", "training steps/s", "speed of `ppo` / this row", "speed of `sb3` / this row"]
     scans = [
         f"{names[kind]} at {', '.join(f'{size}: {rate(value)}' for size, value in scan.items())}"
         for kind, scan in result["scans"].items()

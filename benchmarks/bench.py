@@ -37,14 +37,14 @@ TABLES = [*SCRIPTS, *MODULES]
 
 HEADS = {
     "num_envs": "environments",
-    "ratio": "of bare `Batch`",
-    "ratio_stage_none": "of stage NONE",
-    "physics": "physics' share",
+    "ratio": "rlcli / bare `Batch`",
+    "ratio_stage_none": "rlcli / `Batch` at stage NONE",
+    "physics": "physics / environment step",
     "stock_sb3_ratio": "stock SB3 on the same task",
-    "env_steps_per_s": "environment steps/s",
-    "bare_steps_per_s": "bare steps/s",
+    "env_steps_per_s": "rlcli [environment steps/s]",
+    "bare_steps_per_s": "bare `Batch` [environment steps/s]",
     "train_steps_per_s": "training steps/s",
-    "ms": "ms an iteration",
+    "ms": "parts of an iteration [ms]",
 }
 """Keys of the programs' rows -> longer column titles in the page."""
 

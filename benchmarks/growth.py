@@ -104,12 +104,13 @@ def markdown(result: dict[str, Any]) -> str:
         costs = [f"{row[key]:.3g}" for key in ("us", "bare_us")]
         return [*costs, f"{row['ratio']:.2f}", f"{row['memory_mb']:.0f} MB"]
 
-    heads = ["us an environment step", "of it bare `Batch`", "ratio", "memory"]
+    heads = ["rlcli [us per environment step]", "bare `Batch` [us per environment step]", "bare / rlcli", "memory"]
     large = [row["us"] for row in result["num_envs"] if row["num_envs"] >= 1024]
+    spread = max(large) / min(large) - 1 if large else 0.0
     parts = [
         measured_on(result),
         table(["cartpoles", *heads], [[f"{row['num_envs']:,}", *cells(row)] for row in result["num_envs"]]),
-        f"From 1,024 environments on: within **{max(large) / min(large) - 1:.0%}**." if large else "",
+        f"From 1,024 environments on, rlcli's times differ by at most **{spread:.0%}**." if large else "",
         table(["threads", *heads], [[str(row["threads"]), *cells(row)] for row in result["threads"]]),
         table(
             ["task", "environments", *heads],

@@ -158,7 +158,9 @@ def curves(zoo: Path, entry: Any) -> str:
         )
     if (zoo / "curves" / f"{entry.name}.svg").is_file():
         parts.append(
-            f"![learning curves of {entry.name}](curves/{entry.name}.svg)\n\nData:"
+            f"![learning curves of {entry.name}](curves/{entry.name}.svg)\n\nEach panel shows a metric of the training"
+            " episodes, with exploration noise, over the steps of all environments together. With several seeds, thin"
+            " lines are the seeds and the thick line is their median. Data:"
             f" [curves/{entry.name}.csv](curves/{entry.name}.csv).\n"
         )
     return "\n".join(parts)
@@ -185,20 +187,23 @@ def index(zoo: Path, found: list[Any]) -> str:
         "- Tier A: three seeds reach the full goal within the time limit.",
         "- Tier B: one seed reaches a lower goal within the time limit.",
         "",
-        "Several values in a cell are those of several seeds. The values are:",
+        "Several values in a cell are those of several seeds. Observations and actions are numbers of columns. The",
+        "time is that of the slowest seed; the page of a task names the machine of each training. The values are:",
         "",
         "| value | meaning |",
         "| --- | --- |",
         "| success | share of successful episodes; the page of a task defines its success |",
         "| error_vel_xy, error_vel_yaw | mean errors of the velocity command [m/s], [rad/s] |",
         "| speed | mean speed towards the target [m/s] |",
-        "| successes | mean number of goals reached in a row in an episode |",
+        "| successes | mean number of goals reached in an episode |",
         "",
         "*Manager-based* tasks are [lists of terms](../../tutorials/first-task.md), *direct* tasks are",
         '[one Python class](../../tutorials/direct-task.md). "Isaac Lab\'s parameters" means that the rewards, limits',
-        "and gains are those of Isaac Lab's task; the page of a task lists the differences.",
+        "and gains are those of Isaac Lab's task; the page of a task lists the differences. OmniIsaacGymEnvs is an",
+        "older collection of tasks for Isaac Sim.",
         "",
-        "| task | what the policy does | observations, actions | machine, time (of the limit) | result (required) |",
+        "| task | what the policy does | observations, actions | machine of the limit, time (of the limit) "
+        "| result (required) |",
         "| --- | --- | --- | --- | --- |",
     ]
     shipped = _index_json()

@@ -285,7 +285,7 @@ def _terms_index() -> Iterator[str]:
         yield f"| [{section}]({section}.md) | {counts[section]} | {contents} |"
     yield "\n## Keys of every term of a section\n"
     for section, model in MODELS.items():
-        keys = {"properties": model.model_json_schema()["properties"]}
+        keys = {**model.model_json_schema(), "description": ""}
         yield from _model(f"### {section.capitalize()}", keys, _schema_links())
     yield "## All terms\n"
     for section in SECTIONS:

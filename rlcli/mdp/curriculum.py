@@ -16,9 +16,9 @@ from rlcli.sim.selection import Selection
 class Stages(Term):
     """Schedule that sets the number at `address` to the next of the `values` at each of the `steps`.
 
-    Before the first step the setting keeps its value. `steps` are environment steps since training began, in rising
-    order. Isaac Lab: modify_reward_weight, modify_env_param, modify_term_cfg; mjlab: reward_curriculum,
-    termination_curriculum, commands_vel.
+    Before the first step the setting keeps its value. `steps` are numbers of calls of `env.step` since the training
+    began, in rising order. Isaac Lab: modify_reward_weight, modify_env_param, modify_term_cfg; mjlab:
+    reward_curriculum, termination_curriculum, commands_vel.
     """
 
     address: Address
@@ -45,7 +45,7 @@ class Stages(Term):
 class Interpolate(Term):
     """Schedule that moves the number at `address` linearly from its configured value to `to`.
 
-    It moves between the steps `begin` and `end`, which are environment steps since training began. Lists are
+    It moves between `begin` and `end`, which are numbers of calls of `env.step` since the training began. Lists are
     interpolated element by element.
     """
 
