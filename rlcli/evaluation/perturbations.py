@@ -104,7 +104,7 @@ class Perturbations(StepObserver):
             if rows is not None and physical.derives:
                 derived = rows if derived is None else derived | rows
         if changed:
-            # a perturbation takes changed values for those of an event: it must know those of other perturbations
+            # a perturbation treats changed values as written by an event, so each stores the values after these changes
             for physical in self._physical:
                 physical.note_values()
         if derived is not None:
