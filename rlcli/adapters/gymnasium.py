@@ -164,7 +164,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return obs.copy(), result.reward.cpu().numpy().astype(np.float64), terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return an image of the first environment, uint8 (height, width, 3); None without a `render_mode`."""
+        """Return a tuple with one image, of the first environment; None without a `render_mode`.
+
+        The image is uint8 (height, width, 3).
+        """
         return None if self.render_mode is None else (self._camera.image(),)
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -177,7 +180,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         if mask.shape != (self.num_envs,):
             raise ValueError(f"reset_mask has shape {mask.shape}; pass shape {(self.num_envs,)}")
         running = np.flatnonzero(mask & ~self.ended).tolist()
-        if running or self._last_obs is None:
+        if self._last_obs is None:
+            raise ValueError("no episode has started yet; call reset() without reset_mask first")
+        if running:
             raise ValueError(f"set reset_mask to false for environments {running}: their episodes have not ended")
         if mask.any():
             assert self._first is not None

@@ -54,7 +54,7 @@ RETURN = 0.02
 _SEED = 42
 _FREE = (-np.inf, np.inf)
 _BAD_METADATA = (KeyError, IndexError, TypeError, ValueError)
-"""Errors that metadata raises in the program if they do not fit the model."""
+"""Exceptions that the generated program raises if the metadata does not fit the model."""
 
 
 @dataclass(slots=True)
@@ -239,7 +239,7 @@ def _may_randomize(env: VecEnv) -> bool:
 
 
 class _PlainMujocoRunner:
-    """One plain simulation (MjModel, MjData) and one controller for each environment."""
+    """Runner of an exported policy in plain MuJoCo: an MjModel, an MjData and a controller for each environment."""
 
     def __init__(self, env: VecEnv, policy: Policy, controller: Any, model: mujoco.MjModel, synchronize: bool) -> None:
         engine = env.engine.replayable
@@ -250,7 +250,7 @@ class _PlainMujocoRunner:
         self.disagreeing_steps = 0
         """Steps after which the states of plain MuJoCo and of the engine differed by more than rounding."""
         self.differences = {"action": 0.0, "observation": 0.0, "control": 0.0}
-        """Largest difference of each."""
+        """Largest relative difference of the actions, observations and controls so far."""
         self._require_same_sizes(model)
         n = env.num_envs
         self._policy_action: Callable[[Tensor], Tensor] = trained_policy(env, policy)
@@ -397,7 +397,7 @@ class _PlainMujocoRunner:
 
 
 def _metadata_error(error: Exception) -> CheckpointError:
-    return CheckpointError(f"the metadata do not fit the model; export again: {type(error).__name__}: {error}")
+    return CheckpointError(f"the metadata does not fit the model; export again: {type(error).__name__}: {error}")
 
 
 def _control_bounds(controller: Any, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -46,6 +46,7 @@ def describe(env: VecEnv) -> dict[str, Any]:
 
 
 def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the observation terms by group and the action terms of a manager-based environment."""
     groups = {}
     for group in env.config.observations:
         begin, terms = 0, []
@@ -60,6 +61,7 @@ def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[dict[str, A
 
 
 def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the observation groups and the actions of a direct task, with formulas for the terms of `in_terms`."""
     task, in_terms = env.task, env.task.in_terms()
     groups = {
         group: [_observation(name, f"{type(task).__name__}.{hook}", {}, 0, width)]
@@ -87,13 +89,15 @@ def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any
         terms.append(_observation(term.name, term.config.func, term.config.params, begin, width, value=value))
         begin += width
     if begin != task.num_observations:
-        message = f"{type(task).__name__}.in_terms() must have {task.num_observations} columns, not {begin}"
+        found = f"has {begin} observation columns, but the task has {task.num_observations}"
+        message = f"{type(task).__name__}.in_terms() {found}; list all terms in order"
         raise ConfigError([Problem("observations", "observations", message)])
     groups["policy"] = terms
     return groups, _controls(env, bound["actions"])
 
 
 def _bind(env: DirectEnv, section: str, number: int, entry: Mapping[str, Any]) -> BoundTerm:
+    """Check an entry of a direct task's `in_terms`, and return its term for this environment."""
     path = (section, f"{entry['func']}_{number}")
     signature = env.resolved.vocabulary.find(section, entry["func"])
     if signature is None:

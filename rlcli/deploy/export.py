@@ -33,6 +33,7 @@ BUNDLE = "bundle"
 TOLERANCE = 1e-5
 """Largest accepted difference from the policy, relative to max(1, |value|)."""
 _RANDOM = 256
+"""Number of random observations on which a file is checked."""
 _EPISODE = 32
 """Steps between resets of the hidden state while a file is checked."""
 
@@ -44,7 +45,9 @@ class Exported:
     file: Path
     metadata: dict[str, Any]
     observations: int
+    """Number of observations on which the file was compared with the policy."""
     max_difference: float
+    """Largest difference from the policy, relative to max(1, |value|)."""
 
 
 def check_target(format_: str, output: Path | None) -> None:
@@ -132,7 +135,7 @@ def _observations(checkpoint: Checkpoint, size: int) -> Tensor:
 
 
 def _require_equal(run: PolicyFunction, graph: DeployedPolicy, observations: Tensor, file: Path) -> float:
-    """Return the largest difference between the file and the policy, with batches of 1, 7 and all observations.
+    """Check that file and policy agree, with batches of 1, 7 and all observations; return the largest difference.
 
     For a recurrent policy the rows are the steps of an episode; each side has its own hidden state.
     """

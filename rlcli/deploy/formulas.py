@@ -6,8 +6,8 @@ these. Every value is a row of float32.
 - A list of numbers.
 - `{"field": NAME, "at": [...]}`: elements of a flattened field of MjData.
 - `{"given": NAME, "at": [...]}`: elements of an input. Inputs are `last_action`, `steps` (of the episode),
-  `command/NAME` (a command of the task, such as a target velocity), and the policy's outputs `action` (raw) and
-  `command` (with scale, offset and limits).
+  `command/NAME` (a command of the task, such as a target velocity), `observation/NAME` (the value of an observation
+  term without a formula), and the policy's outputs `action` (raw) and `command` (with scale, offset and limits).
 - `{"op": NAME, "of": [formulas]}`: an operation; `deployed/run_policy.py` implements all of them.
 
 A term without a formula can only be computed by its own code.

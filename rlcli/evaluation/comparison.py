@@ -27,7 +27,8 @@ _WITHOUT_EFFECT = (
     ("summary",),
 )
 """Settings that may differ between the tasks: they do not affect episodes."""
-_MISSING = "nothing"
+_MISSING = "not set"
+"""Text for the value of a setting that a task does not have."""
 
 
 @dataclass(frozen=True, slots=True)

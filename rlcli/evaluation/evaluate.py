@@ -43,7 +43,7 @@ class Evaluation:
     causes: dict[str, list[bool]] = field(default_factory=dict)
     diverged: int = 0
     diverged_by: dict[str, int] = field(default_factory=dict)
-    """Cause of a divergence -> number of episodes."""
+    """Cause of a divergence -> number of simulations that diverged, also in episodes that are not counted."""
     values: dict[str, list[float]] = field(default_factory=dict)
     """Metric of the task -> its mean over each episode: values that a direct task logs, by name, and metrics of
     commands, as `command/metric`."""
@@ -177,6 +177,7 @@ class _EpisodeMeans(StepObserver):
 
 
 def _add_episodes(result: Evaluation, ended: Episodes, quota: Tensor, means: _EpisodeMeans) -> None:
+    """Add the ended episodes of environments that need more episodes, and reduce the numbers in `quota`. (num_envs,)"""
     values = {name: column.tolist() for name, column in ended.metrics.items()} | means.finish(ended.ids)
     for row, env in enumerate(ended.ids.tolist()):
         if quota[env] <= 0:

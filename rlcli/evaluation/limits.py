@@ -35,11 +35,11 @@ class Limit:
 
     @property
     def end(self) -> str:
-        """End of the confidence interval in KEY.low or KEY.high that the option accepts."""
+        """End of the confidence interval that the option accepts after KEY: `low` for a minimum, else `high`."""
         return "low" if self.is_minimum else "high"
 
     def value_in(self, summary: Mapping[str, Any]) -> float | None:
-        """Return the value of the limit's key in an evaluation; None if it is unknown.
+        """Return the value of the limit's key in an evaluation; None if episodes are too few or values not finite.
 
         Raises:
             UsageError: if the evaluation has no such term or value.
@@ -61,7 +61,7 @@ class Limit:
         """Return why an evaluation fails this limit; None if it holds."""
         value = self.value_in(summary)
         if value is None:
-            return f"{self.key} needs two or more episodes; the limit is {self.value:g}"
+            return f"{self.key} needs two or more episodes with finite values; the limit is {self.value:g}"
         if self.is_minimum and value < self.value:
             return f"{self.key} is {value:.6g}, below {self.value:g}"
         if not self.is_minimum and value > self.value:
@@ -105,7 +105,7 @@ def require_success(resolved: Resolved, keys: Iterable[str], instead: str = "--f
         instead: options without `success`, for the hint.
 
     Raises:
-        UsageError: if it does not.
+        UsageError: if a key is `success` and the task does not define success.
     """
     if any(key.partition(".")[0] == "success" for key in keys) and not resolved.task.success:
         raise UsageError("the task defines no success", hint=f"add `success:` to its YAML, or write {instead}")

@@ -104,14 +104,15 @@ class Perturbations(StepObserver):
             if rows is not None and physical.derives:
                 derived = rows if derived is None else derived | rows
         if changed:
-            for physical in self._physical:  # so that no one takes another's values for those of an event
+            # a perturbation treats changed values as written by an event, so each stores the values after these changes
+            for physical in self._physical:
                 physical.note_values()
         if derived is not None:
             env.engine.set_constants(env.engine.select(derived, env.seed, env.episode_index))
 
 
 class _Signal:
-    """Perturbation of some columns of the observations or of the actions."""
+    """Base of noise and delay: a perturbation of some columns of the observations or of the actions."""
 
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor, columns: Tensor, of_action: bool) -> None:
         self.env, self.values, self.columns, self.of_action = env, values, columns, of_action
@@ -135,7 +136,7 @@ class _Noise(_Signal):
 
 
 class _Delay(_Signal):
-    """Delay by some steps. Before enough steps, an episode's first observation is repeated, and the action is 0."""
+    """Delay by some steps. At the start of an episode its first observation is repeated, and the action is 0."""
 
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor, columns: Tensor, of_action: bool) -> None:
         super().__init__(env, sweep, values, columns, of_action)
@@ -274,7 +275,8 @@ class ModelPerturbation:
         if sweep.parameter == "effort_limit":
             limited = env.engine.model.actuator_forcelimited[rows].astype(bool).tolist()
             if unlimited := [name for name, has in zip(names, limited, strict=True) if not has]:
-                raise NameProblem(f"{listing(unlimited)} has no effort limit", "give its joint an effort_limit")
+                hint = "give the joint an effort_limit, or name other actuators"
+                raise NameProblem(f"no effort limit on {listing(unlimited)}", hint)
         self._affected = ~values.isnan() & ((values != 1.0) | sweep.absolute)
 
     def apply(self) -> Tensor | None:
@@ -312,7 +314,7 @@ class ModelPerturbation:
 
 
 class _Part:
-    """Some values of a model field in every environment."""
+    """Some values of a model field in every environment, which one perturbation changes."""
 
     def __init__(self, env: VecEnv, field: str, rows: list[int], axes: list[int] | None) -> None:
         self.field = field
@@ -397,6 +399,7 @@ def _axes(env: VecEnv, field: str, sweep: Sweep) -> list[int] | None:
 
 
 def _require_affine(model: mujoco.MjModel, rows: list[int], names: list[str]) -> None:
+    """Check that scaling the gain and bias parameters of actuators scales their force."""
     kinds = [(int(model.actuator_gaintype[row]), int(model.actuator_biastype[row])) for row in rows]
     unsupported = [
         name
@@ -405,4 +408,4 @@ def _require_affine(model: mujoco.MjModel, rows: list[int], names: list[str]) ->
     ]
     if unsupported:
         hint = "choose motors, position or velocity actuators"
-        raise NameProblem(f"{listing(unsupported)} cannot be scaled as a whole", hint)
+        raise NameProblem(f"{listing(unsupported)}: actuators of this type have no gain that can be scaled", hint)

@@ -44,7 +44,7 @@ class PolicyRequest:
     config: Path | None = None
     runs_dir: Path | None = None
     episodes: int | None = None
-    """Number of episodes to evaluate, for the number of environments; None: the task's own number."""
+    """Number of episodes, for one environment each; None: the task's own number of environments."""
     min_envs: int = 1
     """Smallest number of environments."""
 
@@ -135,7 +135,7 @@ def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
     """Find a task by its name.
 
     Raises:
-        TaskError: if there is no such task; the hint tells whether the name is that of a run.
+        TaskError: if there is no such task; the message or the hint says whether the name is that of a run.
     """
     from rlcli.runs.trusted_tasks import named_task
 
@@ -152,7 +152,7 @@ def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
 
 
 def open_session(request: PolicyRequest, check: Callable[[Resolved], None] = lambda resolved: None) -> Session:
-    """Find and check a policy and its task, then build the environment; a divergence in it is dumped.
+    """Find and check a policy and its task, then build the environment; if it diverges, its state is dumped to a file.
 
     Args:
         request: the policy and the task.

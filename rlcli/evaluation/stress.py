@@ -65,7 +65,7 @@ class StressResult:
         return min(self.variants, key=lambda point: score(self.variants[point]))
 
     def failures(self, limits: Sequence[Limit]) -> list[str]:
-        """Return a sentence for each limit that fails in the variant with the worst value of its metric."""
+        """Return a sentence for each minimum that fails in the variant with the lowest value of its metric."""
         found = []
         for limit in limits:
             values = {point: limit.value_in(summary) for point, summary in self.variants.items()}

@@ -1,4 +1,7 @@
-"""Crash dumps: trajectory files with the engine calls that led to a divergence."""
+"""Crash dumps: trajectory files with the engine calls that led to a divergence.
+
+An engine call simulates one or more physics steps from a state (`rlcli.sim.divergence_report.Call`).
+"""
 
 import itertools
 import logging
@@ -23,7 +26,7 @@ from rlcli.sim.divergence_report import MAX_DESCRIBED, Call, Divergence
 
 _log = logging.getLogger(__name__)
 CALLS = 64
-"""Engine calls of each environment that a crash dump holds, if memory allows."""
+"""Number of engine calls of each environment that a crash dump holds, if memory allows."""
 
 
 class CrashDumper(StepObserver):

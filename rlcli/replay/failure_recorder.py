@@ -2,9 +2,9 @@
 
 Ring buffers hold the last seconds of all environments: the states at the beginning of each engine call
 (`sim.divergence.StateHistory`), observations, actions and rewards. In each iteration one episode of every kind is
-copied: the terminated one with the lowest return, the ones with unusually low and high returns, and the first that
-diverged. The thread that writes the next checkpoint writes them to files. When a training resumes, files that are newer
-than the checkpoint are removed, because their episodes are run again.
+copied: for each set of terminations the one with the lowest return, the ones with unusually low and high returns, and
+the first that diverged for each cause. The thread that writes the next checkpoint writes them to files. When a training
+resumes, files that are newer than the checkpoint are removed, because their episodes are run again.
 
 Recording draws no random numbers and writes nothing to the environment, so that the trained bits stay the same.
 """
@@ -49,7 +49,7 @@ RECENT = 1024
 LEAST = 64
 """Number of returns below which no return is unusual."""
 FAR = 3.0
-"""Interquartile ranges beyond the quartiles from which on a return is unusual (Tukey's outer fences)."""
+"""Distance from the quartiles, in interquartile ranges, above which a return is unusual (Tukey's outer fences)."""
 _RETURNS_FILE = "recent.json"
 _MIN_SPREAD = 1e-3
 """Smallest interquartile range, as a share of the quartiles: returns with three equal digits are not unusual."""
@@ -284,6 +284,7 @@ class FailureRecorder(StepObserver):
         return first - FAR * spread, third + FAR * spread
 
     def _update_quartiles(self) -> None:
+        """Add the iteration's returns to the recent ones, and compute their quartiles."""
         if self._returns:
             self._recent = np.concatenate([self._recent, *self._returns])[-RECENT:]
             self._returns.clear()

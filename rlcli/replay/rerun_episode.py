@@ -28,7 +28,7 @@ class EpisodeStart:
     episodes_before: int
     """Episodes of the environment that were run before."""
     reasons: list[str]
-    """Why they were run."""
+    """Reasons why episode K could not start at once; empty if it did."""
     generators: dict[str, Tensor]
     """States of the generators that all environments share, before any step."""
 

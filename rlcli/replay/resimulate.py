@@ -148,7 +148,7 @@ def _same_bits(left: NDArray[np.generic], right: NDArray[np.generic]) -> bool:
 
 
 class ReplayWorld:
-    """One world of a model, to simulate the engine calls of one environment again.
+    """Simulation of one environment without its task, to run recorded engine calls again.
 
     Args:
         model: the model of all environments.
@@ -240,7 +240,7 @@ class StagedWorld:
 
 @dataclass(frozen=True, slots=True)
 class Staged:
-    """The worlds of a failure or crash file, built from the installed task."""
+    """A failure or crash file with a simulation for each of its environments, built from the installed task."""
 
     resolved: Resolved
     model: mujoco.MjModel

@@ -125,7 +125,7 @@ class DivergencePoint(_Strict):
     cause: str
     """See `rlcli.sim.divergence_report.Divergence`."""
     place: str
-    """The joint, actuator or element."""
+    """The joint, actuator or array element whose value shows the divergence."""
     value: str
     """Its value as Python prints it: `nan`, `1e+30`."""
 
@@ -136,7 +136,7 @@ class DivergencePoint(_Strict):
 
 
 class World(_Strict):
-    """The engine calls of one environment."""
+    """The engine calls of one environment that a failure or crash file holds."""
 
     env: Count
     """Environment of the run."""
@@ -173,7 +173,7 @@ class Failure(_Strict):
 
 
 class Header(_Strict):
-    """The JSON document of a file."""
+    """The JSON document of a trajectory file: everything except its tensors."""
 
     format: int
     kind: Kind
@@ -265,7 +265,9 @@ class Trajectory:
         return {n.removeprefix(prefix): tensor for n, tensor in self.tensors.items() if n.startswith(prefix)}
 
     def resolved(self, named: TaskSource | None = None) -> Resolved:
-        """Return the recorded configuration with the task's installed code and models; engine calls need one world.
+        """Return the recorded configuration with the task's installed code and models.
+
+        A failure or crash file gets one environment, in which the calls of each recorded environment are simulated.
 
         Args:
             named: the task that the command line names: if the recorded task is not installed, its code is used.
@@ -293,7 +295,8 @@ class Trajectory:
     def mismatch_error(self, error: Exception) -> CheckpointError:
         """Return the error for a file whose states do not fit the installed task."""
         message = f"{self.file} does not fit the installed task: {' '.join(str(error).split())}"
-        return CheckpointError(message, hint=f"install the version that made it: {self.header.task}")
+        words = ", ".join(f"{key} {value}" for key, value in self.header.task.items() if value is not None)
+        return CheckpointError(message, hint=f"install the version that made it: {words}")
 
 
 def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor]) -> None:

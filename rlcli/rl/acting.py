@@ -19,13 +19,14 @@ PATIENCE = 10
 def trained_policy(
     env: Environment, policy: Policy, *, stochastic: bool = False, generator: torch.Generator | None = None
 ) -> Act:
-    """Return the action function of a policy. It resets the hidden state of an environment at each episode start.
+    """Return the action function of a policy, which resets an environment's hidden state at each episode start.
 
     Args:
         env: the environment.
         policy: the policy.
         stochastic: sample actions instead of taking the mean.
-        generator: source of the noise. Environments that share a random stream then get the same noise.
+        generator: source of the noise; environments that share a random stream then get the same noise. None: torch's
+            global generator, with different noise in every environment.
     """
     hidden: Tensor | None = None
     repeats = env.num_envs // (env.engine.shared_streams or env.num_envs) if generator is not None else 1

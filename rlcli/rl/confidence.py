@@ -14,11 +14,11 @@ NORMAL = 1.959963984540054
 RESAMPLES = 2000
 """Number of bootstrap samples."""
 _GRID = 20_001
-"""Points of the numerical integration."""
+"""Number of points of the numerical integration in `student_quantile`."""
 _SEED = 0
 """Fixed seed: the same values always give the same interval."""
 _BLOCK = 2**21
-"""Most indices in memory at a time."""
+"""Largest number of random indices of bootstrap samples that are in memory at a time."""
 
 
 def proportion(hits: int, count: int) -> dict[str, float]:

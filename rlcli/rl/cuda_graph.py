@@ -39,8 +39,8 @@ def capture_on_gpu(work: Work, device: torch.device, holders: Iterable[Any] = ()
 class Recording:
     """Work that runs eagerly at first, is recorded as a CUDA graph, and is then replayed.
 
-    The first run may allocate memory and synchronise with the device. If a later run does not synchronise and changes
-    no Python number, the run after it is recorded.
+    Only the first run may synchronise with the device. After a run that neither synchronises nor changes a Python
+    number of the holders, the next run is recorded. Work that cannot be recorded always runs eagerly, after a warning.
     """
 
     def __init__(self, work: Work, device: torch.device, holders: list[Any]) -> None:
@@ -50,7 +50,7 @@ class Recording:
         self._warp_capture: Any = None  # keeps the memory alive that Warp allocated during the recording
         self._eager_runs, self._ready = 0, False
         self.refusal: str | None = None
-        """Reason why the work cannot be recorded."""
+        """Reason why the work cannot be recorded; None: no such reason was found so far."""
 
     def __call__(self) -> None:
         """Run the work."""
@@ -78,7 +78,7 @@ class Recording:
         waits = [w for w in caught if "synchronizing CUDA operation" in str(w.message)]
         if waits and self._eager_runs > 1:
             first, *others = sorted({f"{w.filename}:{w.lineno}" for w in waits})
-            more = f" (and {len(others)} more lines)" if others else ""
+            more = f" (so do {', '.join(others[:3])}{', ...' if len(others) > 3 else ''})" if others else ""
             self._refuse(f"{first} waits for the GPU{more}")
         changed = [name for name, value in self._numbers().items() if numbers.get(name, value) != value]
         if changed and not waits:
@@ -117,6 +117,7 @@ class Recording:
         _log.warning(f"the step cannot run as a CUDA graph and is several times slower; change this: {reason}")
 
     def _numbers(self) -> dict[str, Any]:
+        """Return the attributes of the holders that are Python numbers; a graph would replay their recorded values."""
         return {
             f"{type(holder).__name__}.{name}": value
             for holder in self._holders

@@ -152,7 +152,8 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     """Run `rlcli ARGUMENTS` in several processes of this machine.
 
     Returns:
-        Exit code 0, or the exit code of a process that failed by itself and not because of another process.
+        0; the exit code of a process that failed by itself and not because of another process; or, if a signal stopped
+        the launcher, the exit code for that signal.
     """
     import logging
 

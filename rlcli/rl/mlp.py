@@ -18,16 +18,17 @@ from rlcli.machine import has_onednn, processor
 
 _aten = torch.ops.aten
 _AVX512 = torch.backends.cpu.get_cpu_capability() == "AVX512"
-"""Without AVX-512, numpy's expm1 is not vectorised."""
+"""Whether the processor has AVX-512; without it numpy's expm1 is not vectorised, and oneDNN is not used."""
 _WORTH, _LARGE = 2**20, 64 * 64
-"""Number of multiplications from which oneDNN's product is faster. A sum over samples must also have a result with
-so many elements."""
+"""`_WORTH`: number of multiplications from which oneDNN's matrix product is faster. `_LARGE`: the gradient of a layer's
+weights must also have at least this number of elements."""
 
 
 _ROWS, _WIDE = 8192, 64
-"""Most samples of a part whose widest layer has `_WIDE` columns: with more, results leave the cache."""
+"""A part of the samples has at most `_ROWS` rows if the widest layer has `_WIDE` outputs, fewer for wider layers: with
+more rows, intermediate results leave the cache."""
 _pools: list[ThreadPoolExecutor] = []
-"""The threads of `use_threads`."""
+"""The thread pool that `use_threads` has made; empty for one thread."""
 
 
 def use_threads(count: int) -> None:
@@ -39,7 +40,7 @@ def use_threads(count: int) -> None:
 
 
 def part_rows(layers: Iterable[nn.Module]) -> int:
-    """Return the number of samples whose intermediate results stay in the cache."""
+    """Return the largest number of samples whose intermediate results in these layers stay in the cache."""
     widths = [layer.out_features for layer in layers if isinstance(layer, nn.Linear)]
     return max(1, _ROWS * _WIDE // max(_WIDE, *widths))
 
@@ -113,7 +114,7 @@ FAST_ACTIVATIONS: dict[type[nn.Module], Activation] = {
 
 
 def is_plain(layers: Iterable[nn.Module]) -> bool:
-    """Return whether the layers are linear layers on a CPU with one known activation between them."""
+    """Return whether the layers are linear layers with biases on a CPU, with one of `FAST_ACTIVATIONS` between them."""
     linears, activations = list(layers)[::2], list(layers)[1::2]
     return (
         all(isinstance(layer, nn.Linear) and layer.bias is not None for layer in linears)
@@ -153,9 +154,9 @@ class Mlp(nn.Sequential):
 
 
 def _hidden(inputs: Tensor, linears: list[nn.Linear], activations: list[Activation]) -> Tensor:
-    """Return the outputs of layers that each have an activation. (n, d) -> (n, h)"""
+    """Return the outputs of the hidden layers, each followed by its activation. (n, d) -> (n, h)"""
     outputs = torch.empty(len(inputs), linears[-1].out_features)
-    rows = max(512, part_rows(linears) // 512 * 512)  # with these parts the bits of a row do not depend on its part
+    rows = max(512, part_rows(linears) // 512 * 512)  # with multiples of 512 a row's bits do not depend on its part
     starts = [rows * number for number in range(max(1, len(inputs) // rows))]
     ends = [*starts[1:], len(inputs)]
     inference = torch.is_inference_mode_enabled()  # a setting of each thread

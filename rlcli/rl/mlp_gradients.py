@@ -38,7 +38,7 @@ class PartMemory:
         actor: layers of the actor.
         critic: layers of the critic.
         rows: number of samples of the largest minibatch.
-        tensors: tensors of the shapes that `shapes` returns; None: new ones.
+        tensors: memory with the names and shapes of the attribute `shapes`; None: allocate it.
     """
 
     def __init__(self, actor: Layers, critic: Layers, rows: int, tensors: Mapping[str, Tensor] | None = None) -> None:
@@ -55,7 +55,7 @@ class PartMemory:
         self.shapes = {"gradients": (self._parts, sizes), "numbers": (2, self._parts, self._columns)}
         tensors = tensors or {name: torch.zeros(shape) for name, shape in self.shapes.items()}
         self._gradients, self.numbers = tensors["gradients"], tensors["numbers"]
-        """`numbers`: the numbers of each network and part that are summed. (2, parts, columns)"""
+        """`numbers`: the statistics of each network and part, see `OutputGradient`. (2, parts, columns)"""
         self._views = [_views(row, self._shapes) for row in self._gradients]
         self._sum = torch.zeros(sizes)
         self._sum_views = _views(self._sum, self._shapes)
@@ -75,7 +75,10 @@ class PartMemory:
         return self._views[part][self._ends[network] : self._ends[network + 1]]
 
     def sum_parts(self, rows: int, out: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Write the gradients of a minibatch; return the sums of both networks' numbers: (columns,) and ()."""
+        """Add up the parts of a minibatch: write its gradients to `out`; return the statistics of actor and critic.
+
+        The statistics have the shapes (columns,) and ().
+        """
         parts = len(self.split(rows))
         torch.sum(self._gradients[:parts], dim=0, out=self._sum)
         for gradient, transposed in zip(out, self._sum_views, strict=True):
@@ -186,5 +189,6 @@ class _Passes:
 
 
 def _views(vector: Tensor, shapes: Sequence[torch.Size]) -> list[Tensor]:
+    """Return consecutive parts of a vector as views of the given shapes."""
     parts = vector.split_with_sizes([shape.numel() for shape in shapes])
     return [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]

@@ -77,7 +77,7 @@ def require_finite_learner(
 
 
 class GradientWatch:
-    """Watch that finds the first gradient that is not finite, and does not let it change the weights.
+    """Hooks that find the first gradient that is not finite, and keep it from changing the weights.
 
     Args:
         module: the module whose gradients are checked.
@@ -86,7 +86,7 @@ class GradientWatch:
 
     def __init__(self, module: nn.Module, optimizers: Iterable[torch.optim.Optimizer]) -> None:
         self.first: str | None = None
-        """Name of the first parameter with such a gradient, in the order of the backward pass; None: all are finite."""
+        """First parameter whose gradient is not finite, in the order of the backward pass; None: all are finite."""
         for name, parameter in module.named_parameters():
             if parameter.requires_grad:
                 hook = functools.partial(self._check, name)

@@ -1,4 +1,4 @@
-"""State of optimisers as flat tensors for a checkpoint."""
+"""Saving and loading of optimisers' states as flat tensors of a checkpoint, and an Adam that imports fast."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
-    """Return a copy of an optimiser's state; the keys are PREFIX + index of the parameter + "." + slot."""
+    """Return a copy of an optimiser's state; its keys are PREFIX, parameter index and name, as in `0.exp_avg`."""
     return {
         f"{prefix}{number}.{slot}": torch.as_tensor(value).clone()
         for number, slots in optimizer.state_dict()["state"].items()

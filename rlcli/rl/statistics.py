@@ -18,7 +18,7 @@ _METRICS = {
     "held": "Success",
     "value": "Success_Value",
 }
-"""Kind of a sum -> group of its metric."""
+"""Prefix of a sum's name in `EpisodeStatistics.add` -> group of the metric that is computed from the sum."""
 
 
 class EpisodeStatistics:
@@ -76,7 +76,7 @@ class EpisodeStatistics:
                 process_group.average_(values).mul_(process_group.world_size)
 
     def flush(self) -> dict[str, float]:
-        """Return the metrics of the iteration and reset its sums; without an episode a mean is left out."""
+        """Return the metrics of the iteration and reset its sums; a mean over no episodes is left out."""
         sums: dict[str, float] = {}
         for names, values in self._sums.items():
             for name, value in zip(names.split(","), values.tolist(), strict=True):

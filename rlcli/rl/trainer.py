@@ -48,7 +48,7 @@ class Report:
 
 
 class Trainer(Protocol):
-    """Learner in a `VecEnv`. Between two iterations its state can be saved and restored exactly."""
+    """Algorithm that trains a policy in an environment; between two iterations its state can be saved and restored."""
 
     @property
     def iteration(self) -> int:

@@ -37,11 +37,11 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the same seed and actions give the same trajectory, in a new environment and after reset(seed)."""
     env, other = subject.env(episode_steps=12), subject.env(episode_steps=12)
     first, second, third = (record_outputs(one, random_actions(one, subject.bound, 30)) for one in (env, other, env))
-    message = "differs between two new environments, one seed and one set of actions"
-    hint = "use the selection (uniform, normal, choice) or self.draws(env_ids) instead of torch.rand, numpy"
+    message = "differs between two new environments with the same seed and actions"
+    hint = "draw from the selection (uniform, normal, choice) or self.draws(env_ids) instead of torch.rand, numpy"
     findings = list(compare_trajectories(env, (first, second), message, f"{hint} or time"))
     if not findings:
-        message = "differs between a new environment, and the same one after reset(seed), with one set of actions"
+        message = "differs between a new environment and the same one after reset(seed), with the same actions"
         hint = "clear all state of the last episode in the term's reset(selection), or in reset_idx"
         findings = list(compare_trajectories(env, (first, third), message, hint))
     yield from findings
@@ -92,6 +92,7 @@ def start_states(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 def _start(env: VecEnv, obs: dict[str, Tensor]) -> Tensor:
+    """Return observations and engine state, one row for each environment. (num_envs, values)"""
     parts = [*obs.values(), *engine_state(env).values()]
     return torch.cat([part.reshape(env.num_envs, -1).double() for part in parts], dim=1)
 
@@ -152,8 +153,8 @@ def partial_reset(subject: TaskUnderTest) -> Iterator[Finding]:
 def final_observations(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that a step returns the last observation of an ended episode, not the first one of the new episode."""
     result = _env_pair(subject).step()[1]
-    over = (result.terminated | result.truncated)[_ENDING]
-    if not bool(over.all()):
+    done = (result.terminated | result.truncated)[_ENDING]
+    if not bool(done.all()):
         return  # the check `truncation` reports this
     if result.final_obs is None:
         message = f"the episodes of environments {_ENDING} ended without final observations"
@@ -230,7 +231,9 @@ def truncation(subject: TaskUnderTest) -> Iterator[Finding]:
             yield warning_at(where, message, "choose start states whose episodes last some steps under zero actions")
             return
     if early[0] and early[0] == early[1] and len(early[0]) == 1:
-        message = f"every episode is truncated {early[0].pop()} steps before its limit; allowed is exactly at it"
+        count = early[0].pop()
+        steps = f"{count} step{'s' if count > 1 else ''}"
+        message = f"every episode is truncated {steps} before its limit; it must be truncated at its limit"
         yield error_at("terminations", message, hint)
     elif any(early):
         message = "some episodes are truncated before their limit"
@@ -257,11 +260,12 @@ def termination(subject: TaskUnderTest) -> Iterator[Finding]:
     ended = [result.episodes for result in subject.recording().steps if result.episodes is not None]
     lengths = [n for e in ended for n, out in zip(e.lengths.tolist(), e.truncated.tolist(), strict=True) if not out]
     if len(lengths) >= subject.num_envs and len(set(lengths)) == 1 and lengths[0] > 1:
-        message = f"all {len(lengths)} terminations under random actions came after exactly {lengths[0]} steps: a timer"
+        message = f"all {len(lengths)} terminations under random actions came after exactly {lengths[0]} steps"
         yield warning_at("terminations", message, hint)
 
 
 def _declared(subject: TaskUnderTest, cause: str) -> bool:
+    """Return whether the task declares a termination as a time-out."""
     term = subject.resolved.task.terminations.get(cause)
     return bool(term.time_out) if term is not None else cause == "time_out"
 
@@ -303,9 +307,9 @@ def observation_after_reset(subject: TaskUnderTest) -> Iterator[Finding]:
 
     task.get_observations = recorded  # type: ignore[method-assign]
     result = pair.step()[1]
-    over = (result.terminated | result.truncated).tolist()
+    done = (result.terminated | result.truncated).tolist()
     # an episode of the others may end in this step too
-    running = [row for row in range(subject.num_envs) if row not in _ENDING and not over[row]]
+    running = [row for row in range(subject.num_envs) if row not in _ENDING and not done[row]]
     for before, after in pairwise(observations):
         rows = [row for row in running if not equal_values(before[row], after[row])]
         if rows:

@@ -79,7 +79,7 @@ class Rollout:
     policy: str
     env: VecEnv
     reward: Tensor
-    over: Tensor
+    done: Tensor
     """Whether the episode ended with this step. bool"""
     terminated: Tensor
     terms: dict[str, Tensor]
@@ -113,8 +113,8 @@ def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollou
             for step in range(steps):
                 action = act(step)
                 result = env.step(action)
-                over = result.terminated | result.truncated
-                _append(steps_of, {"reward": result.reward, "over": over, "terminated": result.terminated})
+                done = result.terminated | result.truncated
+                _append(steps_of, {"reward": result.reward, "done": done, "terminated": result.terminated})
                 if isinstance(env, ManagedEnv):
                     _append(terms, env.reward_manager.values())
                 if limits:
@@ -128,7 +128,7 @@ def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollou
         policy,
         env,
         reward=_stack(steps_of["reward"], env),
-        over=_stack(steps_of["over"], env),
+        done=_stack(steps_of["done"], env),
         terminated=_stack(steps_of["terminated"], env),
         terms={name: torch.stack(values) for name, values in terms.items()},
         obs={group: torch.stack(values) for group, values in obs.items()},
@@ -151,7 +151,7 @@ def _append(lists: defaultdict[str, list[Tensor]], values: dict[str, Tensor]) ->
 
 
 class _PhysicsObserver(StepObserver):
-    """Observer that records velocities and saturated efforts and controls, before any environment is reset."""
+    """Observer that records velocities after physics, before any reset; with `limits` also saturated efforts."""
 
     def __init__(self, env: VecEnv, *, limits: bool) -> None:
         self._env, self._limits = env, limits

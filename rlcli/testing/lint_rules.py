@@ -98,7 +98,7 @@ def _weighted_terms(evidence: RolloutEvidence) -> list[str]:
 
 
 def silent_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that every reward term with a weight is not always 0 under all fixed policies."""
+    """Check that no reward term with a weight other than 0 is 0 in every step of all fixed policies."""
     if evidence.steps < min(evidence.subject.resolved.task.max_episode_length, MAX_STEPS):
         return  # a term may be other than 0 only at the end of an episode, which a shorter rollout does not reach
     steps = sum(rollout.reward.numel() for rollout in evidence.rollouts)
@@ -111,10 +111,11 @@ def silent_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 DOMINANT = 0.99
+"""Share of the reward's size from which a term is dominant."""
 
 
 def dominant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Report a reward term that is so large, with every kind of action, that the other terms have no effect."""
+    """Check that no reward term is so large, under every fixed policy, that the other terms have no effect."""
     active = _weighted_terms(evidence)
     shares: dict[str, list[float]] = {name: [] for name in active}
     for rollout in evidence.rollouts:
@@ -151,7 +152,7 @@ def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
     running_steps, terminal_steps = [], []
     for rollout in evidence.rollouts:
         terminated = rollout.terminated.bool()
-        running_steps.append(rollout.reward[~terminated & ~rollout.over.bool()])
+        running_steps.append(rollout.reward[~terminated & ~rollout.done.bool()])
         terminal_steps.append(rollout.reward[terminated])
     running, terminal = torch.cat(running_steps), torch.cat(terminal_steps)
     if len(terminal) < 10 or not len(running):
@@ -169,7 +170,7 @@ def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
     return_terminated = _mean([e.total for e in finished if e.terminated])
     numbers = {"good_step": good, "last_step": last, "horizon": horizon, "return_terminated": return_terminated}
     message = f"the reward of a good step is {good:.3g}, {good * horizon:.3g} over the agent's horizon of {horizon:.0f}"
-    message += f" steps, and that of a terminal step is {last:.3g}"
+    message += f" steps, and the reward of a terminal step is {last:.3g}"
     if timed_out:
         if return_terminated <= _mean(timed_out):
             return
@@ -185,7 +186,7 @@ def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 LARGE, SMALL = 100.0, 0.01
-"""Limits of the usual size. `cart-double-pendulum` has a column above 75 in 1 % of the steps, and learns well."""
+"""Largest and smallest usual size of a column. `cart-double-pendulum` learns well with one above 75 in 1 % of steps."""
 
 
 def constant_observation(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -226,6 +227,7 @@ def _columns(evidence: RolloutEvidence) -> Iterator[tuple[str, Tensor]]:
 
 
 SATURATED = 0.8
+"""Share of the steps at a limit from which a quantity is reported."""
 
 
 def saturated_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -240,6 +242,7 @@ def saturated_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 DEAD = 1e-6
+"""Largest change of a position or velocity that counts as no effect of an action."""
 
 
 def dead_action(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -277,6 +280,7 @@ def _state_after(env: VecEnv, start: dict[str, Tensor], action: Tensor, steps: i
 
 
 DRIFT, RATIO = 0.2, 1.5
+"""Largest usual relative energy error, and ratio of speeds, between the time step and half of it."""
 
 
 def timestep(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -287,7 +291,7 @@ def timestep(evidence: RolloutEvidence) -> Iterator[Remark]:
     diverged = {rollout.policy: rollout.diverged for rollout in evidence.rollouts if rollout.diverged}
     if diverged:
         names = ", ".join(diverged)
-        message = f"the simulation diverged {sum(diverged.values())} times (fixed policies: {names})"
+        message = f"the simulation diverged (fixed policies: {names}; number of divergences: {sum(diverged.values())})"
         yield error_at(where, message, hint, {"diverged": sum(diverged.values())})
         return
     env = evidence.env(8)
@@ -326,11 +330,14 @@ def _compare_half_and_double_step(evidence: RolloutEvidence, dt: float, where: s
     decimation = task.decimation // 2 if task.decimation % 2 == 0 else task.decimation
     twice = record_rollout(evidence.env(16, sim__dt=2 * dt, decimation=decimation), "random", bound, steps)
     if twice.diverged:
-        message = f"with twice the step the simulation diverges, {twice.diverged} times in {steps} steps: no margin"
+        message = (
+            f"with a time step of {2 * dt:g} s the simulation diverges within {steps} steps, so the margin is small"
+        )
         yield warning_at(where, message, hint, {"diverged_at_twice": twice.diverged})
 
 
 NEAREST, FARTHEST = 0.05, 10.0
+"""Smallest and largest usual horizon, as a share of the episode length."""
 
 
 def horizon(evidence: RolloutEvidence) -> Iterator[Remark]:

@@ -31,6 +31,7 @@ from rlcli.testing.steps import equal_values, random_actions, record_outputs, st
 from rlcli.testing.task_under_test import TaskUnderTest, element_names, task_of
 
 STEPS = 16
+"""Number of steps of a compared trajectory."""
 EPISODE = 12
 """Steps of an episode, so that episodes end within the `STEPS`."""
 
@@ -47,6 +48,7 @@ def threads(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 FEW = 3
+"""Number of environments of the smaller of two compared environments."""
 
 
 def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
@@ -183,6 +185,7 @@ def _columns(terms: list[dict[str, Any]]) -> list[str]:
 # --- speed ---
 
 SMALL, LARGE = 16, 256
+"""Numbers of environments whose executed lines of Python are compared."""
 
 
 def speed(subject: TaskUnderTest) -> Iterator[Finding]:
@@ -237,7 +240,9 @@ def _count_lines(env: VecEnv, action: Tensor) -> Counter[tuple[str, int]]:
 # --- the GPU engine ---
 
 FEW_WORLDS = 2
+"""Number of environments on the GPU engine, which MuJoCo Warp simulates slowly on a CPU."""
 CLOSE = 1e-3
+"""Largest accepted difference between the engines, relative to 1 + |value|."""
 
 
 def engines(subject: TaskUnderTest) -> Iterator[Finding]:

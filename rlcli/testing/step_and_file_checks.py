@@ -169,9 +169,9 @@ def extreme_actions(subject: TaskUnderTest) -> Iterator[Finding]:
 def _check_divergence(subject: TaskUnderTest, env: VecEnv, steps: int) -> Iterator[Finding]:
     if env.divergences:
         where = f"sim.dt = {env.physics_dt:g} s, {steps} of {STEPS} steps"
-        message = f"the simulation diverged {env.divergences} times with actions within +-{subject.bound:g}"
+        message = f"the simulation diverged with actions within +-{subject.bound:g} (divergences: {env.divergences})"
         hint = "take a smaller sim.dt, more damping or armature, lower gains, or an effort_limit"
-        yield error_at(where, f"{message}; it must never", hint)
+        yield error_at(where, f"{message}; it must never diverge", hint)
 
 
 def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:

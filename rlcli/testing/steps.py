@@ -47,7 +47,7 @@ class EndedEpisode:
 
 
 def ended_episodes(result: StepResult) -> list[EndedEpisode]:
-    """Return the episodes that ended in the last step of an environment; later its result is overwritten."""
+    """Return the episodes that ended in a step; call it before the next step, which overwrites the result."""
     if result.episodes is None:
         return []
     ended = result.episodes.ended()

@@ -36,7 +36,7 @@ class TaskUnderTest:
     ) -> None:
         self.source, self.num_envs, self.seed = source, num_envs, seed
         self._agent, self._overrides, self._config = agent, tuple(overrides), config
-        # the configuration must be valid without our flags, and for playing
+        # the configuration must be valid without the settings of the checks, and in play mode
         resolve(source, agent=agent, config_file=config, overrides=overrides)
         resolve(source, agent=agent, config_file=config, overrides=overrides, play=True)
         self.resolved = self._resolve({})
@@ -115,7 +115,7 @@ def open_task(
 
 
 def expire_episodes(env: VecEnv, rows: list[int]) -> None:
-    """Set the episode length of some environments to one step before the time limit."""
+    """Set the number of steps of some environments' episodes so that the next step reaches the time limit."""
     env.episode_length_buf[rows] = env.max_episode_length - 1
     if isinstance(env, DirectEnv):
         env.task.progress_buf[rows] = env.max_episode_length - 1

@@ -13,6 +13,7 @@ from rlcli.envs.vec_env import VecEnv
 PASSIVE_S = 1.0
 """Simulated time without actuators [s]."""
 MAX_STEPS = 1000
+"""Largest number of physics steps of the measurement."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,7 @@ _DIVERGED = [int(w) for w in (_W.mjWARN_BADQPOS, _W.mjWARN_BADQVEL, _W.mjWARN_BA
 
 
 def _difference(coarse: np.ndarray, fine: np.ndarray) -> float:
+    """Return the largest difference of the total energies, relative to the exchanged energy. (steps + 1, 2) each"""
     if np.isnan(coarse).any():
         return np.inf
     if np.isnan(fine).any():

@@ -1,4 +1,7 @@
-"""Writer of checkpoints: it works in the background, writes each checkpoint completely or not at all, and prunes."""
+"""Writer of checkpoints in the background, each completely or not at all; it also removes old checkpoints.
+
+A log is data that only grows, such as a replay buffer. Its rows are written once, into files that checkpoints share.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +28,12 @@ from rlcli.runs.checkpoint_reader import FORMAT, LOG_FOLDER, Checkpoint, Shard, 
 from rlcli.runs.run import Run
 
 _SHARD_BYTES = 64 << 20
-"""Largest size of a file with rows of a log [bytes]."""
+"""Largest size of a file with rows of a log, such as a replay buffer [bytes]."""
 _DEFAULT_LAST = 10
-"""Number of newest checkpoints to keep by default if the time decides when to save."""
+"""Number of newest checkpoints to keep by default if checkpoints are saved by time, without a `save_interval`."""
 
 _NewRows = list[tuple[int, int, dict[str, Tensor]]]
-"""Rows of a log that are in no file yet: (start, stop, columns) for each new file."""
+"""Rows of a log, such as a replay buffer, that are in no file yet: (start, stop, columns) for each new file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +102,7 @@ class CheckpointWriter:
         self._thread.start()
 
     def save_cases(self, iteration: int, step: int) -> None:
-        """Write the recorded episodes of a failed iteration, after which there is no checkpoint."""
+        """Write the recorded failed episodes of an iteration that ended with an error, so without a checkpoint."""
         if self.cases is not None:
             self.cases.commit(iteration, step)
             batch = self.cases.take(step)
@@ -140,7 +143,7 @@ class CheckpointWriter:
     ) -> None:
         try:
             if self.cases is not None and batch is not None:
-                self.cases.write(batch)  # before the checkpoint: a resumed run removes episodes without one
+                self.cases.write(batch)  # before the checkpoint: a resumed run removes episodes without a checkpoint
             logs = {name: self._write_rows(name, state.logs[name], parts) for name, parts in fresh.items()}
             extra = {**self._manifest, "iteration": iteration, **({"logs": logs} if logs else {})}
             write_checkpoint(self.checkpoints, step, state, extra)
@@ -259,7 +262,7 @@ def drop_after(checkpoints: Path, step: int) -> list[int]:
 
 
 def drop_rows(checkpoints: Path) -> None:
-    """Remove the rows of logs that no checkpoint needs."""
+    """Remove the files with rows of logs, such as a replay buffer, that no checkpoint needs."""
     files = set((checkpoints / LOG_FOLDER).glob("*/*.safetensors"))
     if not files:
         return

@@ -17,6 +17,7 @@ from rlcli.rl.trainer_base import BaseTrainer
 
 RETURN, LENGTH, SUCCESS = "Train/mean_reward", "Train/mean_episode_length", "Train/success_rate"
 _GROUPS = ("Train/", "Eval/success", "Loss/", "Policy/", "Episode_", "Success", "Health/")
+"""Prefixes of the metrics that the checks read."""
 _TIMES = 40
 """Number of times in a training at which the checks run."""
 _MIN_ITERATIONS = 8
@@ -27,6 +28,7 @@ _AT = 1e-3
 """Relative distance from a bound at which a value counts as at the bound."""
 
 Found = Iterator[tuple[str, str]]
+"""Message and hint of each problem that a check finds; the hint follows the word "try"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +58,7 @@ class Health:
         self.settings: dict[str, Any] = agent.model_dump()
         self.iteration = 0
         self.findings: list[Finding] = []
-        """Findings of the newest check that the check before it had, too."""
+        """Problems that both the newest and the previous run of the checks found."""
         self._series: dict[str, list[float]] = {}
         self._suspects: dict[str, Finding] = {}
 
@@ -116,7 +118,7 @@ class Health:
         return values[-max(3, len(values) // 8) :]
 
     def change(self, name: str) -> float:
-        """Return the change of a metric since the beginning, in multiples of its noise or a tenth of its size."""
+        """Return the change of a metric since the beginning, divided by its noise or a tenth of its initial value."""
         before, after = self.first(name), self.last(name)
         if not before:
             return 0.0
@@ -129,7 +131,7 @@ class Health:
         return statistics.median(self.last(name)) if self.values(name) else None
 
     def struggles(self, after: float) -> bool:
-        """Return whether a share of the training is done, and success is still rare or not defined."""
+        """Return whether at least the share `after` of the training is done, and success is rare or not defined."""
         return self.progress >= after and all((self.median(n) or 0.0) < _SOLVED for n in (SUCCESS, "Eval/success_rate"))
 
 
@@ -161,25 +163,26 @@ def probe(trainer: Trainer) -> dict[str, float]:
 
 
 def no_reward(health: Health) -> Found:
-    """Check that returns differ."""
+    """Check that the mean return is not the same in all iterations."""
     values = health.values(RETURN)
     if len(values) >= (_MIN_ITERATIONS if any(values) else 3) and max(values) - min(values) <= 1e-6 * abs(values[0]):
         what = "every reward is 0" if values[0] == 0.0 else "the reward depends on nothing that the policy changes"
-        yield f"the return is {values[0]:g} in all {len(values)} iterations: {what}", "rlcli lint TASK, and the weights"
+        message = f"the return is {values[0]:g} in all {len(values)} iterations: {what}"
+        yield message, "`rlcli lint TASK`, and other reward weights"
 
 
 def no_progress(health: Health) -> Found:
-    """Check that the return, the length of episodes or a value of the task moves."""
+    """Check that the return, a reward term, the episode length or a value of a success condition changes."""
     watched = [RETURN, LENGTH, *health.names("Episode_Reward/"), *health.names("Success_Value/")]
     if health.struggles(0.15) and all(abs(health.change(name)) < 1.0 for name in watched):
         value = statistics.fmean(health.last(RETURN)) if health.values(RETURN) else 0.0
         done = f"{health.progress:.0%} of the training"
         message = f"return, reward terms and episode length have not moved in {done} (return {value:.4g})"
-        yield message, "rlcli lint TASK (dead-action, silent-reward), a larger agent.learning_rate, or larger actions"
+        yield message, "`rlcli lint TASK` (dead-action, silent-reward), a larger agent.learning_rate, or larger actions"
 
 
 def one_termination(health: Health) -> Found:
-    """Check that episodes do not all end by the same termination, ever as early."""
+    """Check that episodes do not all end by the same termination, as early as at the beginning of the training."""
     late = {name for name, term in health.task.terminations.items() if term is not None and term.time_out}
     for metric in health.names("Episode_Termination/"):
         name, share = metric.partition("/")[2], health.median(metric)
@@ -187,15 +190,15 @@ def one_termination(health: Health) -> Found:
             continue
         if health.change(LENGTH) < 1.0 and not _approaches(health.values(RETURN)):
             length = statistics.fmean(health.last(LENGTH))
-            message = f"{share:.0%} of the episodes end by '{name}', after {length:.0f} steps, as at the beginning"
-            yield message, "looser limits, an easier start of episodes, or a reward of each step alive"
+            message = f"{share:.0%} of the episodes end by '{name}', after {length:.0f} steps, as early as at first"
+            yield message, "looser limits, an easier start of episodes, or a reward for each step"
 
 
 def short_episodes(health: Health) -> Found:
     """Check that episodes have more than a few steps."""
     length, full = health.median(LENGTH), health.task.max_episode_length
     if length is not None and length <= min(3.0, full / 4):
-        yield f"episodes end after {length:.3g} of {full} steps", "rlcli lint TASK (early-resets)"
+        yield f"episodes end after {length:.3g} of {full} steps", "`rlcli lint TASK` (early-resets)"
 
 
 def dying_pays(health: Health) -> Found:
@@ -203,8 +206,8 @@ def dying_pays(health: Health) -> Found:
     if health.struggles(0.1) and health.change(RETURN) > 1.0 and health.values(LENGTH):
         before, after = (statistics.fmean(part) for part in (health.first(LENGTH), health.last(LENGTH)))
         if after < 0.7 * before:
-            message = f"the return rises while episodes shrink from {before:.0f} to {after:.0f} steps: ending pays"
-            yield message, "signs of the weights, a reward of each step alive, or a penalty for terminations"
+            message = f"the return rises while episodes shrink from {before:.0f} to {after:.0f} steps"
+            yield message, "other signs of the reward weights, a reward for each step, or a penalty for terminations"
 
 
 def exploration(health: Health) -> Found:
@@ -217,8 +220,8 @@ def exploration(health: Health) -> Found:
         yield f"the standard deviation of actions has fallen from {start:.3g} to {std:.3g}", "a larger entropy_coef"
     if std > 3.0 * (bound or float("inf")) or (std > 1.25 * start and std > (bound or 1.0) and _rises(health)):
         limit = f", and the bound of actions is {bound:g}" if bound else ""
-        message = f"the standard deviation of actions is {std:.3g}, {std / start:.1f} times the first one{limit}"
-        yield message, "a smaller entropy_coef or init_std, and rlcli lint TASK (dead-action)"
+        message = f"the standard deviation of actions is {std:.3g}, {std / start:.1f} times the initial one{limit}"
+        yield message, "a smaller entropy_coef or init_std, and `rlcli lint TASK` (dead-action)"
 
 
 def _rises(health: Health) -> bool:
@@ -232,7 +235,7 @@ def update_size(health: Health) -> Found:
     if kl is None or not health.struggles(0.1):
         return
     if kl > 4.0 * target:
-        message = f"the KL divergence of an update is {kl:.3g}, and {target:g} is the target"
+        message = f"the KL divergence of an update is {kl:.3g}, more than 4 times {target:g}"
         yield message, "a smaller agent.learning_rate, fewer epochs, or schedule adaptive with desired_kl"
     if abs(kl) < 1e-6:
         yield f"an update hardly changes the policy: its KL divergence is {kl:.1g}", "a larger agent.learning_rate"
@@ -258,14 +261,15 @@ def value_function(health: Health) -> Found:
         yield message, "a smaller agent.learning_rate or reward_scale"
     elif explained < 0.02 and loss > 0.0 and not _approaches(health.values(RETURN)) and health.change(RETURN) < 1.0:
         message = f"the critic explains {explained:.2f} of the variance of returns"
-        yield message, "observations that show the state, normalize_observations, or another gamma"
+        yield message, "observations that contain the state, normalize_observations, or another gamma"
 
 
 def observations(health: Health) -> Found:
     """Check that observations vary and are not at their clip."""
     for metric in health.names("Health/constant/"):
         if health.median(metric) == 1.0 and health.struggles(0.1):
-            yield f"the observation '{metric.rpartition('/')[2]}' is the same in all environments", "its scale and func"
+            name = metric.rpartition("/")[2]
+            yield f"the observation '{name}' is the same in all environments", "another func or scale of this term"
     for metric in [*health.names("Health/clipped/"), *health.names("Health/normalized")]:
         share = health.median(metric) or 0.0
         if share > 0.9 and health.struggles(0.1):
@@ -281,7 +285,7 @@ def actions_at_bound(health: Health) -> Found:
 
 
 def blocked_success(health: Health) -> Found:
-    """Check that no condition of success fails while the others hold, or stands still far from its bound."""
+    """Check that no single condition of success blocks success, or never holds and does not approach its bound."""
     for name, condition in health.task.success.items():
         held, values = health.median(f"Success/{name}"), health.values(f"Success_Value/{name}")
         if held is None or condition is None or not health.struggles(0.15):
@@ -291,14 +295,14 @@ def blocked_success(health: Health) -> Found:
         learned = health.change(RETURN) > 1.0 and not _approaches(health.values(RETURN))
         never = max(health.values(f"Success/{name}")) == 0.0 and (learned or health.progress == 1.0)
         if (never and not _approaches(_gaps(values, condition.model_dump()))) or alone:
-            value = f", its value is {statistics.fmean(values[-3:]):.3g}, and the bound is" if values else ""
-            bound = bound_text(condition.model_dump())
-            message = f"the condition '{name}' of success holds in {held:.1%} of the episodes{value} {bound}".rstrip()
+            value = f"; its value is {statistics.fmean(values[-3:]):.3g}" if values else ""
+            bound = f"; it must be {text}" if (text := bound_text(condition.model_dump())) else ""
+            message = f"the condition '{name}' of success holds in {held:.1%} of the episodes{value}{bound}"
             yield message, f"a larger reward for it, or another bound of success.{name}"
 
 
 def _gaps(values: list[float], bounds: Mapping[str, Any]) -> list[float]:
-    """Return the distances of values to their bounds, negative: a rise is an approach."""
+    """Return minus the distance of each value to its bounds, 0 within them, so that a rise means an approach."""
     low, high = bounds.get("at_least"), bounds.get("at_most")
     return [-max((low if low is not None else v) - v, v - (high if high is not None else v), 0.0) for v in values]
 

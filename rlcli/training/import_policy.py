@@ -228,7 +228,8 @@ def _layer(weights: Mapping[str, Tensor], name: str, file: Path) -> _Layer:
     if weight is None or bias is None or weight.dim() != 2 or bias.shape != weight.shape[:1] or not weight.numel():
         shapes = ["missing" if value is None else tuple(value.shape) for value in (weight, bias)]
         found = f"{name}.weight: {shapes[0]}, {name}.bias: {shapes[1]}"
-        raise CheckpointError(f"{file}: {found}; only linear layers with a bias, (outputs, inputs) and (outputs,), fit")
+        expected = "weights must be (outputs, inputs) and biases (outputs,)"
+        raise CheckpointError(f"{file}: {found}; {expected}; use linear layers with a bias")
     return weight, bias
 
 
@@ -240,7 +241,8 @@ def _mlp_policy(
         raise CheckpointError(f"{file} has no layers; choose a file with a policy")
     for (before, _), (after, _) in itertools.pairwise(layers):
         if after.shape[1] != len(before):
-            raise CheckpointError(f"{file}: layers do not fit: {len(before)} outputs, {after.shape[1]} inputs")
+            message = f"a layer with {len(before)} outputs is followed by one with {after.shape[1]} inputs"
+            raise CheckpointError(f"{file}: {message}; choose an undamaged file")
     spec = {
         "kind": kind,
         "observation_size": layers[0][0].shape[1],
@@ -256,17 +258,17 @@ def _mlp_policy(
 
 
 def _log_std(weights: Mapping[str, Tensor], names: Mapping[str, str], file: Path) -> Tensor:
-    """Return the log standard deviation of the actions, whichever of both parameters the file has."""
+    """Return the log standard deviation of the actions, from the parameter `std` or `log_std` of the file."""
     if names["log_std"] in weights:
         return weights[names["log_std"]]
     if names["std"] not in weights:
-        message = f"{file}: the standard deviation depends on the state, which cannot be imported; train it constant"
+        message = f"{file}: the standard deviation depends on the state, which cannot be imported; train a constant one"
         raise CheckpointError(message)
     return weights[names["std"]].clamp(min=_MIN_STD).log()
 
 
 def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the specification and the weights of the LSTM below a prefix; both are empty without an LSTM."""
+    """Return the specification and the weights of the LSTM whose names have a prefix; both are empty without one."""
     lstm: dict[str, Tensor] = {}
     for name, value in below(weights, prefix).items():
         kind, _, layer = name.rpartition("_l")
@@ -296,6 +298,7 @@ def _empirical_normalizer(stats: Mapping[str, Tensor], file: Path) -> dict[str, 
 
 
 def _normalizer(mean: Tensor, var: Tensor, stats: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors of a saved policy's normaliser; the count is 0 if the file has none."""
     count = stats.get("count", torch.zeros(())).double().reshape(-1)[:1].sum()
     return {"normalizer.mean": mean.double(), "normalizer.var": var.double(), "normalizer.count": count}
 

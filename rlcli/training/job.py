@@ -1,4 +1,4 @@
-"""`Job`: everything that a training needs to know before it starts. The module imports neither torch nor MuJoCo."""
+"""`Job`: the run and the settings of a training that is to start. The module imports neither torch nor MuJoCo."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Job:
     resume_from: Checkpoint | None = None
     """Checkpoint to resume from; None: training starts at iteration 0."""
     created: bool = True
-    """Whether the run's folder was created for this job. A resumed run without a checkpoint starts again."""
+    """Whether the run's folder was created for this job; False for a run that is resumed or was prepared before."""
     init_from: Path | None = None
     """Folder of the checkpoint whose weights the policy starts with."""
     stages: list[int] = field(default_factory=list)

@@ -372,13 +372,14 @@ def _require_larger_budget(request: TrainingRequest, run: Run, folder: Path | No
         wanted = request.budget.get(f"agent.max_{unit}")
         if wanted is not None and wanted <= number:
             option = f"--max-{unit}"
-            message = f"{run.folder} has {number:,} {unit}, and {option} counts from its start: {wanted:,} end before"
+            done_text = f"{run.folder} has {number:,} {unit}"
+            message = f"{done_text}, and {option} counts from its start: {wanted:,} leaves nothing to train"
             hint = f"give more than {number}, or leave out {option} to keep the run's budget"
             raise UsageError(message, hint=hint)
 
 
 def _overrides_in(given: object) -> Any:
-    """Return the entries of `given` that overrides have set."""
+    """Return the entries that overrides have set, of the entry `given` (key -> origin of its value) of run.json."""
     if not isinstance(given, dict):
         return given
     return {key: origin for key, origin in given.items() if str(origin).startswith("override")}

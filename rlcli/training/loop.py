@@ -61,7 +61,7 @@ class TrainLoop:
     metrics: dict[str, float] = field(init=False, default_factory=dict)
     """Metrics of the newest iteration."""
     reached: bool = field(init=False, default=False)
-    """Whether an evaluation has reached the bar that ends the training."""
+    """Whether an evaluation has reached the threshold that ends the training (`--until`)."""
     _ranks: distributed.ProcessGroup = field(init=False, default_factory=distributed.current)
     _boundary: tuple[int, int] = field(init=False, default=(0, 0))
     """Iteration and environment steps at the beginning of the current iteration."""

@@ -28,7 +28,7 @@ class PeriodicEval:
         episodes: number of episodes of an evaluation.
         interval: number of iterations between evaluations.
         history: metrics of the previous iterations; an iteration without an evaluation is ignored.
-        until: bar that ends the training.
+        until: threshold at which the training ends; None: only its budget ends it.
     """
 
     def __init__(
@@ -53,7 +53,10 @@ class PeriodicEval:
         return iteration % self._interval == 0
 
     def run(self, policy: Callable[[], Policy]) -> dict[str, float]:
-        """Evaluate a policy. The policy is made inside, because making it draws random weights."""
+        """Evaluate the policy that `policy` returns, and restore the random generators after it.
+
+        The policy is built within, because building it draws random weights.
+        """
         with undisturbed():
             if self._env is None:
                 seed_generators(0)  # a task may draw random numbers while it is built

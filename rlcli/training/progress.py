@@ -1,4 +1,4 @@
-"""Progress of a training, for display. The module imports nothing heavy: another process displays it too."""
+"""Progress of a training, for display. The module imports nothing heavy, because other commands display it, too."""
 
 from __future__ import annotations
 
@@ -42,6 +42,7 @@ def progress_from_metrics(rows: Sequence[Mapping[str, Any]], iterations: int | N
     last = rows[-1]
     metrics = {k: v for k, v in last.items() if type(v) in (int, float) and k not in ("iteration", "step")}
     duration = sum(_number(row, "Perf/collection_time") + _number(row, "Perf/learning_time") for row in rows)
+    # steps before the iteration of the first row, whose duration counts, too
     before = rows[0]["step"] - rows[0]["step"] // max(1, rows[0]["iteration"])
     rate = (last["step"] - before) / duration if duration > 0.0 else 0.0
     steps_per_iteration = last["step"] / max(1, last["iteration"])

@@ -231,14 +231,15 @@ def _health(job: Job, iterations: int) -> Health | None:
 
 
 def _report_bar(run: Run, bar: str, reached: bool) -> None:
-    """Log and record the time and the steps that the training took to the bar of `--until`."""
+    """Log and record the time and the steps that the training took to the threshold `bar` of `--until`."""
     rows = read_metrics(run.metrics)
     seconds, step = sum(map(training_s, rows)), rows[-1]["step"] if rows else 0
     run.update(until={"bar": bar, "reached": reached, "seconds": seconds, "step": step})
     if reached:
         _log.info(f"{bar} reached after {step:,} steps and {seconds:.1f} s of rollouts and updates")
     else:
-        _log.warning(f"{bar} was not reached in {step:,} steps: the lower end of no evaluation's interval was so high")
+        why = "in no evaluation did the lower end of the 95 % interval reach it"
+        _log.warning(f"{bar} was not reached in {step:,} steps: {why}")
 
 
 def _training_videos(job: Job, stop: StopRequest) -> TrainingVideos | None:
@@ -271,4 +272,4 @@ def _warn_of_physics(env: Environment) -> None:
     }
     for name, count in env.engine.warnings.items():
         if count:
-            _log.warning("%s times: %s", count, advice[name])
+            _log.warning("MuJoCo warning (%s x): %s", count, advice[name])

@@ -52,7 +52,7 @@ def build_trainer(job: Job, device: str) -> tuple[Trainer, Environment]:
     if saved is None:
         trainer.start()
     elif job.writes and (dropped := drop_after(job.run.checkpoints, saved.step)):
-        _log.info("removed %s later checkpoints: the resumed run replaces them", len(dropped))
+        _log.info("removed later checkpoints, which the resumed run replaces: %s", len(dropped))
     return trainer, env
 
 
@@ -78,7 +78,7 @@ def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: E
         raise CheckpointError(f"{saved.folder} is corrupt: manifest.json and state.json have different steps")
     processes, size = state.values.get("processes", 1), distributed.current().world_size
     if processes != size:
-        _log.info("saved by %s processes, continued by %s: every environment starts a new episode", processes, size)
+        _log.info("saved with world size %s, resumed with %s: every environment starts a new episode", processes, size)
 
 
 def _load(saved: Checkpoint, load: Callable[[], Any], failure: str, hint: str | None = None) -> None:

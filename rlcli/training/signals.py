@@ -45,7 +45,7 @@ class StopRequest(StepObserver):
 
     @contextlib.contextmanager
     def interruptible(self, interruptible: bool = True) -> Iterator[None]:
-        """Let the first signal raise `Interrupted` at any point of the block, if a boundary is saved."""
+        """Let the first signal raise `Interrupted` at any point of the block, unless `interruptible` is False."""
         self._interruptible = interruptible
         try:
             self.check()

@@ -91,6 +91,6 @@ def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -
 
 
 def median(values: Sequence[float | None]) -> float | None:
-    """Return the median over seeds; None means that the threshold was not reached."""
+    """Return the median over seeds. None, as a value or as the result, means that the threshold was not reached."""
     found = statistics.median([math.inf if value is None else value for value in values])
     return found if math.isfinite(found) else None

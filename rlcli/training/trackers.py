@@ -1,6 +1,7 @@
 """Experiment trackers: Weights & Biases, MLflow and trackio.
 
-Without settings of the user a tracker writes only to this machine. A tracker can neither stop nor delay a training.
+Without settings of the user a tracker writes only to this machine. A tracker that fails after its start does not stop a
+training, and a slow one delays only its end, by at most a minute.
 """
 
 from __future__ import annotations
@@ -131,7 +132,7 @@ class BackgroundTracker:
 def open_tracker(
     name: str, kind: Callable[..., Tracker], run: Run, config: Mapping[str, Any], resume: tuple[int, int] | None
 ) -> FailSafeLogger:
-    """Open a tracker of a run. A resumed run is continued in the tracker, without a step twice.
+    """Open a tracker of a run. A resumed run continues in the tracker, which stores no step twice.
 
     `run.json` stores the tracker's identifier of the run, and the last step that the tracker had when the run was
     resumed.

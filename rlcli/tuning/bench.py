@@ -35,7 +35,7 @@ UNSTEADY = 0.15
 WORTH = 0.97
 """Share of the present iteration time below which another setting is recommended."""
 _ACTIONS = 8
-"""Different random actions that are applied in turn."""
+"""Number of different random actions that are applied in turn."""
 _ENV_BYTES = 256 * 2**10
 """Assumed memory of one environment before the first measurement [bytes]."""
 
@@ -93,7 +93,7 @@ class Trained:
 
     setting: Setting
     alike: bool
-    """Whether a training learns as with the present setting."""
+    """Whether an iteration has the same samples and gradient steps as with the present setting."""
     samples: int = 0
     """Samples in an iteration."""
     seconds: float | None = None
@@ -117,7 +117,7 @@ class Trained:
 
 @dataclass(slots=True)
 class Findings:
-    """Measurements so far."""
+    """Measurements of a benchmark so far."""
 
     stepped: list[Stepped] = field(default_factory=list)
     trained: list[Trained] = field(default_factory=list)
@@ -250,7 +250,7 @@ class Bench:
             return Stepped(num_envs, engine_threads, workers, rate, physics, _spread(blocks), resident_memory())
 
     def _too_large(self, num_envs: int) -> str | None:
-        """Return the reason for not building so many environments; None if they can be built."""
+        """Return the reason for not measuring so many environments (memory, time); None if they can be measured."""
         smaller = [row for row in self.findings.stepped if row.left_out is None and row.num_envs < num_envs]
         measured = sorted(smaller, key=lambda row: row.num_envs)
         first, last = (measured[0], measured[-1]) if measured else (None, None)
@@ -371,6 +371,7 @@ def _block(call: Callable[[], object], min_s: float) -> float:
 
 
 def _spread(blocks: list[float]) -> float:
+    """Return the interquartile range of the blocks' durations, divided by their median."""
     low, middle, high = statistics.quantiles(blocks, n=4, method="inclusive")
     return (high - low) / middle
 
@@ -392,5 +393,5 @@ def _describe(setting: Setting) -> str:
         parts.append(f"{setting.horizon} steps")
     if setting.minibatches is not None:
         parts.append(f"{setting.minibatches} minibatches")
-    threads = f"threads {setting.engine_threads} and {setting.torch_threads}"
+    threads = f"engine threads {setting.engine_threads}, torch threads {setting.torch_threads}"
     return ", ".join([*parts, threads, f"workers {setting.workers}"])

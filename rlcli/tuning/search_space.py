@@ -89,7 +89,7 @@ class Objective:
 
     @property
     def training_metric(self) -> str | None:
-        """The metric of training that the pruner compares; None: trials are not pruned."""
+        """Metric of a running training that the pruner compares: return or success; None: trials are not pruned."""
         return self.key if self.key in ("return", "success") else None
 
 

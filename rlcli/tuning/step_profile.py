@@ -20,7 +20,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.term import BoundTerm
 
 _WARM_UP = 32
-"""Number of steps before the measurement."""
+"""Number of steps before the measurement, and smallest number of measured steps."""
 _Stage = tuple[str, list[Callable[..., Any]], list[tuple[str, Callable[..., Any]]]]
 """A stage of the step: its name, its methods, and its terms as (name, function)."""
 
@@ -29,7 +29,8 @@ _Stage = tuple[str, list[Callable[..., Any]], list[tuple[str, Callable[..., Any]
 class Cost:
     """Time that one part of the step takes.
 
-    `section` is a stage of the step, as `rewards`; `term` is one of its terms, or None for the whole stage.
+    `section` is a stage of the step, such as `rewards`; `term` is one of its terms, or several that share a function,
+    or None for the whole stage.
     """
 
     section: str
@@ -50,7 +51,7 @@ def profile_step(resolved: Resolved, seconds: float) -> list[Cost]:
     try:
         env.reset(seed=0)
         actions = torch.rand(16, env.num_envs, env.layout.action_size, device=env.device) * 2.0 - 1.0
-        # ages differ as in a long training, so that episodes end in most steps
+        # environments are at different steps of their episodes, as in a long training: some episodes end in most steps
         env.episode_length_buf.copy_(torch.randint(env.max_episode_length, (env.num_envs,), device=env.device))
         _run(env, actions, 0.0)
         profile = cProfile.Profile(builtins=False)

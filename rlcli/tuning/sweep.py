@@ -50,7 +50,7 @@ _ENDED = ("COMPLETE", "PRUNED", "FAIL")
 
 @dataclass(slots=True)
 class Trial:
-    """Trial that is claimed by this process."""
+    """Trial that this process has claimed: while it holds the trial's lock, no other process runs the trial."""
 
     number: int
     folder: Path

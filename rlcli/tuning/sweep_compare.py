@@ -24,7 +24,7 @@ from rlcli.tuning.sweep import Sweep
 _log = logging.getLogger(__name__)
 
 ARMS = {"default": "the task's own settings", "best": "best trial"}
-"""Name in JSON -> name in messages."""
+"""The two compared settings: name in JSON -> name in messages."""
 
 
 @dataclass(slots=True)
@@ -32,6 +32,7 @@ class Training:
     """One training of a comparison."""
 
     arm: str
+    """Settings of the training, a name in ARMS."""
     seed: int
     folder: Path
     reached: Reached | None = None
@@ -51,7 +52,7 @@ class Training:
 
 @dataclass(slots=True)
 class Comparison:
-    """Trainings with both settings, and their times to the threshold."""
+    """Trainings with the task's own settings and with those of the best trial, and their times to the threshold."""
 
     sweep: Path
     task: str
@@ -111,9 +112,10 @@ class Comparison:
 def compare(
     sweep: Sweep, request: TrainingRequest, seeds: Sequence[int], until: str | None, episodes: int, stop: StopRequest
 ) -> Comparison:
-    """Train with both settings, one training after the other, until an evaluation reaches the threshold.
+    """Train with the task's own settings and with those of the best trial, until an evaluation reaches the threshold.
 
-    The runs are kept in the sweep's folder, so that the same command continues after an interruption.
+    The trainings run one after the other. They are kept in the sweep's folder, so that the same command continues after
+    an interruption.
 
     Args:
         sweep: the sweep.
@@ -180,7 +182,7 @@ def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[Traini
 def _train(
     comparison: Comparison, request: TrainingRequest, arm: str, changes: Sequence[str], stop: StopRequest
 ) -> Training:
-    """Train with one of the settings until the threshold is reached, the budget is spent, or a signal arrives."""
+    """Train with the settings `arm` until the threshold is reached, the budget is spent, or a signal arrives."""
     seed, threshold = request.seed, comparison.threshold
     name = "compare-default" if arm == "default" else f"compare-trial-{comparison.trial:04d}"
     training = Training(arm, seed, _run_folder(comparison.sweep, f"{name}-seed-{seed}", request, changes))

@@ -65,7 +65,7 @@ def write_preset(sweep: Sweep, request: TrainingRequest) -> None:
 
 @dataclass(slots=True)
 class _Stage:
-    """Training or evaluation of a trial."""
+    """Training or evaluation of a trial in a subprocess."""
 
     trial: Trial
     process: TrainingProcess

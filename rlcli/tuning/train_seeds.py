@@ -1,4 +1,4 @@
-"""Training of one configuration with several seeds, and their aggregated learning curves."""
+"""Training of one configuration with several seeds (a study), and their aggregated learning curves."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ class StudyView(AbstractContextManager[Any], Protocol):
 
 @dataclass(slots=True)
 class StudyResult:
-    """State of a study at the end of `train_seeds`."""
+    """State of a study, the runs of one configuration with several seeds, at the end of `train_seeds`."""
 
     folder: Path
     task: str

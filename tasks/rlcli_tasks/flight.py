@@ -1,7 +1,7 @@
 """Base of the direct tasks that fly from point to point.
 
-The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, and
-what outlives a step is written in place.
+The hooks can also run as a CUDA graph on a GPU: they read no value back, select environments by masks instead of
+indices, and write tensors that are kept between steps in place.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rlcli.sim.selection import Selection
 class FlightTask(DirectTask):
     """Hover at the target, which jumps every `target_period` steps.
 
-    The `Params` of a robot add the box that targets are drawn from: `target_low` and `target_high` [m].
+    A subclass's `Params` add the box from which targets are sampled: `target_low` and `target_high` [m].
     """
 
     class Params(StrictModel):

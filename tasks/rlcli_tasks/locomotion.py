@@ -1,7 +1,7 @@
 """Base of the direct locomotion tasks: a robot with a torso, joints and feet runs to a far target.
 
-The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, what
-outlives a step is written in place, and tensors are few.
+The hooks can also run as a CUDA graph on a GPU: they read no value back, select environments by masks instead of
+indices, write tensors that are kept between steps in place, and create few tensors.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _JOINTS_FROM = 12
 
 
 def observation_names(joints: tuple[str, ...], feet: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of the columns."""
+    """Return the names of the columns of the observation."""
     return (
         *("height", "vel_x", "vel_y", "vel_z", "rate_x", "rate_y", "rate_z", "yaw", "roll", "target_angle"),
         *("up", "heading"),
@@ -38,7 +38,10 @@ def observation_names(joints: tuple[str, ...], feet: tuple[str, ...]) -> tuple[s
 
 
 def observation_units(joints: int, feet: int, *, rate: str, joint_rate: str, force: str) -> tuple[str, ...]:
-    """Return the units of the columns; rate, joint_rate and force are the value of 1, force without its unit."""
+    """Return the units of the observation's columns.
+
+    A torso rate of `rate`, a joint velocity of `joint_rate` and a force of `force` (without unit) are observed as 1.
+    """
     return (
         *("m", "m/s", "m/s", "m/s", rate, rate, rate, "rad", "rad", "rad", "", ""),
         *("half range",) * joints,
@@ -77,11 +80,11 @@ class LocomotionTask(DirectTask):
     joints: ClassVar[tuple[str, ...]]
     """Joint names in the order of observations and actions, which is the model's order."""
     rate_scale: ClassVar[float]
-    """Factor of the torso's angular velocity."""
+    """Factor on the torso's angular velocity in observations."""
     joint_vel_scale: ClassVar[float]
-    """Factor of joint velocities."""
+    """Factor on joint velocities in observations."""
     force_scale: ClassVar[float]
-    """Factor of forces and torques of the feet."""
+    """Factor on forces and torques of the feet in observations."""
 
     params: Any
 

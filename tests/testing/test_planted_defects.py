@@ -257,7 +257,7 @@ def test_truncation_finds_missing_time_out(managed):
 def test_truncation_finds_early_time_out(managed):
     managed.terms = "def soon(env) -> Tensor:\n    return env.episode_length_buf >= env.max_episode_length - 1\n"
     managed.config["terminations"]["time_out"] = {"func": "soon", "time_out": True}
-    assert "1 steps before its limit" in errors(managed)["truncation"].message
+    assert "1 step before its limit" in errors(managed)["truncation"].message
 
 
 def test_termination_finds_undeclared_time_out(managed):
@@ -346,7 +346,7 @@ def test_raising_check_is_finding_and_others_run(direct):
     found = errors(direct)
     assert "KeyError: 'partial'" in found["finite"].message
     assert "task.py:" in found["finite"].where
-    assert found["partial-reset"].hint == "see finite"
+    assert found["partial-reset"].hint == "see the check finite"
     assert "start-states" in found
 
 

@@ -24,7 +24,7 @@ class _Arm(GymnasiumTask):
     reads = ("xpos",)
 
     def body_position(self, body: str) -> Tensor:
-        """Return a body's position, one physics step late. (num_envs, 3) [m]"""
+        """Return a body's position; as in Gymnasium, it lags by one physics step. (num_envs, 3) [m]"""
         return self.field.xpos[:, self.bodies[body]]
 
     def post_reset(self) -> None:
@@ -34,7 +34,7 @@ class _Arm(GymnasiumTask):
         super().post_reset()
 
     def velocities(self, selection: Selection, still: int) -> Tensor:
-        """Return small velocities for the arm, and 0 for the last joints, which have no actuator. (rows, nv)"""
+        """Return small velocities for the arm, and 0 for the last `still` joints, which have no actuator. (rows, nv)"""
         noise = self.noise(selection, 0.005, self.model.nv)
         noise[:, -still:] = 0.0
         return noise

@@ -21,8 +21,9 @@ from rlcli.sim.selection import Selection
 class GymnasiumTask(DirectTask):
     """One of Gymnasium's MuJoCo tasks.
 
-    `observation` (num_envs, k) and `reward` (num_envs,) are what the buffers hold, before the cast to float32. `ended`
-    (num_envs,) is where the task terminates the episode; it is computed once per step, also for the reward.
+    `observation` (num_envs, k) and `reward` (num_envs,) are the values of the buffers before the cast to float32.
+    `ended` (num_envs,) is true where the task terminates the episode; it is computed once per step, also for the
+    reward.
     """
 
     motors = False

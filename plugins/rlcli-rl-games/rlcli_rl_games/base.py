@@ -28,9 +28,9 @@ from rlcli_rl_games.vec_env import RlGamesVecEnv
 ACTIVATIONS = {"swish": "silu"}
 """rl_games' names of activations that differ from those of a saved policy."""
 OBSERVATION_CLIP = 5.0
-"""rl_games clips normalized observations to +-this."""
+"""rl_games clips normalized observations to +-this value."""
 _EPSILON = 1e-5
-"""rl_games adds this to the variance of observations."""
+"""rl_games adds this number to the variance of observations."""
 _LEARNER_HINT = "lower the learning rate or grad_norm in params.config; the last good checkpoint is kept"
 
 
@@ -39,9 +39,9 @@ class RlGamesTrainer(BaseTrainer):
 
     Args:
         env: the environment.
-        config: the agent.
-        seed: of the networks and of exploration.
-        device: device of the networks and the samples, that of the environment.
+        config: configuration of the agent.
+        seed: seed of the initial weights and of exploration.
+        device: device of networks and samples; it must be the device of the environment.
         torch_threads: threads of torch outside of the environment's step.
     """
 
@@ -199,7 +199,7 @@ class RlGamesTrainer(BaseTrainer):
     def _error(self, key: str, message: str, hint: str) -> ConfigError:
         return agent_error(self.env, ("params", "config", key), message, hint)
 
-    # --- the observation normalizer, which a saved policy has in another form ---
+    # --- the observation normalizer: a saved policy adds 1e-8 to the variance instead of rl_games' epsilon ---
 
     def _normalizer_tensors(self) -> dict[str, Tensor]:
         if not self.spec.normalize:
@@ -225,7 +225,7 @@ def mean_of(values: list[Any]) -> float:
 
 
 def _with_none_activations(value: Any) -> Any:
-    """Return a copy in which a missing activation is the word that rl_games writes for it."""
+    """Return a copy in which null activations are the text "None", which rl_games expects."""
     if isinstance(value, dict):
         return {
             key: "None" if item is None and "activation" in key else _with_none_activations(item)

@@ -1,6 +1,6 @@
 """rl_games' settings in the form of a train YAML, under `params`.
 
-Light: a YAML is checked without importing torch or rl_games.
+The module imports neither torch nor rl_games, so that a YAML is checked fast.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ class _Settings(StrictModel):
 
 
 class Named(StrictModel):
-    """Something that rl_games finds by its name."""
+    """Reference to an algorithm or a model of rl_games by its name."""
 
     name: str
-    """The name."""
+    """Name in rl_games."""
 
 
 class MlpConfig(StrictModel):
@@ -100,7 +100,7 @@ class NetworkConfig(StrictModel):
     """Actor and critic of PPO."""
 
     name: Literal["actor_critic"] = "actor_critic"
-    """actor_critic"""
+    """Name of the network in rl_games."""
     separate: bool = False
     """Whether the critic has a separate network; otherwise it is one more output of the actor's."""
     space: SpaceConfig = SpaceConfig()
@@ -113,7 +113,7 @@ class SacNetworkConfig(StrictModel):
     """Actor and critics of SAC."""
 
     name: Literal["soft_actor_critic"] = "soft_actor_critic"
-    """soft_actor_critic"""
+    """Name of the network in rl_games."""
     separate: Literal[True] = True
     """Actor and critics are separate networks."""
     space: dict[str, Any] | None = None
@@ -153,7 +153,7 @@ class CentralValueConfig(_Settings):
     clip_value: bool
     """Clip the change of the value."""
     normalize_input: bool
-    """Normalize its observations."""
+    """Normalize the observations of this critic."""
     truncate_grads: bool = False
     """Clip the gradient's norm to grad_norm."""
     grad_norm: Positive = 1.0
@@ -167,10 +167,10 @@ class CentralValueConfig(_Settings):
 
 
 class CentralNetworkConfig(StrictModel):
-    """The network of a central value."""
+    """The network of a separate critic (`central_value_config`)."""
 
     name: Literal["actor_critic"] = "actor_critic"
-    """actor_critic"""
+    """Name of the network in rl_games."""
     central_value: Literal[True] = True
     """Only a value output, no actions."""
     mlp: MlpConfig
@@ -268,7 +268,7 @@ class SacSettings(_Settings):
     batch_size: Count
     """Transitions per update."""
     replay_buffer_size: Count
-    """Size of the replay buffer, over all environments."""
+    """Transitions in the replay buffer, over all environments."""
     init_alpha: Positive
     """Initial entropy temperature."""
     learnable_temperature: bool
@@ -302,9 +302,9 @@ class PpoParams(_Params):
     """`params` of PPO."""
 
     algo: Named = Named(name="a2c_continuous")
-    """a2c_continuous"""
+    """Algorithm of rl_games; its name must be a2c_continuous."""
     model: Named = Named(name="continuous_a2c_logstd")
-    """continuous_a2c_logstd"""
+    """Model of rl_games; its name must be continuous_a2c_logstd."""
     network: NetworkConfig
     """Networks."""
     config: PpoSettings
@@ -321,9 +321,9 @@ class SacParams(_Params):
     """`params` of SAC."""
 
     algo: Named = Named(name="sac")
-    """sac"""
+    """Algorithm of rl_games; its name must be sac."""
     model: Named = Named(name="soft_actor_critic")
-    """soft_actor_critic"""
+    """Model of rl_games; its name must be soft_actor_critic."""
     network: SacNetworkConfig
     """Networks."""
     config: SacSettings
@@ -376,7 +376,7 @@ class PpoConfig(RlGamesConfig):
     """Proximal policy optimization (rl_games' `a2c_continuous`)."""
 
     algorithm: Literal["ppo"] = "ppo"
-    """ppo"""
+    """Algorithm: ppo."""
     params: PpoParams
     """`params` of a train YAML, unchanged."""
 
@@ -397,7 +397,7 @@ class SacConfig(RlGamesConfig):
     """Soft actor-critic (rl_games' `sac`). An iteration is `num_steps_per_episode` steps of every environment."""
 
     algorithm: Literal["sac"] = "sac"
-    """sac"""
+    """Algorithm: sac."""
     action_bound: Positive = 1.0
     """Actions are tanh times this bound."""
     params: SacParams

@@ -57,11 +57,11 @@ class RlGamesVecEnv(IVecEnv):
         return self.result.truncated & ~self.result.terminated
 
     def get_env_info(self) -> dict[str, Any]:
-        """Return the spaces."""
+        """Return the observation and action spaces, with actions in +-1."""
         return self.spaces(1.0)
 
     def spaces(self, bound: float) -> dict[str, Any]:
-        """Return the spaces, with actions in +-bound."""
+        """Return the observation and action spaces, with actions in +-bound."""
 
         def box(size: int, limit: float) -> Any:
             return gym.spaces.Box(-limit, limit, (size,), np.float32)

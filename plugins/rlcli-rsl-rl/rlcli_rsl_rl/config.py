@@ -1,6 +1,6 @@
 """RSL-RL's settings, in the form of a `RslRlOnPolicyRunnerCfg` or of RSL-RL 5.
 
-Light: a YAML is checked without importing torch or RSL-RL.
+The module imports neither torch nor RSL-RL, so that a YAML is checked fast.
 """
 
 from __future__ import annotations
@@ -207,10 +207,10 @@ class RunnerConfig(AgentConfig):
     """Return after a time-out: gamma times the value of the last observation of the episode, or, as in RSL-RL
     itself, of the observation before the step."""
     action_bound: Positive | None = None
-    """Actions are clipped to +-this in training, play and export alike; null: unbounded. RSL-RL's name for it,
-    `clip_actions`, is accepted."""
+    """Actions are clipped to +-this value in training, play and export alike; null: unbounded. RSL-RL's name of this
+    key, `clip_actions`, is accepted, too."""
     class_name: Literal["OnPolicyRunner"] = "OnPolicyRunner"
-    """OnPolicyRunner"""
+    """Name of RSL-RL's runner."""
     num_steps_per_env: Count = 24
     """Steps per environment and iteration."""
     obs_groups: dict[str, Annotated[list[str], Field(min_length=1)]] = _NO_GROUPS

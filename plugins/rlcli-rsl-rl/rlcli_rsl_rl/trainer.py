@@ -37,18 +37,18 @@ _log = logging.getLogger(__name__)
 
 _ACTIVATIONS = {"swish": "silu"}
 _NORMALIZER_EPS = 1e-2
-"""RSL-RL adds this to the standard deviation of observations."""
+"""RSL-RL adds this number to the standard deviation of observations."""
 _LEARNER_HINT = "lower algorithm.learning_rate or algorithm.max_grad_norm; the last good checkpoint is kept"
 
 
 class RslRlTrainer(BaseTrainer):
-    """RSL-RL's PPO, driven as its runner does, whose state can be saved after any iteration.
+    """Trainer that calls RSL-RL's PPO as RSL-RL's own runner does; its state can be saved after any iteration.
 
     Args:
         env: the environment.
-        config: the agent.
-        seed: of the networks and of exploration.
-        device: device of the networks and the samples, that of the environment.
+        config: configuration of the agent.
+        seed: seed of the initial weights and of exploration.
+        device: device of networks and samples; it must be the device of the environment.
         torch_threads: threads of the update; the rollout runs torch on one thread, since two thread pools compete.
     """
 
@@ -162,7 +162,7 @@ class RslRlTrainer(BaseTrainer):
 
     @torch.no_grad()
     def _collect(self) -> None:
-        """Take `num_steps_per_env` in every environment; then estimate returns."""
+        """Take `num_steps_per_env` steps in every environment; then estimate returns."""
         bound, pre_step = self.config.action_bound, self.config.bootstrap == "pre_step"
         for _ in range(self.config.num_steps_per_env):
             action = self.alg.act(self._obs)

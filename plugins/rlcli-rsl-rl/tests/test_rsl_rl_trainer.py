@@ -296,7 +296,7 @@ def test_ignored_settings_are_reported_once(caplog):
         (["agent.actor={hidden_dims: [4]}"], "agents.rsl-rl", "older form"),
         (["agent.algorithm.desired_kl=null"], "agents.rsl-rl", "desired_kl"),
         (["agent.algorithm.class_name=Distillation"], "algorithm", "teacher"),
-        (["agent.clip_actions=1.0", "agent.action_bound=2.0"], "agents.rsl-rl", "two names of one setting"),
+        (["agent.clip_actions=1.0", "agent.action_bound=2.0"], "agents.rsl-rl", "name one setting"),
     ],
 )
 def test_invalid_settings_are_refused_without_heavy_imports(overrides, place, words):
@@ -311,7 +311,7 @@ def test_invalid_settings_are_refused_without_heavy_imports(overrides, place, wo
     [
         (["agent.obs_groups={critic: [camera]}"], "obs_groups.critic", "camera"),
         (["agent.obs_groups={teacher: [policy]}"], "obs_groups.teacher", "sets: "),
-        ([CRITIC, "agent.obs_groups={policy: [critic]}"], "obs_groups.policy", "policy alone"),
+        ([CRITIC, "agent.obs_groups={policy: [critic]}"], "obs_groups.policy", "only the observation group 'policy'"),
         (["agent.algorithm.num_mini_batches=90"], "algorithm.num_mini_batches", "96 samples"),
         (
             ["agent.algorithm.symmetry_cfg={data_augmentation_func: 'rlcli.random:nothing'}"],

@@ -115,7 +115,10 @@ class Collector:
             own.copy_(obs[group])
 
     def _inputs(self, t: int, obs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the normalised inputs of actor and critic at step t; store and count the raw observations."""
+        """Return the normalised inputs of actor and critic at step t, and store the raw observations.
+
+        With `normalizer_update: step` the raw observations also update the normalisers, before they are used.
+        """
         if self.normalizer is not None:
             for group, raw in self.raw_obs.items():
                 raw[t].copy_(obs[group])
@@ -153,7 +156,8 @@ class Collector:
             A_t     = delta_t + gamma lambda A_t+1                              (11, as a recursion)
 
         At the end of an episode both V(s_t+1) and A_t+1 are 0. At a time-out the reward r_t gets an additional
-        gamma V(last observation of the episode). The regression target of the critic is A_t + V(s_t).
+        gamma V(last observation of the episode), or gamma V(s_t) with `bootstrap: pre_step`. The regression target of
+        the critic is A_t + V(s_t).
         """
         config, rollout, samples = self.config, self.rollout, self.rollout.samples
         values = self._values() if self.networks.memory is None else self._recurrent_values()
@@ -203,6 +207,7 @@ class Collector:
         return self._value(features), self._value(last), time_out_value
 
     def _value(self, critic_obs: Tensor) -> Tensor:
+        """Return the critic's value in the unit of the rewards, without normalisation. (..., c) -> (...)"""
         value: Tensor = self.networks.value(critic_obs)
         return value if self.value_normalizer is None else self.value_normalizer.inverse(value)
 

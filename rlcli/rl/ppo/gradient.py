@@ -40,7 +40,9 @@ class LayerGradients(Protocol):
     """Computation of the gradients of the layers of both networks."""
 
     def __call__(self, obs: Tensor, critic_obs: Tensor, objective: Objective) -> tuple[Tensor, Tensor]:
-        """Write the gradients; return the sums that `Objective`'s functions return. Inputs (n, d), (n, c)"""
+        """Write the gradients; return the statistics of `Objective.mean_gradient` and `value_gradient`, summed over all
+        samples. Inputs (n, d), (n, c)
+        """
 
 
 MakeLayerGradients = Callable[[Sequence[Tensor]], LayerGradients]
@@ -48,7 +50,7 @@ MakeLayerGradients = Callable[[Sequence[Tensor]], LayerGradients]
 
 
 def threaded_gradients(networks: ActorCritic, rows: int, threads: int) -> MakeLayerGradients:
-    """Return the computation of `LayerGradients` by threads of this process."""
+    """Return a factory of `LayerGradients` that are computed by threads of this process."""
 
     def make(gradients: Sequence[Tensor]) -> LayerGradients:
         mlps = MlpGradients(networks.actor, networks.critic, gradients, rows, threads)
@@ -92,7 +94,7 @@ class ClosedFormGradient:
         networks: actor and critic for which `has_closed_form` is true.
         out: vector for the gradient and, after it, the KL divergence.
         slices: parameter name -> slice of its gradient in `out`.
-        compute: what computes the gradients of the layers: threads or processes.
+        compute: factory of the computation of the layers' gradients, by threads or processes.
     """
 
     def __init__(
@@ -133,7 +135,7 @@ class Objective:
     Args:
         config: configuration of the agent.
         batch: the minibatch.
-        advantage: advantages, standardized if the agent does so. (n,)
+        advantage: advantages, normalised if the agent normalises advantages. (n,)
         std: standard deviation of the policy. (a,)
         mean: memory for the outputs of the actor. (n, a)
     """

@@ -28,12 +28,12 @@ from rlcli.rl.ppo.rollout_buffer import RolloutBuffer, Samples
 def distributed_gradients(
     env: ShardedEnv, networks: ActorCritic, weights: Tensor, config: PpoConfig, rollout: RolloutBuffer
 ) -> Callable[[Sequence[Tensor]], LayerGradients]:
-    """Return the computation of `LayerGradients` by the processes of an environment.
+    """Return a factory of `LayerGradients` that are computed by the processes of an environment.
 
     Args:
         env: the environment.
         networks: actor and critic, MLPs.
-        weights: their parameters, one vector. (p,)
+        weights: vector of all parameters of both networks. (p,)
         config: configuration of the agent.
         rollout: buffer whose minibatches are moved to shared memory.
     """
@@ -71,7 +71,7 @@ def distributed_gradients(
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """Everything that does not change during a training."""
+    """Networks, settings and sizes that each process receives once, before the first update."""
 
     actor: Mlp
     critic: Mlp
@@ -79,16 +79,20 @@ class _Job:
     """Where each parameter is in the vector of all parameters."""
     config: PpoConfig
     columns: tuple[int, int, int]
+    """Columns of actor observation, critic observation and action (`RolloutBuffer.columns`)."""
     sizes: list[int]
+    """Number of samples of each minibatch."""
     rows: int
+    """Number of samples of the largest minibatch."""
 
 
 class _Share:
-    """One process's share of the work."""
+    """Gradient computation of one process: it computes every n-th part of a minibatch, in shared memory."""
 
     def __init__(self, env: VecEnv, job: _Job) -> None:
         tensors = {name.removeprefix("gradient."): tensor for name, tensor in env.shard.shared.items()}
-        actor, critic = copy.deepcopy((job.actor, job.critic))  # in the main process they are the trainer's
+        # copies: in the main process the job holds the trainer's own networks, whose parameters must not move
+        actor, critic = copy.deepcopy((job.actor, job.critic))
         for name, parameter in _parameters(actor, critic):
             start, shape = job.slices[name]
             parameter.data = tensors["weights"][start : start + shape.numel()].view(shape)
@@ -99,7 +103,7 @@ class _Share:
         self._first, self._step = env.shard.number, env.shard.number_of_shards
 
     def compute(self, number: int) -> None:
-        """Write the gradients of every n-th part of a minibatch, n being the number of processes."""
+        """Write the gradients of this process's parts of minibatch `number`: every n-th part for n processes."""
         batch, tensors = self._batches[number], self._tensors
         rows = len(batch.target)
         objective = Objective(self._config, batch, tensors["advantage"][:rows], tensors["std"], tensors["mean"][:rows])

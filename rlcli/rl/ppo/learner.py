@@ -75,7 +75,7 @@ class Learner:
             self.minibatch_gradient = AutogradGradient(self._networks, self.gradient_and_kl, self.functions.loss)
 
     def _gradient_computation(self, threads: int) -> MakeLayerGradients:
-        """Return what computes the gradients of the layers: the processes of the environment, or threads."""
+        """Return the factory of the layers' gradients, computed by the processes of the environment or by threads."""
         env, rollout = self.collector.env, self.collector.rollout
         if env.workers > 1:
             from rlcli.envs.sharding.env import ShardedEnv

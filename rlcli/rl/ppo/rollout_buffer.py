@@ -63,7 +63,7 @@ class RolloutBuffer:
         self._packed = torch.zeros(steps, envs, obs + critic_obs + 2 * action + 5, device=device)
         self.columns, self.sizes = sizes, minibatches
         self.samples = Samples.views(self._packed, *sizes)
-        """(num_steps, num_envs, ...)"""
+        """Samples in the order in which they were collected. (num_steps, num_envs, ...)"""
         self.move(torch.zeros(self._packed.shape[0] * envs, self._packed.shape[2], device=device))
         self.old_std = torch.ones(len(minibatches), action, device=device)
         """Standard deviation of the old policy, for each minibatch; its mean is `Samples.mean`. (minibatches, a)"""
@@ -85,7 +85,7 @@ class RolloutBuffer:
         """Use other memory for the samples in the order of the minibatches. (num_steps * num_envs, ...)"""
         self.ordered = memory
         self.minibatches = [Samples.views(part, *self.columns) for part in memory.split_with_sizes(self.sizes)]
-        """(n, ...) each"""
+        """Samples of each minibatch, views of `ordered`. (n, ...) each"""
 
     def is_finite(self) -> bool:
         """Return whether all samples are finite."""

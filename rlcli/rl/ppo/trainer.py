@@ -210,5 +210,5 @@ def _module_tensors(name: str, module: nn.Module | None) -> dict[str, Tensor]:
 
 
 def _suffix(rank: int) -> str:
-    """Return the suffix of a rank's files and entries in a checkpoint."""
+    """Return the suffix of a rank's files and entries in a checkpoint; rank 0 has none."""
     return f".{rank}" if rank else ""

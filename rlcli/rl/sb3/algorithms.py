@@ -18,7 +18,7 @@ from rlcli.rl.statistics import EpisodeStatistics
 
 
 class _Collecting:
-    """Attributes of both kinds of algorithms, which the trainer sets after it has built the model."""
+    """Base of on-policy and off-policy algorithms: attributes that the trainer sets after it has built the model."""
 
     source: Environment
     statistics: EpisodeStatistics
@@ -74,11 +74,11 @@ class _OnPolicy(_Collecting):
 
 
 class FastPPO(_OnPolicy, PPO):  # type: ignore[misc]
-    """SB3's PPO."""
+    """SB3's PPO with rollouts in torch."""
 
 
 class FastA2C(_OnPolicy, A2C):  # type: ignore[misc]
-    """SB3's A2C."""
+    """SB3's A2C with rollouts in torch."""
 
 
 class _OffPolicy(_Collecting):
@@ -121,12 +121,12 @@ class _OffPolicy(_Collecting):
 
 
 class FastSAC(_OffPolicy, SAC):  # type: ignore[misc]
-    """SB3's SAC."""
+    """SB3's SAC with rollouts in torch."""
 
 
 class FastTD3(_OffPolicy, TD3):  # type: ignore[misc]
-    """SB3's TD3."""
+    """SB3's TD3 with rollouts in torch."""
 
 
 class FastDDPG(_OffPolicy, DDPG):  # type: ignore[misc]
-    """SB3's DDPG."""
+    """SB3's DDPG with rollouts in torch."""

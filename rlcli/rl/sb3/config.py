@@ -162,7 +162,7 @@ class Td3Config(OffPolicyConfig):
     target_policy_noise: NotNegative = 0.2
     """Standard deviation of the noise on the target's actions."""
     target_noise_clip: NotNegative = 0.5
-    """Largest absolute value of that noise."""
+    """Largest absolute value of the noise on the target's actions."""
 
 
 class DdpgConfig(OffPolicyConfig):

@@ -1,7 +1,7 @@
 """A table on three legs catches a ball and holds it in the middle.
 
-The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, and
-what outlives a step is written in place.
+The hooks can also run as a CUDA graph on a GPU: they read no value back, select environments by masks instead of
+indices, and write tensors that are kept between steps in place.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Hand in the direct workflow: fingers turn a cube to one orientation after another.
 
-The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, and
-what outlives a step is written in place.
+The hooks can also run as a CUDA graph on a GPU: they read no value back, select environments by masks instead of
+indices, and write tensors that are kept between steps in place.
 """
 
 from __future__ import annotations
@@ -217,6 +217,7 @@ class HandTask(DirectTask):
         self.reset_buf.copy_(self.distance >= self.params.fall_distance)
 
     def _draw_goal(self, selection: Selection) -> None:
+        """Sample a goal orientation, and show it in the viewer."""
         quat = _random_rotation(selection)
         selection.write(self.goal_quat, quat)
         self.shown.write_root_pose(selection, selection.read(self.shown_pos), quat)

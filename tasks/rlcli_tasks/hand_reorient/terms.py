@@ -1,4 +1,4 @@
-"""Success terms. (num_envs,) each."""
+"""Term for the condition of success of `hand-reorient`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Open drawer in the direct workflow: an arm grasps the handle of a drawer and pulls.
 
-The hooks are written for a GPU as much as for a CPU: no value is read back, no environment is picked by an index, what
-outlives a step is written in place, and tensors are few.
+The hooks can also run as a CUDA graph on a GPU: they read no value back, select environments by masks instead of
+indices, write tensors that are kept between steps in place, and create few tensors.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from rlcli.sim.selection import Selection
 
 JOINTS = (*(f"joint{i}" for i in range(1, 8)), "finger_left", "finger_right")
 FINGERS = slice(7, 9)
-"""Columns of the joints and of the action."""
+"""Columns of the fingers in joint positions and in the action."""
 WAY, OPENING, OPENING_RATE = slice(18, 21), 21, 22
-"""Columns of the observation."""
+"""Columns of the observation: vector from the grasp point to the handle, opening of the drawer, and its rate."""
 FULLY_OPEN = 0.04
-"""Position of a finger [m]."""
+"""Position of a finger when the gripper is fully open [m]."""
 
 
 class DrawerTask(DirectTask):
