@@ -79,9 +79,11 @@ class AutogradGradient:
         return result
 
 
-def has_closed_form(networks: ActorCritic) -> bool:
-    """Return whether `ClosedFormGradient` supports the networks: MLPs on a CPU, no RNN, no CNN, no `tell_coef` loss."""
+def has_closed_form(networks: ActorCritic, config: PpoConfig) -> bool:
+    """Return whether `ClosedFormGradient` supports the agent: MLPs on a CPU, no RNN, no CNN, no auxiliary loss."""
     others = (networks.memory, networks.vision, networks.critic_vision, networks.teller)
+    if config.symmetry is not None and config.symmetry.mirror_coef:
+        return False
     return all(other is None for other in others) and all(map(is_plain, (networks.actor, networks.critic)))
 
 
@@ -123,7 +125,8 @@ class ClosedFormGradient:
             self._out[-1:].copy_(kl)
             loss = surrogate + config.value_coef * value_loss - config.entropy_coef * policy_entropy
             loss = loss + config.bounds_coef * bounds
-            metrics = torch.stack((surrogate, value_loss, policy_entropy, kl, clip_fraction, bounds))
+            mirror = networks.mirror_error(objective.mean)
+            metrics = torch.stack((surrogate, value_loss, policy_entropy, kl, clip_fraction, bounds, mirror))
         return LossResult(loss, metrics, objective.mean, std)
 
 
