@@ -148,6 +148,8 @@ def probe(trainer: Trainer) -> dict[str, float]:
             edges = torch.tensor(term.clip, device=obs.device)[:, None] * scale
             at_edge = ((obs[:, columns] - edges[:, None]).abs() <= _AT * edges[:, None].abs()).any(dim=0)
             found[f"Health/clipped/{term.name}"] = float((at_edge & ~constant[columns]).float().mean())
+    shares = trainer.env.local.condition_shares()
+    found |= {f"Health/held/{name}": share for name, share in shares.items()}
     with undisturbed():  # a new policy draws random weights
         policy = trainer.policy().to(obs.device)
     if policy.normalizer is not None and policy.normalizer.clip is not None:
@@ -290,7 +292,11 @@ def blocked_success(health: Health) -> Found:
         alone = bool(others) and min(others) > 0.5 and held < 0.1 * min(others) and health.progress == 1.0
         learned = health.change(RETURN) > 1.0 and not _approaches(health.values(RETURN))
         never = max(health.values(f"Success/{name}")) == 0.0 and (learned or health.progress == 1.0)
-        if (never and not _approaches(_gaps(values, condition.model_dump()))) or alone:
+        gaps, states = _gaps(values, condition.model_dump()), health.values(f"Health/held/{name}")
+        # the mean is near the bound, but no environment is within it in any of the states at the checks
+        halved = len(gaps) > 3 and statistics.fmean(gaps[-3:]) > 0.5 * statistics.fmean(gaps[:3])
+        unreachable = not any(health.values(f"Success/{name}")) and len(states) > 2 and not any(states) and halved
+        if (never and not _approaches(gaps)) or alone or unreachable:
             value = f", its value is {statistics.fmean(values[-3:]):.3g}, and the bound is" if values else ""
             bound = bound_text(condition.model_dump())
             message = f"the condition '{name}' of success holds in {held:.1%} of the episodes{value} {bound}".rstrip()
