@@ -8,6 +8,7 @@ to be the column of the mirror image, or another column of the same term, or its
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,11 +55,12 @@ class MirrorMaps:
     action: ColumnMap
 
 
-def mirror_maps(resolved: Resolved, *, tolerance: float) -> MirrorMaps:
+def mirror_maps(resolved: Resolved, groups: Iterable[str], *, tolerance: float) -> MirrorMaps:
     """Derive the mirror maps of a task, and test them.
 
     Args:
         resolved: the task.
+        groups: the observation groups that need a map.
         tolerance: largest mean difference between a motion, reward or observation and its mirror image, relative to the
             mean size of its changes.
 
@@ -71,7 +73,7 @@ def mirror_maps(resolved: Resolved, *, tolerance: float) -> MirrorMaps:
     env = make_env(_without_randomness(resolved), shared_streams=_PAIRS)
     assert isinstance(env, ManagedEnv)
     try:
-        return _MirrorTest(env, tolerance).run()
+        return _MirrorTest(env, tolerance).run(groups)
     except TaskError as error:
         raise ConfigError(
             [resolved.problem(path, str(error), "mend the task, raise symmetry.tolerance or set symmetry: null")]
@@ -104,7 +106,7 @@ class _MirrorTest:
         self._mirrors = {name: EntityMirror(entity) for name, entity in env.entities.items()}
         self._action = self._action_map()
 
-    def run(self) -> MirrorMaps:
+    def run(self, groups: Iterable[str]) -> MirrorMaps:
         """Take the steps, compare, and return the maps.
 
         Raises:
@@ -121,12 +123,14 @@ class _MirrorTest:
             for sensor in env.sensors.values():
                 sensor.update(env.step_dt)
             self._compare_motion(before)
-            env._compute_rewards_and_dones(None)
+            _, terminated, _ = env._compute_rewards_and_dones(None)
+            own, images = terminated.float().chunk(2)
+            self._require((images - own).abs().mean(), "terminations differ between mirror images")
             rewards.append(env.reward_manager.step_terms.T.clone())
             observed.append({name: obs.clone() for name, obs in env._compute_observations().items()})
         self._compare_rewards(*torch.stack(rewards).chunk(2, dim=1))
         maps = {}
-        for group in env.layout.observations:
+        for group in groups:
             halves = torch.stack([obs[group] for obs in observed]).chunk(2, dim=1)
             maps[group] = self._observation_map(group, *(half.flatten(0, 1) for half in halves))
         return MirrorMaps(maps, self._action)
@@ -237,20 +241,14 @@ class _MirrorTest:
             return [(partner, 1.0) for partner in rays]
         found = []
         for column, image in enumerate(images.unbind(1)):
-            errors = torch.stack([_relative(image[:, None] - s * own, image[:, None].expand_as(own)) for s in (1, -1)])
-            fits = (errors <= self._tolerance).nonzero().tolist()
             place = f"column {column} of observation '{name}'"
             if image.max() == image.min():
-                raise TaskError(
-                    f"{place} is {float(image[0]):g} in all tested states, so that its mirror image is unknown"
-                )
+                raise TaskError(f"{place} is {float(image[0]):g} in all tested states: its mirror image is unknown")
+            errors = torch.stack([_relative(image[:, None] - s * own, image[:, None].expand_as(own)) for s in (1, -1)])
+            fits = (errors <= self._tolerance).nonzero().tolist()
             if len(fits) != 1:
-                what = (
-                    "matches several columns"
-                    if fits
-                    else f"matches no column (nearest: {float(errors.min()):.2%} away)"
-                )
-                raise TaskError(f"the mirror image of {place} {what}")
+                nearest = f"no column of the term, the nearest is {float(errors.min()):.2%} away"
+                raise TaskError(f"the mirror image of {place} matches {'several columns' if fits else nearest}")
             found.append((fits[0][1], 1.0 - 2.0 * fits[0][0]))
         return found
 

@@ -8,11 +8,13 @@ from rlcli.envs.mirror import mirror_maps
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
 
+GROUPS = ("policy", "critic")
+FALL = "fall: {func: joint_pos_out_of_manual_limit, joints: [left_hip], bounds: [-0.1, 0.1]}"
 LEGS = ([2, 3, 0, 1], [-1, 1, -1, 1])
 
 
 def maps(folder, **files):
-    return mirror_maps(resolve(find_task(mirrored_robot.write(folder, **files))), tolerance=1e-3)
+    return mirror_maps(resolve(find_task(mirrored_robot.write(folder, **files))), GROUPS, tolerance=1e-3)
 
 
 def test_maps_of_a_symmetric_robot(tmp_path):
@@ -41,6 +43,7 @@ def test_maps_of_a_symmetric_robot(tmp_path):
         ("model", '"left_knee" axis="0 1 0"', '"left_knee" axis="0 1 1"', "joint 'robot/left_knee' has another type"),
         ("task", "action_rate_l2,", "joint_vel_l2, joints: [left_knee],", "reward 'calm' differs"),
         ("task", "{func: base_ang_vel}", "{func: joint_vel, joints: [left_hip]}", "observation 'policy.turn' match"),
+        ("task", "{time_out: {", f"{{{FALL}, time_out: {{", "terminations differ"),
         ("task", "joint_position, ", "joint_position, joints: [left_hip, left_knee, right_hip], ", "not its mirror"),
         ("task", "{func: base_ang_vel}", "{func: body_pose_w, bodies: [left_shin]}", "observation 'policy.turn' match"),
     ],
@@ -58,5 +61,5 @@ def test_small_asymmetry_is_allowed_by_the_tolerance(tmp_path):
     model = mirrored_robot.MODEL.replace('mass=".3"', 'mass=".301"', 1)
     file = mirrored_robot.write(tmp_path, model=model)
     with pytest.raises(ConfigError, match="more than tolerance"):
-        mirror_maps(resolve(find_task(file)), tolerance=1e-4)
-    assert mirror_maps(resolve(find_task(file)), tolerance=0.1).action.index.tolist() == LEGS[0]
+        mirror_maps(resolve(find_task(file)), GROUPS, tolerance=1e-4)
+    assert mirror_maps(resolve(find_task(file)), GROUPS, tolerance=0.1).action.index.tolist() == LEGS[0]

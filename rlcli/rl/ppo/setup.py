@@ -84,7 +84,8 @@ def task_mirror(env: Environment, config: PpoConfig) -> MirrorMaps | None:
     """
     if config.symmetry is None:
         return None
-    maps = mirror_maps(env.resolved, tolerance=config.symmetry.tolerance)
+    groups = dict.fromkeys(("policy", *critic_groups(env, config)))
+    maps = mirror_maps(env.resolved, groups, tolerance=config.symmetry.tolerance)
     observations = {group: each.to(env.device) for group, each in maps.observations.items()}
     return MirrorMaps(observations, maps.action.to(env.device))
 
