@@ -94,7 +94,7 @@ class Health:
             if condition is not None and f"Success/{name}" in metrics:
                 value = metrics.get(f"Success_Value/{name}")
                 bound = "" if value is None else f", value {value:.3g}, {bound_text(condition.model_dump())}"
-                lines.append(f"success: {name} held in {metrics[f'Success/{name}']:.1%}{bound}")
+                lines.append(f"success in training: {name} held in {metrics[f'Success/{name}']:.1%}{bound}")
         return lines
 
     def names(self, prefix: str) -> list[str]:
