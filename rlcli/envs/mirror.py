@@ -42,6 +42,11 @@ class ColumnMap:
         """Return the mirror image of values. (..., d) -> (..., d)"""
         return values.index_select(-1, self.index) * self.sign
 
+    @property
+    def is_identity(self) -> bool:
+        """Whether the map changes nothing."""
+        return bool((self.index == torch.arange(len(self.index))).all() and (self.sign == 1.0).all())
+
     def to(self, device: torch.device) -> ColumnMap:
         """Return the map on a device."""
         return ColumnMap(self.index.to(device), self.sign.to(device))
@@ -133,6 +138,8 @@ class _MirrorTest:
         for group in groups:
             halves = torch.stack([obs[group] for obs in observed]).chunk(2, dim=1)
             maps[group] = self._observation_map(group, *(half.flatten(0, 1) for half in halves))
+        if all(each.is_identity for each in (self._action, *maps.values())):
+            raise TaskError("everything moves in the plane of the mirror: each state is its own mirror image")
         return MirrorMaps(maps, self._action)
 
     def _draw(self, *shape: int) -> Tensor:

@@ -1,7 +1,7 @@
 """Mirror maps of a task: derived from a symmetric robot, refused with the name of what is not symmetric."""
 
 import pytest
-from support import mirrored_robot
+from support import mirrored_robot, small_task
 
 from rlcli.config.load import resolve
 from rlcli.envs.mirror import mirror_maps
@@ -55,6 +55,13 @@ def test_asymmetry_is_refused_by_name(tmp_path, place, old, new, named):
         maps(tmp_path, **{place: text.replace(old, new, 1)})
     assert named in str(error.value)
     assert "agents.ppo.symmetry" in str(error.value)
+
+
+def test_planar_robot_is_refused(tmp_path):
+    (tmp_path / "model.xml").write_text(small_task.MODEL)
+    (tmp_path / "task.yaml").write_text(small_task.TASK)
+    with pytest.raises(ConfigError, match="each state is its own mirror image"):
+        mirror_maps(resolve(find_task(str(tmp_path))), ["policy"], tolerance=1e-3)
 
 
 def test_small_asymmetry_is_allowed_by_the_tolerance(tmp_path):
