@@ -23,7 +23,7 @@ from rlcli.envs.managed import ManagedEnv
 from rlcli.errors import ConfigError, TaskError
 from rlcli.managers.observation_pipeline import Pipeline
 from rlcli.scene.entity import Entity
-from rlcli.scene.mirror import EntityMirror
+from rlcli.scene.mirror import QUATERNION, EntityMirror
 from rlcli.scene.sensors import RaySensor
 from rlcli.sim.rotations import from_euler
 
@@ -192,7 +192,10 @@ class _MirrorTest:
                 message = f"command '{term.name}' ({term.config.func}) does not say how it is mirrored"
                 raise TaskError(f"{message}; give its class an attribute mirror_signs: +1 or -1 for each column")
             command[:_PAIRS] = self._draw(command.shape[1])
+            if tuple(signs[3:]) == QUATERNION:
+                command[:_PAIRS, 3:] = torch.nn.functional.normalize(command[:_PAIRS, 3:], dim=1)
             command[_PAIRS:] = command[:_PAIRS] * torch.tensor(signs)
+        env.sim.command_stamp += 1  # terms compute goals again
         env.on_moved(env._select_all())
         env.sim.forward_moved()
 

@@ -295,8 +295,11 @@ def blocked_success(health: Health) -> Found:
         gaps, states = _gaps(values, condition.model_dump()), health.values(f"Health/held/{name}")
         # the mean is near the bound, but no environment is within it in any of the states at the checks
         halved = len(gaps) > 3 and statistics.fmean(gaps[-3:]) > 0.5 * statistics.fmean(gaps[:3])
-        unreachable = not any(health.values(f"Success/{name}")) and len(states) > 2 and not any(states) and halved
-        if (never and not _approaches(gaps)) or alone or unreachable:
+        exact = (
+            bool(values) and condition.at_most is not None and condition.at_most <= 0.0 < min(values)
+        )  # an error of 0
+        unmet = not any(health.values(f"Success/{name}")) and len(states) > 2 and not any(states)
+        if (never and not _approaches(gaps)) or alone or (unmet and (halved or exact)):
             value = f", its value is {statistics.fmean(values[-3:]):.3g}, and the bound is" if values else ""
             bound = bound_text(condition.model_dump())
             message = f"the condition '{name}' of success holds in {held:.1%} of the episodes{value} {bound}".rstrip()
