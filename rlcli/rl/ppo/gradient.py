@@ -73,6 +73,8 @@ class AutogradGradient:
         self, config: PpoConfig, batch: Samples, obs: Tensor, critic_obs: Tensor, advantage: Tensor, old_std: Tensor
     ) -> LossResult:
         """Return the loss of a minibatch and write its gradient into `out`."""
+        if config.symmetry is not None and not config.symmetry.augment:  # images are for the mirror loss only
+            batch, critic_obs, advantage = batch.first_half(), critic_obs.chunk(2)[0], advantage.chunk(2)[0]
         result = self._loss(self._networks, config, batch, obs, critic_obs, advantage, old_std)
         gradients = torch.autograd.grad(result.loss, list(self._networks.parameters()))
         torch.cat([*(part.flatten() for part in gradients), result.metrics[KL : KL + 1]], out=self._out)

@@ -61,8 +61,8 @@ def minibatch_loss(
     Args:
         networks: actor, critic and auxiliary layer.
         config: coefficients and clipping.
-        batch: the samples; with `symmetry` the second half are the mirror images of the first. (n, ...)
-        obs: inputs of the actor's network. (n, d)
+        batch: the samples; with `symmetry.augment` the second half are the mirror images of the first. (n, ...)
+        obs: inputs of the actor's network; with `symmetry` the second half are mirror images. (n or 2 n, d)
         critic_obs: inputs of the critic's network. (n, c)
         advantage: A_t, normalised if the agent normalises advantages. (n,)
         old_std: standard deviation of the policy whose mean is `batch.mean`. (a,)
@@ -70,9 +70,8 @@ def minibatch_loss(
     hidden = networks.hidden(obs)
     std, mean = networks.std, networks.actor[-1](hidden)
     mirror, all_means = networks.mirror_error(mean), mean.detach()
-    if config.symmetry is not None and not config.symmetry.augment:  # the mirror images are for the mirror loss only
-        batch, rows = batch.first_half(), len(mean) // 2
-        hidden, mean, critic_obs, advantage = (part[:rows] for part in (hidden, mean, critic_obs, advantage))
+    if len(mean) > len(advantage):
+        hidden, mean = hidden[: len(advantage)], mean[: len(advantage)]
     value_loss = _value_loss(networks.value(critic_obs), batch, config)
     log_ratio = log_prob((batch.action - mean) / std, std) - batch.log_prob
     ratio = log_ratio.exp()
