@@ -75,7 +75,7 @@ def mirror_maps(resolved: Resolved, groups: Iterable[str], *, tolerance: float) 
     path = ("agents", resolved.agent_name or "", "symmetry")
     if resolved.source.task is not None:
         raise ConfigError([resolved.problem(path, "a direct task has no terms to mirror", "set symmetry: null")])
-    env = make_env(_without_randomness(resolved), shared_streams=_PAIRS)
+    env = make_env(_pairs_on_a_plane(resolved.without_randomness()), shared_streams=_PAIRS)
     assert isinstance(env, ManagedEnv)
     try:
         return _MirrorTest(env, tolerance).run(groups)
@@ -87,20 +87,17 @@ def mirror_maps(resolved: Resolved, groups: Iterable[str], *, tolerance: float) 
         env.close()
 
 
-def _without_randomness(resolved: Resolved) -> Resolved:
-    """Return the task with pairs of environments on a plane, without events, curriculum and noise."""
-    task = resolved.task
+def _pairs_on_a_plane(resolved: Resolved) -> Resolved:
+    """Return the task with `_PAIRS` pairs of environments, and a plane instead of a terrain."""
+    scene = resolved.task.scene
     sensors = {
         name: config.model_copy(update={"lookup": False}) if isinstance(config, RaySensorConfig) else config
-        for name, config in task.scene.sensors.items()
+        for name, config in scene.sensors.items()
     }
-    scene: dict[str, Any] = {"num_envs": 2 * _PAIRS, "sensors": sensors}
-    if task.scene.terrain is not None:
-        scene |= {"terrain": None, "ground": GroundConfig()}
-    clean = {name: group.model_copy(update={"enable_corruption": False}) for name, group in task.observations.items()}
-    changes: dict[str, Any] = {"events": {}, "curriculum": {}, "observations": clean}
-    changes["scene"] = task.scene.model_copy(update=scene)
-    return replace(resolved, task=task.model_copy(update=changes))
+    changes: dict[str, Any] = {"num_envs": 2 * _PAIRS, "sensors": sensors}
+    if scene.terrain is not None:
+        changes |= {"terrain": None, "ground": GroundConfig()}
+    return replace(resolved, task=resolved.task.model_copy(update={"scene": scene.model_copy(update=changes)}))
 
 
 class _MirrorTest:
