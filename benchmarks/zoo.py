@@ -320,6 +320,7 @@ def _row(run: Any, checkpoint: Path, evaluation: dict[str, Any], hardware: str |
         "command": _command(record.get("command") or []),
         "steps": int(checkpoint.name),
         "minutes": round(float(record.get("trained_s") or 0.0) / 60, 2),
+        **({"until": record["until"]} if record.get("until") else {}),
         "versions": {name: versions[name] for name in ("rlcli", "mujoco", "torch") if name in versions},
         "evaluation": {name: evaluation[name] for name in wanted if evaluation.get(name) is not None},
     }

@@ -95,12 +95,16 @@ def results(zoo: Path, entry: Any) -> str:
     if not rows:
         return f"{held}\nNot trained yet.\n"
     names = list(dict.fromkeys(["success", *entry.bar])) if "success" in rows[0]["evaluation"] else list(entry.bar)
+    bar = ["bar reached after"] if any("until" in row for row in rows) else []
     lines = [
-        f"| seed | agent | machine | steps | minutes | {' | '.join(names)} | return |",
-        "| ---: | --- | --- | ---: | ---: |" + " ---: |" * (len(names) + 1),
+        f"| seed | agent | machine | steps | minutes | {' | '.join([*bar, *names])} | return |",
+        "| ---: | --- | --- | ---: | ---: |" + " ---: |" * (len(bar) + len(names) + 1),
     ]
     for row in rows:
-        numbers = [with_interval(row["evaluation"], name) for name in names]
+        numbers = [
+            *(to_bar(row.get("until")) for _ in bar),
+            *(with_interval(row["evaluation"], name) for name in names),
+        ]
         trained = f"{row['steps'] / 1e6:.3g} M | {row['minutes']:.3g}"
         lines.append(
             f"| {row['seed']} | `{row['agent']}` | {row['machine']} | {trained} | {' | '.join(numbers)} |"
@@ -131,6 +135,15 @@ def bars(entry: Any) -> str:
         f"{name} <= {bound['max']:g}" if isinstance(bound, dict) else f"{name} >= {bound:g}"
         for name, bound in entry.bar.items()
     )
+
+
+def to_bar(until: dict[str, Any] | None) -> str:
+    """Format the steps and the time that a training with `--until` took to its bar."""
+    if until is None:
+        return "-"
+    if not until["reached"]:
+        return f"{until['bar']}: not reached"
+    return f"{until['bar']}: {until['step'] / 1e6:.3g} M, {until['seconds'] / 60:.2g} min"
 
 
 def with_interval(evaluation: dict[str, Any], name: str) -> str:

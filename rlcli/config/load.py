@@ -56,6 +56,13 @@ class Resolved:
         scene = self.task.scene.model_copy(update={"num_envs": count})
         return replace(self, task=self.task.model_copy(update={"scene": scene}))
 
+    def without_randomness(self) -> Self:
+        """Return the configuration without events, curriculum and noise."""
+        clean = {"enable_corruption": False}
+        observations = {name: group.model_copy(update=clean) for name, group in self.task.observations.items()}
+        changes: dict[str, Any] = {"events": {}, "curriculum": {}, "observations": observations}
+        return replace(self, task=self.task.model_copy(update=changes))
+
     def require_agent(self) -> tuple[AgentConfig, TrainerSpec]:
         """Return the agent and its trainer, which training needs.
 

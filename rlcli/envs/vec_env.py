@@ -285,6 +285,10 @@ class VecEnv(Workflow):
         """Return each condition of success in one environment, as in `speed 0.21, at most 0.3: has held for 0.4 s`."""
         return [condition.describe(env_id, self.step_dt) for condition in self._counters.conditions]
 
+    def condition_shares(self) -> dict[str, float]:
+        """Return the share of environments in which each condition of success held in the newest step."""
+        return {each.name: float((each.steps > 0.0).float().mean()) for each in self._counters.conditions}
+
     def compute_success(self) -> Tensor | None:
         """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""
         held = [condition.holds_for_tensors() for condition in self._counters.conditions]

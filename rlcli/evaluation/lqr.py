@@ -7,7 +7,7 @@ an equilibrium, if the observations do not determine the state, or if no linear 
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -71,7 +71,7 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
     """
     if not resolved.task.success:
         raise _no_regulator(resolved, "the task defines no success, so its target state is unknown")
-    with contextlib.closing(make_env(_without_randomness(resolved.with_num_envs(1)))) as env:
+    with contextlib.closing(make_env(resolved.with_num_envs(1).without_randomness())) as env:
         model = env.engine.model
         if model.nq != model.nv:
             raise _no_regulator(
@@ -80,7 +80,7 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
         if model.na:
             raise _no_regulator(resolved, "its actuators have internal states")
         count = 2 * model.nv + env.layout.action_size
-    with contextlib.closing(make_env(_without_randomness(resolved.with_num_envs(2 + 16 * count)))) as env:
+    with contextlib.closing(make_env(resolved.with_num_envs(2 + 16 * count).without_randomness())) as env:
         states, after, observed, rest = _sample_steps(env, resolved)
     dynamics, residual = _fit(states, after)
     if residual.max() > _MAX_RESIDUAL:
@@ -159,15 +159,6 @@ def _fit(inputs: Matrix, targets: Matrix) -> tuple[Matrix, Matrix]:
     found, *_ = np.linalg.lstsq(inputs, targets, rcond=_SINGULAR)
     residual = np.sqrt(np.square(targets - inputs @ found).mean(axis=0))
     return found, residual / np.maximum(np.sqrt(np.square(targets).mean(axis=0)), 1e-9)
-
-
-def _without_randomness(resolved: Resolved) -> Resolved:
-    """Return the task without events, curriculum and noise."""
-    task = resolved.task
-    clean = {"enable_corruption": False}
-    observations = {name: group.model_copy(update=clean) for name, group in task.observations.items()}
-    changes: dict[str, Any] = {"events": {}, "curriculum": {}, "observations": observations}
-    return replace(resolved, task=task.model_copy(update=changes))
 
 
 def _coordinates(env: VecEnv) -> list[str]:

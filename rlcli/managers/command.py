@@ -30,7 +30,8 @@ class CommandTerm(Protocol):
     Optional members: `metrics() -> dict[str, Tensor]`, errors of following the command, (num_envs,) each, whose means
     over an episode are logged. `reset(selection)`, `state_dict` and `load_state_dict` for further state. `elements`,
     names of the columns of `command` that a person may set ("" for other columns). `limits`, their usual [low, high].
-    `units`, their units.
+    `units`, their units. `mirror_signs`, +1 or -1 for each column: the command times its signs is the command of the
+    mirror image about the x-z plane of the robot; the agent's key `symmetry` needs it.
 
     `markers() -> list[Marker]` returns the command as arrows, spheres and frames (`rlcli.sim.markers`): positions in
     the world frame (num_envs, 3) [m], like `entity.data.root_pos_w`, and quaternions (w, x, y, z), (num_envs, 4). It is

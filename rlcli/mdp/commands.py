@@ -9,6 +9,7 @@ from torch import Tensor
 
 from rlcli.mdp.term import EntityTerm, Term
 from rlcli.mdp.term_helpers import goal_in_world, goal_quat_in_world
+from rlcli.scene.mirror import QUATERNION, VECTOR
 from rlcli.sim.markers import ACTUAL, COMMANDED, Arrow, Color, Frame, Marker, Sphere
 from rlcli.sim.rotations import atan2, from_euler, heading, rotate, unique, wrap_to_pi, yaw_only
 from rlcli.sim.saved_tensors import TensorState
@@ -22,6 +23,8 @@ _ARM = 0.5
 @dataclass(eq=False)
 class NullCommand(Term):
     """No command. (num_envs, 0)  Isaac Lab: NullCommand."""
+
+    mirror_signs = ()
 
     def __post_init__(self) -> None:
         self.command = torch.zeros(self.env.num_envs, 0, device=self.env.device)
@@ -42,6 +45,7 @@ class _VelocityCommand(EntityTerm, TensorState):
 
     elements = ("vx", "vy", "wz")
     units = ("m/s", "m/s", "rad/s")
+    mirror_signs = (1, -1, -1)
 
     rel_standing: float = 0.0
 
@@ -186,6 +190,7 @@ class UniformPose(EntityTerm):
 
     elements = ("x", "y", "z", "", "", "", "")
     units = ("m", "m", "m")
+    mirror_signs = (*VECTOR, *QUATERNION)
 
     bodies: Bodies
     x: Range
@@ -256,6 +261,7 @@ class UniformPose2d(EntityTerm, TensorState):
 
     elements = ("ahead", "left", "", "turn")
     units = ("m", "m", "m", "rad")
+    mirror_signs = (1, -1, 1, -1)
 
     x: Range
     y: Range

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rlcli.config.schema import GridPatternConfig, RaySensorConfig
+from rlcli.errors import TaskError
 from rlcli.scene.camera import CameraSensor, make_cameras
 from rlcli.scene.entity import Entity
 from rlcli.scene.lazy_sensor import LazySensor
@@ -164,6 +165,20 @@ class RaySensor(LazySensor):
         """Position of the sensor, world frame. (num_envs, 3) [m]"""
         self._cast()
         return self._position
+
+    def mirror_partners(self) -> list[int]:
+        """Return the index of each ray's mirror image about the x-z plane of the sensor.
+
+        Raises:
+            TaskError: for a ray without a mirror image.
+        """
+        rays = torch.cat([self._starts, self._directions], dim=1).cpu()
+        images = rays * torch.tensor([1.0, -1.0, 1.0]).repeat(2)
+        distances, partners = (images[:, None] - rays).abs().amax(dim=2).min(dim=1)
+        if float(distances.max()) > 1e-4:
+            raise TaskError(f"ray {int(distances.argmax())} of the sensor on '{self._config.body}' has no mirror image")
+        found: list[int] = partners.tolist()
+        return found
 
     def on_moved(self, selection: Selection) -> None:
         """Cast the rays of the selected environments again, if rays have been cast in this step."""

@@ -96,7 +96,7 @@ class Health:
             if condition is not None and f"Success/{name}" in metrics:
                 value = metrics.get(f"Success_Value/{name}")
                 bound = "" if value is None else f", value {value:.3g}, {bound_text(condition.model_dump())}"
-                lines.append(f"success: {name} held in {metrics[f'Success/{name}']:.1%}{bound}")
+                lines.append(f"success in training: {name} held in {metrics[f'Success/{name}']:.1%}{bound}")
         return lines
 
     def names(self, prefix: str) -> list[str]:
@@ -150,6 +150,8 @@ def probe(trainer: Trainer) -> dict[str, float]:
             edges = torch.tensor(term.clip, device=obs.device)[:, None] * scale
             at_edge = ((obs[:, columns] - edges[:, None]).abs() <= _AT * edges[:, None].abs()).any(dim=0)
             found[f"Health/clipped/{term.name}"] = float((at_edge & ~constant[columns]).float().mean())
+    shares = trainer.env.local.condition_shares()
+    found |= {f"Health/held/{name}": share for name, share in shares.items()}
     with undisturbed():  # a new policy draws random weights
         policy = trainer.policy().to(obs.device)
     if policy.normalizer is not None and policy.normalizer.clip is not None:
@@ -294,7 +296,13 @@ def blocked_success(health: Health) -> Found:
         alone = bool(others) and min(others) > 0.5 and held < 0.1 * min(others) and health.progress == 1.0
         learned = health.change(RETURN) > 1.0 and not _approaches(health.values(RETURN))
         never = max(health.values(f"Success/{name}")) == 0.0 and (learned or health.progress == 1.0)
-        if (never and not _approaches(_gaps(values, condition.model_dump()))) or alone:
+        gaps, states = _gaps(values, condition.model_dump()), health.values(f"Health/held/{name}")
+        # the mean is near the bound, but no environment is within it in any of the states at the checks
+        halved = len(gaps) > 3 and statistics.fmean(gaps[-3:]) > 0.5 * statistics.fmean(gaps[:3])
+        # an error that must be exactly 0
+        exact = bool(values) and condition.at_most is not None and condition.at_most <= 0.0 < min(values)
+        unmet = not any(health.values(f"Success/{name}")) and len(states) > 2 and not any(states)
+        if (never and not _approaches(gaps)) or alone or (unmet and (halved or exact)):
             value = f"; its value is {statistics.fmean(values[-3:]):.3g}" if values else ""
             bound = f"; it must be {text}" if (text := bound_text(condition.model_dump())) else ""
             message = f"the condition '{name}' of success holds in {held:.1%} of the episodes{value}{bound}"

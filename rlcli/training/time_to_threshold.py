@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rlcli.config.schema import parse_threshold
 from rlcli.errors import UsageError
-from rlcli.safe_text import float_or_nan
 
 _METRICS = {"success": "Eval/success_rate", "return": "Eval/mean_reward", "length": "Eval/mean_episode_length"}
 
@@ -32,16 +32,9 @@ class Threshold:
         return low is not None and low >= self.value
 
     def episodes(self, least: int) -> int:
-        """Return a number of episodes, at least `least`, in which the interval can reach a success rate.
-
-        Raises:
-            UsageError: for a success rate of 1, which the lower end of no interval reaches.
-        """
+        """Return a number of episodes, at least `least`, in which the interval can reach a success rate below 1."""
         if self.key != "success":
             return max(least, 2)
-        if self.value == 1.0:
-            hint = "as in --until success=0.97"
-            raise UsageError("no number of episodes shows a success rate of 1 with 95 % confidence", hint=hint)
         from rlcli.rl.confidence import NORMAL  # it imports numpy
 
         # Wilson's lower end with n of n successes is n / (n + z^2); twice as many episodes leave room for failures
@@ -60,19 +53,15 @@ class Reached:
 
 
 def read_threshold(text: str) -> Threshold:
-    """Parse `success=0.99`, `return=200` or `length=250`.
+    """Return the threshold of the option --until.
 
     Raises:
-        UsageError: for anything else.
+        UsageError: for a text that `parse_threshold` refuses.
     """
-    key, _, number = text.partition("=")
-    value = float_or_nan(number)
-    if key not in _METRICS or not math.isfinite(value):
-        message = f"--until '{text}' is not a threshold"
-        raise UsageError(message, hint="as in --until success=0.99, return=200 or length=250")
-    if key == "success" and not 0.0 < value <= 1.0:
-        raise UsageError(f"--until '{text}': give a success rate above 0 and at most 1")
-    return Threshold(key, value)
+    try:
+        return Threshold(*parse_threshold(text))
+    except ValueError as error:
+        raise UsageError(f"--until {error}") from None
 
 
 def training_s(row: Mapping[str, Any]) -> float:

@@ -100,6 +100,20 @@ def test_training_without_rewards_records_and_prints_the_finding(tmp_path, monke
     assert "the return is 0 in all" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("until", [0.2, 0.25])
+def test_bound_that_no_state_reaches(until):
+    """The value comes near its bound while the return rises: only the states tell that the bound is out of reach."""
+    nearer = {**FAILING, "Success_Value/pole": lambda i: 1.7 * 0.9**i}
+    assert findings({**nearer, "Health/held/pole": lambda i: 0.02}, until=until) == {}
+    found = findings({**nearer, "Health/held/pole": lambda i: 0.0}, until=until)
+    assert "'pole' of success holds in 0.0% of the episodes" in found["blocked-success"].message
+    far = {**FAILING, "Success_Value/pole": lambda i: 1.7 - 0.01 * i, "Health/held/pole": lambda i: 0.0}
+    assert "blocked-success" not in findings(far, until=until)
+    assert (
+        "and the bound is at most 0" in findings(far, "success.pole.at_most=0", until=until)["blocked-success"].message
+    )
+
+
 def test_training_stops_at_a_bar(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["--num-envs", "8", "--logger", "none", "--max-iterations", "40", "episode_length_s=0.2"]

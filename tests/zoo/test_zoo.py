@@ -166,6 +166,18 @@ def test_page_without_results(tmp_path):
     assert zoo_pages.filled(filled, tmp_path, ENTRIES["cartpole"]) == filled
 
 
+def test_results_show_when_a_bar_was_reached(tmp_path):
+    """A training without `--until` and one that missed the bar have their own texts."""
+    (row, *_) = zoo_pages.rows_of(zoo.ZOO, "cartpole")
+    until = {"bar": "success=0.97", "reached": True, "seconds": 90.0, "step": 1_250_000}
+    rows = [{**row, "until": until}, {**row, "until": {**until, "reached": False}}, row]
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "cartpole.json").write_text(json.dumps(rows))
+    lines = zoo_pages.results(tmp_path, ENTRIES["cartpole"]).splitlines()
+    cells = [line.split("|")[6].strip() for line in lines if line.startswith("|")]
+    assert cells == ["bar reached after", "---:", "success=0.97: 1.25 M, 1.5 min", "success=0.97: not reached", "-"]
+
+
 def test_thick_line_is_median_of_seeds():
     class RunCurves:
         def __init__(self, seed, level):

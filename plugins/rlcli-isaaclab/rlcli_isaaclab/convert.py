@@ -147,6 +147,14 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         "clip_range": algorithm.require("clip_param"),
         "normalize_advantage": "minibatch" if algorithm.get("normalize_advantage_per_mini_batch") else "batch",
     }
+    symmetry = algorithm.node("symmetry_cfg")
+    augment, loss = symmetry.get("use_data_augmentation"), symmetry.get("use_mirror_loss")
+    coefficient = as_float(symmetry.get("mirror_loss_coeff", 0.0))
+    coefficient = coefficient if loss else 0.0
+    if augment or coefficient:
+        config["symmetry"] = {"augment": bool(augment), "mirror_coef": coefficient}
+        how = "the mirror image of left and right, found from the model, replaces the function"
+        symmetry.note("approximated", "data_augmentation_func", how)
     algorithm.skip("class_name", "desired_kl")
     top.skip("class_name", "logger", "neptune_project", "wandb_project", "resume", "load_run", "load_checkpoint")
     for name, option in (

@@ -34,6 +34,16 @@ class RslRlPpoActorCriticRecurrentCfg(RslRlPpoActorCriticCfg):
 
 
 @configclass
+class RslRlSymmetryCfg:
+    """Symmetry of the robot in the PPO update."""
+
+    use_data_augmentation: bool = False
+    use_mirror_loss: bool = False
+    data_augmentation_func: Any = None
+    mirror_loss_coeff: float = 0.0
+
+
+@configclass
 class RslRlPpoAlgorithmCfg:
     """Settings of the PPO update."""
 

@@ -42,6 +42,7 @@ from rlcli_isaaclab.rsl_rl import (
     RslRlPpoActorCriticCfg,
     RslRlPpoActorCriticRecurrentCfg,
     RslRlPpoAlgorithmCfg,
+    RslRlSymmetryCfg,
 )
 from rlcli_isaaclab.runtime import ManagerBasedRLEnv
 from rlcli_isaaclab.scene import InteractiveSceneCfg

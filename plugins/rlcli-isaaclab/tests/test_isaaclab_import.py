@@ -23,11 +23,11 @@ ENV, AGENT = HERE / "env.yaml", HERE / "agent.yaml"
 def imported(tmp_path, capsys):
     """Return imported(env_text, ...) -> exit code, JSON document, stderr, folder."""
 
-    def run(text=None, *words, agent=True):
+    def run(text=None, *words, agent=AGENT):
         env = tmp_path / "env.yaml"
         env.write_text(ENV.read_text() if text is None else text, encoding="utf-8")
         folder = tmp_path / "task"
-        agents = [str(AGENT)] if agent else []
+        agents = [str(agent)] if agent else []
         code = main(["import", "isaaclab", str(env), *agents, "-o", str(folder), "--json", *words])
         out, err = capsys.readouterr()
         return code, json.loads(out) if out.strip() else {}, err, folder
@@ -54,6 +54,20 @@ def test_cartpole_run_equals_builtin_cartpole_config(imported):
         0.005,
     )
     assert agent["actor"] == {"hidden": [32, 32], "activation": "elu"}
+
+
+@pytest.mark.parametrize(("loss", "coefficient"), [("true", 0.5), ("false", 0.0)])
+def test_symmetry_cfg_of_agent(imported, tmp_path, loss, coefficient):
+    """The mirror map that rlcli finds replaces the function, and the report says so."""
+    symmetry = f"{{use_data_augmentation: true, use_mirror_loss: {loss}, mirror_loss_coeff: 0.5,"
+    text = AGENT.read_text().replace("symmetry_cfg: null", f"symmetry_cfg: {symmetry} data_augmentation_func: 'a:b'}}")
+    (tmp_path / "agent.yaml").write_text(text)
+    code, document, _, folder = imported(agent=tmp_path / "agent.yaml")
+    assert code == 0
+    symmetry = to_data(resolve(folder_task(folder)))["agents"]["rsl-rl"]["symmetry"]
+    assert (symmetry["augment"], symmetry["mirror_coef"]) == (True, coefficient)
+    status = {row["key"]: row["status"] for row in document["keys"] if "symmetry_cfg" in row["key"]}
+    assert sorted(status.values()) == ["approximated", "mapped", "mapped", "mapped"]
 
 
 def test_imported_task_equals_builtin_cartpole_steps(imported):

@@ -147,16 +147,6 @@ def budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
     return {"agent.max_iterations": max_iterations, "agent.max_steps": max_steps}
 
 
-def until(text: str | None) -> dict[str, Any]:
-    """Return the threshold of --until as a setting of the agent; an empty mapping without --until."""
-    from rlcli.training.time_to_threshold import read_threshold
-
-    if text is None:
-        return {}
-    read_threshold(text).episodes(1)
-    return {"agent.until": text}
-
-
 def video_file(video: Path | None, default: str) -> Path | None:
     """Return the file of --video, the default one if the option has no value; check that it can be written."""
     if video is None:

@@ -20,13 +20,24 @@ class AutopsyConfig(StrictModel):
     """Memory for the last seconds of all environments [MiB]. If it is too small, fewer seconds are recorded."""
 
 
-def _check_threshold(text: str) -> str:
+def parse_threshold(text: str) -> tuple[str, float]:
+    """Return the metric and the value of `success=0.99`, `return=200` or `length=250`.
+
+    Raises:
+        ValueError: for anything else.
+    """
     key, _, number = text.partition("=")
     value = float_or_nan(number)
     if key not in ("success", "return", "length") or not math.isfinite(value):
         raise ValueError(f"'{text}' is not a threshold; write success=0.97, return=200 or length=250")
-    if key == "success" and not 0.0 < value < 1.0:
-        raise ValueError(f"no evaluation can show a success rate of {value:g}; give a number between 0 and 1")
+    if key == "success" and not 0.0 < value <= 1.0:
+        raise ValueError(f"'{text}' is not a threshold; give a success rate above 0 and at most 1")
+    return key, value
+
+
+def _check_threshold(text: str) -> str:
+    if parse_threshold(text) == ("success", 1.0):
+        raise ValueError("no number of episodes shows a success rate of 1 with 95 % confidence; write success=0.97")
     return text
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.environment import Environment
+from rlcli.envs.mirror import MirrorMaps
 from rlcli.envs.step import StepResult
 from rlcli.rl import distributed
 from rlcli.rl.nan_check import moments, require_finite
@@ -32,12 +33,18 @@ class Collector:
         config: configuration of the agent.
         networks: actor and critic.
         statistics: statistics of finished episodes.
+        mirror: mirror maps of the task; None if the agent does not use the symmetry of the robot.
     """
 
     def __init__(
-        self, env: Environment, config: PpoConfig, networks: ActorCritic, statistics: EpisodeStatistics
+        self,
+        env: Environment,
+        config: PpoConfig,
+        networks: ActorCritic,
+        statistics: EpisodeStatistics,
+        mirror: MirrorMaps | None = None,
     ) -> None:
-        self.env, self.config, self.networks = env, config, networks
+        self.env, self.config, self.networks, self.mirror = env, config, networks, mirror
         self.statistics, self.process_group = statistics, distributed.current()
         device, layout = env.device, env.layout
         self.iteration = 0
@@ -57,7 +64,8 @@ class Collector:
 
         sizes = (obs_size, 0 if self._critic_reads_actor_obs else critic_size, layout.action_size)
         steps, minibatches = config.num_steps, minibatch_sizes(env, config, config.num_steps * env.num_envs)
-        self.rollout = RolloutBuffer(steps, env.num_envs, sizes, minibatches, config.rnn is not None, device)
+        whole_envs, mirrored = config.rnn is not None, mirror is not None
+        self.rollout = RolloutBuffer(steps, env.num_envs, sizes, minibatches, whole_envs, device, mirrored)
         self.obs = {
             group: torch.zeros(env.num_envs, layout.size(group), device=device)
             for group in dict.fromkeys(("policy", *groups))
@@ -124,6 +132,11 @@ class Collector:
                 raw[t].copy_(obs[group])
             if self.config.normalizer_update == "step":
                 self.update_normalizers(obs)
+        if self.mirror is not None and self.rollout.images is not None:
+            image = {group: self.mirror.observations[group](obs[group]) for group in self.obs}
+            self.rollout.images.obs[t].copy_(self.actor_input(image))
+            if not self._critic_reads_actor_obs:
+                self.rollout.images.critic_obs[t].copy_(self._critic_input(image))
         return self.actor_input(obs), self._critic_input(obs)
 
     def _actor_features(self, obs: Tensor, episode_start: Tensor) -> Tensor:
@@ -221,6 +234,21 @@ class Collector:
             value[mask] = self._value(critic_obs[mask])
             return value
         return torch.where(mask, self._value(critic_obs), 0.0)
+
+    @torch.no_grad()
+    def complete_images(self) -> None:
+        """Complete the mirror images of the samples, after the advantages.
+
+        As in Mittal et al. 2024, the probability of a mirrored action is that of the action: a symmetric policy has
+        this probability.
+        """
+        samples, images = self.rollout.samples, self.rollout.images
+        if self.mirror is None or images is None:
+            return
+        images.action.copy_(self.mirror.action(samples.action))
+        images.mean.copy_(self.networks.mean(images.obs))
+        for name in ("log_prob", "value", "advantage", "target", "episode_start"):
+            getattr(images, name).copy_(getattr(samples, name))
 
     # --- observations and their normalisation ---
 

@@ -55,6 +55,27 @@ class CnnConfig(StrictModel):
         return self
 
 
+class SymmetryConfig(StrictModel):
+    """Symmetry of a robot about the x-z plane of its root. The training derives how observations and actions change in
+    the mirror, and refuses a robot, reward or observation that is not symmetric. Mittal et al. 2024.
+    """
+
+    augment: bool = True
+    """Add the mirror image of each sample to its minibatch, with the same advantage and value target."""
+    mirror_coef: NotNegative = 0.0
+    """Weight of the mirror loss: the mean squared difference between the mean action for a mirrored observation and the
+    mirrored mean action."""
+    tolerance: Positive = 1e-3
+    """Largest difference between the motion, reward or observation of a robot and of its mirror image that is allowed,
+    relative to the mean size of its changes."""
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> SymmetryConfig:
+        if not self.augment and not self.mirror_coef:
+            raise ValueError("symmetry has no effect: set augment: true or mirror_coef above 0")
+        return self
+
+
 class PpoConfig(AgentConfig):
     """Proximal policy optimisation on the CPU or the GPU."""
 
@@ -147,6 +168,8 @@ class PpoConfig(AgentConfig):
     """Weight of an auxiliary loss: a linear layer, which is not a part of the policy, predicts the critic's observation
     from the actor's last hidden layer. The targets are standardised and clipped to +-3. An actor of images learns
     sooner with it if the critic observes the state."""
+    symmetry: SymmetryConfig | None = None
+    """Mirror symmetry of the robot; null: not used."""
     init: Literal["default", "zero_bias", "orthogonal"] = "default"
     """Initial weights. default: torch's. zero_bias: torch's weights and zero biases. orthogonal: zero biases and
     orthogonal weights with gain sqrt(2) in hidden layers, 0.01 in the actor's and 1 in the critic's output layer."""
@@ -184,6 +207,8 @@ class PpoConfig(AgentConfig):
             raise ValueError(message)
         if self.cnn is not None and self.rnn is not None:
             raise ValueError("cnn and rnn cannot be combined; give the image a history to show motion")
+        if self.symmetry is not None and (self.cnn is not None or self.rnn is not None):
+            raise ValueError("symmetry needs networks without cnn and rnn: a hidden state has no mirror image")
         low, high = self.learning_rate_range
         if low > high:
             raise ValueError(f"learning_rate_range: {low:g} is above {high:g}; write [low, high]")

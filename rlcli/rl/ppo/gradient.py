@@ -75,15 +75,19 @@ class AutogradGradient:
         self, config: PpoConfig, batch: Samples, obs: Tensor, critic_obs: Tensor, advantage: Tensor, old_std: Tensor
     ) -> LossResult:
         """Return the loss of a minibatch and write its gradient into `out`."""
+        if config.symmetry is not None and not config.symmetry.augment:  # images are for the mirror loss only
+            batch, critic_obs, advantage = batch.first_half(), critic_obs.chunk(2)[0], advantage.chunk(2)[0]
         result = self._loss(self._networks, config, batch, obs, critic_obs, advantage, old_std)
         gradients = torch.autograd.grad(result.loss, list(self._networks.parameters()))
         torch.cat([*(part.flatten() for part in gradients), result.metrics[KL : KL + 1]], out=self._out)
         return result
 
 
-def has_closed_form(networks: ActorCritic) -> bool:
-    """Return whether `ClosedFormGradient` supports the networks: MLPs on a CPU, no RNN, no CNN, no `tell_coef` loss."""
+def has_closed_form(networks: ActorCritic, config: PpoConfig) -> bool:
+    """Return whether `ClosedFormGradient` supports the agent: MLPs on a CPU, no RNN, no CNN, no auxiliary loss."""
     others = (networks.memory, networks.vision, networks.critic_vision, networks.teller)
+    if config.symmetry is not None and config.symmetry.mirror_coef:
+        return False
     return all(other is None for other in others) and all(map(is_plain, (networks.actor, networks.critic)))
 
 
@@ -125,7 +129,8 @@ class ClosedFormGradient:
             self._out[-1:].copy_(kl)
             loss = surrogate + config.value_coef * value_loss - config.entropy_coef * policy_entropy
             loss = loss + config.bounds_coef * bounds
-            metrics = torch.stack((surrogate, value_loss, policy_entropy, kl, clip_fraction, bounds))
+            mirror = networks.mirror_error(objective.mean)
+            metrics = torch.stack((surrogate, value_loss, policy_entropy, kl, clip_fraction, bounds, mirror))
         return LossResult(loss, metrics, objective.mean, std)
 
 

@@ -57,7 +57,7 @@ class Learner:
         """Sum of the KL divergences of the minibatches in the current epoch."""
         self._metric_sums = torch.zeros(len(METRICS), device=device)
         self.metric_values = torch.zeros(len(METRICS) + 4, device=device)
-        """`METRICS`, then mean action std, learning rate, 1 if all weights are finite, explained variance. (10,)"""
+        """`METRICS`, then mean action std, learning rate, 1 if all weights are finite, explained variance. (11,)"""
 
         self._tf32 = config.tf32 and device.type == "cuda"
         self.functions = UpdateFunctions()
@@ -67,7 +67,7 @@ class Learner:
         mode = compile_mode(config, device, self._samples_per_rollout * process_group.world_size)
         if mode:
             self.functions = compile_update(self.functions, self._call_all, tuned=mode == "tuned")
-        if not mode and has_closed_form(self._networks):
+        if not mode and has_closed_form(self._networks, config):
             compute = self._gradient_computation(torch_threads)
             self.minibatch_gradient = ClosedFormGradient(self._networks, self.gradient_and_kl, slices, compute)
             self.torch_threads = 1
@@ -90,6 +90,7 @@ class Learner:
         collector = self.collector
         with tf32_matmul(self._tf32):
             collector.estimate_advantages()
+            collector.complete_images()
             if collector.normalizer is not None and self.config.normalizer_update == "rollout":
                 # after the advantages: the networks still see the observations as in the rollout
                 collector.update_normalizers(collector.raw_obs)
@@ -234,6 +235,8 @@ class Learner:
             require_finite(self.collector.named_weights(), iteration)
         if not self.config.bounds_coef:
             del metrics["Loss/bounds"]
+        if self.config.symmetry is None:
+            del metrics["Loss/mirror"]
         return finite_values(metrics)
 
     def _gradient_in_causal_order(self, result: LossResult) -> list[tuple[str, Tensor]]:

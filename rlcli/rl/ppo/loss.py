@@ -17,7 +17,7 @@ from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.ppo.networks import ActorCritic
 from rlcli.rl.ppo.rollout_buffer import Samples
 
-METRICS = ("surrogate", "value", "entropy", "kl", "clip_fraction", "bounds")
+METRICS = ("surrogate", "value", "entropy", "kl", "clip_fraction", "bounds", "mirror")
 """Metrics of a minibatch, in the order of `LossResult.metrics`."""
 KL = METRICS.index("kl")
 """Index of the KL divergence in `METRICS`."""
@@ -29,7 +29,7 @@ class LossResult(NamedTuple):
     loss: Tensor
     """Scalar that the optimiser minimises. ()"""
     metrics: Tensor
-    """`METRICS`, detached. (6,)"""
+    """`METRICS`, detached. (7,)"""
     mean: Tensor
     """Mean actions, detached. (n, a)"""
     std: Tensor
@@ -51,25 +51,28 @@ def minibatch_loss(
         L_clip   = mean( min( r_t A_t, clip(r_t, 1 - clip_range, 1 + clip_range) A_t ) )            (7)
         loss     = - ( L_clip - value_coef * L_value + entropy_coef * entropy )                     (9)
 
-    Two further terms are added to the loss if the agent uses them:
+    Further terms are added to the loss if the agent uses them:
 
         tell_coef x mean squared error of the auxiliary layer `teller`, which predicts the critic's observation
             (standardised, clipped to +-3) from the actor's last hidden layer
         bounds_coef x mean over samples of the squared part of |mean action| above bounds_margin
+        mirror_coef x `ActorCritic.mirror_error`
 
     Args:
         networks: actor, critic and auxiliary layer.
         config: coefficients and clipping.
-        batch: the samples. (n, ...)
-        obs: inputs of the actor's network. (n, d)
+        batch: the samples; with `symmetry.augment` the second half are the mirror images of the first. (n, ...)
+        obs: inputs of the actor's network; with `symmetry` the second half are mirror images. (n or 2 n, d)
         critic_obs: inputs of the critic's network. (n, c)
         advantage: A_t, normalised if the agent normalises advantages. (n,)
         old_std: standard deviation of the policy whose mean is `batch.mean`. (a,)
     """
-    value_loss = _value_loss(networks.value(critic_obs), batch, config)
     hidden = networks.hidden(obs)
     std, mean = networks.std, networks.actor[-1](hidden)
-
+    mirror, all_means = networks.mirror_error(mean), mean.detach()
+    if len(mean) > len(advantage):
+        hidden, mean = hidden[: len(advantage)], mean[: len(advantage)]
+    value_loss = _value_loss(networks.value(critic_obs), batch, config)
     log_ratio = log_prob((batch.action - mean) / std, std) - batch.log_prob
     ratio = log_ratio.exp()
     clipped = ratio.clamp(1.0 - config.clip_range, 1.0 + config.clip_range)
@@ -85,11 +88,14 @@ def minibatch_loss(
     else:
         bounds = torch.zeros_like(loss)
 
+    if config.symmetry is not None and config.symmetry.mirror_coef:
+        loss = loss + config.symmetry.mirror_coef * mirror
+
     with torch.no_grad():
         kl = policy_divergence(config, (batch.mean - mean).square().mean(dim=0), std, old_std)
         clip_fraction = (ratio != clipped).float().mean()
-        metrics = torch.stack((surrogate, value_loss, policy_entropy, kl, clip_fraction, bounds))
-    return LossResult(loss, metrics, mean.detach(), std.detach())
+        metrics = torch.stack((surrogate, value_loss, policy_entropy, kl, clip_fraction, bounds, mirror))
+    return LossResult(loss, metrics, all_means, std.detach())
 
 
 def clip_gradient_(parts: Sequence[Tensor], max_norm: float) -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from rlcli.envs.environment import Environment
+from rlcli.envs.mirror import ColumnMap
 from rlcli.rl.cnn import Cnn, CnnSpec
 from rlcli.rl.mlp import Mlp
 from rlcli.rl.optimizers import Adam
@@ -31,10 +32,18 @@ class ActorCritic(nn.Module):
         env: the environment, which defines the columns of observations and actions.
         config: configuration of networks, initial weights and standard deviation.
         groups: observation groups of the critic.
+        mirror: mirror map of the action; None if the agent does not use the symmetry of the robot.
     """
 
-    def __init__(self, env: Environment, config: PpoConfig, groups: tuple[str, ...]) -> None:
+    mirror_index: Tensor | None
+    mirror_sign: Tensor | None
+
+    def __init__(
+        self, env: Environment, config: PpoConfig, groups: tuple[str, ...], mirror: ColumnMap | None = None
+    ) -> None:
         super().__init__()
+        self.register_buffer("mirror_index", None if mirror is None else mirror.index, persistent=False)
+        self.register_buffer("mirror_sign", None if mirror is None else mirror.sign, persistent=False)
         layout, self.critic_groups = env.layout, groups
         obs_size, action_size = layout.size("policy"), layout.action_size
         critic_obs_size = sum(layout.size(group) for group in groups)
@@ -73,6 +82,17 @@ class ActorCritic(nn.Module):
         """Return the activations of the actor's last hidden layer. (n, d) -> (n, h)"""
         hidden: Tensor = self.actor[:-1](obs if self.vision is None else self.vision(obs))
         return hidden
+
+    def mirror_error(self, mean: Tensor) -> Tensor:
+        """Return the mean squared difference between mean actions for mirrored observations and mirrored mean actions.
+
+        Args:
+            mean: mean actions for n / 2 observations, then for their mirror images. (n, a)
+        """
+        if self.mirror_index is None or self.mirror_sign is None:
+            return mean.new_zeros(())
+        own, image = mean.chunk(2)
+        return (image - (own.index_select(1, self.mirror_index) * self.mirror_sign).detach()).square().mean()
 
     def value(self, critic_obs: Tensor) -> Tensor:
         """Return the value. (..., c) -> (...)"""

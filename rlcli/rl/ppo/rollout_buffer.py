@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -37,6 +37,10 @@ class Samples:
         scalars = [part.squeeze(-1) for part in parts[4:]]
         return cls(parts[0], parts[1] if critic_obs else parts[0], parts[2], parts[3], *scalars)
 
+    def first_half(self) -> Samples:
+        """Return the first half of the samples of a minibatch, without their mirror images."""
+        return Samples(*(getattr(self, each.name).chunk(2)[0] for each in fields(self)))
+
 
 class RolloutBuffer:
     """Samples of a rollout, and a copy of them in the order of the minibatches.
@@ -48,6 +52,7 @@ class RolloutBuffer:
         minibatches: number of samples of each minibatch.
         whole_envs: whether a minibatch holds all steps of its environments.
         device: device of all tensors.
+        mirrored: whether each minibatch also holds the mirror images of its samples, after all samples.
     """
 
     def __init__(
@@ -58,12 +63,17 @@ class RolloutBuffer:
         minibatches: list[int],
         whole_envs: bool,
         device: torch.device,
+        mirrored: bool = False,
     ) -> None:
         obs, critic_obs, action = sizes
-        self._packed = torch.zeros(steps, envs, obs + critic_obs + 2 * action + 5, device=device)
-        self.columns, self.sizes = sizes, minibatches
-        self.samples = Samples.views(self._packed, *sizes)
+        copies = 1 + mirrored
+        self._packed = torch.zeros(copies * steps, envs, obs + critic_obs + 2 * action + 5, device=device)
+        self.columns, self.sizes = sizes, [copies * size for size in minibatches]
+        self._samples_of_minibatches = minibatches
+        self.samples = Samples.views(self._packed[:steps], *sizes)
         """Samples in the order in which they were collected. (num_steps, num_envs, ...)"""
+        self.images = Samples.views(self._packed[steps:], *sizes) if mirrored else None
+        """Mirror images of the samples. (num_steps, num_envs, ...)"""
         self.move(torch.zeros(self._packed.shape[0] * envs, self._packed.shape[2], device=device))
         self.old_std = torch.ones(len(minibatches), action, device=device)
         """Standard deviation of the old policy, for each minibatch; its mean is `Samples.mean`. (minibatches, a)"""
@@ -82,7 +92,7 @@ class RolloutBuffer:
         """Environments of each minibatch; empty without `whole_envs`. (n,) each"""
 
     def move(self, memory: Tensor) -> None:
-        """Use other memory for the samples in the order of the minibatches. (num_steps * num_envs, ...)"""
+        """Use other memory for the minibatches, one after the other. (samples of all minibatches, ...)"""
         self.ordered = memory
         self.minibatches = [Samples.views(part, *self.columns) for part in memory.split_with_sizes(self.sizes)]
         """Samples of each minibatch, views of `ordered`. (n, ...) each"""
@@ -117,4 +127,7 @@ class RolloutBuffer:
 
     def fill_minibatches(self, order: Tensor) -> None:
         """Copy the samples into the minibatches; sample (t, env) has index t * num_envs + env."""
+        if self.images is not None:
+            parts = order.split_with_sizes(self._samples_of_minibatches)
+            order = torch.cat([torch.cat((part, part + len(order))) for part in parts])
         torch.index_select(self._packed.view(self.ordered.shape), 0, order, out=self.ordered)

@@ -8,6 +8,7 @@ import torch
 from pydantic import ValidationError
 
 from rlcli.envs.environment import Environment
+from rlcli.envs.mirror import MirrorMaps, mirror_maps
 from rlcli.rl.cnn import CnnSpec
 from rlcli.rl.policy import PolicySpec
 from rlcli.rl.ppo.config import PpoConfig
@@ -73,6 +74,20 @@ def critic_groups(env: Environment, config: PpoConfig) -> tuple[str, ...]:
             hint = f"groups: {', '.join(available)}"
             raise agent_error(env, ("critic_obs",), f"no observation group '{group}'", hint)
     return groups
+
+
+def task_mirror(env: Environment, config: PpoConfig) -> MirrorMaps | None:
+    """Return the mirror maps of the task on the environment's device; None if the agent uses no symmetry.
+
+    Raises:
+        ConfigError: if the task is not symmetric.
+    """
+    if config.symmetry is None:
+        return None
+    groups = dict.fromkeys(("policy", *critic_groups(env, config)))
+    maps = mirror_maps(env.resolved, groups, tolerance=config.symmetry.tolerance)
+    observations = {group: each.to(env.device) for group, each in maps.observations.items()}
+    return MirrorMaps(observations, maps.action.to(env.device))
 
 
 def minibatch_sizes(env: Environment, config: PpoConfig, total: int) -> list[int]:

@@ -25,7 +25,7 @@ from rlcli.rl.ppo.collector import Collector
 from rlcli.rl.ppo.config import PpoConfig
 from rlcli.rl.ppo.learner import Learner
 from rlcli.rl.ppo.networks import ActorCritic
-from rlcli.rl.ppo.setup import critic_groups, policy_spec
+from rlcli.rl.ppo.setup import critic_groups, policy_spec, task_mirror
 from rlcli.rl.rng import load_rng_state, rng_state, seed_generators
 from rlcli.rl.trainer import Report, TrainerState
 from rlcli.rl.trainer_base import BaseTrainer
@@ -55,10 +55,11 @@ class PpoTrainer(BaseTrainer):
         torch.set_num_threads(torch_threads)
         use_threads(max(torch_threads, env.workers) if device == "cpu" else 1)
         seed_generators(derive(seed, "trainer"))
-        self.networks = ActorCritic(env, config, groups).to(self.device)
+        mirror = task_mirror(env, config)
+        self.networks = ActorCritic(env, config, groups, None if mirror is None else mirror.action).to(self.device)
         # all ranks start with equal weights and explore with different noise
         seed_generators(self.process_group.seed(derive(seed, "exploration"), "exploration"))
-        self.collector = Collector(env, config, self.networks, self.statistics)
+        self.collector = Collector(env, config, self.networks, self.statistics, mirror)
         self.learner = Learner(self.collector, torch_threads)
         self._collect = capture_on_gpu(self.collector.collect, self.device, env.stateful_objects())
         self._update = capture_on_gpu(self.learner.update, self.device)

@@ -177,7 +177,12 @@ def test_output_gradients_match_autograd_at_clipping_edges(clip_value, clip_valu
     zeros = torch.zeros(count)
     batch = Samples(zeros, zeros, action, mean.detach(), log_prob, old, advantage, 0.25 + miss, zeros)
     networks = SimpleNamespace(
-        value=lambda _: value.squeeze(-1), hidden=lambda _: mean, actor=[nn.Identity()], std=std, teller=None
+        value=lambda _: value.squeeze(-1),
+        hidden=lambda _: mean,
+        actor=[nn.Identity()],
+        std=std,
+        teller=None,
+        mirror_error=lambda _: torch.zeros(()),
     )
     result = minibatch_loss(networks, config, batch, zeros, zeros, advantage, torch.ones(1))
     expected = torch.autograd.grad(result.loss, (mean, value, std))
