@@ -24,8 +24,8 @@ import numpy as np
 from rlcli.errors import one_line
 from rlcli.machine import memory_error, python_command, read_plain
 from rlcli.registry import chosen_model, model_file
-from rlcli.safe_text import float_or_nan, shorten
-from rlcli.scene.mjcf_cost import ENDLESS, element_cost, number_of
+from rlcli.safe_text import shorten
+from rlcli.scene.mjcf_cost import ENDLESS, element_cost, float_or_nan, number_of
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 _MAX_TEXT = 16 * 1024 * 1024

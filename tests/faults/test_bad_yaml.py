@@ -235,9 +235,9 @@ def test_thousands_of_mistakes_are_listed_in_part_and_in_little_time(tmp_path, m
     assert len(printed) < 30_000
 
 
-NUM_ENVS = ["0", "-1", "-0", "1e12", "1e3", "1.5", "1e-5", "nan", ".nan", ".inf", "true", "null", "", "[]", "{}", "abc",
-            "0x10", "\u0661\u0662", "\uff11\uff12", "16777217", "1000000000000", "9" * 5000, "'4'", "!!int 4", "4,5",
-            "~", "-" * 10]  # fmt: skip
+NUM_ENVS = ["0", "-1", "-0", "1_000", "4.0", "04", "1e12", "1e3", "1.5", "1e-5", "nan", ".nan", ".inf", "true", "null",
+            "", "[]", "{}", "abc", "0x10", "\u0661\u0662", "\uff11\uff12", "16777217", "1000000000000", "9" * 5000,
+            "'4'", "!!int 4", "4,5", "~", "-" * 10]  # fmt: skip
 
 
 @pytest.mark.parametrize("value", NUM_ENVS)
