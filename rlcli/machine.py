@@ -143,6 +143,22 @@ def require_address_space(least: int = 1 << 30) -> None:
         raise MachineError(message, hint="raise the limit, for example with `ulimit -v unlimited`")
 
 
+def require_memory(size: int, what: str) -> None:
+    """Check that memory is free: a system that overcommits would kill the process later.
+
+    Args:
+        size: the memory [bytes].
+        what: what needs the memory, for the message.
+
+    Raises:
+        DeviceError: if it is not free.
+    """
+    free = min(available_memory(), memory_limit() or _NO_LIMIT)
+    if size > free:
+        message = f"{what} need at least {size / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free on this machine"
+        raise DeviceError(message, hint="use fewer environments: --num-envs")
+
+
 class AddressSpaceCheck:
     """Import hook that calls `require_address_space` before a large library is imported."""
 

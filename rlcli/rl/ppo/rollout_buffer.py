@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rlcli.machine import require_memory
 from rlcli.sim.state_cache import is_finite
 
 
@@ -60,6 +61,9 @@ class RolloutBuffer:
         device: torch.device,
     ) -> None:
         obs, critic_obs, action = sizes
+        if device.type == "cpu":
+            columns = 2 * (obs + critic_obs + 2 * action + 5) + (critic_obs or obs) + 2
+            require_memory(steps * envs * (4 * columns + 17), f"the {steps * envs} samples of a rollout")
         self._packed = torch.zeros(steps, envs, obs + critic_obs + 2 * action + 5, device=device)
         self.columns, self.sizes = sizes, minibatches
         self.samples = Samples.views(self._packed, *sizes)
