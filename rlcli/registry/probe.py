@@ -25,6 +25,13 @@ from rlcli.progress import Work, track
 from rlcli.registry import OWN, TASKS, Entry, package_folder
 
 TIMEOUT_S = 30.0
+_IDLE_S = 3.0
+"""Time after which a process that has loaded nothing more no longer counts as one that uses a core [s]."""
+_MAX_TIMEOUTS = 2
+"""Entries of one distribution that may exceed the time limit; its other entries are not loaded then."""
+_MAX_PROCESSES = 64
+_cores = threading.Semaphore(available_cores())
+"""One for each core; a process that loads entries holds one until it seems to hang."""
 _SUFFIXES = (".py", ".yaml", ".xml")
 _BUILDER = "rlcli.envs.describe_plugins"
 """Module that loads the tasks. It runs in a separate process because plugins may hang or crash, and because the layer
@@ -118,8 +125,8 @@ def probe(
         owners.setdefault(entry.distribution, []).append(entry)
     stop = stop or threading.Event()
     env = {name: value for name, value in os.environ.items() if name not in without}
-    workers = max(1, min(len(owners), available_cores()))
-    with track("tasks and plugins", len(entries)) as work, ThreadPoolExecutor(workers) as pool:
+    what = f"{group.partition('.')[2]} of plugins"
+    with track(what, len(entries)) as work, ThreadPoolExecutor(_MAX_PROCESSES) as pool:
         try:  # Ctrl-C may come while `map` still starts threads, and the first process may already run then
             load = partial(_probe_distribution, timeout_s=timeout_s, group=group, stop=stop, env=env, work=work)
             rows = pool.map(load, owners.values())
@@ -148,10 +155,14 @@ def _probe_distribution(
 ) -> dict[str, Details]:
     """Load the entries of one distribution, in as many processes as needed."""
     found: dict[str, Details] = {}
+    late = f"did not load within {timeout_s:g} s"
     while remaining := [entry.qualified for entry in entries if entry.qualified not in found]:
         if stop.is_set():
             break
-        rows = _probe_names(remaining, timeout_s, group, stop, env)
+        if sum(row.broken == late for row in found.values()) < _MAX_TIMEOUTS:
+            rows = _probe_names(remaining, timeout_s, group, stop, env)
+        else:
+            rows = dict.fromkeys(remaining, Details(broken=f"not loaded, because {_MAX_TIMEOUTS} others {late}"))
         found.update(rows)
         work.advance(len(rows))
     return found
@@ -161,7 +172,11 @@ def _probe_names(
     names: list[str], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str]
 ) -> dict[str, Details]:
     """Load entries in one process and return details of the first one and of all further ones that it reached."""
-    with tempfile.TemporaryDirectory(prefix="rlcli-probe-", ignore_cleanup_errors=True) as folder:
+    with (
+        tempfile.TemporaryDirectory(prefix="rlcli-probe-", ignore_cleanup_errors=True) as folder,
+        contextlib.ExitStack() as core,
+    ):
+        core.enter_context(_cores)
         file, log = Path(folder) / "rows", Path(folder) / "stderr"
         with log.open("wb") as stderr:
             process = subprocess.Popen(
@@ -173,7 +188,7 @@ def _probe_names(
                 start_new_session=True,
             )
         try:
-            code = _wait(process, file, len(names), timeout_s, stop)
+            code = _wait(process, file, len(names), timeout_s, stop, core)
         finally:
             _kill(process)
         rows = _rows(file)
@@ -198,9 +213,14 @@ def _probe_names(
 
 
 def _wait(
-    process: subprocess.Popen[bytes], file: Path, wanted: int, timeout_s: float, stop: threading.Event
+    process: subprocess.Popen[bytes],
+    file: Path,
+    wanted: int,
+    timeout_s: float,
+    stop: threading.Event,
+    core: contextlib.ExitStack,
 ) -> int | None:
-    """Wait for a process that appends rows to a file, and return its exit code.
+    """Wait for a process that appends rows to a file, and return its exit code; free its core if it seems to hang.
 
     Return None if a row, or the end after the last row, takes longer than `timeout_s`, or if `stop` is set.
     """
@@ -210,6 +230,8 @@ def _wait(
             rows, deadline = len(_rows(file)), time.monotonic() + timeout_s
         if time.monotonic() > deadline or stop.is_set():
             return None
+        if time.monotonic() > deadline - timeout_s + _IDLE_S:
+            core.close()
         time.sleep(0.02)
     return process.returncode
 
