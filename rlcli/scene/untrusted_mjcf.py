@@ -252,6 +252,10 @@ class _MjcfScan:
             if len(copies) > _MAX_DEPTH:
                 raise BadModel(f"{file}:{line}: nested deeper than {_MAX_DEPTH} elements; use fewer levels")
             _check_numbers(file, line, name, attributes)
+            if name == "plugin" and not (attributes.get("plugin") or attributes.get("instance")):
+                raise BadModel(
+                    f"{file}:{line}: the plugin has no name, on which MuJoCo may crash; give plugin= or instance="
+                )
             cost = min(copies[-1] * element_cost(name, attributes), ENDLESS)
             self._note_cost(cost, f"{name} at {file}:{line}")
             text.cost += cost

@@ -186,6 +186,12 @@ NAMED = {
         model(asset='<mesh name="m" builtin="supersphere" params="20000 1 1"/>'),
         "too large: as",
     ),
+    "a plugin of a flex without a name": (
+        model(
+            body='<body name="f"><flexcomp name="f" count="3 3 1" spacing="1 1 1" dim="2"><plugin/></flexcomp></body>'
+        ),
+        "the plugin has no name",
+    ),
     "a mass that is no number": (model(body='<geom size="1" mass="nan"/>'), 'geom mass="nan" is not finite'),
     "a place that is no number": (model(body='<geom size="1" pos="0 nan 0"/>'), 'geom pos="0 nan 0" is not finite'),
     "a damping without end": (model(body='<body><joint damping="inf"/></body>'), 'joint damping="inf" is not finite'),
