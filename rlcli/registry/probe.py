@@ -5,6 +5,7 @@ other tasks are in the user's cache folder, under the distribution's name and ve
 """
 
 import contextlib
+import functools
 import json
 import os
 import signal
@@ -30,8 +31,6 @@ _IDLE_S = 3.0
 _MAX_TIMEOUTS = 2
 """Entries of one distribution that may exceed the time limit; its other entries are not loaded then."""
 _MAX_PROCESSES = 64
-_cores = threading.Semaphore(available_cores())
-"""One for each core; a process that loads entries holds one until it seems to hang."""
 _SUFFIXES = (".py", ".yaml", ".xml")
 _BUILDER = "rlcli.envs.describe_plugins"
 """Module that loads the tasks. It runs in a separate process because plugins may hang or crash, and because the layer
@@ -168,6 +167,12 @@ def _probe_distribution(
     return found
 
 
+@functools.cache
+def _cores() -> threading.Semaphore:
+    """Return the cores of the machine; a process that loads entries holds one until it seems to hang."""
+    return threading.Semaphore(available_cores())
+
+
 def _probe_names(
     names: list[str], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str]
 ) -> dict[str, Details]:
@@ -176,7 +181,7 @@ def _probe_names(
         tempfile.TemporaryDirectory(prefix="rlcli-probe-", ignore_cleanup_errors=True) as folder,
         contextlib.ExitStack() as core,
     ):
-        core.enter_context(_cores)
+        core.enter_context(_cores())
         file, log = Path(folder) / "rows", Path(folder) / "stderr"
         with log.open("wb") as stderr:
             process = subprocess.Popen(
