@@ -59,6 +59,9 @@ test-all: $(VENV)/.dev
 	$(BIN)/python tests/coverage_gate.py .coverage.json
 
 # Kills, faults of the machine, signals, divergence, hostile files, exact resume: all cases, and what a night is for.
+# Every day draws new cases; RLCLI_TEST_SEED=YYYYMMDD repeats those of a day.
+test-faults test-faults-long: export RLCLI_TEST_SEED ?= $(shell date +%Y%m%d)
+
 test-faults: $(VENV)/.dev
 	RLCLI_TEST_SIZE=full $(BIN)/python -m pytest -n 2 tests/faults
 

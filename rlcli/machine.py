@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from rlcli.errors import DependencyError, DeviceError, MachineError, RlcliError, UsageError, one_line, pip_install
+from rlcli.safe_text import read_number
 
 _GROUPS, _OWN_GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _NO_LIMIT = 1 << 60
@@ -31,7 +32,21 @@ def available_cores(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> int:
     quota = core_quota(groups, own)
     if quota is not None:  # a thread above the quota is paused for the rest of each period, and the others wait for it
         cores = min(cores, int(quota))
-    return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+    return max(1, cores // launcher_number("LOCAL_WORLD_SIZE", 1, least=1))
+
+
+def launcher_number(name: str, default: int, least: int = 0) -> int:
+    """Return the number in an environment variable that a launcher such as torchrun sets.
+
+    Raises:
+        UsageError: if it is no whole number, or below `least`.
+    """
+    text = os.environ.get(name) or str(default)
+    number = read_number(text)
+    if not isinstance(number, int) or number < least:
+        message = f"the environment variable {name} is '{text}', not a whole number >= {least}"
+        raise UsageError(message, hint=f"unset {name}; only launchers such as torchrun set it")
+    return number
 
 
 def core_quota(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> float | None:
@@ -141,6 +156,22 @@ def require_address_space(least: int = 1 << 30) -> None:
     if (limit := address_space()) is not None and limit < least:
         message = f"the process is limited to {limit >> 20} MiB of memory; {least >> 20} are needed"
         raise MachineError(message, hint="raise the limit, for example with `ulimit -v unlimited`")
+
+
+def require_memory(size: int, what: str) -> None:
+    """Check that memory is free: a system that overcommits would kill the process later.
+
+    Args:
+        size: the memory [bytes].
+        what: what needs the memory, for the message.
+
+    Raises:
+        DeviceError: if it is not free.
+    """
+    free = min(available_memory(), memory_limit() or _NO_LIMIT)
+    if size > free:
+        message = f"{what} need at least {size / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free on this machine"
+        raise DeviceError(message, hint="use fewer environments: --num-envs")
 
 
 class AddressSpaceCheck:

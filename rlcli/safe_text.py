@@ -63,9 +63,22 @@ def _cut(text: str, limit: int) -> str:
     return text if len(text) <= limit else f"{text[: limit // 2]}...{text[3 - limit // 2 :]}"
 
 
+_INT = re.compile(r"[-+]?(0|[1-9][0-9]{0,18})\Z")
+_FLOAT = re.compile(r"(?![-+]?0[0-9]+\Z)[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]{1,4})?\Z")
+
+
+def read_number(text: str) -> int | float | None:
+    """Return the number that a text spells; None for any other text.
+
+    Files and command lines have the same numbers: decimal digits without `_` and spaces, no octal numbers such as
+    `010`, no words such as `inf`.
+    """
+    if _INT.match(text):
+        return int(text)
+    return float(text) if _FLOAT.match(text) else None
+
+
 def float_or_nan(text: str) -> float:
-    """Parse a number; return NaN for any other text."""
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+    """Return the number that a text spells, with spaces around it; NaN for any other text."""
+    number = read_number(text.strip())
+    return math.nan if number is None else float(number)

@@ -7,9 +7,14 @@ from rlcli.config.schema import TaskConfig
 from rlcli.registry.formats import format_keys
 
 
+def foreign_keys(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys that a task file in rlcli's own format does not have, with their values."""
+    return {key: value for key, value in data.items() if key not in TaskConfig.model_fields}
+
+
 def move_foreign_keys(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of a task file with the keys of other frameworks' formats moved into `foreign`."""
-    unknown = data.keys() - TaskConfig.model_fields.keys()
+    unknown = foreign_keys(data).keys()
     keys = format_keys() & unknown if unknown else set()
     if not keys:
         return dict(data)

@@ -16,6 +16,8 @@ from typing import Any
 import yaml
 from yaml import events
 
+from rlcli.safe_text import read_number
+
 MAX_BYTES = 256 * 1024
 MAX_DEPTH = 32
 MAX_ITEMS = 20_000
@@ -24,8 +26,6 @@ MAX_SCALAR = 16 * 1024
 Path = tuple[str | int, ...]
 Mark = tuple[int, int]
 
-_INT = re.compile(r"[-+]?(0|[1-9][0-9]{0,18})\Z")
-_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]{1,4})?\Z")
 _OCTAL = re.compile(r"[-+]?0[0-9]+\Z")
 _NOT_FINITE = re.compile(r"[-+]?\.(inf|nan)\Z", re.IGNORECASE)
 _SURROGATE = re.compile("[\ud800-\udfff]")
@@ -210,10 +210,7 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
         return _CONSTANTS[text]
     if _OCTAL.match(text):
         raise YamlError(f"{text} is ambiguous (octal in YAML 1.1); remove the leading 0 or quote it", event.start_mark)
-    if _INT.match(text):
-        return int(text)
-    if _FLOAT.match(text):
-        number = float(text)
+    if (number := read_number(text)) is not None:
         if math.isinf(number):
             raise YamlError(f"the number {text[:20]} is out of range; allowed: up to 1.8e308", event.start_mark)
         return number

@@ -9,7 +9,7 @@ from typing import Any, Self
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, python_task
-from rlcli.config.foreign_keys import move_foreign_keys
+from rlcli.config.foreign_keys import foreign_keys, move_foreign_keys
 from rlcli.config.given_models import MODELS, model_path, recorded_models
 from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read, without
 from rlcli.config.older_success import upgraded
@@ -125,7 +125,7 @@ class TaskCheck:
         Raises:
             DependencyError: if the format is known and its plugin is not installed.
         """
-        unknown = {key: value for key, value in document.data.items() if key not in TaskConfig.model_fields}
+        unknown = foreign_keys(document.data)
         if not unknown:
             return False
         for form in formats.installed_formats():
@@ -232,9 +232,10 @@ class TaskCheck:
                     self._no_agent(origin.where)
                     continue
                 path = ("agents", name, *path[1:])
-            form = self.format or formats.format_of_key(self.layers.data)
-            if path[0] == MODELS and not (path := model_path(path, form, self.problems)):
-                continue
+            if path[0] == MODELS:
+                form = self.format or formats.format_of_key(foreign_keys(self.layers.data))
+                if not (path := model_path(path, form, self.problems)):
+                    continue
             if value is None and path[0] in SECTIONS and not isinstance(self.layers.get(path), dict):
                 # null removes a term; for a term that does not exist, suggest one with a similar name
                 similar = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))
@@ -297,8 +298,7 @@ class TaskCheck:
         self.locations = self.locations or _key_locations("agents.NAME", AgentConfig)
         self.read_terms()
         data = {key: value for key, value in self.layers.data.items() if key not in PATCHES}
-        unknown = {key: value for key, value in data.items() if key not in TaskConfig.model_fields}
-        self.format = formats.format_of_key(unknown) or self.format
+        self.format = formats.format_of_key(foreign_keys(data)) or self.format
         for section in [name for name in SECTIONS if isinstance(_mapping(data.get(name)).get("func"), str)]:
             func = data.pop(section)["func"]
             self.problem((section,), "a term needs a name", f"write {section}: {{NAME: {{func: {func}, ...}}}}")

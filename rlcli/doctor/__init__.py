@@ -9,7 +9,7 @@ from rlcli.doctor.compute_and_graphics import check_isolated
 from rlcli.doctor.installation import entry_checks, installation_checks, metadata_checks
 from rlcli.doctor.machine import machine_checks, settings_checks
 from rlcli.machine import require_address_space
-from rlcli.registry import FORMATS, TASKS, TRAINERS
+from rlcli.registry.entries import GROUPS
 from rlcli.registry.probe import TIMEOUT_S
 
 __all__ = ["Check", "run_checks"]
@@ -29,13 +29,13 @@ def run_checks(runs_dir: Path, timeout_s: float = TIMEOUT_S) -> list[Check]:
     """
     require_address_space()
     stop = threading.Event()
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor() as pool:
         try:
-            tasks = pool.submit(entry_checks, TASKS, timeout_s, stop)
+            plugins = [pool.submit(entry_checks, group, timeout_s, stop) for group in GROUPS]
             isolated = pool.submit(check_isolated, timeout_s)
             checks = [*installation_checks(), *machine_checks(runs_dir), *settings_checks()]
-            checks += [*isolated.result(), *metadata_checks(), *tasks.result()]
-            return checks + [check for group in (TRAINERS, FORMATS) for check in entry_checks(group, timeout_s, stop)]
+            checks += [*isolated.result(), *metadata_checks()]
+            return checks + [check for future in plugins for check in future.result()]
         except BaseException:  # Ctrl-C
             stop.set()
             raise

@@ -10,6 +10,7 @@ from rlcli.config.schema import TaskConfig
 from rlcli.envs.shard_range import Shard
 from rlcli.envs.vec_env import VecEnv
 from rlcli.machine import restore_garbage_collection
+from rlcli.progress import track
 from rlcli.registry import load_object
 
 _MANAGED, _DIRECT = "rlcli.envs.managed:ManagedEnv", "rlcli.envs.direct:DirectEnv"
@@ -41,5 +42,6 @@ def make_env(
         env_class = resolved.format.load(resolved.format.spec.environment)
     else:
         env_class = load_object(_MANAGED if resolved.source.task is None else _DIRECT)
-    env: VecEnv = env_class(resolved, seed=seed, device=device, shared_streams=shared_streams, shard=shard)
+    with track(f"building {resolved.task.scene.num_envs} environments"):
+        env: VecEnv = env_class(resolved, seed=seed, device=device, shared_streams=shared_streams, shard=shard)
     return env

@@ -2,10 +2,12 @@
 
 import contextlib
 import importlib
+import logging
 import operator
 import os
 import re
 import sys
+import threading
 import traceback
 from collections.abc import Iterator
 from importlib import metadata
@@ -18,6 +20,10 @@ from rlcli.registry.entries import Entry
 from rlcli.task import API_VERSION, TaskSpec
 from rlcli.trainers import TrainerSpec
 
+_log = logging.getLogger(__name__)
+
+_SLOW_S = 10
+"""Time after which a plugin that is still imported is named [s]."""
 _Spec = TypeVar("_Spec", TaskSpec, TrainerSpec, FormatSpec)
 
 
@@ -44,7 +50,7 @@ def load_entry(entry: Entry, kind: type) -> Any:
         DependencyError: raised by the plugin itself, passed on.
     """
     try:
-        with track(f"plugin {entry.qualified} ({entry.value})"):
+        with track(f"plugin {entry.qualified} ({entry.value})"), _named_if_slow(entry):
             value = import_object(entry.value)
     except DependencyError:
         raise
@@ -63,6 +69,19 @@ def load_entry(entry: Entry, kind: type) -> Any:
             f" {type(value).__name__}, expected a {kind.__name__}; report it to the plugin's authors"
         )
     return value
+
+
+@contextlib.contextmanager
+def _named_if_slow(entry: Entry) -> Iterator[None]:
+    """Log a warning if the `with` block, which imports a plugin, takes longer than `_SLOW_S`."""
+    text = f"plugin {entry.distribution} {entry.version}: the import of {entry.value} takes more than {_SLOW_S} s"
+    timer = threading.Timer(_SLOW_S, _log.warning, [f"{text}; if it does not end, exclude it with RLCLI_PLUGINS=none"])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def import_object(reference: str) -> Any:

@@ -5,6 +5,7 @@ other tasks are in the user's cache folder, under the distribution's name and ve
 """
 
 import contextlib
+import functools
 import json
 import os
 import signal
@@ -25,6 +26,11 @@ from rlcli.progress import Work, track
 from rlcli.registry import OWN, TASKS, Entry, package_folder
 
 TIMEOUT_S = 30.0
+_IDLE_S = 3.0
+"""Time after which a process that has loaded nothing more no longer counts as one that uses a core [s]."""
+_MAX_TIMEOUTS = 2
+"""Entries of one distribution that may exceed the time limit; its other entries are not loaded then."""
+_MAX_PROCESSES = 64
 _SUFFIXES = (".py", ".yaml", ".xml")
 _BUILDER = "rlcli.envs.describe_plugins"
 """Module that loads the tasks. It runs in a separate process because plugins may hang or crash, and because the layer
@@ -118,8 +124,8 @@ def probe(
         owners.setdefault(entry.distribution, []).append(entry)
     stop = stop or threading.Event()
     env = {name: value for name, value in os.environ.items() if name not in without}
-    workers = max(1, min(len(owners), available_cores()))
-    with track("tasks and plugins", len(entries)) as work, ThreadPoolExecutor(workers) as pool:
+    what = f"{group.partition('.')[2]} of plugins"
+    with track(what, len(entries)) as work, ThreadPoolExecutor(_MAX_PROCESSES) as pool:
         try:  # Ctrl-C may come while `map` still starts threads, and the first process may already run then
             load = partial(_probe_distribution, timeout_s=timeout_s, group=group, stop=stop, env=env, work=work)
             rows = pool.map(load, owners.values())
@@ -148,13 +154,23 @@ def _probe_distribution(
 ) -> dict[str, Details]:
     """Load the entries of one distribution, in as many processes as needed."""
     found: dict[str, Details] = {}
+    late = f"did not load within {timeout_s:g} s"
     while remaining := [entry.qualified for entry in entries if entry.qualified not in found]:
         if stop.is_set():
             break
-        rows = _probe_names(remaining, timeout_s, group, stop, env)
+        if sum(row.broken == late for row in found.values()) < _MAX_TIMEOUTS:
+            rows = _probe_names(remaining, timeout_s, group, stop, env)
+        else:
+            rows = dict.fromkeys(remaining, Details(broken=f"not loaded, because {_MAX_TIMEOUTS} others {late}"))
         found.update(rows)
         work.advance(len(rows))
     return found
+
+
+@functools.cache
+def _cores() -> threading.Semaphore:
+    """Return the cores of the machine; a process that loads entries holds one until it seems to hang."""
+    return threading.Semaphore(available_cores())
 
 
 def _probe_names(
@@ -164,7 +180,11 @@ def _probe_names(
 
     The entry at which the process crashed or exceeded the time limit is among them, as broken.
     """
-    with tempfile.TemporaryDirectory(prefix="rlcli-probe-", ignore_cleanup_errors=True) as folder:
+    with (
+        tempfile.TemporaryDirectory(prefix="rlcli-probe-", ignore_cleanup_errors=True) as folder,
+        contextlib.ExitStack() as core,
+    ):
+        core.enter_context(_cores())
         file, log = Path(folder) / "rows", Path(folder) / "stderr"
         with log.open("wb") as stderr:
             process = subprocess.Popen(
@@ -176,7 +196,7 @@ def _probe_names(
                 start_new_session=True,
             )
         try:
-            code = _wait(process, file, len(names), timeout_s, stop)
+            code = _wait(process, file, len(names), timeout_s, stop, core)
         finally:
             _kill(process)
         rows = _rows(file)
@@ -201,9 +221,14 @@ def _probe_names(
 
 
 def _wait(
-    process: subprocess.Popen[bytes], file: Path, wanted: int, timeout_s: float, stop: threading.Event
+    process: subprocess.Popen[bytes],
+    file: Path,
+    wanted: int,
+    timeout_s: float,
+    stop: threading.Event,
+    core: contextlib.ExitStack,
 ) -> int | None:
-    """Wait for a process that appends rows to a file, and return its exit code.
+    """Wait for a process that appends rows to a file, and return its exit code; free its core if it seems to hang.
 
     Return None if a row, or the end after the last row, takes longer than `timeout_s`, or if `stop` is set.
     """
@@ -213,6 +238,8 @@ def _wait(
             rows, deadline = len(_rows(file)), time.monotonic() + timeout_s
         if time.monotonic() > deadline or stop.is_set():
             return None
+        if time.monotonic() > deadline - timeout_s + _IDLE_S:
+            core.close()
         time.sleep(0.02)
     return process.returncode
 

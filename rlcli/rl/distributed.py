@@ -15,7 +15,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import INTERRUPTED, STOPPED, MachineError
-from rlcli.machine import python_command
+from rlcli.machine import launcher_number, python_command
 from rlcli.progress import track
 
 if TYPE_CHECKING:
@@ -93,19 +93,19 @@ def current() -> ProcessGroup:
 
 def launched() -> bool:
     """Return whether a launcher started this process as one of several."""
-    return "RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
+    return "RANK" in os.environ and launcher_number("WORLD_SIZE", 1, least=1) > 1
 
 
 def is_rank_zero() -> bool:
     """Return whether this process is the only one or has rank 0."""
-    return not launched() or os.environ["RANK"] == "0"
+    return not launched() or launcher_number("RANK", 0) == 0
 
 
 def local_rank_and_size() -> tuple[int, int]:
     """Return the rank of this process on its machine, and the number of processes there."""
     if not launched():
         return 0, 1
-    return int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    return launcher_number("LOCAL_RANK", 0), launcher_number("LOCAL_WORLD_SIZE", 1, least=1)
 
 
 def join(device: str) -> ProcessGroup:

@@ -7,13 +7,12 @@ import stat
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from rlcli.errors import CheckpointError
 from rlcli.runs.metric_rows import parse_row
-from rlcli.runs.run import CONFIG, RECORD, WAITING, Run, is_locked, open_run, run_folders
+from rlcli.runs.run import CONFIG, RECORD, WAITING, Run, is_locked, open_run, run_folders, seconds_since
 from rlcli.runs.safe_io import read_tail
 
 ENDED = {"finished", "stopped", "diverged", "failed"}
@@ -26,7 +25,8 @@ _MAX_SEARCH_BYTES = 64 * 1024**2
 """Bytes of the metrics that are searched for one row."""
 _MAX_FILES = 20_000
 _STARTING_S = 5.0
-"""Age up to which a run counts as running without a lock, because it may not have its lock yet [s]."""
+"""Age up to which a run counts as running without a lock, because it may not have its lock yet [s]. A
+time stamp this far in the future is one of another clock."""
 
 
 @dataclass(slots=True)
@@ -126,7 +126,7 @@ def state_of(run: Run) -> tuple[str, str | None]:
     recorded = run.record.get("state", "")
     why = run.record.get("reason")
     reason = why if isinstance(why, str) and recorded in ("diverged", "failed") else None
-    if is_locked(run.folder) or (recorded == "running" and _age(run.record.get("started")) < _STARTING_S):
+    if is_locked(run.folder) or (recorded == "running" and abs(seconds_since(run.record.get("started"))) < _STARTING_S):
         return "running", None
     if recorded in ENDED or recorded == WAITING:
         return recorded, reason
@@ -161,7 +161,7 @@ def _tail(run: Run, limit: int) -> tuple[bytes, bool]:
 def _is_new(folder: Path) -> bool:
     """Return whether a folder may belong to a run that is being created: run.json is written last."""
     try:
-        young = time.time() - folder.stat().st_mtime < _STARTING_S
+        young = abs(time.time() - folder.stat().st_mtime) < _STARTING_S
         return young and not {RECORD, "metrics.jsonl"} & set(os.listdir(folder))
     except OSError:
         return False
@@ -212,10 +212,9 @@ def count(value: object) -> int | None:
 
 
 def times(run: Run) -> tuple[float | None, float | None]:
-    """Return the time since the start of a run and its training time [s]; None if unknown."""
-    age = _age(run.record.get("started"))
-    if not math.isfinite(age):
-        return None, None
+    """Return the time since the start of a run and its training time [s]; None if unknown, as after a clock change."""
+    started = seconds_since(run.record.get("started"))
+    age = max(0.0, started) if -_STARTING_S < started < math.inf else None
     before, since = run.record.get("trained_s"), run.record.get("since")
     trained = max(0.0, float(before)) if type(before) is float and math.isfinite(before) else 0.0
     if run.record.get("state") in ENDED and before is not None:
@@ -224,16 +223,8 @@ def times(run: Run) -> tuple[float | None, float | None]:
         written = run.metrics.stat().st_mtime
     except OSError:
         return age, trained
-    begin = _age(since if isinstance(since, str) else run.record.get("started"))
-    return age, trained + max(0.0, written - (time.time() - begin))
-
-
-def _age(stamp: Any) -> float:
-    """Return the seconds since an ISO time stamp; infinity if it is malformed."""
-    try:
-        return max(0.0, time.time() - datetime.fromisoformat(stamp).timestamp())
-    except (TypeError, ValueError, OverflowError, OSError):
-        return math.inf
+    now = written - time.time() + (seconds_since(since) if isinstance(since, str) else started)
+    return age, trained + max(0.0, now) if now < math.inf else None
 
 
 def _resumable(run: Run) -> bool:

@@ -2,10 +2,12 @@
 
 import contextlib
 import errno
+import math
 import os
 import re
 import shutil
 import stat
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -300,6 +302,14 @@ class _Finding(FileModel):
     iteration: Annotated[int, Field(ge=0)]
     message: PrintableText
     hint: PrintableText
+
+
+def seconds_since(stamp: object) -> float:
+    """Return the seconds since an ISO time stamp, negative for one in the future; infinity if it is malformed."""
+    try:
+        return time.time() - datetime.fromisoformat(str(stamp)).timestamp()
+    except (ValueError, OverflowError, OSError):
+        return math.inf
 
 
 class RunRecord(FileModel):

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from rlcli.errors import CheckpointError, UsageError, did_you_mean, listing
-from rlcli.runs.run import RECORD, STUDY, Run, open_run, run_folders, runs_below
+from rlcli.runs.run import RECORD, STUDY, Run, open_run, run_folders, runs_below, seconds_since
 from rlcli.settings import setting
 
 _log = logging.getLogger(__name__)
@@ -155,6 +155,11 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
             of_task = f" of {task}" if task else ""
             hint = f"rlcli train {task or 'TASK'} starts one"
             raise CheckpointError(f"there is no run{of_task} in {runs_dir}", hint=hint)
+        if seconds_since(runs[-1].record.get("started")) < -60:
+            _log.warning(
+                f"{runs[-1].folder} started in the future by this machine's clock, so that `latest` may not be the run"
+                " that was started last; name the run"
+            )
         return runs[-1], f"newest run of {task}" if task else f"newest run in {runs_dir}"
     for candidate in (Path(reference), runs_dir / reference, *([runs_dir / task / reference] if task else [])):
         if os.path.isfile(candidate / RECORD):

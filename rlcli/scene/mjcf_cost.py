@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-from rlcli.safe_text import float_or_nan
-
 ENDLESS = 1e18
 """Upper bound of counts of copies and of costs, so that products of a few of them stay finite."""
 
@@ -38,6 +36,14 @@ def element_cost(name: str, attributes: dict[str, str]) -> float:
         return 1.0 + math.prod(max(1.0, number_of(word)) for word in attributes.get("value", "").split()) / 10
     stored = product("num", "dim", "nsample", "actdim", "resolution", *(["size"] if name == "numeric" else []))
     return 1.0 + stored / 100 + sum(len(value) for value in attributes.values()) / 10_000
+
+
+def float_or_nan(text: str) -> float:
+    """Return the number that a text of an MJCF spells; NaN for any other text."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def number_of(text: str | None) -> float:

@@ -51,7 +51,7 @@ def _equality_couples(model: mujoco.MjModel) -> bool:
     for kind, of_sites, first, second in zip(
         model.eq_type, model.eq_objtype == mujoco.mjtObj.mjOBJ_SITE, model.eq_obj1id, model.eq_obj2id, strict=True
     ):
-        if kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
+        if int(kind) in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
             bodies = model.site_bodyid[[first, second]] if of_sites else np.array([first, second])
             if _moves(model)[bodies].all():
                 return True
@@ -76,5 +76,5 @@ def _contact_couples(model: mujoco.MjModel) -> bool:
 
 
 def _moves(model: mujoco.MjModel) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return which bodies can move."""
-    return np.asarray(model.body_weldid != 0)
+    """Return which bodies have degrees of freedom, of their own or of a parent; a mocap body has none."""
+    return np.asarray(model.body_treeid >= 0)

@@ -25,8 +25,8 @@ import numpy as np
 from rlcli.errors import one_line
 from rlcli.machine import memory_error, python_command, read_plain
 from rlcli.registry import chosen_model, model_file
-from rlcli.safe_text import float_or_nan, shorten
-from rlcli.scene.mjcf_cost import ENDLESS, element_cost, number_of
+from rlcli.safe_text import shorten
+from rlcli.scene.mjcf_cost import ENDLESS, element_cost, float_or_nan, number_of
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 _MAX_TEXT = 16 * 1024 * 1024
@@ -263,6 +263,10 @@ class _MjcfScan:
             if len(copies) > _MAX_DEPTH:
                 raise BadModel(f"{file}:{line}: nested deeper than {_MAX_DEPTH} elements; use fewer levels")
             _check_numbers(file, line, name, attributes)
+            if name == "plugin" and not (attributes.get("plugin") or attributes.get("instance")):
+                raise BadModel(
+                    f"{file}:{line}: the plugin has no name, on which MuJoCo may crash; give plugin= or instance="
+                )
             count = max(1.0, number_of(attributes.get("count"))) if name == "replicate" else 1.0
             cost = min(copies[-1] * count * element_cost(name, attributes), ENDLESS)
             self._note_cost(cost, f"{name} at {file}:{line}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -15,8 +14,8 @@ from mujoco.batch import MODEL_FIELDS, SimulationError
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rlcli import machine
-from rlcli.errors import DeviceError, DivergedError, did_you_mean, listing, one_line
+from rlcli.errors import DivergedError, did_you_mean, listing, one_line
+from rlcli.machine import require_memory
 from rlcli.sim.divergence_report import HISTORY_MEMORY, MORE_MEMORY, Call, StateHistory, StateLayout
 from rlcli.sim.mujoco_private import (
     STATE_FIELDS,
@@ -51,7 +50,8 @@ class BatchWorlds:
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, threads: int, *, persistent: bool) -> None:
         quiet_mujoco()
-        _require_memory(model, num_envs)
+        each = _MIN_STATES_PER_ENV * 8 * mujoco.mj_stateSize(model, INTEGRATION_STATE)
+        require_memory(each * num_envs, f"{num_envs} environments")
         self.model = model
         self.num_envs = num_envs
         self.threads = threads
@@ -222,19 +222,3 @@ def engine_call() -> Iterator[None]:
             yield
     except SimulationError as error:
         raise DivergedError(f"the physics engine stopped: {one_line(error)}", hint=MORE_MEMORY) from None
-
-
-def _require_memory(model: mujoco.MjModel, num_envs: int) -> None:
-    """Refuse worlds that do not fit into memory: a system that overcommits would kill the process later.
-
-    Raises:
-        DeviceError: if they do not fit.
-    """
-    each = _MIN_STATES_PER_ENV * 8 * mujoco.mj_stateSize(model, INTEGRATION_STATE)
-    free = min(machine.available_memory(), machine.memory_limit() or sys.maxsize)
-    if each * num_envs > free:
-        raise DeviceError(
-            f"{num_envs} environments need at least {each * num_envs / 2**30:.1f} GiB,"
-            f" {free / 2**30:.1f} GiB are free on this machine",
-            hint="use fewer environments: --num-envs",
-        )

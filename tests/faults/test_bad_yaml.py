@@ -9,7 +9,7 @@ from typing import Annotated, Any, get_args
 import pytest
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from support import yaml_grammar
-from support.fault_sizes import amount, chosen
+from support.fault_sizes import amount, chosen, seeds
 
 from rlcli.cli.app import main
 from rlcli.config import strict_yaml
@@ -207,7 +207,7 @@ def mutant(draw):
 BATCH = 2000
 
 
-@pytest.mark.parametrize("seed", range(amount(1, 10, 500)))
+@pytest.mark.parametrize("seed", seeds(1, 10, 500))
 def test_random_bytes_give_a_mapping_or_a_syntax_error(seed):
     draw, read = random.Random(seed), 0
     for _ in range(BATCH):
@@ -235,9 +235,9 @@ def test_thousands_of_mistakes_are_listed_in_part_and_in_little_time(tmp_path, m
     assert len(printed) < 30_000
 
 
-NUM_ENVS = ["0", "-1", "-0", "1e12", "1e3", "1.5", "1e-5", "nan", ".nan", ".inf", "true", "null", "", "[]", "{}", "abc",
-            "0x10", "\u0661\u0662", "\uff11\uff12", "16777217", "1000000000000", "9" * 5000, "'4'", "!!int 4", "4,5",
-            "~", "-" * 10]  # fmt: skip
+NUM_ENVS = ["0", "-1", "-0", "1_000", "4.0", "04", "1e12", "1e3", "1.5", "1e-5", "nan", ".nan", ".inf", "true", "null",
+            "", "[]", "{}", "abc", "0x10", "\u0661\u0662", "\uff11\uff12", "16777217", "1000000000000", "9" * 5000,
+            "'4'", "!!int 4", "4,5", "~", "-" * 10]  # fmt: skip
 
 
 @pytest.mark.parametrize("value", NUM_ENVS)
@@ -248,7 +248,7 @@ def test_hostile_number_of_environments_is_refused(value, tmp_path, monkeypatch,
     assert "num" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("first", range(amount(1, 20, 400)))
+@pytest.mark.parametrize("first", seeds(1, 20, 400))
 def test_task_files_and_overrides_of_the_grammar_end_with_a_message(first, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     count = amount(15, 50)
@@ -256,7 +256,7 @@ def test_task_files_and_overrides_of_the_grammar_end_with_a_message(first, tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(amount(2, 20, 200)))
+@pytest.mark.parametrize("seed", seeds(2, 20, 200))
 def test_task_file_of_the_grammar_is_refused_by_the_command(seed, child, tmp_path):
     text, words = yaml_grammar.case(seed, yaml_grammar.documents())
     (tmp_path / "task").mkdir()
@@ -265,7 +265,7 @@ def test_task_file_of_the_grammar_is_refused_by_the_command(seed, child, tmp_pat
     assert not yaml_grammar.complaint(ended.code, ended.err, 0.0)
 
 
-@pytest.mark.parametrize("seed", range(amount(1, 5, 50)))
+@pytest.mark.parametrize("seed", seeds(1, 5, 50))
 def test_mutated_task_gives_a_configuration_or_problems(seed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "task"

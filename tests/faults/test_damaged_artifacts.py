@@ -3,7 +3,7 @@
 import pytest
 import torch
 from support import artifact_grammar
-from support.fault_sizes import amount
+from support.fault_sizes import amount, seeds
 
 
 @pytest.fixture(scope="module")
@@ -12,7 +12,7 @@ def artifacts(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(amount(1, 10, 200)))
+@pytest.mark.parametrize("first", seeds(1, 10, 200))
 def test_commands_refuse_or_read_damaged_artifacts(first, artifacts, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("RLCLI_STATE_DIR", str(tmp_path / "state"))
     monkeypatch.delenv("RLCLI_RUNS_DIR", raising=False)

@@ -2,7 +2,7 @@
 
 import pytest
 from support import echo_grammar
-from support.fault_sizes import amount
+from support.fault_sizes import amount, seeds
 
 
 @pytest.fixture(autouse=True)
@@ -11,7 +11,7 @@ def _alone(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(amount(1, 10, 100)))
+@pytest.mark.parametrize("first", seeds(1, 10, 100))
 def test_messages_repeat_little_of_hostile_text(first, tmp_path, capsys):
     count = amount(30, 60)
     assert echo_grammar.run_all(first * count, count, tmp_path / "cases") == 0, capsys.readouterr().out

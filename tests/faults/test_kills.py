@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from support.child_processes import SMALL
 from support.fault_points import KILLED_AT
-from support.fault_sizes import SIZE, amount, chosen
+from support.fault_sizes import FIRST_SEED, SIZE, amount, chosen, seeds
 from support.run_comparison import assert_loads, assert_same_run, newest
 
 from rlcli.replay.trajectory import read_trajectory
@@ -156,7 +156,7 @@ def test_kill_while_writing_cases_leaves_each_once_and_complete(child, tmp_path,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", range(amount(1, 20, 240)))
+@pytest.mark.parametrize("number", seeds(1, 20, 240))
 def test_run_killed_at_a_random_time_resumes_bit_identical(child, uninterrupted, tmp_path, number):
     draw, name = random.Random(number), list(RUNS)[number % len(RUNS)]
     reference, took = uninterrupted(name)
@@ -216,7 +216,7 @@ def test_cartpole_training_killed_five_times_has_equal_weights(tmp_path):
     begin = time.monotonic()
     process = start(tmp_path / "whole", "cartpole", "--seed", 3)
     assert process.communicate()[0], "its run"
-    took, draw, arguments = time.monotonic() - begin, random.Random(), ("cartpole", "--seed", 3)
+    took, draw, arguments = time.monotonic() - begin, random.Random(FIRST_SEED), ("cartpole", "--seed", 3)
     for _ in range(5):
         process = start(tmp_path / "killed", *arguments)
         time.sleep(draw.uniform(0.1, 0.5) * took)
@@ -251,7 +251,7 @@ def test_killed_writer_leaves_a_complete_file_or_none(child, uninterrupted, tmp_
         shutil.copytree(uninterrupted("sb3-ppo")[0], tmp_path / folder / "runs" / "cartpole" / "r")
     begin = time.monotonic()
     assert child(tmp_path / "whole", *WRITERS[name]).ended(200).code == 0
-    took, draw, folder = time.monotonic() - begin, random.Random(32), tmp_path / "killed"
+    took, draw, folder = time.monotonic() - begin, random.Random(FIRST_SEED), tmp_path / "killed"
     expected = written(tmp_path / "whole" / name)
     for _ in range(amount(2, 5, 40)):
         process = child(folder, *WRITERS[name])

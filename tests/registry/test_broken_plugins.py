@@ -192,10 +192,31 @@ def test_ctrl_c_during_probe_start_kills_processes(broken_plugins, monkeypatch):
     assert time.monotonic() - before < 30.0
 
 
-def test_plugin_that_hangs_is_named_by_the_progress(plugins):
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        ([], "rlcli validate: plugin slow:slow-task (slow:SPEC), 0:10 so far"),
+        (["-q"], "warning: plugin slow 1.0: the import of slow:SPEC takes more than 10 s; if it does not end, exclude"),
+    ],
+)
+def test_plugin_that_hangs_is_named(plugins, flags, named):
     plugins("slow", "import time\ntime.sleep(600)\n")
-    command = [sys.executable, "-m", "rlcli", "validate", "slow-task"]
+    command = [sys.executable, "-m", "rlcli", "validate", "slow-task", *flags]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        line = process.stderr.readline()
+        lines = [process.stderr.readline() for _ in range(1 if flags else 2)]
         process.kill()
-    assert line.startswith("rlcli validate: plugin slow:slow-task (slow:SPEC), 0:10 so far")
+    assert any(line.startswith(named) for line in lines), lines
+
+
+@pytest.mark.slow
+def test_probe_of_many_hanging_plugins_takes_little_more_than_one(plugins):
+    points = "[rlcli.tasks]\n" + "".join(f"{name} = {{0}}:{name}\n" for name in "abcd")
+    for number in range(6):
+        plugins(f"slow{number}", "import time\ntime.sleep(600)\n", entry_points=points.format(f"slow{number}"))
+    before = time.monotonic()
+    entries = [entry for entry in catalog()[0] if entry.distribution.startswith("slow")]
+    rows = probe(entries, timeout_s=5.0)
+    assert time.monotonic() - before < 40
+    reasons = [rows[entry.qualified].broken for entry in entries if entry.distribution == "slow0"]
+    assert reasons == ["did not load within 5 s"] * 2 + ["not loaded, because 2 others did not load within 5 s"] * 2

@@ -221,3 +221,11 @@ def test_broken_format_does_not_stop_own_tasks(plugins, cli, task):
     broken = "plugin elsewhere 1.0: entry point 'elsewhere' = elsewhere:SPEC cannot be imported: RuntimeError: torn"
     assert f"warning: {broken}" in done.stderr
     assert cli("import", "--help").returncode == 0
+
+
+@pytest.mark.parametrize("words", [("validate", "cartpole", "scene.num_envs=8"), ("train", "cartpole", "rewards.x=1")])
+def test_task_of_own_format_imports_no_other_format(plugins, command, words):
+    plugins("elsewhere", "raise SystemExit(7)", entry_points=POINTS)
+    done = command(*words)
+    assert done.returncode == (0 if words[0] == "validate" else 3), done.stderr
+    assert "elsewhere" not in done.stderr + str([name for name in sys.modules if name == "elsewhere"])

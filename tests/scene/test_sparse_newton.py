@@ -105,6 +105,17 @@ def test_sparse_of_the_mjcf_is_kept_with_a_warning(tmp_path, monkeypatch, capsys
     assert 'set jacobian="dense" or solver="CG" until MuJoCo 4.0.1' in printed
 
 
+def test_weld_to_a_mocap_body_couples_nothing():
+    for second, coupled in (("mocap", False), ("b1", True)):
+        text = drawn(1086, "ground").replace(
+            "</worldbody>",
+            f'<body name="mocap" mocap="true"/></worldbody><equality><weld body1="b0" body2="{second}"/></equality>',
+        )
+        model = mujoco.MjModel.from_xml_string(text)
+        assert couples_branches(model) == coupled
+        assert coupled or difference(model, mujoco.mjtJacobian.mjJAC_DENSE) < AGREES
+
+
 @pytest.mark.parametrize("kind", ["ground", "equality", "tendon", "contact"])
 def test_models_without_a_coupling_agree(kind):
     quiet_mujoco()

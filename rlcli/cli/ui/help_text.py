@@ -28,7 +28,7 @@ _MAX_UNGROUPED = 8
 """A command with at most this many options, besides those of "Output", has them all in the panel "Options"."""
 _UNBOUNDED = 10**9
 """The help does not show the range of an option that ends above this number."""
-_METAVARS = {int: "INTEGER", float: "FLOAT", Path: "PATH"}
+METAVARS = {int: "INTEGER", float: "FLOAT", Path: "PATH"}
 
 
 def read_docstring(function: Callable[..., Any]) -> tuple[str, dict[str, str], str]:
@@ -94,7 +94,7 @@ def _name(parameter: Any) -> str:
     """Return the first column of the help: the metavar of an argument, or the flags of an option and its metavar."""
     if parameter.param_type_name == "argument":
         return str(parameter.metavar or parameter.name.upper())
-    metavar = parameter.metavar or _METAVARS.get(parameter.type_descriptor.annotation, "TEXT")
+    metavar = parameter.metavar or METAVARS.get(parameter.type_descriptor.annotation, "TEXT")
     options = ", ".join(sorted(parameter.opts, key=len))
     return options if parameter.is_flag else f"{options} {metavar}"
 

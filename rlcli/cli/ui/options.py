@@ -3,17 +3,19 @@
 import functools
 import inspect
 import json
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 
 from rlcli import progress
 from rlcli.cli.ui.completion import agents, checkpoints, runs, tasks, words
 from rlcli.cli.ui.console import console
-from rlcli.cli.ui.help_text import HelpCommand, read_docstring
+from rlcli.cli.ui.help_text import METAVARS, HelpCommand, read_docstring
 from rlcli.errors import MachineError, UsageError
+from rlcli.safe_text import read_number
 
 CHOOSE = "auto"
 """Value of an option that is given without its value (`--video`)."""
@@ -108,7 +110,8 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
     """
     text, parameter_help, examples = read_docstring(function)
     signature = inspect.signature(function, eval_str=True)
-    for parameter in signature.parameters.values():
+    own = [_with_strict_number(parameter) for parameter in signature.parameters.values()]
+    for parameter in own:
         if parameter.name in parameter_help:
             parameter.annotation.__metadata__[0].help = parameter_help[parameter.name]
     common = [
@@ -116,7 +119,7 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
         for option, info in _COMMON.items()
     ]
 
-    parameters = [*signature.parameters.values(), *common]
+    parameters = [*own, *common]
     if "overrides" in signature.parameters:
         model = inspect.Parameter("model", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=_Models)
         parameters.insert(len(signature.parameters), model)
@@ -138,6 +141,25 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     app.command(name, cls=HelpCommand, help=text, epilog=examples, **settings)(run)
+
+
+def _with_strict_number(parameter: inspect.Parameter) -> inspect.Parameter:
+    """Return a parameter of a command; a number has the same form as in a task file."""
+    from pydantic import BeforeValidator, Field
+
+    kind, *infos = get_args(parameter.annotation) or (None,)
+    kind = next((number for number in (int, float) if kind in (number, number | None)), None)
+    if kind is None or not infos:
+        return parameter
+    info = infos[0]
+
+    def read(value: Any) -> Any:
+        number = read_number(value) if isinstance(value, str) else None
+        return value if number is None or abs(number) == math.inf else number
+
+    strict: Any = Annotated[kind, Field(strict=True, ge=info.min, le=info.max), BeforeValidator(read)]
+    info.metavar = info.metavar or METAVARS[kind]
+    return parameter.replace(annotation=Annotated[strict | None, info])
 
 
 def budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:

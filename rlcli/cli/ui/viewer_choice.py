@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 from rlcli.cli.ui.console import console
 from rlcli.errors import DependencyError, MachineError, UsageError, require_known
 from rlcli.progress import track
+from rlcli.safe_text import float_or_nan
 from rlcli.settings import setting
 from rlcli.viewer.protocol import DEFAULT_PORT, VIEWERS, Viewer
 
@@ -46,13 +48,11 @@ def read_commands(texts: Sequence[str]) -> dict[str, float]:
         UsageError: for anything else.
     """
     values = {}
-    for part in ",".join(texts).split(","):
+    for part in ",".join(texts).split(",") if texts else ():
         name, _, text = part.partition("=")
-        try:
-            values[name.strip()] = float(text)
-        except ValueError:
-            if part or len(texts):
-                raise UsageError(f"--command '{part}' is not NAME=NUMBER", hint="as in --command vx=0.5,wz=0") from None
+        values[name.strip()] = float_or_nan(text)
+        if not math.isfinite(values[name.strip()]):
+            raise UsageError(f"--command '{part}' is not NAME=NUMBER", hint="as in --command vx=0.5,wz=0")
     return values
 
 

@@ -54,6 +54,11 @@ class Channel:
         kind, size = _HEADER.unpack(self._first_bytes(_HEADER.size))
         return kind.rstrip(b"\0"), pickle.loads(self._read(size)) if size else None
 
+    def wait_until_closed(self) -> None:
+        """Discard messages until the other process closes its end."""
+        while self._socket.recv(1 << 16):
+            pass
+
     def close(self) -> None:
         """Close this end of the connection."""
         self._socket.close()

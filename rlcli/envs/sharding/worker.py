@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import random
@@ -55,10 +56,17 @@ def main(connection: int, arrays: int) -> None:
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1"):  # the main process decides when its workers end
         signal.signal(getattr(signal, name), signal.SIG_IGN)
     channel = Channel(socket.socket(fileno=connection), SPIN_S)
-    try:
-        _serve(channel, arrays)
-    except ChannelClosedError:  # the main process has ended, or has closed the environment
-        os._exit(0)  # without waiting for the engine's threads
+    # ChannelClosedError: the main process has ended or has closed the environment; other errors: too little memory to
+    # report an error. The main process names the exit code of a worker that ended by itself.
+    with contextlib.suppress(BaseException):
+        try:
+            _serve(channel, arrays)
+        except ChannelClosedError:
+            raise
+        except BaseException as error:  # of an import, or of a message that cannot be read
+            channel.send(ERROR, _PortableError.of(error))
+            channel.wait_until_closed()
+    os._exit(0)  # without waiting for the engine's threads
 
 
 def _serve(channel: Channel, arrays: int) -> None:

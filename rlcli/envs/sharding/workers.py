@@ -18,7 +18,7 @@ from rlcli.envs.sharding import worker
 from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
 from rlcli.envs.sharding.worker import Job
 from rlcli.errors import MachineError
-from rlcli.machine import python_command
+from rlcli.machine import python_command, require_address_space
 
 _CODE = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[3]);"
@@ -117,9 +117,13 @@ class Workers:
 
     Args:
         count: number of processes; each starts now and imports its modules before `build` sends its job.
+
+    Raises:
+        MachineError: if a limit such as `ulimit -v` leaves no room for torch.
     """
 
     def __init__(self, count: int) -> None:
+        require_address_space()
         self.arrays = _create_shared_file()
         self._workers: list[Worker] = []
         self.close = weakref.finalize(self, _close, self._workers, self.arrays)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from rlcli.machine import require_memory
 from rlcli.sim.state_cache import is_finite
 
 
@@ -67,6 +68,10 @@ class RolloutBuffer:
     ) -> None:
         obs, critic_obs, action = sizes
         copies = 1 + mirrored
+        if device.type == "cpu":
+            columns = 2 * (obs + critic_obs + 2 * action + 5) + (critic_obs or obs) + 2
+            size = copies * steps * envs
+            require_memory(size * (4 * columns + 17), f"the {size} samples of a rollout")
         self._packed = torch.zeros(copies * steps, envs, obs + critic_obs + 2 * action + 5, device=device)
         self.columns, self.sizes = sizes, [copies * size for size in minibatches]
         self._samples_of_minibatches = minibatches

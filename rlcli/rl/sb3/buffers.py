@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,6 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
 from torch import Tensor
 
+from rlcli.machine import require_memory
 from rlcli.rl.policy import Normalizer
 from rlcli.rl.trainer import Rows
 from rlcli.sim.saved_tensors import require_matching_tensors
@@ -25,6 +27,8 @@ class TorchRolloutBuffer(RolloutBuffer):
         """Discard the rollout. The first call allocates the storage."""
         if not hasattr(self, "obs"):
             steps, envs = self.buffer_size, self.n_envs
+            size = 4 * steps * envs * (math.prod(self.obs_shape) + self.action_dim + 6)
+            require_memory(size, f"the {steps * envs} samples of a rollout")
             self.obs = torch.zeros(steps, envs, *self.obs_shape)
             self.action = torch.zeros(steps, envs, self.action_dim)
             self.reward, self.start, self.value, self.log_prob, self.advantage, self.target = (
@@ -81,6 +85,8 @@ class TorchReplayBuffer(ReplayBuffer):
         super().__init__(1, *args, **kwargs)  # SB3's own storage has one row: it is not used
         self.buffer_size = max(1, buffer_size // self.n_envs)
         rows, envs = self.buffer_size, self.n_envs
+        size = 4 * rows * envs * (2 * math.prod(self.obs_shape) + self.action_dim + 2)
+        require_memory(size, f"the {rows * envs} samples of agent.buffer_size")
         self.obs = torch.zeros(rows, envs, *self.obs_shape)
         self.next_obs = torch.zeros(rows, envs, *self.obs_shape)
         self.action = torch.zeros(rows, envs, self.action_dim)

@@ -107,6 +107,27 @@ def test_unlocked_running_run_is_interrupted(cli, made, checkpoint, step, resuma
     assert (found["state"], found["resumable"]) == ("interrupted", resumable)
 
 
+@pytest.mark.parametrize("hours", [1, 24 * 365])
+def test_clock_that_was_ahead_leaves_no_running_run(cli, made, hours):
+    later = datetime.now(UTC) + timedelta(hours=hours)
+    made("a", [row(1)], "running", started=later.isoformat(), trained_s=3.0, since=later.isoformat())
+    (found,) = listed(cli)
+    assert (found["state"], found["resumable"], found["age_s"], found["duration_s"]) == ("interrupted", True, None, 3.0)
+    folder = Path("runs/arm/empty")
+    folder.mkdir()
+    os.utime(folder, (later.timestamp(), later.timestamp()))
+    assert {run["run"]: run["state"] for run in listed(cli)}[str(folder)] == "broken"
+
+
+def test_latest_warns_of_a_start_in_the_future(cli, made):
+    made("a", [row(1)], "finished")
+    assert "future" not in cli("watch", "latest").err
+    made("b", [row(1)], "finished", started=(datetime.now(UTC) + timedelta(hours=1)).isoformat())
+    warned = cli("watch", "latest")
+    assert warned.code == 0
+    assert "started in the future by this machine's clock" in warned.err
+
+
 def test_run_without_checkpoints_is_not_resumable(cli, made):
     made("a", [row(1)], "running", checkpoint=False)
     assert not listed(cli)[0]["resumable"]

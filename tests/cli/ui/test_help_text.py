@@ -6,7 +6,7 @@ import shlex
 import pytest
 import typer
 
-from rlcli.cli.app import COMMANDS, PANELS, _with_values, build
+from rlcli.cli.app import COMMANDS, PANELS, _with_values, build, main
 from rlcli.cli.ui.help_text import OPTION_PANELS, read_docstring
 
 ROOT = typer.main.get_command(build())
@@ -156,3 +156,27 @@ def test_read_docstring_splits_text_options_and_examples():
     assert text == "Do it.\n\nMore text."
     assert helps == {"one": "First line. [default: 3]", "two": "Second."}
     assert examples == "rlcli do it\n    Do it."
+
+
+def number_options(path, *kinds):
+    found = (each for each in find(path).params if each.metavar in (kinds or ("INTEGER", "FLOAT")))
+    return [max(each.opts, key=len) for each in found if each.param_type_name == "option"]
+
+
+def test_commands_have_number_options():
+    assert len({(path, option) for path in LEAVES for option in number_options(path)}) > 40
+
+
+@pytest.mark.parametrize("path", LEAVES, ids=ids)
+@pytest.mark.parametrize("number", ["1_0", "0x1", "1e1 ", "٤", "inf", "nan", ""])
+def test_number_options_refuse_what_files_refuse(path, number, capsys):
+    for option in number_options(path):
+        assert main([*path, f"{option}={number}"]) == 2
+        assert re.search("expected a (whole )?number", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("path", LEAVES, ids=ids)
+def test_whole_numbers_have_no_fraction(path, capsys):
+    for option in number_options(path, "INTEGER"):
+        assert main([*path, f"{option}=8.0"]) == 2
+        assert "expected a whole number, found 8.0" in capsys.readouterr().err

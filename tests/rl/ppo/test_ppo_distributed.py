@@ -15,8 +15,10 @@ from support import worlds
 
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
+from rlcli.errors import UsageError
+from rlcli.machine import available_cores
 from rlcli.registry import find_task
-from rlcli.rl.distributed import _exit_code
+from rlcli.rl.distributed import _exit_code, is_rank_zero, local_rank_and_size
 from rlcli.rl.ppo.trainer import PpoTrainer
 from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.run_ref import list_runs
@@ -257,3 +259,14 @@ def test_gpus_with_device_cpu_is_a_usage_error(tmp_path):
 )
 def test_exit_code_is_of_the_process_that_failed_by_itself(codes, expected):
     assert _exit_code(codes) == expected
+
+
+@pytest.mark.parametrize("name", ["LOCAL_WORLD_SIZE", "WORLD_SIZE", "RANK", "LOCAL_RANK"])
+@pytest.mark.parametrize("text", ["x", "-1", "1_0", "1.0", "9" * 5000])
+def test_malformed_variable_of_a_launcher_is_named(monkeypatch, name, text):
+    variables = {"RANK": "0", "WORLD_SIZE": "2", "LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "1", name: text}
+    for key, value in variables.items():
+        monkeypatch.setenv(key, value)
+    with pytest.raises(UsageError, match=f"^the environment variable {name} is '") as caught:
+        (is_rank_zero(), local_rank_and_size(), available_cores())
+    assert len(caught.value.message) < 400
