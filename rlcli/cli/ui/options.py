@@ -161,10 +161,12 @@ def video_file(video: Path | None, default: str) -> Path | None:
     """Return the file of --video, the default one if the option has no value; check that it can be written."""
     if video is None:
         return None
+    from rlcli.runs.atomic_io import require_regular
     from rlcli.viewer.video_writer import check_video
 
     file = Path(default) if str(video) == CHOOSE else video
     check_video(file)
+    require_regular(file)
     return file
 
 
@@ -172,15 +174,16 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
     """Check, before any work is done, that an output file can be written.
 
     Raises:
-        UsageError: for a folder, or a suffix that is not one of `suffixes`.
+        UsageError: for a suffix that is not one of `suffixes`, or something else than a regular file.
         MachineError: if its folder does not exist.
     """
+    from rlcli.runs.atomic_io import require_regular
+
     if output is None:
         return
     if output.suffix.lower() not in suffixes:
         raise UsageError(f"'{output}' is not a {what}", hint=f"name it *{', *'.join(suffixes)}")
-    if output.is_dir():
-        raise UsageError(f"-o {output} is a folder", hint="give the name of a file in it")
+    require_regular(output)
     if not output.absolute().parent.is_dir():
         raise MachineError(f"cannot write {output}: there is no folder {output.absolute().parent}; create it")
 
