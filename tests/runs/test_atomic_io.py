@@ -95,7 +95,9 @@ def test_disk_error_has_a_hint_for_its_errno(tmp_path, code, hint):
 
 
 def test_disk_error_names_the_first_missing_folder(tmp_path):
-    error = atomic_io.disk_error(tmp_path / "run" / "checkpoints" / "x", FileNotFoundError(errno.ENOENT, "No such file"))
+    error = atomic_io.disk_error(
+        tmp_path / "run" / "checkpoints" / "x", FileNotFoundError(errno.ENOENT, "No such file")
+    )
     assert error.message.endswith(f"x: No such file (there is no folder {tmp_path / 'run'})")
     assert error.hint == "create the folder; if it was moved or deleted meanwhile, put it back"
 
