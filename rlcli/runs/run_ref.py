@@ -1,6 +1,5 @@
 """References to runs and checkpoints on a command line: folder, name, `latest`, `RUN@best` or `RUN@step:N`."""
 
-import contextlib
 import glob
 import logging
 import os
@@ -60,23 +59,34 @@ def _runs_of_task(reference: str, runs_dir: Path) -> list[Run]:
     studies = [] if os.sep in reference else sorted(runs_dir.glob(f"*/{glob.escape(reference)}"))
     for folder in (Path(reference), runs_dir / reference, *studies):
         if not found and os.path.isdir(folder) and not (folder / RECORD).is_file():
-            found = _opened(runs_below(folder))
+            found = _opened(runs_below(folder))[0]
     return found
 
 
 def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
     """Return the runs under a folder, the oldest first; other folders and broken runs are skipped."""
-    runs = _opened(run_folders(runs_dir))
-    return runs if task is None else [run for run in runs if run.record["task"]["name"] == task]
+    return _list_runs(runs_dir, task)[0]
 
 
-def _opened(folders: Iterable[Path]) -> list[Run]:
-    """Open the runs in some folders; return them, the oldest first, without broken ones."""
-    runs = []
+def _list_runs(runs_dir: Path, task: str | None) -> tuple[list[Run], list[CheckpointError]]:
+    """Return the runs of a task (None: all), the oldest first, and the errors of the broken ones."""
+    runs, refused = _opened(run_folders(runs_dir))
+    if task is None:
+        return runs, list(refused.values())
+    of_task = [error for folder, error in refused.items() if folder.is_relative_to(runs_dir / task)]
+    return [run for run in runs if run.record["task"]["name"] == task], of_task
+
+
+def _opened(folders: Iterable[Path]) -> tuple[list[Run], dict[Path, CheckpointError]]:
+    """Open the runs in some folders; return them, the oldest first, and the error of each broken one."""
+    runs, refused = [], {}
     for folder in folders:
-        with contextlib.suppress(CheckpointError):
+        try:
             runs.append(open_run(folder))
-    return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name))
+        except CheckpointError as error:
+            if os.path.lexists(folder / RECORD):  # otherwise it is another folder, not a run
+                refused[folder] = error
+    return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name)), refused
 
 
 def find_checkpoint(
@@ -150,11 +160,17 @@ def default_runs_dir() -> Path:
 
 def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, str]:
     if reference == "latest":
-        runs = list_runs(runs_dir, task)
+        runs, refused = _list_runs(runs_dir, task)
+        more = f"; {len(refused) - 1} more are skipped" if len(refused) > 1 else ""
+        if not runs and refused:
+            message = f"there is no valid run{f' of {task}' if task else ''} in {runs_dir}: {refused[0].message}{more}"
+            raise CheckpointError(message, hint=refused[0].hint)
         if not runs:
             of_task = f" of {task}" if task else ""
             hint = f"rlcli train {task or 'TASK'} starts one"
             raise CheckpointError(f"there is no run{of_task} in {runs_dir}", hint=hint)
+        if refused:
+            _log.warning(f"a run is skipped: {refused[0].message}{more}")
         return runs[-1], f"newest run of {task}" if task else f"newest run in {runs_dir}"
     for candidate in (Path(reference), runs_dir / reference, *([runs_dir / task / reference] if task else [])):
         if os.path.isfile(candidate / RECORD):
