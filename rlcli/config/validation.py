@@ -232,9 +232,10 @@ class TaskCheck:
                     self._no_agent(origin.where)
                     continue
                 path = ("agents", name, *path[1:])
-            form = self.format or formats.format_of_key(self.layers.data)
-            if path[0] == MODELS and not (path := model_path(path, form, self.problems)):
-                continue
+            if path[0] == MODELS:
+                form = self.format or formats.format_of_key(self.layers.data)
+                if not (path := model_path(path, form, self.problems)):
+                    continue
             if value is None and path[0] in SECTIONS and not isinstance(self.layers.get(path), dict):
                 # null removes a term; for a term that does not exist, suggest one with a similar name
                 similar = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))
