@@ -49,10 +49,30 @@ def _nonzero(message: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-Number = Annotated[float, _FractionString()]
-Positive = Annotated[float, Field(gt=0), _FractionString()]
-NotNegative = Annotated[float, Field(ge=0), _FractionString()]
-Count = Annotated[int, Field(ge=1)]
+def _float32(value: float) -> float:
+    if abs(value) > _LARGEST:
+        raise ValueError(f"{value:g} is not a 32-bit number; give at most {_LARGEST:g}")
+    return value
+
+
+def at_least(smallest: float) -> AfterValidator:
+    """Return a validator that refuses positive numbers which are so small that quotients overflow."""
+
+    def check(value: float) -> float:
+        if value < smallest:
+            raise ValueError(f"{value:g} is too small; give at least {smallest:g}")
+        return value
+
+    return AfterValidator(check)
+
+
+_LARGEST = 1e38
+Number = Annotated[float, _FractionString(), AfterValidator(_float32)]
+Positive = Annotated[float, Field(gt=0), _FractionString(), AfterValidator(_float32), at_least(1e-38)]
+NotNegative = Annotated[float, Field(ge=0), _FractionString(), AfterValidator(_float32)]
+Seconds = Annotated[float, Field(gt=0, le=1e9), _FractionString()]
+"""Time that is divided by the control period: with `sim.dt` of at least 1e-9 the number of steps fits 64 bits."""
+Count = Annotated[int, Field(ge=1, lt=2**31)]
 Threads = Annotated[int, Field(ge=1, le=4096)]
 Share = Annotated[float, Field(ge=0, le=1), _FractionString()]
 Vec3 = tuple[Number, Number, Number]
@@ -62,7 +82,7 @@ Quaternion = Annotated[
 ]
 Direction = Annotated[Vec3, _nonzero("a direction must not be zero; straight down is [0, 0, -1]")]
 Range = Annotated[tuple[Number, Number], AfterValidator(_check_order)]
-PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_check_order)]
+SecondsRange = Annotated[tuple[Seconds, Seconds], AfterValidator(_check_order)]
 ShareRange = Annotated[tuple[Share, Share], AfterValidator(_check_order)]
 _Steps = Annotated[int, Field(ge=0, le=1000)]
 StepRange = Annotated[tuple[Annotated[int, Field(ge=0)], _Steps], AfterValidator(_check_order)]
