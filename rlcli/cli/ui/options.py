@@ -94,6 +94,15 @@ _COMMON: dict[str, Any] = {
 """Options that every command has; the console holds their values."""
 
 
+_NEEDED = {
+    "record_mode": ("record", "--record FILE"),
+    "overwrite": ("save_preset", "--save-preset FILE"),
+    "episodes": ("verify", "--verify"),
+    "steps": ("case", "the number of a case"),
+}
+"""Option -> the parameter without which a command ignores it, and how the user writes that parameter."""
+
+
 def add_command(app: typer.Typer, name: str, function: Callable[..., None], **settings: Any) -> None:
     """Add a command to an app, with the common options and the help of the function's docstring.
 
@@ -125,6 +134,10 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
     def run(**values: Any) -> None:
         from rlcli.cli.ui.progress_view import WorkView
 
+        for option, (other, what) in _NEEDED.items():
+            is_alone = {option, other} <= values.keys() and values[other] in (None, False)
+            if is_alone and values[option] != signature.parameters[option].default:
+                raise UsageError(f"--{option.replace('_', '-')} needs {what}", hint="add it, or leave out the option")
         if "overrides" in values and (model := values.pop("model")):
             from rlcli.config.given_models import MODELS, read_models
 

@@ -50,9 +50,19 @@ def test_long_name_is_refused_with_its_limit(cli):
     assert not Path("runs").exists()
 
 
-def test_record_mode_needs_record(cli):
-    done = cli("eval", "cartpole", "--record-mode", "failed")
-    assert (done.code, "--record-mode failed has no --record" in done.err) == (2, True), done.err
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("eval", "cartpole", "--record-mode", "failed"), "--record-mode needs --record FILE"),
+        (("play", "cartpole", "--record-mode", "failed"), "--record-mode needs --record FILE"),
+        (("bench", "cartpole", "--overwrite"), "--overwrite needs --save-preset FILE"),
+        (("export", "cartpole", "--episodes", "8"), "--episodes needs --verify"),
+        (("autopsy", "latest", "--steps", "3"), "--steps needs the number of a case"),
+    ],
+)
+def test_option_that_needs_another_is_refused_alone(cli, words, message):
+    done = cli(*words)
+    assert (done.code, message in done.err) == (2, True), done.err
 
 
 def test_task_that_is_a_pipe_is_named_as_such(cli):
