@@ -14,22 +14,22 @@ from rlcli.scene.terrain import terrain_problems
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("sim.dt=1e-300", "sim.dt: 1e-300 is too small; give at least 1e-09"),
-        ("episode_length_s=1e300", "episode_length_s: expected a number <= 1e+09"),
-        ("decimation=9223372036854775807", "decimation: expected a whole number < 2147483648"),
-        ("success.pole.hold_s=1e30", "hold_s: expected a number <= 1e+09"),
-        ("sim.iterations=4294967296", "sim.iterations: expected a whole number < 2147483648"),
-        ("agent.max_iterations=9999999999999999999", "max_iterations: expected a whole number < 2147483648"),
-        ("agent.max_steps=9999999999999999999", "max_steps: expected a whole number < 4611686018427387904"),
-        ("rewards.alive.weight=1e39", "weight: 1e+39 is not a 32-bit number; give at most 1e+38"),
-        ("scene.ground.size=1e-300", "1e-300 is too small; give at least 1e-38"),
+        ("sim.dt=1e-300", "sim.dt: 1e-300 is out of range; allowed: 1e-09 to 0.1"),
+        ("episode_length_s=1e300", "episode_length_s: 1e+300 is out of range; allowed: 0 to 1e+09"),
+        ("decimation=9223372036854775807", "decimation: 9.22337e+18 is out of range; allowed: 1 to 2.14748e+09"),
+        ("success.pole.hold_s=1e30", "hold_s: 1e+30 is out of range; allowed: 0 to 1e+09"),
+        ("sim.iterations=4294967296", "sim.iterations: 4.29497e+09 is out of range; allowed: 1 to 2.14748e+09"),
+        ("agent.max_iterations=9999999999999999999", "max_iterations: 1e+19 is out of range"),
+        ("agent.max_steps=9999999999999999999", "max_steps: 1e+19 is out of range"),
+        ("rewards.alive.weight=1e39", "weight: 1e+39 is out of range; allowed: -1e+38 to 1e+38"),
+        ("scene.ground.size=1e-300", "1e-300 is out of range; allowed: 1e-38 to 1e+38"),
         (
             "scene.sensors.scan={kind: rays, pattern: {size: [1.0, 1.0], resolution: 1e-30}}",
             "the grid has more than 1,000,000 rays; give a larger resolution or a smaller size",
         ),
         (
             "events.push={func: push_by_setting_velocity, mode: interval, interval_range_s: [1e20, 1e20]}",
-            "interval_range_s.0: expected a number <= 1e+09",
+            "interval_range_s.0: 1e+20 is out of range; allowed: 0 to 1e+09",
         ),
     ],
 )

@@ -49,30 +49,26 @@ def _nonzero(message: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-def _float32(value: float) -> float:
-    if abs(value) > _LARGEST:
-        raise ValueError(f"{value:g} is not a 32-bit number; give at most {_LARGEST:g}")
-    return value
+def _limits(smallest: float, largest: float) -> AfterValidator:
+    """Return a validator that refuses numbers beyond which quotients, integers or 32-bit numbers overflow.
 
-
-def at_least(smallest: float) -> AfterValidator:
-    """Return a validator that refuses positive numbers which are so small that quotients overflow."""
+    The reference pages do not list these limits, because no sensible number reaches them.
+    """
 
     def check(value: float) -> float:
-        if value < smallest:
-            raise ValueError(f"{value:g} is too small; give at least {smallest:g}")
+        if not smallest <= value <= largest:
+            raise ValueError(f"{value:g} is out of range; allowed: {smallest:g} to {largest:g}")
         return value
 
     return AfterValidator(check)
 
 
-_LARGEST = 1e38
-Number = Annotated[float, _FractionString(), AfterValidator(_float32)]
-Positive = Annotated[float, Field(gt=0), _FractionString(), AfterValidator(_float32), at_least(1e-38)]
-NotNegative = Annotated[float, Field(ge=0), _FractionString(), AfterValidator(_float32)]
-Seconds = Annotated[float, Field(gt=0, le=1e9), _FractionString()]
+Number = Annotated[float, _FractionString(), _limits(-1e38, 1e38)]
+Positive = Annotated[float, Field(gt=0), _FractionString(), _limits(1e-38, 1e38)]
+NotNegative = Annotated[float, Field(ge=0), _FractionString(), _limits(0.0, 1e38)]
+Seconds = Annotated[float, Field(gt=0), _FractionString(), _limits(0.0, 1e9)]
 """Time that is divided by the control period: with `sim.dt` of at least 1e-9 the number of steps fits 64 bits."""
-Count = Annotated[int, Field(ge=1, lt=2**31)]
+Count = Annotated[int, Field(ge=1), _limits(1, 2**31 - 1)]
 Threads = Annotated[int, Field(ge=1, le=4096)]
 Share = Annotated[float, Field(ge=0, le=1), _FractionString()]
 Vec3 = tuple[Number, Number, Number]
