@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import io
 import json
@@ -105,8 +106,13 @@ class TensorBoard:
         self._file.close()
 
     def _add(self, **entries: Any) -> None:
-        self._writer.write(self._event(wall_time=time.time(), **entries).SerializeToString())
-        self._file.flush()
+        try:
+            self._writer.write(self._event(wall_time=time.time(), **entries).SerializeToString())
+            self._file.flush()
+        except OSError:
+            with contextlib.suppress(OSError):
+                self._file.close()  # the training drops a logger that has failed
+            raise
 
 
 def check_loggers(names: Sequence[str] | None) -> list[str]:
