@@ -10,7 +10,7 @@ from support.saved_states import state_of
 
 from rlcli.errors import CheckpointError, MachineError, UsageError
 from rlcli.runs.run import create_run, open_run
-from rlcli.runs.run_ref import find_checkpoint, find_run, list_runs
+from rlcli.runs.run_ref import find_checkpoint, find_run, find_runs, list_runs
 from rlcli.training import checkpoint_writer
 
 RECORD = {"task": {"name": "cartpole", "distribution": "rlcli"}, "seed": 1}
@@ -185,6 +185,9 @@ def test_latest_names_the_refused_runs(tmp_path, caplog):
     (runs[0].folder / "tb").symlink_to(tmp_path)
     with pytest.raises(CheckpointError, match=r"no valid run of cartpole in .* 2 more are skipped"):
         find_run("latest", tmp_path, "cartpole")
+    for reference in ("cartpole", runs[0].folder.name):
+        with pytest.raises(CheckpointError, match=r"is a link|not a regular file"):
+            find_runs([reference], tmp_path)
     with pytest.raises(CheckpointError, match="there is no run of other in"):
         find_run("latest", tmp_path, "other")
 
