@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import importlib
 import os
@@ -182,6 +183,8 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
         return failure
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         return Stopped("interrupted", exit_code=INTERRUPTED)
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+        return UsageError(f"'{error.filename}' is too long: a name in a path has at most 255 bytes", hint="shorten it")
     if isinstance(error, OSError):
         file = f"{error.filename}: " if error.filename else ""
         return MachineError(f"{file}{error.strerror or error}")

@@ -50,6 +50,18 @@ def test_long_name_is_refused_with_its_limit(cli):
     assert not Path("runs").exists()
 
 
+@pytest.mark.parametrize("command", ["train", "show", "validate", "check"])
+def test_long_task_is_a_usage_error(cli, command):
+    done = cli(command, "n" * 300)
+    assert done.code == 2
+    assert "is too long: a name in a path has at most 255 bytes" in done.err
+
+
+def test_long_output_file_has_a_hint(cli):
+    done = cli("report", "latest", "-o", "n" * 300 + ".html")
+    assert (done.code, "hint: a name in a path has at most 255 bytes: shorten it" in done.err) == (10, True), done.err
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
