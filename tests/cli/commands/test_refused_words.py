@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from rlcli import machine
 from rlcli.errors import ConfigError
 from rlcli.machine import read_plain
 
@@ -83,13 +84,17 @@ def test_task_that_is_a_pipe_is_named_as_such(cli):
     assert (done.code, "'task' is a device or pipe" in done.err) == (4, True), done.err
 
 
-def test_config_file_is_read_up_to_its_limit(cli):
+def test_config_file_is_read_up_to_its_limit(cli, monkeypatch):
+    monkeypatch.setattr(machine, "_PIPE_S", 0.1)
     with open("sparse.yaml", "wb") as file:
         file.truncate(3 * 2**30)
     assert "larger than 262144 bytes" in cli("show", "cartpole", "--config", "sparse.yaml").err
     os.mkfifo("pipe.yaml")
     done = cli("show", "cartpole", "--config", "pipe.yaml")  # nobody writes to it
-    assert (done.code, "pipe.yaml: cannot be read: it has no content" in done.err) == (3, True), done.err
+    assert (done.code, "pipe.yaml: cannot be read: nothing was written to the pipe in 0.1 s" in done.err) == (
+        3,
+        True,
+    ), done.err
     assert "it is not a regular file" in cli("show", "cartpole", "--config", "/dev/zero").err
 
 
