@@ -7,6 +7,7 @@ import hashlib
 import os
 import platform
 import re
+import select
 import shutil
 import stat
 import sys
@@ -87,17 +88,33 @@ def python_command(*arguments: str) -> list[str]:
     return [sys.executable, "-P", *arguments]
 
 
-def read_plain(file: Path, most: int) -> bytes:
-    """Return the content of a regular file. A pipe or a device at this path is refused without blocking.
+_PIPE_S = 10.0
+"""Time to wait for the first byte of a pipe [s]."""
+
+
+def read_plain(file: Path, most: int, *, pipe: bool = False) -> bytes:
+    """Return the content of a regular file. A device at this path is refused without blocking.
+
+    Args:
+        file: the file.
+        most: largest size [bytes].
+        pipe: whether the file may be a pipe, as a shell creates it for `--config <(...)`.
 
     Raises:
         OSError: if the file is missing, is not a regular file, or is larger than `most` bytes.
     """
     descriptor = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with open(descriptor, "rb") as opened:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        mode = os.fstat(descriptor).st_mode
+        if not (stat.S_ISREG(mode) or (pipe and stat.S_ISFIFO(mode))):
             raise OSError(errno.EINVAL, "it is not a regular file", str(file))
-        data = opened.read(most + 1)
+        if stat.S_ISFIFO(mode):
+            if not select.select([descriptor], [], [], _PIPE_S)[0]:
+                raise OSError(errno.EAGAIN, f"nothing was written to the pipe in {_PIPE_S:g} s", str(file))
+            os.set_blocking(descriptor, True)
+        data: bytes | None = opened.read(most + 1)
+        if data is None:  # files such as /proc/kmsg
+            raise OSError(errno.EAGAIN, "it has no content yet", str(file))
     if len(data) > most:
         raise OSError(errno.EFBIG, f"larger than {most} bytes", str(file))
     return data

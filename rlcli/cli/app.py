@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import importlib
 import os
@@ -130,8 +131,27 @@ def _command_name(arguments: list[str]) -> str | None:
     return word if word in COMMANDS or word in GROUPS else None
 
 
+def _require_words(arguments: list[str]) -> None:
+    """Check that no word of the command line is empty (`--record ""`, `--record=`) and that all are UTF-8.
+
+    Raises:
+        UsageError: with the word and its place.
+    """
+    for position, word in enumerate(arguments):
+        if not word or (word.startswith("--") and word.endswith("=")):
+            name = word or (arguments[position - 1] if position else "rlcli")
+            raise UsageError(f"there is an empty word at {name.rstrip('=')}", hint="give a value, or leave it out")
+    words = dict.fromkeys(arguments, "a word of the command line") | {
+        value: name for name, value in os.environ.items() if name.startswith("RLCLI_")
+    }
+    for word, place in words.items():
+        if any("\ud800" <= character <= "\udfff" for character in word):  # Python's form of other bytes
+            raise UsageError(f"{place} is not UTF-8: '{word}'", hint="rename the file or folder")
+
+
 def _run(arguments: list[str]) -> int:
     try:
+        _require_words(arguments)
         with use_settings(_user_settings(arguments)):
             result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
         if result == INTERRUPTED:  # typer turns Ctrl-C into this exit code
@@ -164,6 +184,8 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
         return failure
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         return Stopped("interrupted", exit_code=INTERRUPTED)
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+        return UsageError(f"'{error.filename}' is too long: a name in a path has at most 255 bytes", hint="shorten it")
     if isinstance(error, OSError):
         file = f"{error.filename}: " if error.filename else ""
         return MachineError(f"{file}{error.strerror or error}")

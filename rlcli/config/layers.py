@@ -144,7 +144,7 @@ def read(file: FilePath, name: str | None = None, *, pipe: bool = False) -> Docu
     """
     name = name or str(file)
     try:
-        return strict_yaml.load(file.read_bytes() if pipe else read_plain(file, strict_yaml.MAX_BYTES))
+        return strict_yaml.load(read_plain(file, strict_yaml.MAX_BYTES, pipe=pipe))
     except OSError as error:
         raise ConfigError([Problem(name, "", f"cannot be read: {error.strerror or error}; check the path")]) from None
     except YamlError as error:

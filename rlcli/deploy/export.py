@@ -22,7 +22,7 @@ from rlcli.deploy.graph import DeployedPolicy
 from rlcli.deploy.metadata import metadata_of, mjlab_properties
 from rlcli.errors import MachineError, UsageError, VerdictError, require_known
 from rlcli.rl.policy import PolicySpec
-from rlcli.runs.atomic_io import remove_leftovers, sync_folder, write_synced
+from rlcli.runs.atomic_io import remove_leftovers, require_regular, sync_folder, write_synced
 from rlcli.runs.checkpoint_manifest import deployment_of, layout_of
 from rlcli.runs.checkpoint_reader import Checkpoint
 
@@ -51,7 +51,7 @@ class Exported:
 
 
 def check_target(format_: str, output: Path | None) -> None:
-    """Check that the format exists and that the output file has its suffix.
+    """Check that the format exists, and that the output file has its suffix and can be written.
 
     Raises:
         UsageError: for an unknown format, or a file with another suffix.
@@ -69,6 +69,7 @@ def check_target(format_: str, output: Path | None) -> None:
     if output.suffix != suffix:
         hint = f"--format {other}" if other else f"--output {output.with_suffix(suffix) if output.name else 'FILE'}"
         raise UsageError(f"'{output}' does not end in {suffix}, the suffix of format {format_}", hint=hint)
+    require_regular(output)
 
 
 def refusal(spec: PolicySpec) -> str | None:

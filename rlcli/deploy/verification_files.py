@@ -10,10 +10,11 @@ import numpy as np
 
 from rlcli.deploy.numpy_export import literal
 from rlcli.errors import UsageError
-from rlcli.runs.atomic_io import disk_errors, write_atomic
+from rlcli.runs.atomic_io import disk_errors, require_regular, write_atomic
 
 PROGRAM = "run_policy.py"
 MODEL = "model.xml"
+BINARY_MODEL = "model.mjb"
 _MARK = "<!-- written by rlcli export -->\n"
 """First line of an exported model. A model file with this line may be overwritten."""
 _TEMPLATE = Path(__file__).parent / "deployed" / PROGRAM
@@ -61,6 +62,8 @@ def check_overwrites(policy: Path) -> None:
     if policy.name == PROGRAM:
         message = f"--verify writes its program to {PROGRAM}, so the policy needs another name"
         raise UsageError(message, hint="give --output FILE")
+    for name in (MODEL, BINARY_MODEL):
+        require_regular(policy.with_name(name))
     model = policy.with_name(MODEL)
     try:
         with model.open("rb") as file:
@@ -85,7 +88,7 @@ def write_program(folder: Path, text: str) -> bool:
     file = folder / PROGRAM
     with disk_errors(folder):
         if file.exists() or file.is_symlink():
-            return file.is_file() and file.read_text(encoding="utf-8", errors="replace") == text
+            return file.is_file() and file.stat().st_size < 2**20 and file.read_bytes() == text.encode()
         write_atomic(file, text)
     return True
 
@@ -97,7 +100,7 @@ def write_model(spec: mujoco.MjSpec, model: mujoco.MjModel, folder: Path) -> Pat
         MachineError: if the file cannot be written.
     """
     text = _model_xml(spec, model)
-    file = folder / (MODEL if text is not None else "model.mjb")
+    file = folder / (MODEL if text is not None else BINARY_MODEL)
     if text is not None:
         return write_atomic(file, _MARK + text)
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)

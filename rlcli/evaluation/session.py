@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.config.layers import flags
 from rlcli.errors import CheckpointError, MachineError, TaskError, UsageError, require_known
+from rlcli.runs.atomic_io import require_regular
 from rlcli.runs.run import RECORD, Run
 from rlcli.runs.run_ref import default_runs_dir, find_run, list_runs
 
@@ -245,17 +246,24 @@ def check_record(record: Path | None, mode: str) -> None:
     """Check the options of a recording, before anything is built.
 
     Raises:
-        UsageError: for an unknown mode, or a folder in place of a file.
+        UsageError: for an unknown mode, or something else than a regular file.
         MachineError: if the folder of the file does not exist.
     """
     modes = ("all", "succeeded", "failed", "separate")
     require_known(mode, modes, "--record-mode", "modes")
     if record is None:
         return
-    if record.is_dir():
-        raise UsageError(f"--record {record} is a folder", hint=f"give a file: {record / 'episodes.safetensors'}")
+    for file in recording_files(record, mode).values():
+        require_regular(file)
     if not record.absolute().parent.is_dir():
         raise MachineError(f"--record: there is no folder {record.absolute().parent}; create it")
+
+
+def recording_files(file: Path, mode: str) -> dict[str, Path]:
+    """Return which episodes (all, succeeded or failed) a mode of `--record-mode` writes, and the file of each."""
+    if mode != "separate":
+        return {mode: file}
+    return {word: file.with_name(f"{file.stem}-{word}{file.suffix}") for word in ("succeeded", "failed")}
 
 
 def run_episodes(
@@ -270,7 +278,7 @@ def run_episodes(
 
     with session.env.observers.added(EpisodeRecorder(session.env, episodes)) as recorder:
         summary = evaluate(session.env, session.act, episodes).summary()
-    files = [str(file) for file in recorder.save(record, mode)]
+    files = [str(file) for file in recorder.save(recording_files(record, mode))]
     _log.info(f"recorded {len(recorder.episodes)} episodes to {' and '.join(files)}")
     return summary, files
 

@@ -32,6 +32,7 @@ SIGNALS = {
 """Parameter -> its unit."""
 _INTEGER = ("action_delay", "observation_delay")
 _MAX_POINTS = 1000
+_MAX_VARIANTS = 10_000
 """Largest number of values of a sweep, and of steps of a delay."""
 _FORM = re.compile(r"(?P<name>\w+)(?:\.(?P<element>[^=]+))?=(?P<absolute>abs:)?(?P<values>[^=]+)")
 
@@ -92,7 +93,7 @@ def read_sweeps(texts: Sequence[str], points: int) -> list[Sweep]:
     """Parse `NAME[.ELEMENT]=[abs:]LOW:HIGH[:POINTS]` or `...=A,B,C`; no parameter may appear twice.
 
     Raises:
-        UsageError: for text of another form, or values that are not possible.
+        UsageError: for text of another form, values that are not possible, or too many combinations.
     """
     sweeps: list[Sweep] = []
     for text in texts:
@@ -100,6 +101,12 @@ def read_sweeps(texts: Sequence[str], points: int) -> list[Sweep]:
         if any(sweep.name == other.name for other in sweeps):
             raise UsageError(f"--sweep: {sweep.name} is given twice; leave out one")
         sweeps.append(sweep)
+    count = math.prod(len(sweep.values) for sweep in sweeps)  # before `grid` builds all combinations
+    if count > _MAX_VARIANTS:
+        raise UsageError(
+            f"{count:,} variants, but at most {_MAX_VARIANTS:,} are allowed",
+            hint="give fewer sweeps, or a smaller --points",
+        )
     return sweeps
 
 

@@ -241,6 +241,7 @@ class ApplyBodyImpulse(BodyTerm, TensorState):
         selection.write(self._wrench, drawn, self._columns)
         low, high = _bounds(self.env, self.duration_s)
         steps = selection.uniform(low[0], high[0], (1,))[:, 0].double() / self.env.step_dt
+        steps.clamp_(max=2.0**62)  # a larger number would be negative as an integer
         selection.write(self._steps_left, (steps * (1.0 - 1e-6)).ceil_().long())
 
     def update(self, select: Callable[[Tensor], Selection | None], running: Tensor) -> None:

@@ -24,8 +24,11 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
     config = root / file
     if (root / "run.json").exists():
         raise TaskError(f"'{folder}' is a run, not a task", hint=f"use --checkpoint {folder}")
-    if root.is_file():
-        raise TaskError(f"'{folder}' is a file, not a task's folder", hint=f"did you mean '{folder.parent}'?")
+    if root.exists() and not root.is_dir():
+        hint = f"did you mean '{folder.parent}'?" if root.is_file() else "give a folder with a task.yaml"
+        raise TaskError(
+            f"'{folder}' is a {'file' if root.is_file() else 'device or pipe'}, not a task's folder", hint=hint
+        )
     other = None
     if config.is_file():
         other = find_in_formats(config)

@@ -1,5 +1,6 @@
 """Recorder of whole episodes of an evaluation; a replay can simulate them again."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -68,8 +69,8 @@ class EpisodeRecorder(StepObserver):
                 self._quota[env] -= 1
                 self.episodes.append(Episode.of(self._env, ended, row, begin=self._begin[env]))
 
-    def save(self, file: Path, mode: str = "all") -> list[Path]:
-        """Write the episodes that a mode keeps: all, succeeded, failed, or separate (a file for each of the two).
+    def save(self, files: Mapping[str, Path]) -> list[Path]:
+        """Write episodes: all, succeeded or failed -> the file of these episodes.
 
         Returns:
             The files that were written.
@@ -77,15 +78,9 @@ class EpisodeRecorder(StepObserver):
         Raises:
             MachineError: if the disk reports an error.
         """
-        if mode == "all":
-            self._write(file, self.episodes)
-            return [file]
-        files = []
-        for word in ("succeeded", "failed") if mode == "separate" else (mode,):
-            target = file.with_name(f"{file.stem}-{word}{file.suffix}") if mode == "separate" else file
-            self._write(target, [e for e in self.episodes if e.succeeded == (word == "succeeded")])
-            files.append(target)
-        return files
+        for word, file in files.items():
+            self._write(file, [e for e in self.episodes if word == "all" or e.succeeded == (word == "succeeded")])
+        return list(files.values())
 
     def _write(self, file: Path, episodes: list[Episode]) -> None:
         last = max((e.begin + e.length for e in episodes), default=0)

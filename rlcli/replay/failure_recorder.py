@@ -180,7 +180,7 @@ class FailureRecorder(StepObserver):
                 header = self._header.model_copy(update={**parts, "follows_constants": kept.follows_constants})
                 write_trajectory(self._folder / name, header, tensors | kept.tensors)
             if batch.returns:  # needed after a resumption, even if no episode is recorded yet
-                self._folder.mkdir(parents=True, exist_ok=True)
+                self._folder.mkdir(exist_ok=True)
                 recent = _RecentReturns(step=batch.step, returns=batch.returns)
                 write_atomic(self._folder / _RETURNS_FILE, recent.model_dump_json(indent=2) + "\n")
         except (RlcliError, OSError) as error:

@@ -311,7 +311,7 @@ def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor]) 
     }
     document["sha256"] = content_digest(copies, document)
     with disk_errors(file.parent):
-        file.parent.mkdir(parents=True, exist_ok=True)
+        file.parent.mkdir(exist_ok=True)  # not `parents=True`: a run that was moved away must not be created again
     write_atomic(file, safetensors.torch.save(copies, metadata={"rlcli": json.dumps(document)}))
 
 

@@ -1,17 +1,19 @@
 """Atomic writing of files: after a crash a reader finds either the old content or the new one."""
 
 import contextlib
+import errno
 import glob
 import json
 import math
 import os
 import re
 import shutil
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rlcli.errors import MachineError
+from rlcli.errors import MachineError, UsageError
 
 
 def write_atomic(file: Path, content: bytes | str) -> Path:
@@ -19,7 +21,9 @@ def write_atomic(file: Path, content: bytes | str) -> Path:
 
     Raises:
         MachineError: if the disk reports an error; the old file is unchanged.
+        UsageError: if there is something else than a regular file.
     """
+    require_regular(file)
     data = content.encode() if isinstance(content, str) else content
     temporary = file.with_name(f".{file.name}.tmp-{os.getpid()}")
     try:
@@ -31,6 +35,24 @@ def write_atomic(file: Path, content: bytes | str) -> Path:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
     return file
+
+
+def require_regular(file: Path) -> None:
+    """Check, before any work is done, that writing a file replaces a regular file or nothing.
+
+    Raises:
+        UsageError: for a folder, a pipe, a socket or a device.
+        MachineError: if the disk reports an error.
+    """
+    with disk_errors(file):
+        try:
+            mode = os.stat(file).st_mode
+        except (FileNotFoundError, NotADirectoryError):  # writing reports a missing folder
+            return
+    if not stat.S_ISREG(mode):
+        kinds = ((stat.S_ISDIR, "folder"), (stat.S_ISFIFO, "pipe"), (stat.S_ISSOCK, "socket"))
+        kind = next((kind for is_kind, kind in kinds if is_kind(mode)), "device")
+        raise UsageError(f"cannot write {file}: it is a {kind}", hint="give the name of a new or a regular file")
 
 
 def write_synced(file: Path, data: bytes) -> None:
@@ -91,7 +113,9 @@ def finite_json(value: Any) -> Any:
 
 def disk_error(path: Path, error: OSError) -> MachineError:
     """Return the error for a path that cannot be written, with a hint that fits the cause."""
-    return MachineError(f"cannot write {path}: {error.strerror or error}", hint=_HINTS.get(error.errno or 0))
+    gone = [str(folder) for folder in path.parents if error.errno == errno.ENOENT and not folder.exists()]
+    missing = f" (there is no folder {gone[-1]})" if gone else ""
+    return MachineError(f"cannot write {path}: {error.strerror or error}{missing}", hint=_HINTS.get(error.errno or 0))
 
 
 @contextlib.contextmanager
@@ -116,9 +140,11 @@ def disk_errors(path: Path, *, remove: bool = False) -> Iterator[None]:
 
 
 _HINTS = {
-    28: "free some space, then continue with --resume",
+    2: "create the folder; if it was moved or deleted meanwhile, put it back",
+    28: "free some space",
+    36: "a name in a path has at most 255 bytes: shorten it",
     13: "choose another folder with --runs-dir",
     30: "the disk is read-only: make it writable, copy the run, or choose another folder with --runs-dir",
     122: "the disk quota is used up: free some space",
 }
-"""errno -> hint: ENOSPC, EACCES, EROFS, EDQUOT."""
+"""errno -> hint: ENOENT, ENOSPC, ENAMETOOLONG, EACCES, EROFS, EDQUOT."""

@@ -4,11 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rlcli.config.strict_yaml import MAX_BYTES
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.runs.checkpoint_reader import open_checkpoint, steps
 from rlcli.runs.provenance import differences
 from rlcli.runs.run import Run, create_run
 from rlcli.runs.run_diff import last_iteration
+from rlcli.runs.safe_io import read_file
 
 IRRELEVANT = ("engine_threads",)
 """Entries of run.json that do not affect the results: physics is the same for any number of engine threads."""
@@ -68,5 +70,5 @@ def create_reproduction(original: Run, runs_dir: Path, name: str, now: Mapping[s
         if key in was
     }
     record: dict[str, Any] = {**now, **kept, "loggers": [], "reproduces": str(original.folder)}
-    config = original.config.read_text(encoding="utf-8")
+    config = read_file(original.config, MAX_BYTES).decode()
     return create_run(runs_dir, was["task"]["name"], name, config, record), initial

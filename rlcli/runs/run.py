@@ -30,6 +30,8 @@ WAITING = "waiting"
 """State of a run of a study that has not started yet."""
 LOCK = ".lock"
 MAX_SEED = 2**62
+MAX_NAME = 200
+"""Longest `--name`; with the time of a run in front it is a part of a path, which has at most 255 bytes."""
 _TASK = re.compile(r"(?!\.{1,2}$)[^/\\:]{1,255}")
 _MAX_FILES = 100_000
 _LOCK_TIMEOUT_S = 0.3
@@ -122,10 +124,12 @@ def new_folder(runs_dir: Path, task: str, name: str | None) -> Path:
     """Create a folder for a run or a study, with the UTC time in its name.
 
     Raises:
-        UsageError: if the name cannot be part of a folder's name.
+        UsageError: if a name cannot be part of a folder's name.
         MachineError: if the folder cannot be created.
     """
     require_name(name)
+    if len(os.fsencode(task)) > 255:
+        raise UsageError(f"the task's name has {len(os.fsencode(task))} bytes, but a folder's name at most 255")
     parent = runs_dir / task
     stem = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S") + (f"-{name}" if name else "")
     with disk_errors(parent):
@@ -141,6 +145,8 @@ def require_name(name: str | None) -> None:
     """
     if name is not None and not _NAME.fullmatch(name):
         raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint="use letters, digits, - and _")
+    if name is not None and len(name) > MAX_NAME:
+        raise UsageError(f"--name has {len(name)} characters; at most {MAX_NAME} are allowed", hint="shorten it")
 
 
 def initialize_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:

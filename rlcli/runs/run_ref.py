@@ -1,6 +1,5 @@
 """References to runs and checkpoints on a command line: folder, name, `latest`, `RUN@best` or `RUN@step:N`."""
 
-import contextlib
 import glob
 import logging
 import os
@@ -37,7 +36,7 @@ def find_runs(references: list[str], runs_dir: Path) -> list[Run]:
     """Find the runs of several references: a folder, a name, `latest`, a task, or a folder of runs.
 
     Raises:
-        CheckpointError: if a reference names no run.
+        CheckpointError: if a reference names no run, or only broken ones.
     """
     found: list[Run] = []
     for reference in references:
@@ -56,27 +55,53 @@ def _runs_of_task(reference: str, runs_dir: Path) -> list[Run]:
     """Return the runs of a task or of a folder of runs; an empty list if the reference names one run."""
     if (Path(reference) / RECORD).is_file() or reference == "latest":
         return []
-    found = list_runs(runs_dir, reference.rpartition(":")[2])
+    found, refused = _list_runs(runs_dir, reference.rpartition(":")[2])
     studies = [] if os.sep in reference else sorted(runs_dir.glob(f"*/{glob.escape(reference)}"))
     for folder in (Path(reference), runs_dir / reference, *studies):
         if not found and os.path.isdir(folder) and not (folder / RECORD).is_file():
-            found = _opened(runs_below(folder))
+            found, broken = _opened(runs_below(folder))
+            refused = list(broken.values())
+    if refused and not found:
+        raise refused[0]
+    _warn_of_skipped(refused)
     return found
 
 
 def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
     """Return the runs under a folder, the oldest first; other folders and broken runs are skipped."""
-    runs = _opened(run_folders(runs_dir))
-    return runs if task is None else [run for run in runs if run.record["task"]["name"] == task]
+    return _list_runs(runs_dir, task)[0]
 
 
-def _opened(folders: Iterable[Path]) -> list[Run]:
-    """Open the runs in some folders; return them, the oldest first, without broken ones."""
-    runs = []
+def _list_runs(runs_dir: Path, task: str | None) -> tuple[list[Run], list[CheckpointError]]:
+    """Return the runs of a task (None: all), the oldest first, and the errors of the broken ones."""
+    runs, refused = _opened(run_folders(runs_dir))
+    if task is None:
+        return runs, list(refused.values())
+    of_task = [error for folder, error in refused.items() if folder.is_relative_to(runs_dir / task)]
+    return [run for run in runs if run.record["task"]["name"] == task], of_task
+
+
+def _first_of(refused: list[CheckpointError]) -> str:
+    """Return the reason why the first broken run is skipped, and how many others are."""
+    more = f"; {len(refused) - 1} more are skipped" if len(refused) > 1 else ""
+    return refused[0].message + more
+
+
+def _warn_of_skipped(refused: list[CheckpointError]) -> None:
+    if refused:
+        _log.warning(f"a run is skipped: {_first_of(refused)}")
+
+
+def _opened(folders: Iterable[Path]) -> tuple[list[Run], dict[Path, CheckpointError]]:
+    """Open the runs in some folders; return them, the oldest first, and the error of each broken one."""
+    runs, refused = [], {}
     for folder in folders:
-        with contextlib.suppress(CheckpointError):
+        try:
             runs.append(open_run(folder))
-    return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name))
+        except CheckpointError as error:
+            if os.path.lexists(folder / RECORD):  # otherwise it is another folder, not a run
+                refused[folder] = error
+    return sorted(runs, key=lambda run: (str(run.record.get("started", "")), run.folder.name)), refused
 
 
 def find_checkpoint(
@@ -150,9 +175,12 @@ def default_runs_dir() -> Path:
 
 def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, str]:
     if reference == "latest":
-        runs = list_runs(runs_dir, task)
+        runs, refused = _list_runs(runs_dir, task)
+        of_task = f" of {task}" if task else ""
+        if not runs and refused:
+            message = f"there is no valid run{of_task} in {runs_dir}: {_first_of(refused)}"
+            raise CheckpointError(message, hint=refused[0].hint)
         if not runs:
-            of_task = f" of {task}" if task else ""
             hint = f"rlcli train {task or 'TASK'} starts one"
             raise CheckpointError(f"there is no run{of_task} in {runs_dir}", hint=hint)
         if seconds_since(runs[-1].record.get("started")) < -60:
@@ -160,6 +188,7 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
                 f"{runs[-1].folder} started in the future by this machine's clock, so that `latest` may not be the run"
                 " that was started last; name the run"
             )
+        _warn_of_skipped(refused)
         return runs[-1], f"newest run of {task}" if task else f"newest run in {runs_dir}"
     for candidate in (Path(reference), runs_dir / reference, *([runs_dir / task / reference] if task else [])):
         if os.path.isfile(candidate / RECORD):
@@ -168,9 +197,13 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
             inside = sorted(file.parent.name for file in candidate.glob(f"*/{RECORD}"))
             message = f"{candidate} is a study of several runs"
             raise CheckpointError(message, hint=f"name one: {listing(str(candidate / n) for n in inside)}")
-    matches = [run for run in list_runs(runs_dir, None) if run.folder.name == reference]
+    runs, broken = _opened(run_folders(runs_dir))
+    matches = [run for run in runs if run.folder.name == reference]
     if len(matches) == 1:
         return matches[0], "as named"
-    names = [run.folder.name for run in list_runs(runs_dir, None)]
+    for folder, error in broken.items():
+        if folder.name == reference:
+            raise error
+    names = [run.folder.name for run in runs]
     near = did_you_mean(reference, names)
     raise CheckpointError(f"no run '{reference}'", hint=near or f"runs in {runs_dir}: {listing(names[-5:])}")

@@ -30,6 +30,8 @@ _MAX_HEIGHTS = 1 << 24
 """Largest number of heights of a height field."""
 _MAX_HEADER = 10_000
 """Largest header of a NumPy file [bytes]."""
+_MAX_PARTS = 2000
+"""Most steps, cells or random heights along one edge of a patch."""
 _START, _MOVE = random.stream("terrain.start"), random.stream("terrain.move")
 _SCATTER = random.stream("terrain.scatter")
 _SPAWN_HALF_WIDTH = 0.5
@@ -260,6 +262,9 @@ def _patch_problems(patch: schema.PatchConfig, edge: float, resolution: float) -
     platform = getattr(patch, "platform", 0.0)
     if platform >= edge:
         yield "platform", f"a platform of {platform:g} m does not fit in a patch of {edge:g} m", "make it smaller"
+    for key in ("spacing", "step_width", "cell"):
+        if (part := getattr(patch, key, edge)) * _MAX_PARTS < edge:
+            yield key, f"{part:g} m divides a patch of {edge:g} m into more than {_MAX_PARTS} parts", "make it larger"
     fine = "set a smaller resolution, or boxes: true"
     if isinstance(patch, schema.StairsPatchConfig) and not patch.boxes and patch.step_width < 2 * resolution:
         yield "step_width", f"{patch.step_width:g} m needs a resolution of half that, not {resolution:g} m", fine

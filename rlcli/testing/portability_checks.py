@@ -21,9 +21,11 @@ from rlcli.envs.make import make_env
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DeviceError, RlcliError, pip_install
+from rlcli.machine import read_plain
 from rlcli.rl.rng import rng_state
 from rlcli.runs.bundle import open_bundle
 from rlcli.runs.restore import require_fit
+from rlcli.runs.safe_io import JSON_LIMIT
 from rlcli.testing.episode_checks import compare_trajectories
 from rlcli.testing.findings import Finding, NotRunError, error_at, warning_at
 from rlcli.testing.host_sync import HostSyncError, HostSyncGuard
@@ -145,8 +147,8 @@ def layout(subject: TaskUnderTest) -> Iterator[Finding]:
         raise NotRunError(f"there is no {file.name}; `rlcli check TASK --record-layout` writes it")
     hint = f"undo the change, or accept it with --record-layout: policies trained before no longer fit ({file.name})"
     try:
-        recorded = _groups(json.loads(file.read_text(encoding="utf-8")))
-    except (ValueError, KeyError, AttributeError, TypeError) as error:
+        recorded = _groups(json.loads(read_plain(file, JSON_LIMIT)))
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         yield error_at(file.name, f"is not a recorded layout: {error!r}", "write it again: --record-layout")
         return
     current = _groups(json.loads(json.dumps(subject.env().layout.record())))

@@ -253,10 +253,8 @@ def drop_after(checkpoints: Path, step: int) -> list[int]:
     later = [saved for saved in steps(checkpoints) if saved > step]
     for saved in reversed(later):
         _remove(checkpoints / f"{saved:012d}")
-    latest, content = checkpoints / "latest", f"{step:012d}\n"
-    # without a later checkpoint the file may still be wrong: the run was killed before it wrote the file
-    if not latest.is_file() or latest.read_bytes() != content.encode():
-        write_atomic(latest, content)
+    # also without a later checkpoint, because a run may be killed before it wrote the file
+    write_atomic(checkpoints / "latest", f"{step:012d}\n")
     drop_rows(checkpoints)
     return later
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import io
 import json
 import math
+import os
+import platform
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,22 +82,37 @@ class TensorBoard:
     """
 
     def __init__(self, folder: Path, *, resume_after_step: int | None = None) -> None:
-        from torch.utils.tensorboard import SummaryWriter
+        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.summary.writer.record_writer import RecordWriter
 
+        name = f"events.out.tfevents.{time.time():.6f}.{platform.node()}.{os.getpid()}"
         with disk_errors(folder):
+            folder.mkdir(exist_ok=True)
             if resume_after_step is not None:
                 for file in sorted(folder.glob("events.out.tfevents.*")):
                     _remove_events_after(file, resume_after_step)
-            self._writer: Any = SummaryWriter(str(folder))
+            self._file = (folder / name).open("wb")
+            # not SummaryWriter: its thread prints a traceback when the disk is full
+            self._event, self._writer = Event, RecordWriter(self._file)
+            self._add(file_version="brain.Event:2")
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
         """Add scalars at the environment step."""
-        for name, value in metrics.items():
-            self._writer.add_scalar(name, value, step)
+        values = [{"tag": name, "simple_value": value} for name, value in metrics.items()]
+        self._add(step=step, summary={"value": values})
 
     def close(self, state: str = "finished") -> None:
-        """Flush and close."""
-        self._writer.close()
+        """Close the file."""
+        self._file.close()
+
+    def _add(self, **entries: Any) -> None:
+        try:
+            self._writer.write(self._event(wall_time=time.time(), **entries).SerializeToString())
+            self._file.flush()
+        except OSError:
+            with contextlib.suppress(OSError):
+                self._file.close()  # the training drops a logger that has failed
+            raise
 
 
 def check_loggers(names: Sequence[str] | None) -> list[str]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING
 
-from rlcli.errors import DivergedError, Stopped
+from rlcli.errors import DivergedError, MachineError, Stopped
 from rlcli.rl import distributed
 from rlcli.rl.budget import Budget
 from rlcli.rl.trainer import Report, Trainer
@@ -91,6 +91,9 @@ class TrainLoop:
                 if isinstance(error, DivergedError):
                     iteration, step = self._boundary
                     self.writer.save_cases(iteration + 1, step + self.trainer.steps_per_iteration)
+            if isinstance(error, MachineError):
+                resume = f"then continue with `rlcli train --resume {shlex.quote(str(self.run.folder))}`"
+                error.hint = f"{error.hint}; {resume}" if error.hint else f"correct this, {resume}"
             raise
 
     def _train(self, budget: Budget) -> None:

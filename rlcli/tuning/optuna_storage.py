@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import optuna
 
 JOURNAL = "journal.log"
+_MAX_JOURNAL = 512 * 2**20
 _ATTEMPTS = 5
 """Attempts to create the tables of a database."""
 
@@ -100,6 +101,8 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
     file = folder / JOURNAL
     if file.is_symlink():
         raise CheckpointError(f"{file} is a link; replace it by the file itself")
+    if file.exists() and not (file.is_file() and file.stat().st_size <= _MAX_JOURNAL):
+        raise CheckpointError(f"{file} is not a regular file of at most {_MAX_JOURNAL:,} bytes; choose another --name")
     if not create and not file.is_file():
         raise CheckpointError(f"{folder} has no {JOURNAL}, the file of its trials; choose another --name")
 

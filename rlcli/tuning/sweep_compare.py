@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.config.dump import to_data, to_yaml
+from rlcli.config.strict_yaml import MAX_BYTES
 from rlcli.errors import CheckpointError, DivergedError, RlcliError, UsageError
 from rlcli.evaluation.limits import require_success
 from rlcli.runs.overview import newest_rows, overview
 from rlcli.runs.run import CONFIG, Run
+from rlcli.runs.safe_io import read_file
 from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.loggers import read_metrics
 from rlcli.training.signals import StopRequest
@@ -223,7 +225,7 @@ def _run_folder(sweep: Path, name: str, request: TrainingRequest, changes: Seque
     number = 1
     while True:
         folder = sweep / (name if number == 1 else f"{name}-{number}")
-        if not (folder / CONFIG).is_file() or (folder / CONFIG).read_text(encoding="utf-8") == config:
+        if not (folder / CONFIG).is_file() or read_file(folder / CONFIG, MAX_BYTES) == config.encode():
             folder.mkdir(exist_ok=True)
             return folder
         number += 1

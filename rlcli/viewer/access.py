@@ -45,8 +45,11 @@ def refusal_reason(port: int, path: str, request_headers: Mapping[str, Sequence[
         path: the path of the request, with its query.
         request_headers: header name in lower case -> its values.
     """
+    for name, values in request_headers.items():
+        if len(values) > 1 and (name in ("host", "origin", "upgrade") or name.startswith("sec-fetch-")):
+            return f"the header {name} appears twice"
     host = [value.lower() for value in request_headers.get("host", ())]
-    if len(host) != 1 or host[0] not in allowed_hosts(port):
+    if not host or host[0] not in allowed_hosts(port):
         return "the Host header does not name this machine"
     route = path.partition("?")[0]
     if not path.startswith("/") or ".." in route or "\\" in route or "%" in route:
@@ -58,7 +61,7 @@ def refusal_reason(port: int, path: str, request_headers: Mapping[str, Sequence[
     origin = [value.lower() for value in request_headers.get("origin", ())]
     own = f"http://{host[0]}"
     # browsers always send Origin with a WebSocket, but not with every request for a page
-    if (is_websocket and not origin) or any(value != own for value in origin) or len(origin) > 1:
+    if (is_websocket and not origin) or any(value != own for value in origin):
         return "another page sent the request"
     site, mode, target = (
         (*request_headers.get(f"sec-fetch-{name}", ()), "")[0].lower() for name in ("site", "mode", "dest")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import DependencyError, MachineError, UsageError, pip_install
-from rlcli.runs.atomic_io import disk_errors
+from rlcli.runs.atomic_io import disk_errors, require_regular
 
 if TYPE_CHECKING:
     import numpy as np
@@ -67,6 +67,7 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
 
     def __init__(self, file: Path, period: float) -> None:
         check_video(file)
+        require_regular(file)
         import imageio.v2 as imageio
 
         self.file = file
@@ -82,7 +83,7 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
             settings = {"fps": self.fps, "codec": "libx264", "quality": 7, "macro_block_size": 2}
             settings["ffmpeg_log_level"] = "error"
         with disk_errors(file):
-            file.parent.mkdir(parents=True, exist_ok=True)
+            file.parent.mkdir(exist_ok=True)
             self._temporary.unlink(missing_ok=True)  # the writer would follow a symbolic link
             self._writer: Any = imageio.get_writer(self._temporary, **settings)
 

@@ -65,12 +65,12 @@ def recorded(task, tmp_path):
     whole, count = tmp_path / "whole.safetensors", ENVS * (EPISODE + 1)
     with env.observers.added(EpisodeRecorder(env, count)) as recorder:
         evaluate(env, policy(env), count)
-    recorder.save(whole)
+    recorder.save({"all": whole})
     env = make_task_env(task)
     start = start_episode(env, policy(env), ENV_ID, EPISODE)
     with env.observers.added(EpisodeRecorder(env, 1, env_id=ENV_ID)) as recorder:
         run_episode(env, policy(env), start.obs, ENV_ID)
-    recorder.save(tmp_path / "one.safetensors")
+    recorder.save({"all": tmp_path / "one.safetensors"})
     recording = read_trajectory(whole)
     number = [n for n, e in enumerate(recording.header.episodes) if e.env == ENV_ID][EPISODE]
     return parts(recording, number), parts(read_trajectory(tmp_path / "one.safetensors"), 0), start
@@ -107,7 +107,7 @@ def test_dependent_episode_runs_earlier_ones_with_reasons(what, tmp_path):
     env = make_task_env(task)  # the reason matters: without the earlier episodes it is another episode
     with env.observers.added(EpisodeRecorder(env, 1, env_id=ENV_ID)) as recorder:
         run_episode(env, policy(env), env.reset(seed=SEED, episode=EPISODE)["policy"], ENV_ID)
-    recorder.save(tmp_path / "other.safetensors")
+    recorder.save({"all": tmp_path / "other.safetensors"})
     other = parts(read_trajectory(tmp_path / "other.safetensors"), 0)
     assert whole["qpos"].shape != other["qpos"].shape or not torch.equal(whole["qpos"], other["qpos"])
 

@@ -38,7 +38,7 @@ def recorded(task, file, episodes=9, num_envs=4):
     env = build(task, num_envs)
     with env.observers.added(EpisodeRecorder(env, episodes)) as recorder:
         evaluate(env, random_policy(env, 1.0, 3), episodes)
-    recorder.save(file)
+    recorder.save({"all": file})
     return read_trajectory(file)
 
 

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from rlcli.errors import MachineError
+from rlcli.errors import MachineError, UsageError
 from rlcli.runs import atomic_io
 
 
@@ -20,6 +20,14 @@ def test_write_atomic_writes_text_and_bytes_unchanged(tmp_path, content, bytes_)
     atomic_io.write_atomic(tmp_path / "file", content)
     assert (tmp_path / "file").read_bytes() == bytes_
     assert names(tmp_path) == ["file"]
+
+
+def test_write_atomic_replaces_no_pipe(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UsageError, match="pipe: it is a pipe"):
+        atomic_io.write_atomic(tmp_path / "pipe", "content")
+    assert (tmp_path / "pipe").is_fifo()
+    assert names(tmp_path) == ["pipe"]
 
 
 def test_write_atomic_syncs_before_the_rename(tmp_path, monkeypatch):
@@ -70,7 +78,7 @@ def test_write_atomic_reports_an_error_of_the_temporary_path(tmp_path):
 @pytest.mark.parametrize(
     ("code", "hint"),
     [
-        (errno.ENOSPC, "free some space, then continue with --resume"),
+        (errno.ENOSPC, "free some space"),
         (errno.EACCES, "choose another folder with --runs-dir"),
         (
             errno.EROFS,
@@ -84,6 +92,14 @@ def test_disk_error_has_a_hint_for_its_errno(tmp_path, code, hint):
     error = atomic_io.disk_error(tmp_path, OSError(code, os.strerror(code)))
     assert error.message == f"cannot write {tmp_path}: {os.strerror(code)}"
     assert error.hint == hint
+
+
+def test_disk_error_names_the_first_missing_folder(tmp_path):
+    error = atomic_io.disk_error(
+        tmp_path / "run" / "checkpoints" / "x", FileNotFoundError(errno.ENOENT, "No such file")
+    )
+    assert error.message.endswith(f"x: No such file (there is no folder {tmp_path / 'run'})")
+    assert error.hint == "create the folder; if it was moved or deleted meanwhile, put it back"
 
 
 def test_disk_error_without_errno_keeps_its_message(tmp_path):

@@ -1,6 +1,7 @@
 """Run folders, and references to them on a command line."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -9,7 +10,7 @@ from support.saved_states import state_of
 
 from rlcli.errors import CheckpointError, MachineError, UsageError
 from rlcli.runs.run import create_run, open_run
-from rlcli.runs.run_ref import find_checkpoint, find_run, list_runs
+from rlcli.runs.run_ref import find_checkpoint, find_run, find_runs, list_runs
 from rlcli.training import checkpoint_writer
 
 RECORD = {"task": {"name": "cartpole", "distribution": "rlcli"}, "seed": 1}
@@ -171,6 +172,24 @@ def test_damaged_record_does_not_hide_other_runs(tmp_path, content):
     with pytest.raises(CheckpointError, match=r"run\.json is corrupt"):
         find_run(str(bad.folder), tmp_path)
     assert find_run("latest", tmp_path)[0].folder == good.folder
+
+
+def test_latest_names_the_refused_runs(tmp_path, caplog):
+    runs = [make_run(tmp_path, steps=(1,)) for _ in range(3)]
+    for run in runs[1:]:
+        run.config.unlink(missing_ok=True)
+        os.mkfifo(run.config)
+    assert find_run("latest", tmp_path, "cartpole")[0].folder == runs[0].folder
+    assert "a run is skipped: " in caplog.text
+    assert "is not a regular file; delete it; 1 more are skipped" in caplog.text
+    (runs[0].folder / "tb").symlink_to(tmp_path)
+    with pytest.raises(CheckpointError, match=r"no valid run of cartpole in .* 2 more are skipped"):
+        find_run("latest", tmp_path, "cartpole")
+    for reference in ("cartpole", runs[0].folder.name):
+        with pytest.raises(CheckpointError, match=r"is a link|not a regular file"):
+            find_runs([reference], tmp_path)
+    with pytest.raises(CheckpointError, match="there is no run of other in"):
+        find_run("latest", tmp_path, "other")
 
 
 def test_runs_folder_that_is_a_file_raises_machine_error(tmp_path):

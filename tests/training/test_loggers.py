@@ -2,6 +2,7 @@
 
 import json
 import math
+import resource
 
 import pytest
 
@@ -66,6 +67,18 @@ def test_tensorboard_has_no_step_twice_after_resume(tmp_path):
     # files of one second and one process are read in the order of their names, in which 10 comes before 9
     written = sorted(events.Scalars("Loss/value"), key=lambda event: event.wall_time)
     assert [(e.step, e.value) for e in written] == [(16, 16.0), (32, 32.0), (48, 480.0)]
+
+
+def test_tensorboard_raises_a_disk_error_where_it_writes_and_prints_nothing(tmp_path, capfd):
+    board = TensorBoard(tmp_path)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500, hard))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            board.write(1, 16, {f"Loss/{number}": 1.0 for number in range(100)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert capfd.readouterr().err == ""
 
 
 def test_check_loggers_accepts_installed_names(monkeypatch):

@@ -116,3 +116,10 @@ def test_content_security_policy_allows_only_own_server():
     assert {word for word in named if "//" in word} == {"ws://localhost:8080", "ws://127.0.0.1:8080"}
     assert "*" not in named
     assert "frame-ancestors 'none'" in policy
+
+
+@pytest.mark.parametrize("name", ["host", "origin", "sec-fetch-site", "sec-fetch-mode", "sec-fetch-dest", "upgrade"])
+def test_security_header_that_appears_twice_is_refused(name):
+    values = {"host": "localhost:8080", "origin": "http://localhost:8080", "upgrade": "websocket"}
+    headers = {**socket(), name: [values.get(name, "same-origin")] * 2}
+    assert refusal_reason(8080, "/state", headers) == f"the header {name} appears twice"

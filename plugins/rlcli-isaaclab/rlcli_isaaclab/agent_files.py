@@ -9,8 +9,10 @@ from typing import Any
 
 import yaml
 
+from rlcli.config.strict_yaml import MAX_BYTES
 from rlcli.errors import ConfigError, Problem
 from rlcli.formats import Note
+from rlcli.machine import read_plain
 from rlcli_isaaclab.settings import Node, Report
 
 
@@ -24,8 +26,8 @@ def read_agent(file: Path, library: str, notes: list[Note]) -> dict[str, Any] | 
     if reader is None:
         return None
     try:
-        data = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
+        data = yaml.safe_load(read_plain(file, MAX_BYTES))
+    except (OSError, yaml.YAMLError, RecursionError) as error:
         raise ConfigError([Problem(str(file), "", f"cannot be read: {' '.join(str(error).split())}")]) from None
     if not isinstance(data, dict):
         raise ConfigError([Problem(str(file), "", "the top level must be a mapping (key: value)")])

@@ -10,7 +10,9 @@ from typing import Any
 
 import yaml
 
+from rlcli.config.strict_yaml import MAX_BYTES
 from rlcli.errors import TaskError
+from rlcli.machine import read_plain
 from rlcli.registry.models import MODELS
 
 MODEL_MAP = "models.yaml"
@@ -58,8 +60,8 @@ def given_models(root: Path, asked: Mapping[str, Any]) -> GivenModels:
         if not file.is_file():
             continue
         try:
-            content = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
-        except yaml.YAMLError as error:
+            content = yaml.safe_load(read_plain(file, MAX_BYTES)) or {}
+        except (OSError, yaml.YAMLError, RecursionError) as error:
             raise TaskError(f"{file}: not YAML: {' '.join(str(error).split())}", hint="write NAME: FILE.xml") from None
         if not isinstance(content, Mapping):
             raise TaskError(f"{file}: expected lines NAME: FILE", hint="for example robot: robot.xml")

@@ -158,14 +158,15 @@ def _preset_file(name: str, overwrite: bool) -> Path:
         UsageError: if the file exists and may not be replaced.
         MachineError: if the folder does not exist or cannot be written.
     """
+    from rlcli.runs.atomic_io import require_regular
+
     file = Path(name)
     if not name or file.name in ("", ".."):
         raise UsageError("--save-preset needs the name of a file", hint="as in --save-preset cartpole.yaml")
     if file.suffix not in (".yaml", ".yml"):
         file = file.with_name(f"{file.name}.yaml")
     folder = file.absolute().parent
-    if file.is_dir():
-        raise UsageError(f"--save-preset {file} is a folder", hint=f"give a file: {file / 'preset.yaml'}")
+    require_regular(file)
     if os.path.lexists(file) and not overwrite:
         raise UsageError(f"--save-preset: {file} exists", hint="choose another name, or add --overwrite")
     if not folder.is_dir():

@@ -96,6 +96,15 @@ _COMMON: dict[str, Any] = {
 """Options that every command has; the console holds their values."""
 
 
+_NEEDED = {
+    "record_mode": ("record", "--record FILE"),
+    "overwrite": ("save_preset", "--save-preset FILE"),
+    "episodes": ("verify", "--verify"),
+    "steps": ("case", "the number of a case"),
+}
+"""Option -> the parameter without which a command ignores it, and how the user writes that parameter."""
+
+
 def add_command(app: typer.Typer, name: str, function: Callable[..., None], **settings: Any) -> None:
     """Add a command to an app, with the common options and the help of the function's docstring.
 
@@ -128,6 +137,10 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
     def run(**values: Any) -> None:
         from rlcli.cli.ui.progress_view import WorkView
 
+        for option, (other, what) in _NEEDED.items():
+            is_alone = {option, other} <= values.keys() and values[other] in (None, False)
+            if is_alone and values[option] != signature.parameters[option].default:
+                raise UsageError(f"--{option.replace('_', '-')} needs {what}", hint="add it, or leave out the option")
         if "overrides" in values and (model := values.pop("model")):
             from rlcli.config.given_models import MODELS, read_models
 
@@ -173,10 +186,12 @@ def video_file(video: Path | None, default: str) -> Path | None:
     """Return the file of --video, the default one if the option has no value; check that it can be written."""
     if video is None:
         return None
+    from rlcli.runs.atomic_io import require_regular
     from rlcli.viewer.video_writer import check_video
 
     file = Path(default) if str(video) == CHOOSE else video
     check_video(file)
+    require_regular(file)
     return file
 
 
@@ -184,15 +199,16 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
     """Check, before any work is done, that an output file can be written.
 
     Raises:
-        UsageError: for a folder, or a suffix that is not one of `suffixes`.
+        UsageError: for a suffix that is not one of `suffixes`, or something else than a regular file.
         MachineError: if its folder does not exist.
     """
+    from rlcli.runs.atomic_io import require_regular
+
     if output is None:
         return
     if output.suffix.lower() not in suffixes:
         raise UsageError(f"'{output}' is not a {what}", hint=f"name it *{', *'.join(suffixes)}")
-    if output.is_dir():
-        raise UsageError(f"-o {output} is a folder", hint="give the name of a file in it")
+    require_regular(output)
     if not output.absolute().parent.is_dir():
         raise MachineError(f"cannot write {output}: there is no folder {output.absolute().parent}; create it")
 

@@ -86,7 +86,7 @@ def play_episode(
     elif record is not None:
         with session.env.observers.added(EpisodeRecorder(session.env, 1, env_id=env_id)) as recorder:
             last = run_episode(session.env, session.act, start.obs, env_id)
-        recorded = [str(written) for written in recorder.save(record)]
+        recorded = [str(written) for written in recorder.save({"all": record})]
         console.info(f"recorded to {recorded[0]}")
     else:
         last = run_episode(session.env, session.act, start.obs, env_id)

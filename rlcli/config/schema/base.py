@@ -49,10 +49,26 @@ def _nonzero(message: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-Number = Annotated[float, _FractionString()]
-Positive = Annotated[float, Field(gt=0), _FractionString()]
-NotNegative = Annotated[float, Field(ge=0), _FractionString()]
-Count = Annotated[int, Field(ge=1)]
+def _limits(smallest: float, largest: float) -> AfterValidator:
+    """Return a validator that refuses numbers beyond which quotients, integers or 32-bit numbers overflow.
+
+    The reference pages do not list these limits, because no sensible number reaches them.
+    """
+
+    def check(value: float) -> float:
+        if not smallest <= value <= largest:
+            raise ValueError(f"{value:g} is out of range; allowed: {smallest:g} to {largest:g}")
+        return value
+
+    return AfterValidator(check)
+
+
+Number = Annotated[float, _FractionString(), _limits(-1e38, 1e38)]
+Positive = Annotated[float, Field(gt=0), _FractionString(), _limits(1e-38, 1e38)]
+NotNegative = Annotated[float, Field(ge=0), _FractionString(), _limits(0.0, 1e38)]
+Seconds = Annotated[float, Field(gt=0), _FractionString(), _limits(0.0, 1e9)]
+"""Time that is divided by the control period: with `sim.dt` of at least 1e-9 the number of steps fits 64 bits."""
+Count = Annotated[int, Field(ge=1), _limits(1, 2**31 - 1)]
 Threads = Annotated[int, Field(ge=1, le=4096)]
 Share = Annotated[float, Field(ge=0, le=1), _FractionString()]
 Vec3 = tuple[Number, Number, Number]
@@ -62,7 +78,7 @@ Quaternion = Annotated[
 ]
 Direction = Annotated[Vec3, _nonzero("a direction must not be zero; straight down is [0, 0, -1]")]
 Range = Annotated[tuple[Number, Number], AfterValidator(_check_order)]
-PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_check_order)]
+SecondsRange = Annotated[tuple[Seconds, Seconds], AfterValidator(_check_order)]
 ShareRange = Annotated[tuple[Share, Share], AfterValidator(_check_order)]
 _Steps = Annotated[int, Field(ge=0, le=1000)]
 StepRange = Annotated[tuple[Annotated[int, Field(ge=0)], _Steps], AfterValidator(_check_order)]

@@ -6,6 +6,8 @@ from pydantic import Field, model_validator
 
 from rlcli.config.schema.base import Count, Direction, Names, NotNegative, Positive, StrictModel, Vec3
 
+_MAX_RAYS = 1_000_000
+
 
 class TouchedConfig(StrictModel):
     """The other side of the contacts that a contact sensor measures."""
@@ -43,6 +45,12 @@ class GridPatternConfig(StrictModel):
     """Distance between neighbouring rays [m]."""
     direction: Direction = (0.0, 0.0, -1.0)
     """Direction of the rays in the sensor's frame; it is normalised."""
+
+    @model_validator(mode="after")
+    def _limited(self) -> Self:
+        if (self.size[0] / self.resolution + 1) * (self.size[1] / self.resolution + 1) > _MAX_RAYS:
+            raise ValueError(f"the grid has more than {_MAX_RAYS:,} rays; give a larger resolution or a smaller size")
+        return self
 
 
 class RaySensorConfig(StrictModel):

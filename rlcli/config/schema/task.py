@@ -5,7 +5,17 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from rlcli.config.schema.base import Count, Number, Positive, StrictModel, Threads, Vec3, _FractionString
+from rlcli.config.schema.base import (
+    Count,
+    Number,
+    Positive,
+    Seconds,
+    StrictModel,
+    Threads,
+    Vec3,
+    _FractionString,
+    _limits,
+)
 from rlcli.config.schema.scene import SceneConfig
 from rlcli.config.schema.terms import (
     ActionConfig,
@@ -22,7 +32,7 @@ from rlcli.config.schema.terms import (
 class SimConfig(StrictModel):
     """Physics simulation."""
 
-    dt: Annotated[float, Field(gt=0, le=0.1), _FractionString()]
+    dt: Annotated[float, Field(gt=0, le=0.1), _FractionString(), _limits(1e-9, 0.1)]
     """Physics time step [s]."""
     render_interval: Count = 1
     """Physics steps between two frames of a video. Videos have at most one frame for each environment step."""
@@ -84,7 +94,7 @@ class TaskConfig(StrictModel):
     """Physics simulation."""
     decimation: Count
     """Number of physics steps in an environment step; step_dt = dt x decimation."""
-    episode_length_s: Positive
+    episode_length_s: Seconds
     """Largest length of an episode [s]; longer episodes are truncated."""
     scene: SceneConfig
     """Environments, ground, lights, robots and objects."""

@@ -10,7 +10,17 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
 
-from rlcli.config.schema.base import Count, NotNegative, Number, PositiveRange, Range, Share, StepRange, StrictModel
+from rlcli.config.schema.base import (
+    Count,
+    NotNegative,
+    Number,
+    Range,
+    SecondsRange,
+    Share,
+    StepRange,
+    StrictModel,
+    _limits,
+)
 
 Columns = Number | Annotated[list[Number], Field(min_length=1)]
 """One number for all columns of a term, or one number for each column."""
@@ -66,7 +76,7 @@ class EventConfig(TermConfig):
 
     mode: Literal["startup", "reset", "interval"]
     """startup: once at the start; reset: when an episode starts; interval: repeatedly."""
-    interval_range_s: PositiveRange | None = None
+    interval_range_s: SecondsRange | None = None
     """[low, high] time between two events [s], drawn for each environment; required by mode interval."""
     global_time: bool = False
     """Mode interval: true: one timer for all environments, which resets do not restart."""
@@ -261,7 +271,7 @@ class ActionConfig(TermConfig):
 class CommandConfig(TermConfig):
     """A command for the policy, for example a target velocity, which is sampled again from time to time."""
 
-    resampling_time_s: PositiveRange
+    resampling_time_s: SecondsRange
     """[low, high] time until the next sample [s], drawn for each environment. Each episode starts with a new
     command."""
 
@@ -282,7 +292,7 @@ class SuccessConfig(TermConfig):
     at_least: Number | None = None
     """Smallest value of the term with which the condition holds."""
 
-    hold_s: NotNegative = 1.0
+    hold_s: Annotated[NotNegative, _limits(0.0, 1e9)] = 1.0
     """How long the condition must hold before the time-out [s]."""
 
 

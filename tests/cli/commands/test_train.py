@@ -366,6 +366,32 @@ def test_deleted_run_folder_is_machine_error(cli, only_run, monkeypatch):
     assert not Path("runs").exists()
 
 
+def test_moved_run_folder_is_named_and_not_created_again(cli, only_run, monkeypatch):
+    from rlcli.rl.sb3.trainer import Sb3Trainer
+
+    real, moved = Sb3Trainer.iterate, Path("moved")
+
+    def iterate(self):
+        if not moved.exists():
+            only_run().rename(moved)
+        return real(self)
+
+    monkeypatch.setattr(Sb3Trainer, "iterate", iterate)
+    done = cli("train", "cartpole", *SMALL, "--max-iterations", 2)
+    assert done.code == 10, done.err
+    assert "(there is no folder runs/cartpole/" in done.err
+    assert "was moved or deleted meanwhile, put it back; then continue with `rlcli train --resume runs/" in done.err
+    assert list(Path("runs").glob("*/*")) == []
+
+
+def test_resume_of_a_run_with_an_oversized_latest_file_replaces_it(cli, only_run):
+    cli("train", "cartpole", *SMALL, "--max-iterations", 1)
+    latest = only_run() / "checkpoints" / "latest"
+    os.truncate(latest, 6 * 2**30)
+    assert cli("train", "--resume", only_run(), "--max-iterations", 2).code == 0
+    assert latest.stat().st_size < 100
+
+
 def test_runs_dir_that_is_a_file_is_machine_error(cli):
     Path("runs").touch()
     done = cli("train", "cartpole", *SMALL)

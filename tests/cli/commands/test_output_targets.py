@@ -1,0 +1,52 @@
+"""Files that the user names for output: a pipe, a socket, a device or a folder is refused before any work."""
+
+import os
+import socket
+import stat
+
+import pytest
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+def expect_code(result, code):
+    assert result.code == code, result.err
+    return result
+
+
+COMMANDS = {
+    "eval --record": ("eval", "cartpole", "--record", "out"),
+    "eval --record-mode": ("eval", "cartpole", "--record", "out-of", "--record-mode", "separate"),
+    "play --record": ("play", "cartpole", "--policy", "zero", "--record", "out"),
+    "play --video": ("play", "cartpole", "--policy", "zero", "--video", "out.gif"),
+    "replay --video": ("replay", "episodes.safetensors", "--video", "out.gif"),
+    "autopsy --video": ("autopsy", "latest", "1", "--video", "out.gif"),
+    "export onnx": ("export", "cartpole", "--output", "out.onnx"),
+    "export numpy": ("export", "cartpole", "--format", "numpy", "--output", "out.py"),
+    "export torch": ("export", "cartpole", "--format", "torch", "--output", "out.pt2"),
+    "stress": ("stress", "cartpole", "--sweep", "gravity=1", "-o", "out.png"),
+    "plot": ("plot", "latest", "-o", "out.svg"),
+    "report": ("report", "latest", "-o", "out.html"),
+    "bench": ("bench", "cartpole", "--save-preset", "out.yaml", "--overwrite"),
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_output_to_a_pipe_is_refused_before_any_work(cli, tmp_path, name):
+    words = COMMANDS[name]
+    file = tmp_path / next((word for word in words if word.startswith("out")), "").replace("out-of", "out-of-failed")
+    os.mkfifo(file)
+    error = expect_code(cli(*words), 2).err
+    assert f"cannot write {file.name}: it is a pipe" in error
+    assert "hint: give the name of a new or a regular file" in error
+    assert stat.S_ISFIFO(file.stat().st_mode)
+
+
+def test_output_to_a_link_to_a_socket_is_refused(cli, tmp_path):
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind("s")
+        (tmp_path / "link.html").symlink_to("s")
+        assert (
+            "cannot write link.html: it is a socket" in expect_code(cli("report", "latest", "-o", "link.html"), 2).err
+        )
+    assert (tmp_path / "link.html").is_symlink()
