@@ -131,6 +131,7 @@ def _command_name(arguments: list[str]) -> str | None:
 
 def _run(arguments: list[str]) -> int:
     try:
+        _require_folder_and_output()
         with use_settings(_user_settings(arguments)):
             result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
         if result == INTERRUPTED:  # typer turns Ctrl-C into this exit code
@@ -138,7 +139,8 @@ def _run(arguments: list[str]) -> int:
         return result if isinstance(result, int) else 0
     except NoArgsIsHelpError as error:
         if not console.json:
-            console.info(error.message)
+            for line in error.message.split("\n"):
+                console.info(line)
             return 2
         failure: RlcliError = UsageError("no command given", hint="rlcli --help lists the commands")
     except (Exception, KeyboardInterrupt) as error:
@@ -148,6 +150,21 @@ def _run(arguments: list[str]) -> int:
             traceback.print_exc()
     console.error(failure)
     return failure.exit_code
+
+
+def _require_folder_and_output() -> None:
+    """Check that the current folder exists and that stdout is open; libraries would stop with obscure errors.
+
+    Raises:
+        MachineError: if the folder was deleted, or the parent process closed stdout.
+    """
+    try:
+        os.getcwd()
+    except OSError as error:
+        message = f"the current folder cannot be used: {error.strerror}"
+        raise MachineError(message, hint="it may have been deleted; change to another folder with `cd`") from None
+    if sys.stdout is None:
+        raise MachineError("the standard output is closed", hint="redirect it to a file or to /dev/null")
 
 
 def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
