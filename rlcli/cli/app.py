@@ -19,7 +19,7 @@ from rlcli.cli.ui.help_text import HelpGroup
 from rlcli.cli.ui.options import CHOOSE, add_command
 from rlcli.config.settings_file import read_settings
 from rlcli.errors import INTERRUPTED, CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
-from rlcli.machine import AddressSpaceCheck, delay_garbage_collection, memory_error
+from rlcli.machine import AddressSpaceCheck, MatplotlibFinder, delay_garbage_collection, memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.safe_text import remember_given
 from rlcli.settings import settings_file, use_settings
@@ -97,7 +97,7 @@ def main(arguments: list[str] | None = None) -> int:
     console.owns_process = arguments is None
     if console.owns_process:
         delay_garbage_collection()
-        sys.meta_path.insert(0, AddressSpaceCheck)
+        sys.meta_path[:0] = [AddressSpaceCheck, MatplotlibFinder]
     arguments = sys.argv[1:] if arguments is None else arguments
     remember_given([*arguments, *(value for name, value in os.environ.items() if name.startswith("RLCLI_"))])
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
