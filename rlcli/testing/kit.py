@@ -14,6 +14,7 @@ import torch
 
 from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
 from rlcli.progress import tracked
+from rlcli.runs.atomic_io import write_atomic
 from rlcli.testing import episode_checks, portability_checks, step_and_file_checks
 from rlcli.testing.findings import Finding, NotRunError, error_text
 from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, open_task
@@ -113,8 +114,7 @@ def record_layout(
     subject = open_task(task, agent, overrides, config, NUM_ENVS, 0)
     record, file = subject.env().layout.record(), portability_checks.layout_file(subject)
     columns = {part: record[part] for part in ("observations", "actions")}
-    file.write_text(json.dumps(columns, indent=1) + "\n", encoding="utf-8")
-    return file
+    return write_atomic(file, json.dumps(columns, indent=1) + "\n")  # a link at this path is replaced, not followed
 
 
 def _build(subject: TaskUnderTest) -> Iterator[Finding]:
