@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from rlcli.config.schema import AgentConfig, Count, NotNegative, Positive, StrictModel
+from rlcli.config.schema import AgentConfig, Count, NotNegative, Positive, Single, StrictModel
 from rlcli.trainers import TrainerSpec
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -206,7 +206,7 @@ class RunnerConfig(AgentConfig):
     bootstrap: Literal["final_obs", "pre_step"] = "final_obs"
     """Return after a time-out: gamma times the value of the last observation of the episode, or, as in RSL-RL
     itself, of the observation before the step."""
-    action_bound: Positive | None = None
+    action_bound: Single | None = None
     """Actions are clipped to +-this in training, play and export alike; null: unbounded. RSL-RL's name for it,
     `clip_actions`, is accepted."""
     class_name: Literal["OnPolicyRunner"] = "OnPolicyRunner"

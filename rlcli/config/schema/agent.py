@@ -5,7 +5,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from rlcli.config.schema.base import Count, Positive, StrictModel, Threads, _FractionString
+from rlcli.config.schema.base import Count, Single, StrictModel, Threads, _FractionString
 from rlcli.safe_text import float_or_nan
 
 
@@ -63,7 +63,7 @@ class AgentConfig(StrictModel):
     """Recording of failed and unusual episodes during training on a CPU; null: no recording."""
     torch_threads: Threads | None = None
     """Number of CPU threads of the policy update; null: min(4, cores). Another number gives other rounding errors."""
-    action_bound: Positive | None = 1.0
+    action_bound: Single | None = 1.0
     """Actions of the policy are clipped to +-`action_bound` in training, play and export; null: no clipping."""
 
     @model_validator(mode="after")

@@ -53,6 +53,12 @@ Number = Annotated[float, _FractionString()]
 Positive = Annotated[float, Field(gt=0), _FractionString()]
 NotNegative = Annotated[float, Field(ge=0), _FractionString()]
 Count = Annotated[int, Field(ge=1)]
+Width = Annotated[int, Field(ge=1, le=2**24)]
+"""Number of columns of a layer of a network."""
+Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=100)]
+"""Widths of the layers of a network."""
+Single = Annotated[float, Field(gt=0, le=1e30), _FractionString()]
+"""Positive number that single precision can hold."""
 Threads = Annotated[int, Field(ge=1, le=4096)]
 Share = Annotated[float, Field(ge=0, le=1), _FractionString()]
 Vec3 = tuple[Number, Number, Number]
