@@ -1,6 +1,7 @@
 """Tasks that are not installed: a folder with a YAML file, or a configuration in a Python file or package."""
 
 import ast
+import os
 import re
 from pathlib import Path
 
@@ -24,8 +25,11 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
     config = root / file
     if (root / "run.json").exists():
         raise TaskError(f"'{folder}' is a run, not a task", hint=f"use --checkpoint {folder}")
-    if root.is_file():
-        raise TaskError(f"'{folder}' is a file, not a task's folder", hint=f"did you mean '{folder.parent}'?")
+    if root.exists() and not root.is_dir():
+        hint = f"did you mean '{folder.parent}'?" if root.is_file() else None
+        raise TaskError(f"'{folder}' is a {'file' if hint else 'pipe or a device'}, not a task's folder", hint=hint)
+    if os.path.lexists(config) and not config.is_file():
+        raise TaskError(f"'{config}' is not a regular file; put the task's YAML in its place")
     other = None
     if config.is_file():
         other = find_in_formats(config)
