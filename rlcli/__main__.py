@@ -7,7 +7,11 @@ the current folder either.
 import os
 import sys
 
-if not sys.flags.safe_path and sys.path and sys.path[0] in ("", os.getcwd()):
+try:
+    current = os.getcwd()
+except OSError:  # the folder was deleted; `main` reports it
+    current = ""
+if not sys.flags.safe_path and sys.path and sys.path[0] in ("", current):
     del sys.path[0]
 
 from rlcli.cli.app import main

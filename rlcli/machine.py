@@ -11,9 +11,11 @@ import select
 import shutil
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 
 from rlcli.errors import DependencyError, DeviceError, MachineError, RlcliError, UsageError, one_line, pip_install
 from rlcli.safe_text import read_number
@@ -203,6 +205,28 @@ class AddressSpaceCheck:
         """
         if name in ("numpy", "mujoco", "torch"):
             require_address_space()
+
+
+class MatplotlibFinder:
+    """Import hook that imports matplotlib in its own folder.
+
+    matplotlib reads a file `matplotlibrc` of the current folder, which may be a pipe or belong to someone else.
+    """
+
+    @staticmethod
+    def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
+        """Return the specification of matplotlib; None for other modules."""
+        spec = PathFinder.find_spec(name, path, target) if name == "matplotlib" else None
+        if spec is None or spec.loader is None or spec.origin is None:
+            return None
+        execute, folder = spec.loader.exec_module, Path(spec.origin).parent / "mpl-data"
+
+        def execute_in_folder(module: ModuleType) -> None:
+            with contextlib.chdir(folder):
+                execute(module)
+
+        spec.loader.exec_module = execute_in_folder  # type: ignore[method-assign]
+        return spec
 
 
 _NO_MEMORY = re.compile(

@@ -27,15 +27,8 @@ _given: list[str] = []
 def remember_given(words: Iterable[str]) -> None:
     """Store long and unprintable words of the command line and of its environment variables; messages shorten them."""
     parts = {part for word in map(str, words) for part in (word, str(Path(word)), *word.split("=", 1))}
-    parts |= set(map(_printable, parts))
+    parts |= set(map(printable, parts))
     _given[:] = sorted((part for part in parts if len(part) > 200 or not part.isprintable()), key=len, reverse=True)
-
-
-def without_control(text: str) -> str:
-    """Return a text in which the words of the command line have their control characters and newlines escaped."""
-    for part in _given:
-        text = text.replace(part, _printable(part))
-    return text
 
 
 def message_line(text: str) -> str:
@@ -44,16 +37,11 @@ def message_line(text: str) -> str:
     Characters that are not printable are escaped. Words, quotes and arguments of over 200 characters are cut.
     """
     for part in _given:
-        text = text.replace(part, _cut(_printable(part), 200))
-    return _cut(_LONG.sub(lambda found: _cut(found[0], 200), _printable(text[: 10 * _MAX_LINE])), _MAX_LINE)
+        text = text.replace(part, _cut(printable(part), 200))
+    return _cut(_LONG.sub(lambda found: _cut(found[0], 200), printable(text[: 10 * _MAX_LINE])), _MAX_LINE)
 
 
-def message_lines(text: str) -> str:
-    """Return the text of a message of several lines, each as `message_line` returns it."""
-    return "\n".join(map(message_line, without_control(text).split("\n")))
-
-
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
     """Return a text with escapes in place of the characters that are not printable."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 

@@ -20,7 +20,7 @@ from rlcli.cli.ui.help_text import HelpGroup
 from rlcli.cli.ui.options import CHOOSE, add_command
 from rlcli.config.settings_file import read_settings
 from rlcli.errors import INTERRUPTED, CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
-from rlcli.machine import AddressSpaceCheck, delay_garbage_collection, memory_error
+from rlcli.machine import AddressSpaceCheck, MatplotlibFinder, delay_garbage_collection, memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.safe_text import remember_given
 from rlcli.settings import settings_file, use_settings
@@ -99,7 +99,7 @@ def main(arguments: list[str] | None = None) -> int:
     if console.owns_process:
         os.environ.setdefault("PYTHONSAFEPATH", "1")  # MuJoCo's GLFW starts Python, which imports from this folder
         delay_garbage_collection()
-        sys.meta_path.insert(0, AddressSpaceCheck)
+        sys.meta_path[:0] = [AddressSpaceCheck, MatplotlibFinder]
     arguments = sys.argv[1:] if arguments is None else arguments
     remember_given([*arguments, *(value for name, value in os.environ.items() if name.startswith("RLCLI_"))])
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
@@ -152,6 +152,7 @@ def _require_words(arguments: list[str]) -> None:
 def _run(arguments: list[str]) -> int:
     try:
         _require_words(arguments)
+        _require_folder_and_output()
         with use_settings(_user_settings(arguments)):
             result = build(_command_name(arguments))(arguments, prog_name="rlcli", standalone_mode=False)
         if result == INTERRUPTED:  # typer turns Ctrl-C into this exit code
@@ -159,7 +160,8 @@ def _run(arguments: list[str]) -> int:
         return result if isinstance(result, int) else 0
     except NoArgsIsHelpError as error:
         if not console.json:
-            console.info(error.message)
+            for line in error.message.split("\n"):
+                console.info(line)
             return 2
         failure: RlcliError = UsageError("no command given", hint="rlcli --help lists the commands")
     except (Exception, KeyboardInterrupt) as error:
@@ -169,6 +171,21 @@ def _run(arguments: list[str]) -> int:
             traceback.print_exc()
     console.error(failure)
     return failure.exit_code
+
+
+def _require_folder_and_output() -> None:
+    """Check that the current folder exists and that stdout is open; libraries would stop with obscure errors.
+
+    Raises:
+        MachineError: if the folder was deleted, or the parent process closed stdout.
+    """
+    try:
+        os.getcwd()
+    except OSError as error:
+        message = f"the current folder cannot be used: {error.strerror}"
+        raise MachineError(message, hint="it may have been deleted; change to another folder with `cd`") from None
+    if sys.stdout is None:
+        raise MachineError("the standard output is closed", hint="redirect it to a file or to /dev/null")
 
 
 def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:

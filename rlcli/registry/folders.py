@@ -1,6 +1,7 @@
 """Tasks that are not installed: a folder with a YAML file, or a configuration in a Python file or package."""
 
 import ast
+import os
 import re
 from pathlib import Path
 
@@ -29,6 +30,8 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
         raise TaskError(
             f"'{folder}' is a {'file' if root.is_file() else 'device or pipe'}, not a task's folder", hint=hint
         )
+    if os.path.lexists(config) and not config.is_file():
+        raise TaskError(f"'{config}' is not a regular file; put the task's YAML in its place")
     other = None
     if config.is_file():
         other = find_in_formats(config)

@@ -35,13 +35,17 @@ class TaskSource:
     policy: Path | None = None
     """The folder of the trained policy that is shipped with the task; None: there is none."""
 
+    shown: Path | None = None
+    """File that messages name, if `config` is a temporary copy of a part of it; None: `config`."""
+
     @property
     def label(self) -> str:
         """Name of the configuration file in messages: relative to the current folder if possible."""
+        file = self.shown or self.config
         try:
-            return str(self.config.relative_to(Path.cwd()))
+            return str(file.relative_to(Path.cwd()))
         except ValueError:
-            return str(self.config)
+            return str(file)
 
     def record(self) -> dict[str, str | None]:
         """Return the data that a run stores to find the task again."""

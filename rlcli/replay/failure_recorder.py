@@ -313,18 +313,18 @@ class FailureRecorder(StepObserver):
         return max(1, min(round(seconds / env.step_dt), most, memory // bytes_per_step))
 
     def _read_folder(self, step: int | None) -> None:
-        """Read the files of earlier checkpoints, and remove those of later ones."""
+        """Read the files of earlier checkpoints, and remove those of later ones; a file that cannot be read is kept."""
         if not self._folder.is_dir():
             return
         for file in sorted(self._folder.iterdir()):
             named = FILE_NAME.fullmatch(file.name)
             if named is None:
                 continue
-            failure = None
-            if step is not None and int(named[1]) <= step:
-                with contextlib.suppress(CheckpointError):
-                    failure = read_trajectory(file).header.failure
-            if failure is None:
+            try:
+                failure = read_trajectory(file).header.failure
+            except CheckpointError:
+                continue
+            if step is None or int(named[1]) > step or failure is None:
                 file.unlink(missing_ok=True)
             else:
                 self._files[file.name] = failure.kind

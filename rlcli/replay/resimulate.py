@@ -6,6 +6,7 @@ without the task's terms.
 """
 
 import contextlib
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -20,7 +21,7 @@ from rlcli.envs.observers import StepObserver
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import UsageError
 from rlcli.registry import TaskSource
-from rlcli.replay.trajectory import STATE_FIELDS, DivergencePoint, Trajectory, World
+from rlcli.replay.trajectory import STATE_FIELDS, DivergencePoint, Episode, Trajectory, World
 from rlcli.runs.provenance import model_digest
 from rlcli.sim.divergence_report import WARNING_FIELDS, Call, Divergence
 from rlcli.sim.engine import open_cpu_engine
@@ -111,23 +112,26 @@ def replay_episodes(
     Raises:
         CheckpointError: if the recording does not fit the environment.
     """
-    numbers = sorted(episodes)
-    chosen = [(n, recording.header.episodes[n], recording.part(f"episode.{n}.")) for n in numbers]
-    result = Replay(sum(e.length for _, e, _ in chosen))
+    tensors, starting = recording.of_episodes(), defaultdict(list)
+    for number in sorted(episodes):
+        e = recording.header.episodes[number]
+        starting[e.begin].append((number, e, tensors[number]))
+    chosen = [e for several in starting.values() for _, e, _ in several]
+    result = Replay(sum(e.length for e in chosen))
     try:
         env.load_state_dict(recording.part("start."))
     except (KeyError, RuntimeError, ValueError) as error:
         raise recording.mismatch_error(error) from None
     actions, after = recording.tensors["actions"], StateReader(env)
     with env.observers.added(after):
-        for t in range(max((e.begin + e.length for _, e, _ in chosen), default=0)):
+        current: list[tuple[int, Episode, dict[str, Tensor]]] = []
+        for t in range(max((e.begin + e.length for e in chosen), default=0)):
             before_step(t)
             before = read_state(env)
             rewards = env.step(actions[t].to(env.device)).reward.cpu()
-            for number, e, recorded in chosen:
+            current = [one for one in current if t < one[1].begin + one[1].length] + starting[t]
+            for number, e, recorded in current:
                 step = t - e.begin
-                if not 0 <= step < e.length:
-                    continue
                 pairs = [(0, n, recorded[n][0], before[n][e.env]) for n in STATE_FIELDS if step == 0]
                 pairs += [(step + 1, n, recorded[n][step + 1], after.state[n][e.env]) for n in STATE_FIELDS]
                 pairs.append((step + 1, "reward", recorded["rewards"][step], rewards[e.env]))

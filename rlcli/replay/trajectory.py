@@ -36,7 +36,7 @@ from rlcli.config.load import Resolved, resolve
 from rlcli.envs.environment import Environment
 from rlcli.envs.layout import TermLayout
 from rlcli.envs.step import Episodes
-from rlcli.errors import CheckpointError, ConfigError
+from rlcli.errors import CheckpointError
 from rlcli.registry import TaskSource
 from rlcli.runs.atomic_io import disk_errors, write_atomic
 from rlcli.runs.provenance import model_digest
@@ -264,6 +264,15 @@ class Trajectory:
         """Return the tensors whose names begin with a prefix, without it."""
         return {n.removeprefix(prefix): tensor for n, tensor in self.tensors.items() if n.startswith(prefix)}
 
+    def of_episodes(self) -> dict[int, dict[str, Tensor]]:
+        """Return the tensors of each episode by its number, by names without the prefix `episode.K.`."""
+        found: dict[int, dict[str, Tensor]] = {number: {} for number in range(len(self.header.episodes))}
+        for name, tensor in self.part("episode.").items():
+            number, _, rest = name.partition(".")
+            if number.isdecimal() and int(number) in found:
+                found[int(number)][rest] = tensor
+        return found
+
     def resolved(self, named: TaskSource | None = None) -> Resolved:
         """Return the recorded configuration with the task's installed code and models.
 
@@ -282,11 +291,7 @@ class Trajectory:
             config = Path(folder) / "task.yaml"
             config.write_text(self.header.config, encoding="utf-8")
             flags = {"scene.num_envs": 1} if self.header.worlds else {}
-            try:
-                resolved = resolve(replace(source, config=config), flags=flags)
-            except ConfigError as error:
-                problems = (replace(p, where=p.where.replace(str(config), str(self.file))) for p in error.problems)
-                raise ConfigError(problems) from None
+            resolved = resolve(replace(source, config=config, shown=self.file), flags=flags)
         if not flags and resolved.task.scene.num_envs != self.header.num_envs:
             message = f"{self.file} is corrupt: num_envs differs between header and configuration; record it again"
             raise CheckpointError(message)
@@ -333,6 +338,8 @@ def read_trajectory(file: Path) -> Trajectory:
             if data.get("kind") != "recording" and file.stat().st_size > _MAX_BYTES:
                 raise ValueError(f"the file is larger than {_MAX_BYTES >> 20} MiB")
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 (not a mapping)
+        if isinstance(data.get("episodes"), list) and len(data["episodes"]) > len(tensors):
+            raise ValueError(f"the header has {len(data['episodes'])} episodes, but the file {len(tensors)} tensors")
         if data.pop("sha256", None) != content_digest(tensors, data):
             raise CheckpointError(f"{file} is corrupt: its hash does not match; record it again")
         header = check_json(Header, data, file)

@@ -119,5 +119,5 @@ class PageMedia:
         except FileNotFoundError:
             return None
         if data[4:8] != b"ftyp":
-            raise CheckpointError(f"{file} is not an MP4 video; delete it")
+            raise CheckpointError(f"{file} is not an MP4 video; move it out of the run")
         return data

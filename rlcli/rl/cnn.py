@@ -6,8 +6,10 @@ import math
 from typing import Annotated
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor, nn
+
+from rlcli.config.schema import Positive
 
 _Size = Annotated[int, Field(ge=1, le=4096)]
 
@@ -43,7 +45,7 @@ class CnnSpec(BaseModel):
     """Kernel size of each layer (square) [pixels]."""
     strides: list[_Size]
     """Stride of each layer [pixels]."""
-    motion: PositiveFloat | None = None
+    motion: Positive | None = None
     """Each older image of a history becomes (newest - older) times this factor; null: images are not changed."""
 
     @model_validator(mode="after")

@@ -6,17 +6,19 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from torch import Tensor, nn
 
+from rlcli.config import messages
+from rlcli.config.schema import Positive, Width
 from rlcli.errors import CheckpointError
 from rlcli.rl.cnn import Cnn, CnnSpec
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 _LOG_STD_RANGE = (-20.0, 2.0)
 _MAX_BYTES = 2**31
-Width = Annotated[int, Field(ge=1, le=2**24)]
-"""Number of columns of a layer."""
+_LogStd = Annotated[float, Field(ge=-80, le=80)]
+"""Logarithm of a standard deviation that single precision can hold."""
 Layers = Annotated[list[Width], Field(max_length=100)]
 """Width of each layer."""
 
@@ -43,11 +45,11 @@ class PolicySpec(BaseModel):
     action_size: Width
     hidden: Layers
     activation: Literal["elu", "relu", "tanh", "silu"]
-    action_bound: PositiveFloat | None
+    action_bound: Positive | None
     normalize: bool = False
-    normalize_clip: PositiveFloat | None = 10.0
+    normalize_clip: Positive | None = 10.0
     """Normalised observations are clipped to +-this value; null: no clipping."""
-    log_std_range: tuple[float, float] | None = None
+    log_std_range: tuple[_LogStd, _LogStd] | None = None
     """For a squashed-gaussian-mlp: tanh maps the log standard deviation into this range; null: it is clamped to
     [-20, 2]."""
     memory: Layers = []
@@ -269,9 +271,9 @@ def blank_policy(spec: Mapping[str, object]) -> Policy:
     try:
         checked = PolicySpec.model_validate(spec)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        key = ".".join(map(str, first["loc"])) or "all"
-        raise CheckpointError(f"policy.json is not valid; export it again: {key[:80]}: {first['msg']}") from None
+        first = next(messages.problems(error, PolicySpec, spec, messages.dotted))
+        place = first.path[:80] or "all"
+        raise CheckpointError(f"policy.json is not valid; export it again: {place}: {first.message}") from None
     with torch.device("meta"):
         policy = Policy(checked)
     if size_of(policy) > _MAX_BYTES:

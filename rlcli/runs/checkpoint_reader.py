@@ -37,6 +37,10 @@ LogName = Annotated[str, Field(pattern=_NAME + "$")]
 _MAX_FILES = 4096
 
 
+class FormatError(CheckpointError):
+    """A checkpoint of another format than this rlcli reads, such as that of a newer rlcli."""
+
+
 class FileEntry(FileModel):
     """Entry of a manifest for one file: its size [bytes] and its sha256."""
 
@@ -272,14 +276,15 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     """Open a checkpoint and check its manifest; each file is checked when it is read.
 
     Raises:
-        CheckpointError: if it is missing, incomplete, corrupt or of another format.
+        CheckpointError: if it is missing, incomplete or corrupt.
+        FormatError: if it has another format.
     """
     file = folder / "manifest.json"
     data = read_file(file, JSON_LIMIT, missing=f"{folder} is not a checkpoint: it has no manifest.json; check the path")
     manifest = parse_json(data, file)
     if type(manifest.get("format")) is not int or manifest["format"] != FORMAT:
         message = f"{folder} has checkpoint format {str(manifest.get('format'))[:40]}; this rlcli reads {FORMAT}"
-        raise CheckpointError(message, hint="use the rlcli version that run.json names")
+        raise FormatError(message, hint="use the rlcli version that run.json names, or an older checkpoint: RUN@step:N")
     step = check_json(_Manifest, manifest, file).step
     name = folder.name
     if name.isdecimal() and name.isascii() and len(name) >= 12 and int(name) != step:
@@ -288,10 +293,10 @@ def open_checkpoint(folder: Path) -> Checkpoint:
 
 
 def steps(checkpoints: Path) -> list[int]:
-    """Return the steps of a run's complete checkpoints, ascending; links and other folders are ignored."""
+    """Return the steps of a run's checkpoints, ascending; links and folders with other names are ignored."""
     if checkpoints.is_symlink() or not checkpoints.is_dir():
         return []
-    names = [file.parent.name for file in checkpoints.glob("*/manifest.json") if not file.parent.is_symlink()]
+    names = [entry.name for entry in checkpoints.iterdir() if not entry.is_symlink()]
     return sorted(int(name) for name in names if name.isdecimal() and name == f"{int(name):012d}")
 
 

@@ -2,6 +2,8 @@
 
 import contextlib
 import errno
+import functools
+import logging
 import math
 import os
 import re
@@ -22,6 +24,7 @@ from rlcli.errors import CheckpointError, MachineError, UsageError
 from rlcli.runs.atomic_io import disk_error, disk_errors, to_json, write_atomic
 from rlcli.runs.safe_io import FileModel, PrintableText, check_json, read_file, read_json, refuse_links, require_inside
 
+_log = logging.getLogger(__name__)
 CONFIG = "config.yaml"
 RECORD = "run.json"
 STUDY = "study.json"
@@ -177,7 +180,7 @@ def open_run(folder: Path) -> Run:
             refuse_links(folder / inner)
     for part in (folder / CONFIG, folder / "metrics.jsonl"):
         if part.exists() and not part.is_file():
-            raise CheckpointError(f"{part} is not a regular file; delete it")  # reading a pipe would block
+            raise CheckpointError(f"{part} is not a regular file; move it out of the run")  # reading a pipe would block
     check_json(RunRecord, record, folder / RECORD)
     return Run(folder, record)
 
@@ -202,11 +205,22 @@ def runs_below(folder: Path, depth: int = 3) -> Iterator[Path]:
 
 
 def _subfolders(folder: Path) -> list[Path]:
+    """Return the folders in a folder, without hidden ones and links: a link could lead to all files of the machine."""
     try:
         with os.scandir(folder) as entries:
-            return [Path(entry.path) for entry in entries if not entry.name.startswith(".") and entry.is_dir()]
+            found = [entry for entry in entries if not entry.name.startswith(".") and entry.is_dir()]
     except OSError:
         return []
+    for entry in found:
+        if entry.is_symlink():
+            _warn_of_link(entry.path)
+    return [Path(entry.path) for entry in found if not entry.is_symlink()]
+
+
+@functools.cache
+def _warn_of_link(path: str) -> None:
+    """Log one warning for a link, however often its folder is searched."""
+    _log.warning("%s is a link; rlcli does not search it for runs", path)
 
 
 def is_locked(folder: Path) -> bool:
@@ -269,11 +283,11 @@ def require_own(run: Run, *parts: str) -> None:
             continue
         except (OSError, RuntimeError) as error:
             reason = getattr(error, "strerror", None) or error
-            message, hint = f"{path} cannot be part of a run: {reason}", "delete it, or move it out of the run"
+            message, hint = f"{path} cannot be part of a run: {reason}", "move it out of the run"
             raise CheckpointError(message, hint=hint) from None
         if count > _MAX_FILES:
             message = f"{run.folder} has more than {_MAX_FILES} files"
-            raise CheckpointError(message, hint="delete files that do not belong to the run")
+            raise CheckpointError(message, hint="move files that do not belong to the run elsewhere")
 
 
 def _require_task_name(name: str) -> str:

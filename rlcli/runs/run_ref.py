@@ -152,18 +152,27 @@ def find_checkpoint(
 
 
 def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Path, str]:
-    """Return the newest valid checkpoint and the reason for the choice; warn of each newer, corrupt one."""
-    from rlcli.runs.checkpoint_reader import open_checkpoint
+    """Return the newest valid checkpoint and the reason for the choice; warn of each newer, corrupt one.
+
+    Raises:
+        CheckpointError: if the newest intact one has another format, or is the untrained policy of step 0.
+    """
+    from rlcli.runs.checkpoint_reader import FormatError, open_checkpoint
 
     for skipped, step in enumerate(reversed(have)):
         folder = run.checkpoints / f"{step:012d}"
         try:
             open_checkpoint(folder).verify(whole=whole)
+        except FormatError:
+            raise
         except CheckpointError as error:
             if skipped == len(have) - 1:
                 raise
             _log.warning(f"checkpoint {folder.name} is skipped: {error.message}")
             continue
+        if skipped and step == 0:
+            message = f"{run.folder} has no intact checkpoint but that of step 0, before the training"
+            raise CheckpointError(message, hint="restore a newer one from a copy; RUN@step:0 names that of step 0")
         return folder, f"{why}, its newest {'good ' if skipped else ''}checkpoint"
     raise AssertionError("find_checkpoint refuses a run without checkpoints")
 

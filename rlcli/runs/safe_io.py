@@ -5,6 +5,7 @@ import errno
 import json
 import math
 import os
+import re
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,9 +60,22 @@ def check_json(kind: type[Model], value: object, file: Path, *keys: str, hint: s
     try:
         return kind.model_validate_json(json.dumps(value))  # strict models accept a list for a tuple only in JSON
     except ValidationError as error:
-        problem = next(messages.problems(error, kind, value, messages.dotted))
-        at = ".".join(filter(None, (*keys, problem.path)))[:200]
-        raise CheckpointError(f"{file} is corrupt: {at + ': ' if at else ''}{problem.message}", hint=hint) from None
+        if error.errors()[0]["type"] == "json_invalid":
+            path, message = _find_half_character(value), "the text has half of a surrogate pair, which is no character"
+        else:
+            problem = next(messages.problems(error, kind, value, messages.dotted))
+            path, message = problem.path, problem.message
+        at = ".".join(filter(None, (*keys, path)))[:200]
+        raise CheckpointError(f"{file} is corrupt: {at + ': ' if at else ''}{message}", hint=hint) from None
+
+
+def _find_half_character(value: object, path: tuple[str | int, ...] = ()) -> str:
+    """Return the dotted key of the first text with a single surrogate; an empty text if there is none."""
+    if isinstance(value, str):
+        return messages.dotted(path) if re.search("[\ud800-\udfff]", value) else ""
+    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    inner = (_find_half_character(text, (*path, key)) for key, item in parts for text in (key, item))
+    return next(filter(None, inner), "")
 
 
 @contextlib.contextmanager
@@ -129,7 +143,7 @@ def _opened(file: Path) -> Iterator[tuple[BinaryIO, int]]:
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode):
             os.close(handle)
-            raise CheckpointError(f"{file} is not a regular file; delete it")
+            raise CheckpointError(f"{file} is not a regular file: it is a folder, a pipe or a device")
         with os.fdopen(handle, "rb") as opened:
             yield opened, status.st_size
     except (FileNotFoundError, NotADirectoryError) as error:

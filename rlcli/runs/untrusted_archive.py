@@ -1,9 +1,10 @@
-"""Reading of files saved by torch and Stable-Baselines3; nothing but tensors is unpickled."""
+"""Reading of files saved by torch and Stable-Baselines3; only tensors and plain data are unpickled."""
 
 import io
 import pickletools
 import re
 import stat
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -111,9 +112,10 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
         raise CheckpointError(f"{where} is not a torch file: bad data.pkl; save it again with torch.save")
     _require_tensors_only(_content(archive, described[0], where), where)
     try:
-        saved = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except Exception as error:
-        message = f"{where} cannot be read as tensors and numbers: {one_line(error, 300)}"
+        with warnings.catch_warnings(action="ignore"):
+            saved = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception:  # torch's own message advises to unpickle the file without any check
+        message = f"{where} is corrupt, or has more than tensors, numbers and text"
         raise CheckpointError(message, hint="save a state_dict again with torch.save") from None
     if not isinstance(saved, Mapping):
         raise CheckpointError(f"{where} is not a mapping of names to tensors; save a state_dict")

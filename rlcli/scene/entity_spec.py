@@ -112,8 +112,10 @@ def _load_mjcf(
         raise SceneProblem(path, error.message, error.hint) from None
     if ":" not in entity.model and not file.is_relative_to(root):
         raise SceneProblem(path, f"'{entity.model}' lies outside the task's folder {root}; move it inside")
-    if not file.is_file():
-        files = sorted(str(p.relative_to(root)) for p in root.rglob("*.xml"))
+    if file.exists() and not file.is_file():
+        raise SceneProblem(path, f"'{entity.model}' in {root} is not a regular file; put an MJCF in its place")
+    if not file.exists():
+        files = sorted(str(p.relative_to(root)) for p in root.rglob("*.xml") if p.is_file())
         hint = f"MJCF files there: {', '.join(files) or 'none'}"
         raise SceneProblem(path, f"no file '{entity.model}' in {root}", hint)
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -66,15 +67,17 @@ class SimData:
 
     def refresh(self) -> None:
         """Copy the joint state of every world from the engine."""
-        for copy, source in self._copied:
-            copy[...] = source
+        with np.errstate(over="ignore"):  # infinity in float32: `is_finite` finds it
+            for copy, source in self._copied:
+                copy[...] = source
         self.stamp += 1
 
     def refresh_rows(self, selection: Selection) -> None:
         """Copy the state of the selected worlds, and drop the values computed from it."""
-        for copy, source in self._copied:
-            rows = ids_of(selection)
-            copy[rows] = source[rows]
+        with np.errstate(over="ignore"):
+            for copy, source in self._copied:
+                rows = ids_of(selection)
+                copy[rows] = source[rows]
         self.stamp += 1
 
     def save_good_state(self) -> None:

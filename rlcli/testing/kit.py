@@ -114,7 +114,7 @@ def record_layout(
     subject = open_task(task, agent, overrides, config, NUM_ENVS, 0)
     record, file = subject.env().layout.record(), portability_checks.layout_file(subject)
     columns = {part: record[part] for part in ("observations", "actions")}
-    return write_atomic(file, json.dumps(columns, indent=1) + "\n")
+    return write_atomic(file, json.dumps(columns, indent=1) + "\n")  # a link at this path is replaced, not followed
 
 
 def _build(subject: TaskUnderTest) -> Iterator[Finding]:

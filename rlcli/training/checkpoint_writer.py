@@ -6,6 +6,7 @@ A log is data that only grows, such as a replay buffer. Its rows are written onc
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import secrets
 import shutil
@@ -27,6 +28,7 @@ from rlcli.runs.atomic_io import disk_errors, sync_folder, to_json, write_atomic
 from rlcli.runs.checkpoint_reader import FORMAT, LOG_FOLDER, Checkpoint, Shard, open_checkpoint, sha256, steps
 from rlcli.runs.run import Run
 
+_log = logging.getLogger(__name__)
 _SHARD_BYTES = 64 << 20
 """Largest size of a file with rows of a log, such as a replay buffer [bytes]."""
 _DEFAULT_LAST = 10
@@ -242,25 +244,39 @@ def prune(checkpoints: Path, keep: Keep, best: int | None) -> None:
         return
     for step in saved[1 : -keep.last]:
         folder = checkpoints / f"{step:012d}"
-        if step == best or (keep.every and _iteration(folder) % keep.every == 0):
-            continue
-        _remove(folder)
+        with contextlib.suppress(OSError, CheckpointError):  # what cannot be read is kept
+            iteration = open_checkpoint(folder).iteration
+            if step != best and not (keep.every and iteration % keep.every == 0):
+                _remove(folder)
     drop_rows(checkpoints)
 
 
 def drop_after(checkpoints: Path, step: int) -> list[int]:
-    """Remove the checkpoints after the step at which training is resumed; return their steps."""
+    """Remove the checkpoints after the step at which training is resumed; return their steps.
+
+    A checkpoint that cannot be read is renamed to `STEP.unreadable` instead. The rows of logs that only it needs are
+    moved into its folder.
+    """
     later = [saved for saved in steps(checkpoints) if saved > step]
+    removed, aside = [], None
     for saved in reversed(later):
-        _remove(checkpoints / f"{saved:012d}")
+        folder = checkpoints / f"{saved:012d}"
+        try:
+            open_checkpoint(folder).verify(whole=True)
+        except CheckpointError as error:
+            aside = _set_aside(folder)
+            _log.warning(f"{folder} cannot be read and is kept as {aside.name}: {error.message}")
+        else:
+            _remove(folder)
+            removed.append(saved)
     # also without a later checkpoint, because a run may be killed before it wrote the file
     write_atomic(checkpoints / "latest", f"{step:012d}\n")
-    drop_rows(checkpoints)
-    return later
+    drop_rows(checkpoints, aside)
+    return removed[::-1]
 
 
-def drop_rows(checkpoints: Path) -> None:
-    """Remove the files with rows of logs, such as a replay buffer, that no checkpoint needs."""
+def drop_rows(checkpoints: Path, aside: Path | None = None) -> None:
+    """Remove the files with rows of logs (of a replay buffer) that no checkpoint needs, or move them to `aside`."""
     files = set((checkpoints / LOG_FOLDER).glob("*/*.safetensors"))
     if not files:
         return
@@ -272,7 +288,12 @@ def drop_rows(checkpoints: Path) -> None:
         return  # a damaged checkpoint: which rows it needs is unknown
     for file in files:
         with contextlib.suppress(OSError):
-            file.unlink(missing_ok=True)
+            if aside is None:
+                file.unlink(missing_ok=True)
+            else:
+                target = aside / file.relative_to(checkpoints)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                file.rename(target)
 
 
 def remove_temporary_files(checkpoints: Path) -> None:
@@ -295,14 +316,16 @@ def _remove(folder: Path) -> None:
     shutil.rmtree(temporary, ignore_errors=True)
 
 
+def _set_aside(folder: Path) -> Path:
+    """Rename a checkpoint so that no reader takes it for one; return its new folder."""
+    target, number = folder.with_name(f"{folder.name}.unreadable"), 1
+    while os.path.lexists(target):
+        number += 1
+        target = folder.with_name(f"{folder.name}.unreadable-{number}")
+    with disk_errors(target):
+        return folder.rename(target)
+
+
 def _temporary_folder(parent: Path) -> Path:
     """Return a new name for a folder that `remove_temporary_files` removes."""
     return parent / f".tmp-{os.getpid()}-{secrets.token_hex(4)}"
-
-
-def _iteration(folder: Path) -> int:
-    """Return the iteration of a checkpoint; 0 if it cannot be read."""
-    try:
-        return open_checkpoint(folder).iteration
-    except (OSError, CheckpointError):
-        return 0  # a multiple of every interval: the checkpoint is kept

@@ -178,15 +178,54 @@ def test_full_disk_is_one_message(rlcli, arguments):
     with open("/dev/full", "w") as stdout:
         done = rlcli(*arguments, stdout=stdout)
     assert done.returncode == 10
-    assert done.stderr == "error: No space left on device\n"
+    assert "error: cannot write the output: No space left on device\n" in done.stderr
 
 
-def test_closed_stdout_is_not_an_error(here):
+@pytest.mark.parametrize("arguments", [["terms", "--json"], ["--help"]])
+def test_closed_stdout_is_one_message(here, arguments):
     done = subprocess.run(
-        [sys.executable, "-m", "rlcli", "list-tasks"], cwd=here, stderr=subprocess.PIPE, text=True,
+        [sys.executable, "-m", "rlcli", *arguments], cwd=here, stderr=subprocess.PIPE, text=True,
         preexec_fn=lambda: os.close(1),
     )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.returncode, done.stderr.splitlines()[0]) == (10, "error: the standard output is closed")
+
+
+@pytest.mark.parametrize("arguments", [["--help"], *([name] for name in COMMANDS), ["validate", "/"]])
+def test_deleted_current_folder_is_one_message(in_process, here, arguments):
+    here.rmdir()
+    code, out, err = in_process(*arguments)
+    assert (code, out) == (10, "")
+    assert err.startswith("error: the current folder cannot be used: No such file or directory\nhint: ")
+
+
+FORGED = "x\nerror: forged\r\x1b[2J\t\u2028\u202e\ud800"
+
+
+@pytest.mark.parametrize("method", ["data", "info", "detail", "warn", "table", "title", "heat_map", "error"])
+def test_text_of_a_file_cannot_add_lines(capfd, method):
+    from rlcli.cli.ui.console import Console
+    from rlcli.errors import CheckpointError, ConfigError, Problem
+    from rlcli.reporting.heat_map import Axis, HeatMap
+
+    console = Console(verbose=True)
+    {
+        "data": lambda: console.data(FORGED, FORGED),
+        "info": lambda: console.info(FORGED),
+        "detail": lambda: console.detail(FORGED),
+        "warn": lambda: console.warn(FORGED),
+        "table": lambda: console.table([FORGED], [[FORGED]]),
+        "title": lambda: console.table(["a"], [["b"]], FORGED),
+        "heat_map": lambda: console.heat_map(
+            FORGED, FORGED, HeatMap(FORGED, Axis("a", (FORGED,)), Axis("b", (FORGED,)), [[0.5]], 0.0, 1.0)
+        ),
+        "error": lambda: (
+            console.error(CheckpointError(FORGED, hint=FORGED)),
+            console.error(ConfigError([Problem(FORGED, FORGED, FORGED, FORGED)])),
+        ),
+    }[method]()
+    out, err = capfd.readouterr()
+    assert all(character == "\n" or character.isprintable() for character in out + err)
+    assert not [line for line in (out + err).splitlines() if line.startswith("error: forged")]
 
 
 def test_unencodable_text_is_escaped(rlcli, small):

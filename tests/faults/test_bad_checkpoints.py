@@ -168,20 +168,58 @@ def test_file_missing_in_the_manifest_is_not_read(stage):
     assert set(checkpoint.state().tensors) == {"policy", "trainer", "env", "rng"}
 
 
-@pytest.mark.parametrize("reader", ["eval", "init", "resume"])
-def test_newest_valid_checkpoint_is_used_with_a_warning(reader, stage, capfd):
-    def damage(folder):
-        (folder / "policy.safetensors").write_bytes(b"gone")
+@pytest.fixture
+def continued(stage):
+    """Return a run that was resumed once, with checkpoints at steps 0, 128 and 256, and the newest one."""
+    run, _ = stage(Case("", lambda folder: None, ()))
+    assert main(command("resume", run)) == 0
+    return run, run / "checkpoints" / "000000000256"
 
-    run, folder = stage(Case("", damage, ()))
-    older = run / "checkpoints" / "000000000000"
-    assert main([*command(reader, run), "-q"] if reader != "init" else command(reader, run)) == 0
+
+@pytest.mark.parametrize("reader", ["eval", "init", "resume"])
+def test_newest_valid_checkpoint_is_used_with_a_warning(reader, continued, capfd):
+    run, folder = continued
+    (folder / "policy.safetensors").write_bytes(b"gone")
+    words = [
+        *command(reader, run),
+        *(["-q"] if reader != "init" else []),
+        *(["--max-iterations", "3"] * (reader == "resume")),
+    ]
+    assert main(words) == 0
     err = capfd.readouterr().err
     assert f"warning: checkpoint {folder.name} is skipped: {folder}/policy.safetensors is corrupt" in err
     if reader == "resume":
-        assert older.is_dir()
-        open_checkpoint(run / "checkpoints" / "000000000256").state()
-        assert not folder.exists()
+        assert (folder.parent / "000000000128").is_dir()
+        assert (folder.with_name("000000000256.unreadable") / "policy.safetensors").read_bytes() == b"gone"
+        open_checkpoint(folder.parent / "000000000384").state()
+
+
+@pytest.mark.parametrize(
+    ("damage", "reader"),
+    [
+        ("newer format", "resume"), ("newer format", "init"), ("no policy", "resume"), ("no manifest", "resume"),
+        ("no manifest", "eval"), ("no checkpoint", "resume"), ("a file", "resume"),
+    ],
+)  # fmt: skip
+def test_trained_policy_is_not_replaced_by_the_untrained_one(damage, reader, stage, capfd):
+    run, folder = stage(Case("", lambda folder: None, ()))
+    if damage == "newer format":
+        manifest = json.loads((folder / "manifest.json").read_text())
+        (folder / "manifest.json").write_text(json.dumps({**manifest, "format": 99}))
+    elif damage == "a file":
+        shutil.rmtree(folder)
+        folder.write_text("not a folder")
+    else:
+        for file in {"no policy": ["policy.safetensors"], "no manifest": ["manifest.json"]}.get(
+            damage, folder.iterdir()
+        ):
+            (folder / file).rename(folder / f"{Path(file).name}.bak")
+    before = snapshot(run)
+    assert main(command(reader, run)) == 5
+    err = capfd.readouterr().err
+    expected = "has checkpoint format 99; this rlcli reads 1" if damage == "newer format" else "RUN@step:0"
+    assert expected in err
+    assert snapshot(run) == before
 
 
 def test_play_ignores_damage_of_the_training_state(stage, capfd):

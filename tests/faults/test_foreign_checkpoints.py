@@ -653,3 +653,12 @@ def test_damaged_file_is_refused_or_read_unchanged(form):
                 last = max(name for name in found.weights if name.startswith("actor.") and name.endswith("weight"))
                 assert torch.equal(found.weights[last], want), f"{kind} at {at}"
     assert refusals > count
+
+
+def test_refusal_of_torch_is_no_advice_to_unpickle(capfd):
+    """The opcodes are those of tensors, but torch's unpickler refuses the sequence."""
+    Path("model.pt").write_bytes(described(b"\x80\x02}X\x01\x00\x00\x00aR."))
+    message = refused_by_command(capfd, "rsl-rl", "model.pt")
+    assert "is corrupt, or has more than tensors, numbers and text" in message
+    assert "weights_only" not in message
+    assert "Warning" not in message

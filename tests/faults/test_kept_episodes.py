@@ -220,6 +220,23 @@ def test_oldest_case_of_the_most_frequent_kind_is_dropped(tmp_path):
     assert [case.failure.step for case in cases(tmp_path)] == [2, 7, 8, 9]
 
 
+def test_resume_keeps_cases_that_cannot_be_read(tmp_path):
+    env = build("cartpole", 4)
+    kept = recorder_of(env, tmp_path)
+    env.reset()
+    for _ in range(5):
+        env.step(torch.zeros(4, 1))
+    for number in (1, 2, 3):
+        returns(kept, [10.0], truncated=False, cause="cart_out_of_bounds")
+        kept.commit(number, number)
+    kept.write(kept.take(3))
+    first, _, last = sorted((tmp_path / FOLDER).glob("*.safetensors"))
+    for file in (first, last):
+        file.write_bytes(b"damaged")
+    FailureRecorder(env, AutopsyConfig(), tmp_path, 1)
+    assert names(tmp_path) == [first.name, last.name]
+
+
 def test_memory_limit_shortens_cases(tmp_path):
     env = build(critter(tmp_path), 400)
     kept = recorder_of(env, tmp_path / "run", seconds=20.0, memory_mib=6)

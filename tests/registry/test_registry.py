@@ -1,5 +1,7 @@
 """Lookup of tasks and trainers in installed distributions, with broken ones among them."""
 
+import os
+
 import pytest
 
 from rlcli.errors import TaskError
@@ -164,6 +166,19 @@ def test_folder_without_task_lists_its_files(tmp_path):
     assert "it has no task.yaml; found: notes.txt" in failure(str(tmp_path))
     assert "no such folder" in failure(str(tmp_path / "nowhere"))
     assert "is a file, not a task's folder" in failure(str(tmp_path / "notes.txt"))
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "broken link", "device"])
+def test_special_file_is_not_a_task(tmp_path, kind):
+    file = tmp_path / "task.yaml"
+    if kind == "pipe":
+        os.mkfifo(file)
+    elif kind == "folder":
+        file.mkdir()
+    else:
+        file.symlink_to("/dev/zero" if kind == "device" else tmp_path / "nothing")
+    assert "task.yaml' is not a regular file" in failure(str(tmp_path))
+    assert "'/dev/zero' is a pipe or a device, not a task's folder" in failure("/dev/zero")
 
 
 def test_folder_files_do_not_shadow_modules(tmp_path):

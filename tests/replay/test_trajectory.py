@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from support.worlds import CRITTER, CRITTER_TASK, build, critter, edited
 
@@ -13,7 +14,7 @@ from rlcli.errors import CheckpointError
 from rlcli.evaluation.evaluate import evaluate
 from rlcli.replay.episode_recorder import EpisodeRecorder
 from rlcli.replay.resimulate import replay_episodes
-from rlcli.replay.trajectory import read_trajectory
+from rlcli.replay.trajectory import content_digest, read_trajectory
 from rlcli.rl.acting import random_policy
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -175,3 +176,41 @@ def test_replay_writes_a_video(cli):
     result = cli("replay", "r.safetensors", "--episode", 1, "--video", "r.gif", "--json").json
     assert result["equal"] is True
     assert result["frames"] >= 10
+
+
+def forged(file, change=lambda header: None, tensors=lambda name, tensor: tensor):
+    """Write a recording again with a changed header or changed tensors and a valid hash."""
+    content = {name: tensors(name, tensor) for name, tensor in load_file(file).items()}
+    with safe_open(file, "pt") as opened:
+        header = json.loads(opened.metadata()["rlcli"])
+    del header["sha256"]
+    change(header)
+    header["sha256"] = content_digest(content, header)
+    save_file(content, file, metadata={"rlcli": json.dumps(header)})
+
+
+def test_many_episodes_without_tensors_are_refused_early(cli, task):
+    recorded(task, Path("r.safetensors"), 2, 2)
+    forged("r.safetensors", lambda header: header.update(episodes=header["episodes"] * 100_000))
+    message = expect_code(cli("replay", "r.safetensors"), 5).err
+    assert "the header has 200000 episodes, but the file" in message
+
+
+def test_mistake_in_a_recorded_configuration_names_the_recording(cli, task):
+    recorded(task, Path("r.safetensors"), 2, 2)
+    forged("r.safetensors", lambda header: header.update(config=header["config"] + "\nnonsense: 3\n"))
+    message = expect_code(cli("replay", "r.safetensors", "--task", "./critter"), 3).err
+    assert "error: r.safetensors:" in message
+    assert "task.yaml" not in message
+    assert "unknown key 'nonsense'" in message
+
+
+def test_huge_numbers_in_a_recording_print_no_warning(cli, task):
+    def huge(name, tensor):
+        return torch.frombuffer(bytearray(b"\x7f" * tensor.nbytes), dtype=tensor.dtype).reshape(tensor.shape)
+
+    recorded(task, Path("r.safetensors"), 2, 2)
+    forged("r.safetensors", tensors=lambda name, t: huge(name, t) if t.dtype.is_floating_point and t.numel() else t)
+    result = cli("replay", "r.safetensors", "--task", "./critter")
+    assert result.code in (5, 6, 9)
+    assert "Warning" not in result.err

@@ -1,14 +1,18 @@
 """Reading of checkpoints, and a specific error for each kind of damage."""
 
 import json
+import re
 import shutil
 
 import pytest
 import safetensors.torch
 import torch
-from support.saved_states import rehash, state_of
+from support.saved_states import SPEC, rehash, state_of
 
-from rlcli.errors import CheckpointError
+from rlcli.config.load import resolve
+from rlcli.errors import CheckpointError, ConfigError
+from rlcli.registry import find_task
+from rlcli.rl.policy import blank_policy
 from rlcli.rl.trainer import Rows
 from rlcli.runs import checkpoint_reader
 from rlcli.training.checkpoint_writer import CheckpointWriter, Keep
@@ -335,3 +339,31 @@ def test_steps_ignores_links(folder):
     folder.parent.rename(aside)
     folder.parent.symlink_to(aside)
     assert checkpoint_reader.steps(folder.parent) == []
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("action_bound", 1e308), ("normalize_clip", 1e300), ("log_std_range", [-1e308, 1e308]),
+        ("hidden", [10**9, 10**9]), ("hidden", [8] * 101), ("observation_size", 2**40), ("memory", [0]),
+    ],
+)  # fmt: skip
+def test_numbers_of_a_policy_fit_single_precision(key, value):
+    with pytest.raises(CheckpointError, match=rf"policy\.json is not valid; export it again: {key}"):
+        blank_policy({**SPEC, key: value})
+
+
+@pytest.mark.parametrize(
+    ("trainer", "change"),
+    [
+        ("sb3", "policy.hidden=[64, 1000000000]"), ("ppo", "actor.hidden=[1000000000]"),
+        ("ppo", "rnn={hidden: 1000000000}"), ("ppo", "rnn={layers: 1000}"), ("sb3", "action_bound=1e308"),
+        ("ppo", "action_bound=1e308"),
+    ],
+)  # fmt: skip
+def test_settings_of_an_agent_fit_the_limits_of_a_policy(tmp_path, trainer, change):
+    (tmp_path / "agent.yaml").write_text(f"agents: {{x: {{trainer: {trainer}, algorithm: ppo, max_iterations: 1}}}}\n")
+    with pytest.raises(ConfigError) as caught:
+        resolve(find_task("cartpole"), agent="x", config_file=tmp_path / "agent.yaml", overrides=[f"agent.{change}"])
+    (problem,) = caught.value.problems
+    assert re.search("number <= ", problem.message), problem

@@ -9,7 +9,7 @@ import pytest
 from rlcli.errors import CheckpointError
 from rlcli.runs import safe_io
 from rlcli.runs.checkpoint_reader import open_checkpoint
-from rlcli.runs.safe_io import parse_json, read_file, read_tail, refuse_links
+from rlcli.runs.safe_io import check_json, parse_json, read_file, read_tail, refuse_links
 from rlcli.safe_text import message_line
 
 
@@ -65,8 +65,9 @@ def test_read_file_refuses_special_files_without_blocking(tmp_path, kind):
         os.mkfifo(odd)
     else:
         odd = type(odd)("/dev/zero")
-    with pytest.raises(CheckpointError, match="is not a regular file"):
+    with pytest.raises(CheckpointError, match="is not a regular file") as caught:
         read_file(odd, 100)
+    assert "delete" not in f"{caught.value.message} {caught.value.hint}", "the user named this file"
 
 
 def test_read_file_closes_its_handle(file, tmp_path):
@@ -208,3 +209,18 @@ def test_refuse_links_names_the_first_link(tmp_path):
         refuse_links(tmp_path)
     with pytest.raises(CheckpointError, match=r"nowhere cannot be read: No such file"):
         refuse_links(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("value", "place"),
+    [
+        ({"started": "\ud800"}, "started"),
+        ({"task": {"name": "a\udfffb"}}, "task.name"),
+        ({"loggers": ["none", "\ud800x"]}, "loggers.1"),
+    ],
+)
+def test_check_json_names_the_place_of_half_a_character(tmp_path, value, place):
+    from rlcli.runs.run import RunRecord
+
+    with pytest.raises(CheckpointError, match=rf"run\.json is corrupt: {place}: the text has half of a surrogate pair"):
+        check_json(RunRecord, value, tmp_path / "run.json")

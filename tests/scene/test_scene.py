@@ -313,6 +313,7 @@ def test_entity_without_bodies_is_fixed(tmp_path):
     [
         ({"model": "../outside.xml"}, r"scene.entities.robot.model: '../outside.xml' lies outside the task's folder"),
         ({"model": "amr.xml"}, r"scene.entities.robot.model: no file 'amr.xml' in .*MJCF files there: .*arm.xml"),
+        ({"model": "pipe.xml"}, r"scene.entities.robot.model: 'pipe.xml' in .* is not a regular file"),
         ({"model": "broken.xml"}, r"scene.entities.robot.model: 'broken.xml' is not a valid MJCF: .*bdoy"),
         ({"joints": {"elbo": {"damping": 1.0}}}, r"robot.joints.elbo: no joint matches 'elbo'; did you mean 'elbow'"),
         ({"joints": {"wrist": {"damping": 1.0}}}, r"no joint matches 'wrist'.*joints: shoulder, elbow"),
@@ -323,6 +324,7 @@ def test_entity_without_bodies_is_fixed(tmp_path):
 def test_mismatch_with_model_raises_config_error_with_key(tmp_path, robot, message):
     folder = arm(tmp_path, robot=robot)
     (tmp_path / "outside.xml").write_text(ARM)
+    os.mkfifo(folder / "pipe.xml")
     (folder / "broken.xml").write_text("<mujoco><worldbody><bdoy/></worldbody></mujoco>")
     with pytest.raises(ConfigError, match=message) as caught:
         build(folder)

@@ -420,3 +420,13 @@ def test_policy_is_not_run_without_shipped_policy(managed):
     found, notes = only(managed, "policy")
     assert found == []
     assert "--format bundle" in notes["policy"]
+
+
+def test_recording_a_layout_replaces_a_link(managed, tmp_path):
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    file = managed.write() / "task.layout.json"
+    file.symlink_to(victim)
+    assert record_layout(managed.path) == file
+    assert victim.read_text() == "precious"
+    assert not file.is_symlink()

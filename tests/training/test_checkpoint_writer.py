@@ -216,3 +216,31 @@ def test_drop_after_repairs_latest_file(folder, content):
     (folder / "latest").unlink() if content is None else (folder / "latest").write_text(content)
     assert checkpoint_writer.drop_after(folder, 200) == []
     assert (folder / "latest").read_text() == "000000000200\n"
+
+
+@pytest.mark.parametrize("damage", ["format", "policy.safetensors", "rng.safetensors", "manifest.json"])
+def test_drop_after_keeps_what_it_cannot_read(folder, damage):
+    writer = CheckpointWriter(folder, Keep(), {})
+    for iteration in range(1, 5):
+        writer.save(state_with(6 * iteration), iteration, 100 * iteration)
+    writer.wait()
+    broken = folder / f"{300:012d}"
+    if damage == "format":
+        manifest = json.loads((broken / "manifest.json").read_text())
+        (broken / "manifest.json").write_text(json.dumps({**manifest, "format": 99}))
+    else:
+        (broken / damage).rename(broken / "aside")
+    names = sorted(file.name for file in broken.iterdir())
+    rows = sorted(file.name for file in (folder / "logs/replay").iterdir())
+    assert checkpoint_writer.drop_after(folder, 200) == [400]
+    kept = folder / f"{300:012d}.unreadable"
+    assert checkpoint_reader.steps(folder) == [100, 200]
+    assert {*names} <= {file.name for file in kept.iterdir()}
+    assert sorted(file.name for file in folder.glob("**/0*-*.safetensors")) == rows
+
+
+def test_pruning_keeps_what_it_cannot_read(folder):
+    save_all(folder, Keep(), range(4))
+    (folder / f"{200:012d}/manifest.json").write_text("{")
+    save_all(folder, Keep(last=1), [4])
+    assert checkpoint_reader.steps(folder) == [0, 200, 400]

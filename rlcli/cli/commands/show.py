@@ -40,7 +40,7 @@ def command(
     source = find_task(task)
     if schema:
         content = json_schema(*extensions(source))
-        console.data(json_module.dumps(content, indent=2))
+        console.data(*json_module.dumps(content, indent=2).split("\n"))
         console.document("show", schema_document=content)
         return
     words = overrides or []
@@ -48,5 +48,6 @@ def command(
     values = flags(scene__num_envs=num_envs)
     resolved = resolve(source, agent=agent, play=play, config_file=config, overrides=changes, flags=values)
     data = select(to_data(resolved), keys)
-    console.data((to_yaml_with_origins(resolved, data) if origin else to_yaml(data)).rstrip("\n"))
+    text = to_yaml_with_origins(resolved, data) if origin else to_yaml(data)
+    console.data(*text.rstrip("\n").split("\n"))
     console.document("show", config=data, **({"origins": origins(resolved, data)} if origin else {}))

@@ -67,11 +67,11 @@ def _signature(entry: TermEntry) -> list[str]:
 def _print_details(entry: TermEntry) -> None:
     from rlcli.config.term_docs import yaml_text
 
-    console.data(f"{entry.name} ({entry.section})\n{entry.summary}\n")
+    console.data(f"{entry.name} ({entry.section})", entry.summary, "")
     rows = [
         [key.name, key.type, "required" if key.required else yaml_text(key.default), key.description]
         for key in entry.keys
     ]
     if rows:
         console.table(["key", "type", "default", "meaning"], rows)
-    console.data(f"\nexample: {entry.example}")
+    console.data("", f"example: {entry.example}")

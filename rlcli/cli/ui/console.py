@@ -7,14 +7,15 @@ import errno
 import json
 import logging
 import os
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from rlcli.cli.ui.terminal import supports_styles
-from rlcli.errors import ConfigError, RlcliError
-from rlcli.safe_text import UNSAFE, message_line, message_lines, without_control
+from rlcli.errors import ConfigError, MachineError, RlcliError
+from rlcli.safe_text import UNSAFE, message_line
 
 if TYPE_CHECKING:
     from rlcli.reporting.heat_map import HeatMap
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 1
 _ERRORS_OF_ONE_RANK = ("bug", "device", "diverged")
 """Kinds of errors that may happen on one rank only, so that every rank prints them."""
+_ESCAPED = re.compile(f"{UNSAFE.pattern}|[\t\n]")
 _NO_READER = (errno.EPIPE, errno.EIO)
 """Errors of writing to a pipe without a reader, and to a terminal that was closed."""
 
@@ -66,10 +68,10 @@ class Console:
                 sys.stderr.write("\r\x1b[K")
                 sys.stderr.flush()
 
-    def data(self, text: str) -> None:
-        """Print the result as text; with --json print nothing."""
+    def data(self, *lines: str) -> None:
+        """Print lines of the result; newlines in a line are escaped. With --json print nothing."""
         if not self.json and not self.muted:
-            _write(sys.stdout, text)
+            _write(sys.stdout, *lines)
 
     def document(self, command: str, **content: Any) -> None:
         """Print the result as JSON; without --json print nothing."""
@@ -80,12 +82,12 @@ class Console:
     def info(self, text: str) -> None:
         """Print a message about progress, unless -q is set."""
         if not self.quiet and not self.muted:
-            _write(sys.stderr, message_lines(text))
+            _write(sys.stderr, message_line(text))
 
     def detail(self, text: str) -> None:
         """Print a message if -v is set."""
         if self.verbose and not self.quiet and not self.muted:
-            _write(sys.stderr, message_lines(text))
+            _write(sys.stderr, message_line(text))
 
     def warn(self, text: str) -> None:
         """Print a non-fatal warning."""
@@ -99,25 +101,25 @@ class Console:
         if self.json and not self.muted and not self.has_document:
             problems = [asdict(problem) for problem in error.problems] if isinstance(error, ConfigError) else []
             content = {"kind": error.kind, "exit_code": error.exit_code, "message": error.message, "hint": error.hint}
-            with contextlib.suppress(OSError):  # stdout itself may be broken
+            with contextlib.suppress(MachineError):  # stdout itself may be broken
                 self._write_json(error={**content, "problems": problems})
-        lines = error.message.split("\n")
-        _write(sys.stderr, "\n".join(f"error: {line}" for line in lines))
+        _write(sys.stderr, *(f"error: {line}" for line in error.message.split("\n")))
         if error.hint:
             _write(sys.stderr, f"hint: {error.hint}")
 
     def _write_json(self, **content: Any) -> None:
         text = json.dumps({"schema": SCHEMA_VERSION, **content}, indent=2, default=str)
-        _write(self.out or sys.stdout, text)
+        _write(self.out or sys.stdout, *text.split("\n"))
 
     def table(self, columns: list[str], rows: list[list[str]], title: str | None = None) -> None:
         """Print a table on stdout: padded columns in a pipe, a table that fits the width on a terminal."""
         if self.json:
             return
+        columns, rows = [*map(plain, columns)], [[*map(plain, row)] for row in rows]
         if supports_styles(sys.stdout):
             from rlcli.cli.ui.tables import draw_table
 
-            draw_table([*map(plain, columns)], [[*map(plain, row)] for row in rows], title and plain(title))
+            draw_table(columns, rows, title and plain(title))
             return
         widths = [max(len(cell) for cell in column) for column in zip(columns, *rows, strict=True)]
         for row in [columns, *rows]:
@@ -170,8 +172,13 @@ def print_log_records() -> None:
 
 
 def plain(text: str) -> str:
-    """Escape control characters, so that text of an untrusted file cannot control the terminal."""
-    return UNSAFE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    """Escape control characters and newlines: text of untrusted files cannot control the terminal or add lines."""
+    return _ESCAPED.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def output_error(error: OSError) -> MachineError:
+    """Return the error for output that cannot be written."""
+    return MachineError(f"cannot write the output: {error.strerror or error}", hint="redirect it to another place")
 
 
 def discard(stream: Any) -> None:
@@ -180,16 +187,21 @@ def discard(stream: Any) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _write(stream: Any, text: str) -> None:
-    if stream is None:  # the parent process closed it
+def _write(stream: Any, *lines: str) -> None:
+    """Print some lines.
+
+    Raises:
+        MachineError: if stdout cannot be written, for example to a full disk.
+    """
+    if stream is None:  # the parent process closed stderr; without stdout no command runs
         return
-    text = plain(without_control(text))
+    text = "\n".join(map(plain, lines))
     console.clear_line()
     try:
         print(text, file=stream, flush=True)
     except OSError as error:
-        if error.errno not in _NO_READER and stream is not sys.stderr:
-            raise
         discard(stream)  # the reader has ended, or the disk of a log is full: the command continues
+        if error.errno not in _NO_READER and stream is not sys.stderr:
+            raise output_error(error) from None
     except UnicodeEncodeError:
         print(text.encode(stream.encoding, "backslashreplace").decode(stream.encoding), file=stream, flush=True)

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from rlcli.cli.ui.console import console
-from rlcli.safe_text import shorten
+from rlcli.safe_text import printable, shorten
 
 if TYPE_CHECKING:
     from rlcli.runs.config_diff import Difference, Section
@@ -46,7 +46,7 @@ def report_differences(command: str, sections: Sequence[Section], left: str, rig
     else:
         section, found = first
         sides = " | ".join(_sides(found))
-        console.data(f"first difference: {section} {_safe(found.where)}: {sides}")
+        console.data(f"first difference: {section} {found.where}: {sides}")
 
     def document(difference: Difference) -> dict[str, Any]:
         facts: dict[str, Any] = finite_json(asdict(difference))
@@ -77,7 +77,7 @@ def _rows(section: Section) -> list[list[str]]:
         kind = each.category or section.name
         counts[kind] += 1
         if counts[kind] <= _MAX_ROWS or console.verbose:
-            rows.append([kind, _safe(each.where), *_sides(each)])
+            rows.append([kind, each.where, *_sides(each)])
     for kind, count in counts.items():
         if count > _MAX_ROWS and not console.verbose:
             rows.append([kind, f"and {count - _MAX_ROWS} more (-v shows them)", "", ""])
@@ -87,14 +87,9 @@ def _rows(section: Section) -> list[list[str]]:
 def _sides(difference: Difference) -> list[str]:
     """Return the value of each side, and the file and line that set it."""
     sides = ((difference.left, difference.left_from), (difference.right, difference.right_from))
-    return [f"{cell(value)} ({_safe(origin)})" if origin else cell(value) for value, origin in sides]
+    return [f"{cell(value)} ({origin})" if origin else cell(value) for value, origin in sides]
 
 
 def cell(value: object) -> str:
     """Format a value as a cell of the table; `-` for None."""
-    return "-" if value is None else shorten(_safe(value if isinstance(value, str) else repr(value)), _WIDTH)
-
-
-def _safe(text: str) -> str:
-    """Escape the control characters in text of an untrusted file."""
-    return text.encode("unicode_escape").decode("ascii") if not text.isprintable() else text
+    return "-" if value is None else shorten(printable(value if isinstance(value, str) else repr(value)), _WIDTH)

@@ -170,7 +170,7 @@ class TrainingView(LiveView):
                 is_share = prefix == "Episode_Termination/" or (name.endswith("_rate") and prefix == "Train/")
                 table.add_row(Text(plain(name.partition("/")[2])), f"{value:.1%}" if is_share else f"{value:.4g}")
             tables.append(table)
-        notes = Text(plain("\n".join(progress.notes)), style="yellow")
+        notes = Text("\n".join(map(plain, progress.notes)), style="yellow")
         return Group(head, Columns(tables, padding=(0, 4)), notes)
 
 

@@ -69,6 +69,10 @@ NotNegative = Annotated[float, Field(ge=0), _FractionString(), _limits(0.0, 1e38
 Seconds = Annotated[float, Field(gt=0), _FractionString(), _limits(0.0, 1e9)]
 """Time that is divided by the control period: with `sim.dt` of at least 1e-9 the number of steps fits 64 bits."""
 Count = Annotated[int, Field(ge=1), _limits(1, 2**31 - 1)]
+Width = Annotated[int, Field(ge=1, le=2**24)]
+"""Number of columns of a layer of a network."""
+Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=100)]
+"""Widths of the layers of a network."""
 Threads = Annotated[int, Field(ge=1, le=4096)]
 Share = Annotated[float, Field(ge=0, le=1), _FractionString()]
 Vec3 = tuple[Number, Number, Number]

@@ -7,16 +7,18 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from rlcli.config.schema import AgentConfig, Count, NotNegative, Positive, StrictModel
+from rlcli.config.schema import AgentConfig, Count, NotNegative, Positive, StrictModel, Width, Widths
 from rlcli.trainers import TrainerSpec
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
+_Sizes = Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(min_length=1, max_length=16)]
+"""Channels, kernels or strides of the layers of a CNN."""
 
 
 class NetworkConfig(StrictModel):
     """Multilayer perceptron."""
 
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
+    hidden: Widths = (64, 64)
     """Widths of the hidden layers."""
     activation: Literal["elu", "relu", "tanh", "silu"] = "elu"
     """Activation between layers."""
@@ -27,20 +29,20 @@ class RnnConfig(StrictModel):
 
     type: Literal["lstm"] = "lstm"
     """Kind of the RNN: lstm."""
-    hidden: Count = 64
+    hidden: Width = 64
     """Number of cells of a layer."""
-    layers: Count = 1
+    layers: Annotated[int, Field(ge=1, le=100)] = 1
     """Number of layers."""
 
 
 class CnnConfig(StrictModel):
     """CNN over each image of an observation, without padding, with the activation of the network behind it."""
 
-    channels: Annotated[tuple[Count, ...], Field(min_length=1)] = (16, 32)
+    channels: _Sizes = (16, 32)
     """Output channels of each layer."""
-    kernels: Annotated[tuple[Count, ...], Field(min_length=1)] = (8, 4)
+    kernels: _Sizes = (8, 4)
     """Edge of each layer's square kernel [pixels]."""
-    strides: Annotated[tuple[Count, ...], Field(min_length=1)] = (4, 2)
+    strides: _Sizes = (4, 2)
     """Stride of each layer [pixels]."""
     motion: Positive | None = None
     """Each older image of a history becomes (newest - older) times this factor, so that velocities are learned much

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rlcli.config.schema import AgentConfig, Count, NotNegative, Positive, StrictModel
+from rlcli.config.schema import AgentConfig, Count, NotNegative, Positive, StrictModel, Widths
 from rlcli.trainers import TrainerSpec
 
 Discount = Annotated[float, Field(ge=0, le=1)]
@@ -15,7 +15,7 @@ Discount = Annotated[float, Field(ge=0, le=1)]
 class NetworkConfig(StrictModel):
     """Networks of actor and critic, which have the same shape."""
 
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (64, 64)
+    hidden: Widths = (64, 64)
     """Widths of the hidden layers."""
     activation: Literal["elu", "relu", "tanh", "silu"] = "tanh"
     """Activation between layers."""
@@ -28,7 +28,7 @@ class NetworkConfig(StrictModel):
 class OffPolicyNetworkConfig(NetworkConfig):
     """Networks of actor and critics of an off-policy algorithm."""
 
-    hidden: Annotated[tuple[Count, ...], Field(min_length=1)] = (256, 256)
+    hidden: Widths = (256, 256)
     """Widths of the hidden layers."""
     activation: Literal["elu", "relu", "tanh", "silu"] = "relu"
     """Activation between layers."""

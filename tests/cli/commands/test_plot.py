@@ -1,5 +1,6 @@
 """`rlcli plot`: references of runs, contents and path of the figure, and invalid arguments."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -75,9 +76,11 @@ def test_figure_bytes_are_reproducible(cli, runs, kind):
 
 def test_figure_ignores_matplotlibrc(cli, runs, tmp_path, environment):
     assert cli("plot", "cartpole", "-o", "a.svg", "--metrics", "return").code == 0
-    (tmp_path / "matplotlibrc").write_text("lines.linewidth: 9\nfont.size: 30\nbackend: TkAgg\n")
+    (tmp_path / "own").write_text("lines.linewidth: 9\nfont.size: 30\nbackend: TkAgg\n")
+    os.mkfifo(tmp_path / "matplotlibrc")  # reading it would block
     line = [sys.executable, "-m", "rlcli", "plot", "cartpole", "-o", "b.svg", "-q", "--metrics", "return"]
-    done = subprocess.run(line, capture_output=True, text=True, env={**environment, "PYTHONHASHSEED": "5"}, timeout=120)
+    env = {**environment, "PYTHONHASHSEED": "5", "MATPLOTLIBRC": str(tmp_path / "own")}
+    done = subprocess.run(line, capture_output=True, text=True, env=env, timeout=120)
     assert (done.returncode, done.stderr) == (0, "")
     assert Path("a.svg").read_bytes() == Path("b.svg").read_bytes()
 

@@ -430,3 +430,18 @@ def test_run_being_created_is_not_broken(cli):
     assert "0/?" in cli("runs").out
     os.utime(folder, (0, 0))
     assert listed(cli)[0]["state"] == "broken"
+
+
+def test_links_in_a_folder_of_runs_are_not_followed(cli, made, tmp_path):
+    made(state="finished")
+    elsewhere = tmp_path / "elsewhere"
+    Path("runs").rename(elsewhere)
+    Path("runs").mkdir()
+    Path("runs/root").symlink_to("/")
+    Path("runs/arm").symlink_to(elsewhere / "arm")
+    Path("runs/own").mkdir()
+    Path("runs/own/linked").symlink_to(next((elsewhere / "arm").iterdir()))
+    result = cli("runs", "--json")
+    assert result.json["runs"] == []
+    for link in ("runs/root", "runs/arm", "runs/own/linked"):
+        assert result.err.count(f"{link} is a link; rlcli does not search it") == 1
