@@ -218,7 +218,10 @@ def test_broken_format_does_not_stop_own_tasks(plugins, cli, task):
     (task / "task.py").unlink()
     done = cli("validate", str(task))
     assert done.returncode == 0, done.stderr
-    assert "warning: plugin elsewhere 1.0: entry point 'elsewhere' = elsewhere:SPEC cannot be imported: RuntimeError: torn" in done.stderr
+    assert (
+        "warning: plugin elsewhere 1.0: entry point 'elsewhere' = elsewhere:SPEC cannot be imported: RuntimeError: torn"
+        in done.stderr
+    )
     assert cli("import", "--help").returncode == 0
 
 

@@ -28,7 +28,9 @@ def test_read_file_refuses_one_byte_above_the_limit(file):
 
 @pytest.mark.parametrize("size", [7, 9])
 def test_read_file_refuses_another_size(file, size):
-    with pytest.raises(CheckpointError, match=rf"is corrupt: its size is 8 bytes, but the manifest has {size}") as caught:
+    with pytest.raises(
+        CheckpointError, match=rf"is corrupt: its size is 8 bytes, but the manifest has {size}"
+    ) as caught:
         read_file(file, 100, size=size)
     assert caught.value.hint == "choose an older checkpoint: RUN@step:N"
 
