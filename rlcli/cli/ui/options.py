@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
+from typer.models import OptionInfo
 
 from rlcli import progress
 from rlcli.cli.ui.completion import agents, checkpoints, runs, tasks, words
@@ -171,7 +172,8 @@ def _with_strict_number(parameter: inspect.Parameter) -> inspect.Parameter:
         return value if number is None or abs(number) == math.inf else number
 
     strict: Any = Annotated[kind, Field(strict=True, ge=info.min, le=info.max), BeforeValidator(read)]
-    info.metavar = info.metavar or METAVARS[kind]
+    if isinstance(info, OptionInfo):  # an argument is shown with its name
+        info.metavar = info.metavar or METAVARS[kind]
     return parameter.replace(annotation=Annotated[strict | None, info])
 
 
