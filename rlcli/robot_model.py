@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -30,8 +31,9 @@ class Robot:
         }
         home = _home(spec)
         _clean(spec)
-        self.model = model = spec.compile()
+        spec.compile()
         self.xml, self.assets = _collect_assets(spec, file)
+        self.model = model = _compile_copy(self.xml, self.assets)
         self.dt = model.opt.timestep if model.opt.timestep <= 0.01 else 0.005
         self.decimation = max(1, round(_CONTROL_DT / self.dt))
         balls = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_BALL)]
@@ -52,6 +54,7 @@ class Robot:
                 address = model.jnt_qposadr[joint]
                 self.data.qpos[address] = np.clip(self.data.qpos[address], *model.jnt_range[joint])
         self.height = self._stand() if self.free else 0.0
+        """Height of the root above the ground in the default pose [m]."""
         mujoco.mj_forward(model, self.data)
         self.inertia = self._inertia()
 
@@ -75,7 +78,10 @@ class Robot:
         return int(self.model.jnt_bodyid[self.free[0]])
 
     def effort(self, joint: int) -> float:
-        """Return the largest effort of a joint's actuator, else an estimate from the mass that it carries."""
+        """Return the largest effort of a joint's actuator, else an estimate from the weight that it carries.
+
+        A joint of a floating base is assumed to carry half of the robot's weight, at half of its height.
+        """
         model, a = self.model, self.actuator.get(joint)
         if model.jnt_actfrclimited[joint]:
             return float(np.abs(model.jnt_actfrcrange[joint]).max())
@@ -84,8 +90,11 @@ class Robot:
         if a is not None and model.actuator_ctrllimited[a] and not model.actuator_biasprm[a, 1]:
             largest = np.abs(model.actuator_ctrlrange[a]).max()
             return float(largest * model.actuator_gainprm[a, 0] * model.actuator_gear[a, 0])
-        mass = float(model.body_subtreemass[model.jnt_bodyid[joint]])
-        return max(0.05, 2.0 * 9.81 * mass * (1.0 if model.jnt_type[joint] == SCALAR[1] else 0.3))
+        carried, lever = model.jnt_bodyid[joint], 0.6
+        if self.free and model.body_rootid[carried] == self.root:
+            carried, lever = self.root, 0.5 * max(self.height, 0.05)
+        weight = 9.81 * float(model.body_subtreemass[carried])
+        return max(0.05, weight * (2.0 if model.jnt_type[joint] == SCALAR[1] else lever))
 
     def settings(self) -> dict[str, dict[str, float]]:
         """Return the gains of joints whose actuator in the file is no position actuator, from efforts and inertias."""
@@ -134,9 +143,9 @@ class Robot:
         mujoco.mj_kinematics(model, data)
         found = []
         for geom in range(model.ngeom):
-            solid = model.geom_contype[geom] or model.geom_conaffinity[geom]
-            if solid and model.geom_bodyid[geom] and _lowest(model, data, geom) < 0.0:
-                found.append(int(model.geom_bodyid[geom]))
+            solid, body = model.geom_contype[geom] or model.geom_conaffinity[geom], int(model.geom_bodyid[geom])
+            if solid and model.body_rootid[body] == self.root and _lowest(model, data, geom) < 0.0:
+                found.append(body)
         return list(dict.fromkeys(found))
 
     def _inertia(self) -> dict[int, float]:
@@ -178,18 +187,19 @@ class Robot:
 
 
 def _home(spec: mujoco.MjSpec) -> np.ndarray | None:
-    """Return the positions of the keyframe home or stand, else of the first one."""
+    """Return the positions of the keyframe home or stand, else of the first one, else of the numeric `init_qpos`."""
     keys = sorted(spec.keys, key=lambda key: key.name not in ("home", "stand", "standing"))
-    return np.array(keys[0].qpos) if keys else None
+    start = next((numeric for numeric in spec.numerics if numeric.name == "init_qpos"), None)  # a habit of Gymnasium
+    return np.array(keys[0].qpos if keys else start.data) if keys or start is not None else None
 
 
 def _clean(spec: mujoco.MjSpec) -> None:
-    """Remove what the scene has itself (floor, lights, keyframes), centre a free root, and name every element."""
+    """Remove what the scene has itself (ground, lights, keyframes), centre a free root, and name every element."""
     for key in list(spec.keys):
         spec.delete(key)
     world = spec.worldbody
     for geom in list(world.geoms):
-        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+        if geom.type in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD):
             spec.delete(geom)
     for light in list(spec.lights):
         spec.delete(light)
@@ -209,19 +219,36 @@ def _collect_assets(spec: mujoco.MjSpec, file: Path) -> tuple[str, dict[str, Pat
     tree = ElementTree.fromstring(spec.to_xml())
     found: dict[str, Path] = {}
     home = Path(spec.modelfiledir or file.parent)
-    for element in tree.iterfind("asset//*[@file]"):
-        name = element.get("file", "")
-        folder = spec.texturedir if element.tag == "texture" else spec.meshdir
-        origin, place = home / folder / name, f"assets/{Path(name).name}"
-        if found.setdefault(place, origin).resolve() != origin.resolve():
-            raise ValueError(f"two files have the name {Path(name).name}; rename one")
-        element.set("file", Path(name).name)
+    for element in tree.iter():
+        for key in [key for key in element.attrib if key.startswith("file") and element.tag != "text"]:
+            name = element.attrib[key]
+            folder = spec.texturedir if element.tag == "texture" else spec.meshdir
+            origin = next((path for path in (home / folder / name, home / name) if path.is_file()), None)
+            if origin is None:
+                raise ValueError(f"a {element.tag} loads {home / folder / name}, which does not exist; move it there")
+            place = f"assets/{origin.name}"
+            for number in range(len(found)):  # another file may have the same name
+                if found.get(place, origin).resolve() == origin.resolve():
+                    break
+                place = f"assets/{number}_{origin.name}"
+            found[place] = origin
+            element.set(key, Path(place).name)
     compiler = tree.find("compiler")
     if compiler is None:
         compiler = ElementTree.SubElement(tree, "compiler")
-    compiler.attrib.pop("assetdir", None)
+    for key in ("assetdir", "strippath"):
+        compiler.attrib.pop(key, None)
     compiler.attrib.update(meshdir="assets", texturedir="assets")
     return ElementTree.tostring(tree, encoding="unicode"), found
+
+
+def _compile_copy(xml: str, assets: Mapping[str, Path]) -> mujoco.MjModel:
+    """Compile an MJCF with its files in memory, without any other file.
+
+    Raises:
+        ValueError: if MuJoCo cannot compile it, for example because it needs a further file.
+    """
+    return mujoco.MjModel.from_xml_string(xml, {place: origin.read_bytes() for place, origin in assets.items()})
 
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:

@@ -54,7 +54,9 @@ def read_robot(file: Path, name: str) -> RobotTask:
         spec = read_mjcf(file, [file.parent.resolve(), file.resolve().parent.parent])
         robot = Robot(spec, file)
     except (BadModel, ValueError) as error:
-        raise TaskError(f"{file} cannot be used: {error}", hint="MuJoCo must be able to compile it") from None
+        raise TaskError(
+            f"{file} cannot be used: {error}", hint="correct the file; python -m mujoco.viewer --mjcf FILE shows it"
+        ) from None
     if not robot.driven:
         raise UsageError(
             f"{file}: no joint can be driven", hint="add hinges or slides, with motors or position actuators"
@@ -66,7 +68,7 @@ def read_robot(file: Path, name: str) -> RobotTask:
         "summary": f"{_SUMMARIES[kind]} ({name}).",
         "decimation": robot.decimation,
         "episode_length_s": 20.0 if kind == "velocity" else 8.0,
-        "sim": {"dt": robot.dt},
+        "sim": {"dt": robot.dt, "integrator": "implicitfast"},  # stable with the damping of position servos
         "scene": robot.scene() | {"sensors": sensors},
         **parts,
         "play": {"scene": {"num_envs": 16}},
