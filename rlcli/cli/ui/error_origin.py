@@ -1,13 +1,15 @@
-"""Origin of an unexpected exception: the code of a task or plugin, or a bug in rlcli."""
+"""Origin of an unexpected exception: the code of a task or plugin, a missing dependency, or a bug in rlcli."""
 
 import contextlib
+import re
 import sysconfig
 import traceback
+from importlib import metadata, util
 from pathlib import Path
 from types import FrameType
 
 import rlcli
-from rlcli.errors import TaskError
+from rlcli.errors import DependencyError, TaskError, pip_install
 from rlcli.registry import OWN, TASKS, TRAINERS, catalog, is_framework
 
 
@@ -24,6 +26,25 @@ def error_of_task(error: BaseException) -> TaskError | None:
         f"{code.co_filename}:{line}: {code.co_name}: {message}",
         hint="correct the task's code at this line; --debug shows the traceback",
     )
+
+
+def missing_dependency(error: BaseException) -> DependencyError | None:
+    """Return an error with the command that installs a missing dependency of rlcli; None for any other exception."""
+    module = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+    if not module or util.find_spec(module) is not None:
+        return None
+    for requirement in metadata.requires(OWN) or []:
+        name, extra = re.split(r"[^\w.-]", requirement, maxsplit=1)[0], re.search(r"extra == .(\w+)", requirement)
+        if name.lower() == _DISTRIBUTIONS.get(module, module.lower().replace("_", "-")):
+            hint = pip_install(f"{OWN}[{extra[1]}]" if extra else name)
+            if name == "torch":
+                hint += "; on Linux without a GPU, add --index-url https://download.pytorch.org/whl/cpu"
+            return DependencyError(f"{name} is not installed", hint=hint)
+    return None
+
+
+_DISTRIBUTIONS = {"yaml": "pyyaml", "warp": "warp-lang", "mlflow": "mlflow-skinny"}
+"""Module -> distribution, where the names differ."""
 
 
 def _is_task_code(frame: FrameType, packages: dict[str, str]) -> bool:
