@@ -31,8 +31,13 @@ class Robot:
         }
         home = _home(spec)
         _clean(spec)
-        spec.compile()
-        self.xml, self.assets = _collect_assets(spec, file)
+        tilted = _tilted_roots(spec.compile())
+        tree = ElementTree.fromstring(spec.to_xml())
+        for body in tree.findall("worldbody/body"):
+            if body.get("name") in tilted:
+                _insert_level_root(body)
+        self.assets = _collect_assets(tree, spec, file)
+        self.xml = ElementTree.tostring(tree, encoding="unicode")
         self.model = model = _compile_copy(self.xml, self.assets)
         self.dt = model.opt.timestep if model.opt.timestep <= 0.01 else 0.005
         self.decimation = max(1, round(_CONTROL_DT / self.dt))
@@ -118,12 +123,16 @@ class Robot:
         pose = {self.name(j): round(float(self.data.qpos[self.model.jnt_qposadr[j]]), 4) for j in self.joints}
         if pose := {name: value for name, value in pose.items() if value}:
             robot["init"] = {"joint_pos": pose}
-        envs = 1024 if self.kind() == "velocity" else 512
+        envs = 256 if self.kind() == "velocity" else 512
         return {"num_envs": envs, "env_spacing": 2.5, "entities": {"robot": robot}}
 
     def feet(self) -> list[str]:
         """Return the bodies that touch the ground in the default pose, without the root."""
-        return [self.body(b) for b in self._touching(-0.01) if b != self.root]
+        return [self.body(b) for b in self._touching(-0.01) if self.model.body_weldid[b] != self.root]
+
+    def trunk(self) -> list[str]:
+        """Return the root and the bodies fixed to it, those with a geom."""
+        return [self.body(b) for b in dict.fromkeys(self.model.geom_bodyid) if self.model.body_weldid[b] == self.root]
 
     def _stand(self) -> float:
         """Lower the root until the robot touches the ground; return the height of the root [m]."""
@@ -214,9 +223,28 @@ def _clean(spec: mujoco.MjSpec) -> None:
             joint.parent.pos = [0.0, 0.0, 0.0]
 
 
-def _collect_assets(spec: mujoco.MjSpec, file: Path) -> tuple[str, dict[str, Path]]:
-    """Return the MJCF with all of its files in the folder `assets`, and these files by their new place."""
-    tree = ElementTree.fromstring(spec.to_xml())
+def _tilted_roots(model: mujoco.MjModel) -> list[str]:
+    """Return the free bodies whose z axis does not point up in the default pose."""
+    up = {body: 1.0 - 2.0 * float(np.square(model.body_quat[body, 1:3]).sum()) for body in range(1, model.nbody)}
+    return [model.body(body).name for body in up if model.body_dofnum[body] == 6 and up[body] < 0.95]
+
+
+def _insert_level_root(body: ElementTree.Element) -> None:
+    """Move the free joint of a body to a new parent that is level, because terms read the tilt of the root.
+
+    The element of the body becomes the new parent, and a copy of the body its child.
+    """
+    child = ElementTree.Element("body", body.attrib | {"pos": "0 0 0"})
+    joints = [part for part in body if part.tag == "freejoint" or part.get("type") == "free"]
+    child.extend([part for part in body if part not in joints])
+    kept = {key: value for key, value in body.attrib.items() if key in ("childclass", "pos")}
+    body.clear()
+    body.attrib.update(kept, name=f"{child.attrib['name']}_level")
+    body.extend([*joints, child])
+
+
+def _collect_assets(tree: ElementTree.Element, spec: mujoco.MjSpec, file: Path) -> dict[str, Path]:
+    """Refer to all files of an MJCF in the folder `assets`, and return these files by their new place."""
     found: dict[str, Path] = {}
     home = Path(spec.modelfiledir or file.parent)
     for element in tree.iter():
@@ -239,7 +267,7 @@ def _collect_assets(spec: mujoco.MjSpec, file: Path) -> tuple[str, dict[str, Pat
     for key in ("assetdir", "strippath"):
         compiler.attrib.pop(key, None)
     compiler.attrib.update(meshdir="assets", texturedir="assets")
-    return ElementTree.tostring(tree, encoding="unicode"), found
+    return found
 
 
 def _compile_copy(xml: str, assets: Mapping[str, Path]) -> mujoco.MjModel:

@@ -74,7 +74,7 @@ def read_robot(file: Path, name: str) -> RobotTask:
         "play": {"scene": {"num_envs": 16}},
         "agents": {
             "default": "ppo",
-            "ppo": {**_AGENT, "max_iterations": 1000 if kind == "velocity" else 300},
+            "ppo": {**_AGENT, "max_iterations": 1500 if kind == "velocity" else 300},
         },
     }
     task = json.loads(json.dumps(task))  # without shared lists, which YAML would write as anchors
@@ -89,7 +89,7 @@ _SUMMARIES = {
 
 
 def _velocity(robot: Robot) -> dict[str, Any]:
-    joints, feet, trunk = [robot.name(j) for j in robot.driven], robot.feet(), robot.body(robot.root)
+    joints, feet = [robot.name(j) for j in robot.driven], robot.feet()
     return {
         "commands": {
             "velocity": {
@@ -149,7 +149,7 @@ def _velocity(robot: Robot) -> dict[str, Any]:
         },
         "_sensors": {
             "feet": {"kind": "contact", "bodies": feet, "against": "ground"},
-            "trunk": {"kind": "contact", "bodies": [trunk], "against": "ground"},
+            "trunk": {"kind": "contact", "bodies": robot.trunk(), "against": "ground"},
         },
     }
 

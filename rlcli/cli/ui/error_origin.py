@@ -4,7 +4,7 @@ import contextlib
 import re
 import sysconfig
 import traceback
-from importlib import metadata, util
+from importlib import metadata
 from pathlib import Path
 from types import FrameType
 
@@ -30,17 +30,19 @@ def error_of_task(error: BaseException) -> TaskError | None:
 
 def missing_dependency(error: BaseException) -> DependencyError | None:
     """Return an error with the command that installs a missing dependency of rlcli; None for any other exception."""
-    module = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
-    if not module or util.find_spec(module) is not None:
+    module = error.name if isinstance(error, ModuleNotFoundError) else None
+    if module is None:
         return None
-    for requirement in metadata.requires(OWN) or []:
-        name, extra = re.split(r"[^\w.-]", requirement, maxsplit=1)[0], re.search(r"extra == .(\w+)", requirement)
-        if name.lower() == _DISTRIBUTIONS.get(module, module.lower().replace("_", "-")):
-            hint = pip_install(f"{OWN}[{extra[1]}]" if extra else name)
-            if name == "torch":
-                hint += "; on Linux without a GPU, add --index-url https://download.pytorch.org/whl/cpu"
-            return DependencyError(f"{name} is not installed", hint=hint)
-    return None
+    distribution = _DISTRIBUTIONS.get(module, module.lower().replace("_", "-"))
+    needed = [line for line in metadata.requires(OWN) or [] if re.split(r"[^\w.-]", line)[0].lower() == distribution]
+    if not needed:
+        return None
+    extras = [match[1] for line in needed if (match := re.search(r"extra == .(\w+)", line))]
+    extra = next((extra for extra in extras if extra not in ("all", "dev")), "all")
+    hint = pip_install(f"{OWN}[{extra}]" if len(extras) == len(needed) else distribution)
+    if distribution == "torch":
+        hint += "; on Linux without a GPU, add --index-url https://download.pytorch.org/whl/cpu"
+    return DependencyError(f"{distribution} is not installed", hint=hint)
 
 
 _DISTRIBUTIONS = {"yaml": "pyyaml", "warp": "warp-lang", "mlflow": "mlflow-skinny"}

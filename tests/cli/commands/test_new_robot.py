@@ -99,6 +99,15 @@ def test_loose_object_and_terrain_do_not_lift_the_robot(cli, tmp_path):
     assert task["scene"]["entities"]["robot"]["pos"][2] == pytest.approx(0.225, abs=0.001)
 
 
+def test_root_whose_z_axis_is_not_up_gets_a_level_parent(cli, tmp_path):
+    _, task = written(cli, tmp_path, DOG.replace('name="trunk"', 'name="trunk" euler="90 0 0"'))
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "my-robot" / "my_robot" / "model.xml"))
+    assert model.body("trunk_level").dofnum == 6
+    assert model.body("trunk_level").quat.tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert model.body("trunk").quat.tolist() == pytest.approx([0.7071, 0.7071, 0.0, 0.0], abs=1e-4)
+    assert task["scene"]["sensors"]["trunk"]["bodies"] == ["trunk"]
+
+
 def write_assets(folder):
     """Write a mesh in two sizes, an image, a height field and a skin; the meshes have the same file name."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
