@@ -67,7 +67,9 @@ class Robot:
         """Return what the robot can do: velocity, reach or balance."""
         if len(self.free) == 1 and len(self.driven) >= 4 and self.feet():
             return "velocity"
-        return "reach" if not self.free and not self.passive and len(self.driven) >= 2 else "balance"
+        if self.free or self.passive or len(self.driven) < 2:
+            return "balance"
+        return "reach" if np.ptp(self.workspace(), axis=1).max() > 0.01 else "balance"
 
     def name(self, joint: int) -> str:
         """Return the name of a joint."""
@@ -162,9 +164,14 @@ class Robot:
         mujoco.mj_fullM(self.model, self.data, matrix)
         return {j: float(matrix[self.model.jnt_dofadr[j], self.model.jnt_dofadr[j]]) for j in self.joints}
 
-    def workspace(self, body: int) -> list[list[float]]:
-        """Return a box of positions that a body reaches near the default pose, 20 % to 80 % of random ones. (3, 2)"""
+    def workspace(self) -> list[list[float]]:
+        """Return a box of positions of the last body near the default pose, 20 % to 80 % of random ones. (3, 2)
+
+        Positions are in the frame of the fixed root, as the goals of commands.
+        """
         generator, model, data = np.random.default_rng(0), self.model, mujoco.MjData(self.model)
+        root, body, turn = self._first_body(), self.last_body(), np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.body_quat[root])
         places = []
         for _ in range(300):
             data.qpos[:] = self.data.qpos
@@ -174,8 +181,7 @@ class Robot:
                 limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
                 data.qpos[address] = np.clip(value, *limits)
             mujoco.mj_kinematics(model, data)
-            root = data.xpos[self._first_body()]
-            places.append(data.xpos[body] - root)
+            places.append((data.xpos[body] - model.body_pos[root]) @ turn.reshape(3, 3))
         return [[round(float(x), 3) for x in ends] for ends in np.percentile(places, [20, 80], axis=0).T]
 
     def _first_body(self) -> int:

@@ -155,8 +155,7 @@ def _velocity(robot: Robot) -> dict[str, Any]:
 
 
 def _reach(robot: Robot) -> dict[str, Any]:
-    joints, last = [robot.name(j) for j in robot.driven], robot.last_body()
-    hand, box = robot.body(last), robot.workspace(last)
+    joints, hand, box = [robot.name(j) for j in robot.driven], robot.body(robot.last_body()), robot.workspace()
     goal = {"bodies": hand, "command": "goal"}
     return {
         "commands": {

@@ -146,6 +146,23 @@ def test_every_file_of_the_model_is_copied(cli, tmp_path):
     assert large == pytest.approx(2 * small, rel=1e-3)
 
 
+POINT = """<mujoco><worldbody><body name="point" pos="1 0 0" euler="0 0 90"><joint name="x" type="{kind}" axis="1 0 0"/>
+<joint name="y" type="{kind}" axis="0 1 0"/><geom size="0.1" mass="1"/></body></worldbody></mujoco>"""
+
+
+def test_goals_are_in_the_frame_of_a_root_that_moves_itself(cli, tmp_path):
+    _, task = written(cli, tmp_path, POINT.format(kind="slide"))
+    goal = task["commands"]["goal"]
+    assert goal["x"] == pytest.approx([-0.06, 0.06], abs=0.02)
+    assert goal["y"] == pytest.approx([-0.06, 0.06], abs=0.02)
+    assert task["observations"]["policy"]["goal"]["columns"] == [0, 1]
+
+
+def test_robot_whose_last_body_cannot_move_keeps_its_pose(cli, tmp_path):
+    result, _ = written(cli, tmp_path, POINT.format(kind="hinge"))
+    assert result.json["flavour"] == "balance"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("text", [DOG, CART, ARM], ids=["dog", "cart", "arm"])
 def test_task_passes_check_and_trains(cli, tmp_path, text):
