@@ -16,6 +16,9 @@ from rlcli.errors import listing
 _CONTROL_DT = 0.02
 SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 """Joint types with one position: hinge and slide."""
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_ROOT = 1
+"""The first body: the root of an entity."""
 
 
 class Robot:
@@ -31,11 +34,9 @@ class Robot:
         }
         home = _home(spec)
         _clean(spec)
-        tilted = _tilted_roots(spec.compile())
+        original = spec.compile()
         tree = ElementTree.fromstring(spec.to_xml())
-        for body in tree.findall("worldbody/body"):
-            if body.get("name") in tilted:
-                _insert_level_root(body)
+        _put_robot_first(tree, original)
         self.assets = _collect_assets(tree, spec, file)
         self.xml = ElementTree.tostring(tree, encoding="unicode")
         self.model = model = _compile_copy(self.xml, self.assets)
@@ -44,7 +45,8 @@ class Robot:
         balls = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_BALL)]
         if balls:
             raise ValueError(f"ball joints are not supported: {listing(balls)}; use three hinges")
-        self.free = [j for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_FREE)]
+        self.free = bool(model.njnt and model.body_jntnum[_ROOT] and model.jnt_type[0] == _FREE)
+        """Whether the base of the robot floats."""
         self.joints = [j for j in range(model.njnt) if model.jnt_type[j] in SCALAR]
         joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
         self.actuator = {int(model.actuator_trnid[a, 0]): a for a in range(model.nu) if joint_actuator[a]}
@@ -52,9 +54,9 @@ class Robot:
         self.driven = [j for j in self.joints if j in self.actuator or not model.nu]
         self.passive = [j for j in self.joints if j not in self.driven]
         self.data = mujoco.MjData(model)
-        if home is not None and len(home) == model.nq:
-            self.data.qpos[:] = home
         for joint in self.joints:
+            if home is not None and len(home) == model.nq:
+                self.data.qpos[model.jnt_qposadr[joint]] = home[original.joint(self.name(joint)).qposadr[0]]
             if model.jnt_limited[joint]:
                 address = model.jnt_qposadr[joint]
                 self.data.qpos[address] = np.clip(self.data.qpos[address], *model.jnt_range[joint])
@@ -65,7 +67,7 @@ class Robot:
 
     def kind(self) -> str:
         """Return what the robot can do: velocity, reach or balance."""
-        if len(self.free) == 1 and len(self.driven) >= 4 and self.feet():
+        if self.free and len(self.driven) >= max(4, len(self.passive) + 1) and self.feet():
             return "velocity"
         if self.free or self.passive or len(self.driven) < 2:
             return "balance"
@@ -78,11 +80,6 @@ class Robot:
     def body(self, number: int) -> str:
         """Return the name of a body."""
         return str(self.model.body(number).name)
-
-    @property
-    def root(self) -> int:
-        """The body with the free joint."""
-        return int(self.model.jnt_bodyid[self.free[0]])
 
     def effort(self, joint: int) -> float:
         """Return the largest effort of a joint's actuator, else an estimate from the weight that it carries.
@@ -98,8 +95,8 @@ class Robot:
             largest = np.abs(model.actuator_ctrlrange[a]).max()
             return float(largest * model.actuator_gainprm[a, 0] * model.actuator_gear[a, 0])
         carried, lever = model.jnt_bodyid[joint], 0.6
-        if self.free and model.body_rootid[carried] == self.root:
-            carried, lever = self.root, 0.5 * max(self.height, 0.05)
+        if self.free and model.body_rootid[carried] == _ROOT:
+            carried, lever = _ROOT, 0.5 * max(self.height, 0.05)
         weight = 9.81 * float(model.body_subtreemass[carried])
         return max(0.05, weight * (2.0 if model.jnt_type[joint] == SCALAR[1] else lever))
 
@@ -130,11 +127,11 @@ class Robot:
 
     def feet(self) -> list[str]:
         """Return the bodies that touch the ground in the default pose, without the root."""
-        return [self.body(b) for b in self._touching(-0.01) if self.model.body_weldid[b] != self.root]
+        return [self.body(b) for b in self._touching(-0.01) if self.model.body_weldid[b] != _ROOT]
 
     def trunk(self) -> list[str]:
         """Return the root and the bodies fixed to it, those with a geom."""
-        return [self.body(b) for b in dict.fromkeys(self.model.geom_bodyid) if self.model.body_weldid[b] == self.root]
+        return [self.body(b) for b in dict.fromkeys(self.model.geom_bodyid) if self.model.body_weldid[b] == _ROOT]
 
     def _stand(self) -> float:
         """Lower the root until the robot touches the ground; return the height of the root [m]."""
@@ -142,20 +139,19 @@ class Robot:
         for _ in range(30):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self._touching(middle, absolute=True) else (low, middle)
-        self.data.qpos[self.model.jnt_qposadr[self.free[0]] + 2] = high
+        self.data.qpos[2] = high
         return high
 
     def _touching(self, height: float, *, absolute: bool = False) -> list[int]:
         """Return the bodies with a geom below z = 0, with the root at a height, or moved by it."""
         model, data = self.model, mujoco.MjData(self.model)
         data.qpos[:] = self.data.qpos
-        place = model.jnt_qposadr[self.free[0]] + 2
-        data.qpos[place] = height if absolute else data.qpos[place] + height
+        data.qpos[2] = height if absolute else data.qpos[2] + height
         mujoco.mj_kinematics(model, data)
         found = []
         for geom in range(model.ngeom):
             solid, body = model.geom_contype[geom] or model.geom_conaffinity[geom], int(model.geom_bodyid[geom])
-            if solid and model.body_rootid[body] == self.root and _lowest(model, data, geom) < 0.0:
+            if solid and model.body_rootid[body] == _ROOT and _lowest(model, data, geom) < 0.0:
                 found.append(body)
         return list(dict.fromkeys(found))
 
@@ -170,8 +166,8 @@ class Robot:
         Positions are in the frame of the fixed root, as the goals of commands.
         """
         generator, model, data = np.random.default_rng(0), self.model, mujoco.MjData(self.model)
-        root, body, turn = self._first_body(), self.last_body(), np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.body_quat[root])
+        body, turn = self.last_body(), np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.body_quat[_ROOT])
         places = []
         for _ in range(300):
             data.qpos[:] = self.data.qpos
@@ -181,12 +177,8 @@ class Robot:
                 limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
                 data.qpos[address] = np.clip(value, *limits)
             mujoco.mj_kinematics(model, data)
-            places.append((data.xpos[body] - model.body_pos[root]) @ turn.reshape(3, 3))
+            places.append((data.xpos[body] - model.body_pos[_ROOT]) @ turn.reshape(3, 3))
         return [[round(float(x), 3) for x in ends] for ends in np.percentile(places, [20, 80], axis=0).T]
-
-    def _first_body(self) -> int:
-        """Return the root of the robot: the first body below the world."""
-        return int(self.model.body_rootid[self.model.jnt_bodyid[self.joints[0]]])
 
     def last_body(self) -> int:
         """Return the body at the end of the longest chain of driven joints."""
@@ -205,11 +197,13 @@ def _home(spec: mujoco.MjSpec) -> np.ndarray | None:
     """Return the positions of the keyframe home or stand, else of the first one, else of the numeric `init_qpos`."""
     keys = sorted(spec.keys, key=lambda key: key.name not in ("home", "stand", "standing"))
     start = next((numeric for numeric in spec.numerics if numeric.name == "init_qpos"), None)  # a habit of Gymnasium
-    return np.array(keys[0].qpos if keys else start.data) if keys or start is not None else None
+    if keys:
+        return np.array(keys[0].qpos)
+    return None if start is None else np.array(start.data)
 
 
 def _clean(spec: mujoco.MjSpec) -> None:
-    """Remove what the scene has itself (ground, lights, keyframes), centre a free root, and name every element."""
+    """Remove what the scene has itself (ground, lights, keyframes), and name every element."""
     for key in list(spec.keys):
         spec.delete(key)
     world = spec.worldbody
@@ -224,15 +218,27 @@ def _clean(spec: mujoco.MjSpec) -> None:
             if not element.name:
                 element.name = next(n for i in range(number, 10**6) if (n := f"{kind}{i}") not in taken)
                 taken.add(element.name)
-    for joint in spec.joints:
-        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
-            joint.parent.pos = [0.0, 0.0, 0.0]
 
 
-def _tilted_roots(model: mujoco.MjModel) -> list[str]:
-    """Return the free bodies whose z axis does not point up in the default pose."""
-    up = {body: 1.0 - 2.0 * float(np.square(model.body_quat[body, 1:3]).sum()) for body in range(1, model.nbody)}
-    return [model.body(body).name for body in up if model.body_dofnum[body] == 6 and up[body] < 0.95]
+def _put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
+    """Make the body with most driven joints the first one, the root of an entity; centre and level it if it is free."""
+    joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    driven = model.actuator_trnid[joint_actuator, 0] if model.nu else np.flatnonzero(np.isin(model.jnt_type, SCALAR))
+    world, bodies = tree.find("worldbody"), tree.findall("worldbody/body")
+    if world is None or not len(driven):
+        return
+    root = int(np.bincount(model.body_rootid[model.jnt_bodyid[driven]]).argmax())
+    robot = next(body for body in bodies if body.get("name") == model.body(root).name)
+    begin = list(world).index(bodies[0])
+    world.remove(robot)
+    world.insert(begin, robot)
+    if model.body_dofnum[root] < 6 or model.jnt_type[model.body_jntadr[root]] != _FREE:
+        return
+    for body in bodies:  # other bodies keep their place relative to the robot
+        place = model.body(body.get("name")).pos - model.body_pos[root]
+        body.set("pos", " ".join(f"{value:.6g}" for value in place))
+    if 1.0 - 2.0 * float(np.square(model.body_quat[root, 1:3]).sum()) < 0.95:  # its z axis is not up
+        _insert_level_root(robot)
 
 
 def _insert_level_root(body: ElementTree.Element) -> None:

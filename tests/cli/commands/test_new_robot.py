@@ -146,6 +146,15 @@ def test_every_file_of_the_model_is_copied(cli, tmp_path):
     assert large == pytest.approx(2 * small, rel=1e-3)
 
 
+def test_robot_that_is_listed_after_an_object_is_the_root(cli, tmp_path):
+    ball = '<worldbody><body name="ball" pos="1 0 0.2"><freejoint/><geom size="0.1"/></body>'
+    _, task = written(cli, tmp_path, ARM.replace("<worldbody>", ball))
+    assert task["commands"]["goal"]["bodies"] == "hand"
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "my-robot" / "my_robot" / "model.xml"))
+    assert model.body(1).name == "upper"
+    assert model.body("ball").pos.tolist() == [1.0, 0.0, 0.2]
+
+
 POINT = """<mujoco><worldbody><body name="point" pos="1 0 0" euler="0 0 90"><joint name="x" type="{kind}" axis="1 0 0"/>
 <joint name="y" type="{kind}" axis="0 1 0"/><geom size="0.1" mass="1"/></body></worldbody></mujoco>"""
 
