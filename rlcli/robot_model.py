@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -16,6 +17,9 @@ _CONTROL_DT = 0.02
 """Control period of the new task [s]."""
 SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 """Joint types with one position: hinge and slide."""
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_ROOT = 1
+"""The first body: the root of an entity."""
 
 
 class Robot:
@@ -31,14 +35,19 @@ class Robot:
         }
         home = _home(spec)
         _clean(spec)
-        self.model = model = spec.compile()
-        self.xml, self.assets = _collect_assets(spec, file)
+        original = spec.compile()
+        tree = ElementTree.fromstring(spec.to_xml())
+        _put_robot_first(tree, original)
+        self.assets = _collect_assets(tree, spec, file)
+        self.xml = ElementTree.tostring(tree, encoding="unicode")
+        self.model = model = _compile_copy(self.xml, self.assets)
         self.dt = model.opt.timestep if model.opt.timestep <= 0.01 else 0.005
         self.decimation = max(1, round(_CONTROL_DT / self.dt))
         balls = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_BALL)]
         if balls:
             raise ValueError(f"ball joints are not supported: {listing(balls)}; use three hinges")
-        self.free = [j for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_FREE)]
+        self.free = bool(model.njnt and model.body_jntnum[_ROOT] and model.jnt_type[0] == _FREE)
+        """Whether the base of the robot floats."""
         self.joints = [j for j in range(model.njnt) if model.jnt_type[j] in SCALAR]
         joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
         self.actuator = {int(model.actuator_trnid[a, 0]): a for a in range(model.nu) if joint_actuator[a]}
@@ -46,21 +55,24 @@ class Robot:
         self.driven = [j for j in self.joints if j in self.actuator or not model.nu]
         self.passive = [j for j in self.joints if j not in self.driven]
         self.data = mujoco.MjData(model)
-        if home is not None and len(home) == model.nq:
-            self.data.qpos[:] = home
         for joint in self.joints:
+            if home is not None and len(home) == model.nq:
+                self.data.qpos[model.jnt_qposadr[joint]] = home[original.joint(self.name(joint)).qposadr[0]]
             if model.jnt_limited[joint]:
                 address = model.jnt_qposadr[joint]
                 self.data.qpos[address] = np.clip(self.data.qpos[address], *model.jnt_range[joint])
         self.height = self._stand() if self.free else 0.0
+        """Height of the root above the ground in the default pose [m]."""
         mujoco.mj_forward(model, self.data)
         self.inertia = self._inertia()
 
     def kind(self) -> str:
         """Return the kind of task that fits the robot: velocity, reach or balance."""
-        if len(self.free) == 1 and len(self.driven) >= 4 and self.feet():
+        if self.free and len(self.driven) >= max(4, len(self.passive) + 1) and self.feet():
             return "velocity"
-        return "reach" if not self.free and not self.passive and len(self.driven) >= 2 else "balance"
+        if self.free or self.passive or len(self.driven) < 2:
+            return "balance"
+        return "reach" if np.ptp(self.workspace(), axis=1).max() > 0.01 else "balance"
 
     def name(self, joint: int) -> str:
         """Return the name of a joint."""
@@ -70,13 +82,11 @@ class Robot:
         """Return the name of a body."""
         return str(self.model.body(number).name)
 
-    @property
-    def root(self) -> int:
-        """The body with the free joint."""
-        return int(self.model.jnt_bodyid[self.free[0]])
-
     def effort(self, joint: int) -> float:
-        """Return the largest effort of a joint's actuator, else an estimate from the carried mass [N or N m]."""
+        """Return the largest effort of a joint's actuator, else an estimate from the weight that it carries.
+
+        A joint of a floating base is assumed to carry half of the robot's weight, at half of its height.
+        """
         model, a = self.model, self.actuator.get(joint)
         if model.jnt_actfrclimited[joint]:
             return float(np.abs(model.jnt_actfrcrange[joint]).max())
@@ -85,9 +95,11 @@ class Robot:
         if a is not None and model.actuator_ctrllimited[a] and not model.actuator_biasprm[a, 1]:
             largest = np.abs(model.actuator_ctrlrange[a]).max()
             return float(largest * model.actuator_gainprm[a, 0] * model.actuator_gear[a, 0])
-        mass = float(model.body_subtreemass[model.jnt_bodyid[joint]])
-        # twice the weight; a hinge carries it at a lever of 0.3 m
-        return max(0.05, 2.0 * 9.81 * mass * (1.0 if model.jnt_type[joint] == SCALAR[1] else 0.3))
+        carried, lever = model.jnt_bodyid[joint], 0.6
+        if self.free and model.body_rootid[carried] == _ROOT:
+            carried, lever = _ROOT, 0.5 * max(self.height, 0.05)
+        weight = 9.81 * float(model.body_subtreemass[carried])
+        return max(0.05, weight * (2.0 if model.jnt_type[joint] == SCALAR[1] else lever))
 
     def settings(self) -> dict[str, dict[str, float]]:
         """Return gains for joints without a position actuator in the file, from their largest effort and inertia."""
@@ -111,12 +123,16 @@ class Robot:
         pose = {self.name(j): round(float(self.data.qpos[self.model.jnt_qposadr[j]]), 4) for j in self.joints}
         if pose := {name: value for name, value in pose.items() if value}:
             robot["init"] = {"joint_pos": pose}
-        envs = 1024 if self.kind() == "velocity" else 512
+        envs = 256 if self.kind() == "velocity" else 512
         return {"num_envs": envs, "env_spacing": 2.5, "entities": {"robot": robot}}
 
     def feet(self) -> list[str]:
         """Return the bodies that touch the ground in the default pose (with the robot 1 cm lower), without the root."""
-        return [self.body(b) for b in self._touching(-0.01) if b != self.root]
+        return [self.body(b) for b in self._touching(-0.01) if self.model.body_weldid[b] != _ROOT]
+
+    def trunk(self) -> list[str]:
+        """Return the root and the bodies fixed to it, those with a geom."""
+        return [self.body(b) for b in dict.fromkeys(self.model.geom_bodyid) if self.model.body_weldid[b] == _ROOT]
 
     def _stand(self) -> float:
         """Lower the root until the robot touches the ground; return the height of the root [m]."""
@@ -124,7 +140,7 @@ class Robot:
         for _ in range(30):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self._touching(middle, absolute=True) else (low, middle)
-        self.data.qpos[self.model.jnt_qposadr[self.free[0]] + 2] = high
+        self.data.qpos[2] = high
         return high
 
     def _touching(self, height: float, *, absolute: bool = False) -> list[int]:
@@ -134,14 +150,13 @@ class Robot:
         """
         model, data = self.model, mujoco.MjData(self.model)
         data.qpos[:] = self.data.qpos
-        place = model.jnt_qposadr[self.free[0]] + 2
-        data.qpos[place] = height if absolute else data.qpos[place] + height
+        data.qpos[2] = height if absolute else data.qpos[2] + height
         mujoco.mj_kinematics(model, data)
         found = []
         for geom in range(model.ngeom):
-            solid = model.geom_contype[geom] or model.geom_conaffinity[geom]
-            if solid and model.geom_bodyid[geom] and _lowest(model, data, geom) < 0.0:
-                found.append(int(model.geom_bodyid[geom]))
+            solid, body = model.geom_contype[geom] or model.geom_conaffinity[geom], int(model.geom_bodyid[geom])
+            if solid and model.body_rootid[body] == _ROOT and _lowest(model, data, geom) < 0.0:
+                found.append(body)
         return list(dict.fromkeys(found))
 
     def _inertia(self) -> dict[int, float]:
@@ -149,12 +164,14 @@ class Robot:
         mujoco.mj_fullM(self.model, self.data, matrix)
         return {j: float(matrix[self.model.jnt_dofadr[j], self.model.jnt_dofadr[j]]) for j in self.joints}
 
-    def workspace(self, body: int) -> list[list[float]]:
-        """Return a box of positions that a body reaches near the default pose, relative to the root [m]. (3, 2)
+    def workspace(self) -> list[list[float]]:
+        """Return a box of positions of the last body near the default pose, 20 % to 80 % of 300 random ones [m]. (3, 2)
 
-        The box goes from the 20 % to the 80 % quantile of the positions in 300 random poses.
+        Positions are in the frame of the fixed root, as the goals of commands.
         """
         generator, model, data = np.random.default_rng(0), self.model, mujoco.MjData(self.model)
+        body, turn = self.last_body(), np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.body_quat[_ROOT])
         places = []
         for _ in range(300):
             data.qpos[:] = self.data.qpos
@@ -164,13 +181,8 @@ class Robot:
                 limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
                 data.qpos[address] = np.clip(value, *limits)
             mujoco.mj_kinematics(model, data)
-            root = data.xpos[self._first_body()]
-            places.append(data.xpos[body] - root)
+            places.append((data.xpos[body] - model.body_pos[_ROOT]) @ turn.reshape(3, 3))
         return [[round(float(x), 3) for x in ends] for ends in np.percentile(places, [20, 80], axis=0).T]
-
-    def _first_body(self) -> int:
-        """Return the root of the robot: the first body below the world."""
-        return int(self.model.body_rootid[self.model.jnt_bodyid[self.joints[0]]])
 
     def last_body(self) -> int:
         """Return the body at the end of the longest chain of driven joints."""
@@ -186,18 +198,21 @@ class Robot:
 
 
 def _home(spec: mujoco.MjSpec) -> np.ndarray | None:
-    """Return `qpos` of the keyframe home, stand or standing, else of the first one; None without a keyframe."""
+    """Return `qpos` of the keyframe home or stand, else of the first one, else of the numeric `init_qpos`, else None."""
     keys = sorted(spec.keys, key=lambda key: key.name not in ("home", "stand", "standing"))
-    return np.array(keys[0].qpos) if keys else None
+    start = next((numeric for numeric in spec.numerics if numeric.name == "init_qpos"), None)  # a habit of Gymnasium
+    if keys:
+        return np.array(keys[0].qpos)
+    return None if start is None else np.array(start.data)
 
 
 def _clean(spec: mujoco.MjSpec) -> None:
-    """Remove floor, lights and keyframes, which the task's scene replaces; centre a free root; name every element."""
+    """Remove what the scene has itself (ground, lights, keyframes), and name every element."""
     for key in list(spec.keys):
         spec.delete(key)
     world = spec.worldbody
     for geom in list(world.geoms):
-        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+        if geom.type in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD):
             spec.delete(geom)
     for light in list(spec.lights):
         spec.delete(light)
@@ -207,29 +222,77 @@ def _clean(spec: mujoco.MjSpec) -> None:
             if not element.name:
                 element.name = next(n for i in range(number, 10**6) if (n := f"{kind}{i}") not in taken)
                 taken.add(element.name)
-    for joint in spec.joints:
-        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
-            joint.parent.pos = [0.0, 0.0, 0.0]
 
 
-def _collect_assets(spec: mujoco.MjSpec, file: Path) -> tuple[str, dict[str, Path]]:
-    """Return the MJCF with references to the folder `assets`, and the files to copy: new path -> original file."""
-    tree = ElementTree.fromstring(spec.to_xml())
+def _put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
+    """Make the body with most driven joints the first one, the root of an entity; centre and level it if it is free."""
+    joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    driven = model.actuator_trnid[joint_actuator, 0] if model.nu else np.flatnonzero(np.isin(model.jnt_type, SCALAR))
+    world, bodies = tree.find("worldbody"), tree.findall("worldbody/body")
+    if world is None or not len(driven):
+        return
+    root = int(np.bincount(model.body_rootid[model.jnt_bodyid[driven]]).argmax())
+    robot = next(body for body in bodies if body.get("name") == model.body(root).name)
+    begin = list(world).index(bodies[0])
+    world.remove(robot)
+    world.insert(begin, robot)
+    if model.body_dofnum[root] < 6 or model.jnt_type[model.body_jntadr[root]] != _FREE:
+        return
+    for body in bodies:  # other bodies keep their place relative to the robot
+        place = model.body(body.get("name")).pos - model.body_pos[root]
+        body.set("pos", " ".join(f"{value:.6g}" for value in place))
+    if 1.0 - 2.0 * float(np.square(model.body_quat[root, 1:3]).sum()) < 0.95:  # its z axis is not up
+        _insert_level_root(robot)
+
+
+def _insert_level_root(body: ElementTree.Element) -> None:
+    """Move the free joint of a body to a new parent that is level, because terms read the tilt of the root.
+
+    The element of the body becomes the new parent, and a copy of the body its child.
+    """
+    child = ElementTree.Element("body", body.attrib | {"pos": "0 0 0"})
+    joints = [part for part in body if part.tag == "freejoint" or part.get("type") == "free"]
+    child.extend([part for part in body if part not in joints])
+    kept = {key: value for key, value in body.attrib.items() if key in ("childclass", "pos")}
+    body.clear()
+    body.attrib.update(kept, name=f"{child.attrib['name']}_level")
+    body.extend([*joints, child])
+
+
+def _collect_assets(tree: ElementTree.Element, spec: mujoco.MjSpec, file: Path) -> dict[str, Path]:
+    """Refer to all files of an MJCF in the folder `assets`, and return these files by their new place."""
     found: dict[str, Path] = {}
     home = Path(spec.modelfiledir or file.parent)
-    for element in tree.iterfind("asset//*[@file]"):
-        name = element.get("file", "")
-        folder = spec.texturedir if element.tag == "texture" else spec.meshdir
-        origin, place = home / folder / name, f"assets/{Path(name).name}"
-        if found.setdefault(place, origin).resolve() != origin.resolve():
-            raise ValueError(f"two files have the name {Path(name).name}; rename one")
-        element.set("file", Path(name).name)
+    for element in tree.iter():
+        for key in [key for key in element.attrib if key.startswith("file") and element.tag != "text"]:
+            name = element.attrib[key]
+            folder = spec.texturedir if element.tag == "texture" else spec.meshdir
+            origin = next((path for path in (home / folder / name, home / name) if path.is_file()), None)
+            if origin is None:
+                raise ValueError(f"a {element.tag} loads {home / folder / name}, which does not exist; move it there")
+            place = f"assets/{origin.name}"
+            for number in range(len(found)):  # another file may have the same name
+                if found.get(place, origin).resolve() == origin.resolve():
+                    break
+                place = f"assets/{number}_{origin.name}"
+            found[place] = origin
+            element.set(key, Path(place).name)
     compiler = tree.find("compiler")
     if compiler is None:
         compiler = ElementTree.SubElement(tree, "compiler")
-    compiler.attrib.pop("assetdir", None)
+    for key in ("assetdir", "strippath"):
+        compiler.attrib.pop(key, None)
     compiler.attrib.update(meshdir="assets", texturedir="assets")
-    return ElementTree.tostring(tree, encoding="unicode"), found
+    return found
+
+
+def _compile_copy(xml: str, assets: Mapping[str, Path]) -> mujoco.MjModel:
+    """Compile an MJCF with its files in memory, without any other file.
+
+    Raises:
+        ValueError: if MuJoCo cannot compile it, for example because it needs a further file.
+    """
+    return mujoco.MjModel.from_xml_string(xml, {place: origin.read_bytes() for place, origin in assets.items()})
 
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:

@@ -54,7 +54,9 @@ def read_robot(file: Path, name: str) -> RobotTask:
         spec = read_mjcf(file, [file.parent.resolve(), file.resolve().parent.parent])
         robot = Robot(spec, file)
     except (BadModel, ValueError) as error:
-        raise TaskError(f"{file} cannot be used: {error}", hint="correct this MJCF for MuJoCo") from None
+        raise TaskError(
+            f"{file} cannot be used: {error}", hint="correct the file; python -m mujoco.viewer --mjcf FILE shows it"
+        ) from None
     if not robot.driven:
         raise UsageError(
             f"{file}: no joint can be driven", hint="add hinges or slides, with motors or position actuators"
@@ -66,13 +68,13 @@ def read_robot(file: Path, name: str) -> RobotTask:
         "summary": f"{_SUMMARIES[kind]} ({name}).",
         "decimation": robot.decimation,
         "episode_length_s": 20.0 if kind == "velocity" else 8.0,
-        "sim": {"dt": robot.dt},
+        "sim": {"dt": robot.dt, "integrator": "implicitfast"},  # stable with the damping of position servos
         "scene": robot.scene() | {"sensors": sensors},
         **parts,
         "play": {"scene": {"num_envs": 16}},
         "agents": {
             "default": "ppo",
-            "ppo": {**_AGENT, "max_iterations": 1000 if kind == "velocity" else 300},
+            "ppo": {**_AGENT, "max_iterations": 1500 if kind == "velocity" else 300},
         },
     }
     task = json.loads(json.dumps(task))  # without shared lists, which YAML would write as anchors
@@ -87,7 +89,7 @@ _SUMMARIES = {
 
 
 def _velocity(robot: Robot) -> dict[str, Any]:
-    joints, feet, trunk = [robot.name(j) for j in robot.driven], robot.feet(), robot.body(robot.root)
+    joints, feet = [robot.name(j) for j in robot.driven], robot.feet()
     return {
         "commands": {
             "velocity": {
@@ -147,14 +149,13 @@ def _velocity(robot: Robot) -> dict[str, Any]:
         },
         "_sensors": {
             "feet": {"kind": "contact", "bodies": feet, "against": "ground"},
-            "trunk": {"kind": "contact", "bodies": [trunk], "against": "ground"},
+            "trunk": {"kind": "contact", "bodies": robot.trunk(), "against": "ground"},
         },
     }
 
 
 def _reach(robot: Robot) -> dict[str, Any]:
-    joints, last = [robot.name(j) for j in robot.driven], robot.last_body()
-    hand, box = robot.body(last), robot.workspace(last)
+    joints, hand, box = [robot.name(j) for j in robot.driven], robot.body(robot.last_body()), robot.workspace()
     goal = {"bodies": hand, "command": "goal"}
     return {
         "commands": {

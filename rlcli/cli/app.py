@@ -207,10 +207,10 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
         file = f"{error.filename}: " if error.filename else ""
         return MachineError(f"{file}{error.strerror or error}")
 
-    from rlcli.cli.ui.error_origin import error_of_task
+    from rlcli.cli.ui.error_origin import error_of_task, missing_dependency
     from rlcli.sim.gl import opengl_import_error
 
-    known = opengl_import_error(error) or error_of_task(error)
+    known = opengl_import_error(error) or missing_dependency(error) or error_of_task(error)
     if known is not None:
         return known
     bug = RlcliError(

@@ -9,7 +9,7 @@ import numpy as np
 
 from rlcli.sim.skippable_work import colliding_pairs
 
-_TRIALS, _STEPS = 8, 100
+_TRIALS, _STEPS = 16, 100
 _MARGIN = 3
 """Factor by which the capacity exceeds the largest number in short random simulations."""
 _DEFAULT_CONTACTS = 8
@@ -81,18 +81,31 @@ def _contact_rows(model: mujoco.MjModel, condim: int) -> int:
 
 
 def _sampled_maximum(model: mujoco.MjModel) -> tuple[int, int]:
-    """Return the largest numbers of contacts and rows in short simulations with random velocities and controls."""
+    """Return the largest numbers of contacts and rows in short simulations with random velocities and controls.
+
+    Half of the simulations begin with random joint positions, half of them at a random point of a height field.
+    """
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     contacts = rows = 0
-    for _ in range(_TRIALS):
+    for trial in range(_TRIALS):
         mujoco.mj_resetData(model, data)
         data.qvel[:] = rng.normal(0.0, 1.0, model.nv)
-        _move_on_height_field(model, data, rng)
+        if trial % 2:
+            _move_on_height_field(model, data, rng)
+        if trial % 4 > 1:
+            _move_joints(model, data, rng)
         for _ in range(_STEPS):
             data.ctrl[:] = rng.uniform(-1.0, 1.0, model.nu)
             mujoco.mj_step(model, data)
             contacts, rows = max(contacts, data.ncon), max(rows, data.nefc)
     return contacts, rows
+
+
+def _move_joints(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator) -> None:
+    """Move hinges and slides to random positions within their limits, or within 1 rad or 1 m of 0."""
+    scalar = model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)
+    limits = np.where(model.jnt_limited[:, None], model.jnt_range, [-1.0, 1.0])[scalar]
+    data.qpos[model.jnt_qposadr[scalar]] = rng.uniform(limits[:, 0], limits[:, 1])
 
 
 def _move_on_height_field(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generator) -> None:

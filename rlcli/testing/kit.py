@@ -147,5 +147,6 @@ def _run(name: str, subject: TaskUnderTest, before: list[Finding]) -> Iterator[F
 def _stopped(name: str, subject: TaskUnderTest, error: Exception, before: list[Finding]) -> Finding:
     message = f"the check was stopped by {error_text(error)}"
     earlier = next((f.check for f in before if f.message == message), None)
-    hint = "correct the code that raises it, then check again" if earlier is None else f"see the check {earlier}"
+    advice = getattr(error, "hint", None) or "correct the code that raises it, then check again"
+    hint = advice if earlier is None else f"see the check {earlier}"
     return Finding(name, "error", subject.location(error), message, hint)

@@ -88,5 +88,5 @@ def _apply_rule(name: str, evidence: RolloutEvidence) -> Iterator[Remark]:
         raise
     except Exception as error:
         message = f"the rule was stopped by {error_text(error)}"
-        hint = "correct the code that raises it, then lint again"
+        hint = getattr(error, "hint", None) or "correct the code that raises it, then lint again"
         yield Remark(name, "error", evidence.subject.location(error), message, hint)

@@ -63,7 +63,7 @@ def stops(evidence: RolloutEvidence) -> Iterator[Remark]:
             seen.add(text)
             step = len(rollout.reward)
             message = f"the {rollout.policy} policy was stopped after {step} steps by {text}"
-            hint = "correct the code that raises it; `rlcli check` finds more details"
+            hint = getattr(rollout.error, "hint", None) or "correct the code that raises it, then lint again"
             yield error_at(evidence.subject.location(rollout.error), message, hint, {"step": step})
 
 

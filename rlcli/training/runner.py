@@ -133,7 +133,8 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
     close("finished")
     if job.writes and agent.until is not None:
         _report_bar(run, agent.until, loop.reached)
-    for note in [] if loop.health is None else loop.health.notes(loop.metrics):
+    # after a passed evaluation, the few episodes that ended in training are mostly failures of older policies
+    for note in [] if loop.health is None or loop.reached else loop.health.notes(loop.metrics):
         _log.info("%s", note)
     for finding in run.findings() if job.writes else ():
         _log.warning("at the end: %s", finding)

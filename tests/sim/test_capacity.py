@@ -106,6 +106,16 @@ def test_capacity_covers_contacts_of_parent_and_child():
     assert capacity.constraints >= rows
 
 
+def test_capacity_covers_contacts_at_joint_limits():
+    joint = '<joint type="slide" axis="0 0 1" range="-1 0"/>'
+    box = f'<body pos="{{}} 0 1">{joint}<geom type="box" size="0.1 0.1 0.6"/></body>'
+    parts = "".join(box.format(i) for i in range(16))
+    xml = f"""<mujoco><option gravity="0 0 0"/><default><joint limited="true" damping="1e4"/></default><worldbody>
+      <geom type="plane" size="20 20 1"/>{parts}</worldbody></mujoco>"""
+    capacity = required_capacity(mujoco.MjModel.from_xml_string(xml))
+    assert capacity.contacts >= 4 * 16
+
+
 def test_settings_replace_estimated_capacity():
     model = mujoco.MjModel.from_xml_string(BOXES)
     estimate, found = required_capacity(model), required_capacity(model, contacts=5)

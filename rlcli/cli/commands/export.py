@@ -25,7 +25,7 @@ def command(
     task: TaskOfPolicy = None,
     checkpoint: CheckpointRef = None,
     format: Annotated[str, choice("FORMAT", "onnx", "torch", "numpy", "bundle")] = "onnx",
-    output: Annotated[Path | None, typer.Option()] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output")] = None,
     verify: Annotated[bool, typer.Option("--verify")] = False,
     episodes: Annotated[int, typer.Option(min=1)] = 64,
     runs_dir: RunsDir = None,

@@ -1,13 +1,15 @@
-"""Origin of an unexpected exception: the code of a task or plugin, or a bug in rlcli."""
+"""Origin of an unexpected exception: the code of a task or plugin, a missing dependency, or a bug in rlcli."""
 
 import contextlib
+import re
 import sysconfig
 import traceback
+from importlib import metadata
 from pathlib import Path
 from types import FrameType
 
 import rlcli
-from rlcli.errors import TaskError
+from rlcli.errors import DependencyError, TaskError, pip_install
 from rlcli.registry import OWN, TASKS, TRAINERS, catalog, is_framework
 
 
@@ -24,6 +26,27 @@ def error_of_task(error: BaseException) -> TaskError | None:
         f"{code.co_filename}:{line}: {code.co_name}: {message}",
         hint="correct the task's code at this line; --debug shows the traceback",
     )
+
+
+def missing_dependency(error: BaseException) -> DependencyError | None:
+    """Return an error with the command that installs a missing dependency of rlcli; None for any other exception."""
+    module = error.name if isinstance(error, ModuleNotFoundError) else None
+    if module is None:
+        return None
+    distribution = _DISTRIBUTIONS.get(module, module.lower().replace("_", "-"))
+    needed = [line for line in metadata.requires(OWN) or [] if re.split(r"[^\w.-]", line)[0].lower() == distribution]
+    if not needed:
+        return None
+    extras = [match[1] for line in needed if (match := re.search(r"extra == .(\w+)", line))]
+    extra = next((extra for extra in extras if extra not in ("all", "dev")), "all")
+    hint = pip_install(f"{OWN}[{extra}]" if len(extras) == len(needed) else distribution)
+    if distribution == "torch":
+        hint += "; on Linux without a GPU, add --index-url https://download.pytorch.org/whl/cpu"
+    return DependencyError(f"{distribution} is not installed", hint=hint)
+
+
+_DISTRIBUTIONS = {"yaml": "pyyaml", "warp": "warp-lang", "mlflow": "mlflow-skinny"}
+"""Module -> distribution, where the names differ."""
 
 
 def _is_task_code(frame: FrameType, packages: dict[str, str]) -> bool:

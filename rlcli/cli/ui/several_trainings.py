@@ -104,7 +104,9 @@ def print_sweep(sweep: Sweep) -> None:
     if best is not None:
         run = documents[best.number]["run"] or "on the machine that trained it"
         console.info(f"best: trial {best.number}; its run: {run}")
-        console.info(f"to train with its settings: rlcli train {settings['task']} --config {file}")
+        source = settings["source"]  # a task of no package is named by its folder
+        task = settings["task"] if source.get("distribution") else source.get("folder", settings["task"])
+        console.info(f"to train with its settings: rlcli train {task} --config {file}")
     console.document(
         "sweep",
         sweep=str(sweep.folder),

@@ -1,7 +1,13 @@
 """`rlcli new --robot`: what a task for the robot of an MJCF contains, and refused files."""
 
+import shutil
+import struct
+
+import mujoco
+import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -76,6 +82,94 @@ def test_fixed_base_reaches_with_its_last_body(cli, tmp_path):
     # gains of the motors follow from their efforts; the position actuator keeps its own
     joints = task["scene"]["entities"]["robot"]["joints"]
     assert {name: values["effort_limit"] for name, values in joints.items()} == {"b": 5.0, "c": 2.0}
+
+
+def test_default_pose_is_that_of_numeric_init_qpos(cli, tmp_path):
+    start = '<custom><numeric name="init_qpos" data="0 0 1 1 0 0 0 0.5 0.5 0.5 0.5"/></custom>'
+    _, task = written(cli, tmp_path, DOG.replace("</mujoco>", start + "</mujoco>"))
+    assert list(task["scene"]["entities"]["robot"]["init"]["joint_pos"].values()) == [0.5] * 4
+
+
+def test_loose_object_and_terrain_do_not_lift_the_robot(cli, tmp_path):
+    ball = '<body name="ball" pos="2 0 3"><freejoint/><geom size="0.1"/></body></worldbody>'
+    field = '<geom type="hfield" hfield="h"/><light'
+    text = DOG.replace("</worldbody>", ball).replace("<light", field)
+    text = text.replace("<worldbody>", '<asset><hfield name="h" nrow="3" ncol="3" size="9 9 2 1"/></asset><worldbody>')
+    _, task = written(cli, tmp_path, text)
+    assert task["scene"]["entities"]["robot"]["pos"][2] == pytest.approx(0.225, abs=0.001)
+
+
+def test_root_whose_z_axis_is_not_up_gets_a_level_parent(cli, tmp_path):
+    _, task = written(cli, tmp_path, DOG.replace('name="trunk"', 'name="trunk" euler="90 0 0"'))
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "my-robot" / "my_robot" / "model.xml"))
+    assert model.body("trunk_level").dofnum == 6
+    assert model.body("trunk_level").quat.tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert model.body("trunk").quat.tolist() == pytest.approx([0.7071, 0.7071, 0.0, 0.0], abs=1e-4)
+    assert task["scene"]["sensors"]["trunk"]["bodies"] == ["trunk"]
+
+
+def write_assets(folder):
+    """Write a mesh in two sizes, an image, a height field and a skin; the meshes have the same file name."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], np.int32)
+    for name, size in (("left", 0.1), ("right", 0.2)):
+        (folder / name).mkdir(parents=True)
+        lines = [*(f"v {x} {y} {z}" for x, y, z in corners * size), *(f"f {a} {b} {c}" for a, b, c in faces + 1)]
+        (folder / name / "part.obj").write_text("\n".join(lines))
+    Image.new("RGB", (4, 4)).save(folder / "side.png")
+    (folder / "field.bin").write_bytes(struct.pack("<2i4f", 2, 2, 0, 1, 2, 3))
+    bone = b"arm".ljust(40, b"\0") + struct.pack("<7fi4i4f", 0, 0, 0, 1, 0, 0, 0, 4, 0, 1, 2, 3, 1, 1, 1, 1)
+    skin = struct.pack("<4i", 4, 0, 4, 1) + (corners * 0.1).tobytes() + faces.tobytes() + bone
+    (folder / "arm.skn").write_bytes(skin)
+    (folder / "part.xml").write_text('<mujoco><geom type="mesh" mesh="right" pos="0 0 0.5"/></mujoco>')
+
+
+ASSETS = """<mujoco><compiler meshdir="files" texturedir="files"/><asset>
+<mesh name="left" file="left/part.obj"/><mesh name="right" file="right/part.obj"/>
+<hfield name="field" file="field.bin" size="0.2 0.2 0.1 0.1"/><texture name="sides" type="cube" {sides}/>
+<material name="painted" texture="sides"/></asset><deformable><skin file="arm.skn"/></deformable><worldbody>
+<body name="arm"><joint name="hinge" axis="0 1 0"/><geom type="mesh" mesh="left" material="painted"/>
+<geom type="hfield" hfield="field"/><include file="files/part.xml"/></body></worldbody></mujoco>"""
+
+
+def test_every_file_of_the_model_is_copied(cli, tmp_path):
+    write_assets(tmp_path / "files")
+    sides = " ".join(f'file{side}="side.png"' for side in ("right", "left", "up", "down", "front", "back"))
+    written(cli, tmp_path, ASSETS.format(sides=sides))
+    shutil.rmtree(tmp_path / "files")
+    copied = tmp_path / "my-robot" / "my_robot"
+    names = {"part.obj", "0_part.obj", "side.png", "field.bin", "arm.skn"}
+    assert {path.name for path in (copied / "assets").iterdir()} == names
+    model = mujoco.MjModel.from_xml_path(str(copied / "model.xml"))
+    assert (model.nmesh, model.nhfield, model.nskin, model.ntex) == (2, 1, 1, 1)
+    small, large = sorted(float(np.ptp(model.mesh_vert[begin : begin + 4])) for begin in model.mesh_vertadr)
+    assert large == pytest.approx(2 * small, rel=1e-3)
+
+
+def test_robot_that_is_listed_after_an_object_is_the_root(cli, tmp_path):
+    ball = '<worldbody><body name="ball" pos="1 0 0.2"><freejoint/><geom size="0.1"/></body>'
+    _, task = written(cli, tmp_path, ARM.replace("<worldbody>", ball))
+    assert task["commands"]["goal"]["bodies"] == "hand"
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "my-robot" / "my_robot" / "model.xml"))
+    assert model.body(1).name == "upper"
+    assert model.body("ball").pos.tolist() == [1.0, 0.0, 0.2]
+
+
+POINT = """<mujoco><worldbody><body name="point" pos="1 0 0" euler="0 0 90"><joint name="x" type="{kind}" axis="1 0 0"/>
+<joint name="y" type="{kind}" axis="0 1 0"/><geom size="0.1" mass="1"/></body></worldbody></mujoco>"""
+
+
+def test_goals_are_in_the_frame_of_a_root_that_moves_itself(cli, tmp_path):
+    _, task = written(cli, tmp_path, POINT.format(kind="slide"))
+    goal = task["commands"]["goal"]
+    assert goal["x"] == pytest.approx([-0.06, 0.06], abs=0.02)
+    assert goal["y"] == pytest.approx([-0.06, 0.06], abs=0.02)
+    assert task["observations"]["policy"]["goal"]["columns"] == [0, 1]
+
+
+def test_robot_whose_last_body_cannot_move_keeps_its_pose(cli, tmp_path):
+    result, _ = written(cli, tmp_path, POINT.format(kind="hinge"))
+    assert result.json["flavour"] == "balance"
 
 
 @pytest.mark.slow
