@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
+import sys
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,11 +13,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import mujoco
 import torch
 from torch import Tensor
 
 from rlcli.config.schema import Names, Number, StrictModel
 from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, SignatureError
+from rlcli.registry import is_framework
 from rlcli.sim.selection import Selection
 from rlcli_isaaclab.config_class import to_dict
 from rlcli_isaaclab.direct_env import building
@@ -77,6 +80,8 @@ class UserTerm:
         self.is_class = isinstance(function, type)
         self.__name__, self.__module__ = function.__name__, function.__module__
         self.target = functools.partial(_bind_term, self)
+        if section == "events" and "set_coms(" in file_text(function):
+            self.target.prepare = _unset_simple  # type: ignore[attr-defined]
         call = function.__call__ if self.is_class else function
         declared = list(inspect.signature(call).parameters.values())
         takes_env_ids = section in ("events", "curriculum")
@@ -218,6 +223,10 @@ def entity_data(settings: Any) -> dict[str, Any]:
     return data
 
 
+_AFTER_RESET = {"rewards": ("reward_manager", torch.float32), "terminations": ("termination_manager", torch.bool)}
+"""Sections whose terms Isaac Lab first calls in the first step: their manager, and the type of their values."""
+
+
 class _Bound:
     """The user's function, bound to an environment and parameters."""
 
@@ -234,12 +243,36 @@ class _Bound:
         if self._reads_reset:  # the first value has the shape of all values: let the reset make what the term reads
             self._reads_reset = False
             self._env.run_own_reset_events()
-        value = self.term(self._env, **self.params)
+        manager, dtype = _AFTER_RESET.get(self._section, ("num_envs", None))
+        try:
+            value = self.term(self._env, **self.params)
+        except Exception:
+            if hasattr(self._env.managed, manager):
+                raise
+            # the check of shapes calls the term before the first reset, which creates what the function needs
+            return torch.zeros(self._env.num_envs, device=self._env.device, dtype=dtype)
         if self._section == "observations" and value.dim() == 1:
             return value.unsqueeze(1).float()  # a group that is not concatenated may have such terms
         if self._section == "observations" and value.dim() == 3:
             return value.flatten(1)  # as Isaac Lab does for a term with a history
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
+
+
+def file_text(function: Any) -> str:
+    """Return the text of the file that defines a function."""
+    file = getattr(sys.modules.get(function.__module__), "__file__", None)
+    return _text(file) if file and file.endswith(".py") and not is_framework(function.__module__) else ""
+
+
+@functools.cache
+def _text(file: str) -> str:
+    return Path(file).read_text(encoding="utf-8", errors="replace")
+
+
+def _unset_simple(spec: mujoco.MjSpec, params: Mapping[str, Any]) -> None:
+    """Clear the `simple` flag of all bodies, with which MuJoCo assumes the centre of mass at the frame's origin."""
+    for body in spec.bodies:
+        body.simple = 0
 
 
 def _source(function: Any) -> str:

@@ -62,7 +62,7 @@ Quaternion = Annotated[
 ]
 Direction = Annotated[Vec3, _nonzero("a direction must not be zero; straight down is [0, 0, -1]")]
 Range = Annotated[tuple[Number, Number], AfterValidator(_check_order)]
-PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_check_order)]
+NotNegativeRange = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_check_order)]
 ShareRange = Annotated[tuple[Share, Share], AfterValidator(_check_order)]
 _Steps = Annotated[int, Field(ge=0, le=1000)]
 StepRange = Annotated[tuple[Annotated[int, Field(ge=0)], _Steps], AfterValidator(_check_order)]

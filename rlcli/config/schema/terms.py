@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
 
-from rlcli.config.schema.base import Count, NotNegative, Number, PositiveRange, Range, Share, StepRange, StrictModel
+from rlcli.config.schema.base import Count, NotNegative, NotNegativeRange, Number, Range, Share, StepRange, StrictModel
 
 Columns = Number | Annotated[list[Number], Field(min_length=1)]
 """One number for all columns of a term, or one number for each column."""
@@ -63,8 +63,8 @@ class EventConfig(TermConfig):
 
     mode: Literal["startup", "reset", "interval"]
     """startup: once at the start; reset: when an episode starts; interval: repeatedly."""
-    interval_range_s: PositiveRange | None = None
-    """[low, high] time between two events [s], drawn for each environment; required by mode interval."""
+    interval_range_s: NotNegativeRange | None = None
+    """[low, high] time between two events [s], drawn for each environment; required by mode interval. 0: every step."""
     global_time: bool = False
     """Mode interval: true: one timer for all environments, which resets do not restart."""
     min_steps_between: Annotated[int, Field(ge=0)] = 0
@@ -258,9 +258,9 @@ class ActionConfig(TermConfig):
 class CommandConfig(TermConfig):
     """A command for the policy, for example a target velocity, which is sampled again from time to time."""
 
-    resampling_time_s: PositiveRange
-    """[low, high] time until the next sample [s], drawn for each environment. Each episode starts with a new
-    command."""
+    resampling_time_s: NotNegativeRange
+    """[low, high] time until the next sample [s], drawn for each environment; 0: every step. Each episode starts with a
+    new command."""
 
 
 class CurriculumConfig(TermConfig):
