@@ -118,6 +118,12 @@ class Data:
         return torch.as_tensor(masses, dtype=torch.float32).expand(self._env.num_envs, -1).clone()
 
     @property
+    def default_inertia(self) -> Tensor:
+        """Moments of inertia in the model, as matrices row by row. (num_envs, bodies, 9) [kg m^2]"""
+        moments = torch.as_tensor(self._env.engine.model.body_inertia[self._entity.body_ids], dtype=torch.float32)
+        return torch.diag_embed(moments).flatten(1).expand(self._env.num_envs, -1, -1).clone()
+
+    @property
     def body_com_quat_w(self) -> Tensor:
         """Principal axes of the bodies' inertia (w, x, y, z), world frame. (num_envs, bodies, 4)"""
         update_state(self._env)
