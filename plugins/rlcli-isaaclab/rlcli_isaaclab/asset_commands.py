@@ -14,8 +14,9 @@ from rlcli.scene.entity import Entity
 from rlcli.scene.jacobian import Jacobian
 from rlcli.scene.model_fields import DERIVED_FROM
 from rlcli.sim.rotations import rotate
+from rlcli.sim.selection import Selection
 from rlcli_isaaclab.absent import report_once
-from rlcli_isaaclab.substeps import update_state
+from rlcli_isaaclab.substeps import Substeps, update_state
 from rlcli_isaaclab.utils.math import skew_symmetric_matrix
 
 
@@ -63,6 +64,33 @@ class BodyWrench:
     def __init__(self, env: VecEnv, entity: Entity) -> None:
         self._env, self._entity = env, entity
         self._local: Tensor | None = None
+        self._is_global = False
+        self.is_applied = False
+        """Whether something calls `apply` before each physics step."""
+
+    @property
+    def local(self) -> Tensor:
+        """Force and torque on each body, which act until they change. (num_envs, bodies, 6) [N, N m]"""
+        if self._local is None:
+            shape = (self._env.num_envs, len(self._entity.names["Bodies"]), 6)
+            self._local = torch.zeros(shape, device=self._env.device)
+            self.start()
+        return self._local
+
+    def start(self) -> None:
+        """Let the environment call `apply` before each physics step, unless the task's own code does."""
+        if not self.is_applied:
+            self.is_applied = True
+            _WrenchSteps(self._env, f"forces on {self._entity.name}", self)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the forces, for a checkpoint."""
+        return {} if self._local is None else {"wrench": self._local.clone()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore the forces."""
+        if "wrench" in state:
+            self.local.copy_(state["wrench"])
 
     def set_forces_and_torques(
         self,
@@ -75,14 +103,13 @@ class BodyWrench:
         **other: Any,
     ) -> None:
         """Replace forces [N] and torques [N m]. (rows, bodies, 3) each"""
-        count = len(self._entity.names["Bodies"])
-        if self._local is None:
-            self._local = torch.zeros(self._env.num_envs, count, 6, device=self._env.device)
+        local = self.local
+        count = local.shape[1]
         rows = torch.arange(self._env.num_envs) if env_ids is None else torch.as_tensor(env_ids)
         bodies = torch.arange(count) if body_ids is None or isinstance(body_ids, slice) else torch.as_tensor(body_ids)
         for part, values in ((slice(0, 3), forces), (slice(3, 6), torques)):
             if values is not None:
-                self._local[rows[:, None], bodies.reshape(1, -1), part] = values
+                local[rows[:, None], bodies.reshape(1, -1), part] = values
         self._is_global = is_global
 
     def reset(self, env_ids: Any) -> None:
@@ -100,6 +127,14 @@ class BodyWrench:
             quat = self._entity.data.body_quat_w
             world = torch.cat([rotate(quat, world[..., :3]), rotate(quat, world[..., 3:])], dim=-1)
         self._env.engine.field("xfrc_applied")[:, self._entity.body_ids] = world.to(torch.float64)
+
+
+class _WrenchSteps(Substeps):
+    """Caller of `BodyWrench.apply`. A new episode starts without forces, as in Isaac Lab."""
+
+    def reset(self, selection: Selection) -> None:
+        """Remove the forces of new episodes."""
+        self._code.reset(selection.env_ids())  # type: ignore[attr-defined]
 
 
 class PhysxView:

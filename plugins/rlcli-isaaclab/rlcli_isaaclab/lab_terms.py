@@ -39,7 +39,7 @@ def action_rate_l2_clamped(env: Any) -> Tensor:
 
 
 def fingers_contact_force_b(env: Any, contact_sensor_names: list[str], asset_cfg: Any = None) -> Tensor:
-    """Forces of the filtered objects, or of everything, on the sensors' bodies, root frame [N]. (num_envs, 3 k)"""
+    """Return forces on the sensors' bodies, of filtered objects or of everything, root frame. (num_envs, 3 k) [N]"""
     robot = env.scene["robot" if asset_cfg is None else asset_cfg.name]
     data = [env.scene.sensors[name].data for name in contact_sensor_names]
     forces = [d.net_forces_w if d.force_matrix_w is None else d.force_matrix_w.sum(dim=2) for d in data]

@@ -83,7 +83,7 @@ class ObservationManagerFacade(ManagerFacade):
     @property
     def active_terms(self) -> Any:
         """Names of the terms of each group, in order."""
-        return {name: [term.name for term in group.terms] for name, group in self._manager.groups.items()}
+        return {name: [p.term.name for p in group.pipelines] for name, group in self._manager.groups.items()}
 
 
 class TerminationManagerFacade(ManagerFacade):

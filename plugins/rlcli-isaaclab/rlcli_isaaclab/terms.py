@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
+import re
 import sys
 import typing
 from collections.abc import Mapping
@@ -223,6 +224,8 @@ def entity_data(settings: Any) -> dict[str, Any]:
     return data
 
 
+_CHECKS_FOR_LIST = re.compile(r"isinstance\([\w.]+\.(joint|body)_ids, list\)")
+"""Code that tells a list of ids, as Isaac Lab has it, from a slice. rlcli has tensors, which a GPU need not copy."""
 _AFTER_RESET = {"rewards": ("reward_manager", torch.float32), "terminations": ("termination_manager", torch.bool)}
 """Sections whose terms Isaac Lab first calls in the first step: their manager, and the type of their values."""
 
@@ -347,6 +350,7 @@ class _BoundAction(_BoundObject):
         self.size = term.action_dim
         self.elements = tuple(f"{name}[{i}]" for i in range(self.size))
         self.sinks = (f"action {name}",)
+        term._asset.start_wrenches(by_task=True)
         self._substeps = Substeps(managed, f"action {name}", self)
 
     def process(self, action: Tensor) -> None:
@@ -437,12 +441,20 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
     facade.use(term.context)
     if term.section == "curriculum":
         facade.open_weights()  # before the reward manager is created, which fixes the weights otherwise
+    if any(word in file_text(term.function) for word in ("external_force", "wrench_composer")):
+        for asset in facade.scene.articulations.values():
+            asset.start_wrenches()
     values: dict[str, Any] = {key: _resolved(value, facade.scene) for key, value in term.objects.items()}
     for key, value in params.items():
         if isinstance(value, EntityModel):
             value = SceneEntityCfg(**value.model_dump())
             facade.scene.resolve(value)
         values[term.original[key]] = value
+    if _CHECKS_FOR_LIST.search(file_text(term.function)):
+        for chosen in values.values():
+            for key in ("joint_ids", "body_ids"):
+                if isinstance(chosen, SceneEntityCfg) and isinstance(getattr(chosen, key), Tensor):
+                    setattr(chosen, key, getattr(chosen, key).tolist())
     if not term.is_class:
         return _Bound(term.function, term.section, facade, values)
     with building(env):
