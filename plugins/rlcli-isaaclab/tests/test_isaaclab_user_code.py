@@ -208,6 +208,30 @@ def test_reward_that_needs_the_first_reset(tmp_path):
     assert env.step(torch.zeros(4, 2)).reward.tolist() == pytest.approx([0.02] * 4)
 
 
+SPAWNER = """
+@configclass
+class OwnFileCfg(sim_utils.UsdFileCfg):
+    activate_contact_sensors: bool = True
+    rigid_props = sim_utils.RigidBodyPropertiesCfg(disable_gravity=False)
+    usd_path: str = "omniverse://somewhere/rover.usd"
+
+    def __post_init__(self):
+        self.scale = (1.0, 1.0, 1.0)
+
+
+first, second = OwnFileCfg(), OwnFileCfg(activate_contact_sensors=False)
+first.rigid_props.disable_gravity = True
+assert first.activate_contact_sensors and not second.activate_contact_sensors
+assert not second.rigid_props.disable_gravity
+"""
+
+
+def test_subclass_of_a_spawner(tmp_path, monkeypatch):
+    usual = 'sim_utils.UsdFileCfg(usd_path="omniverse://somewhere/rover.usd")'
+    monkeypatch.setattr(sys.modules[__name__], "HEAD", HEAD.replace(usual, "OwnFileCfg()"))
+    assert rover(tmp_path / "rover", SPAWNER).task.scene.entities["robot"].model.endswith("rover.xml")
+
+
 # --- imports ---
 
 
