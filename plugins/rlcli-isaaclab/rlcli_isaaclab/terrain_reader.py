@@ -59,7 +59,7 @@ def read_ground(item: Node, spawn: Node) -> dict[str, Any]:
 
 
 def read_friction(material: Node) -> dict[str, float]:
-    """Return `friction`, the sliding friction: Isaac Lab's default is 0.5, rlcli's is 1."""
+    """Return `friction`, the sliding friction; empty for Isaac Lab's default of 0.5, which becomes rlcli's default."""
     material.skip("func", "restitution_combine_mode", "friction_combine_mode", "improve_patch_friction")
     material.skip("compliant_contact_stiffness", "compliant_contact_damping")
     static = material.get("static_friction", 0.5)
@@ -70,7 +70,7 @@ def read_friction(material: Node) -> dict[str, float]:
         material.note("ignored", "restitution", "in MuJoCo, solref of a geom sets how contacts bounce")
     else:
         material.skip("restitution")
-    return {"friction": as_float(dynamic)}
+    return {} if dynamic == 0.5 else {"friction": as_float(dynamic)}
 
 
 def read_terrain(item: Node, scene: dict[str, Any]) -> dict[str, Any] | None:

@@ -281,6 +281,20 @@ from isaaclab.controllers.pink_ik_cfg import PinkIKControllerCfg
     assert draw(torch.ones(2, 2), (5.0, 5.0), None, slice(None), "add", "uniform").eq(6.0).all()
 
 
+def test_environment_class_of_the_task_is_reported(unchanged):
+    def notes():
+        return [str(note) for note in resolve(find_task(str(unchanged))).notes if note.key == "entry_point"]
+
+    assert notes() == []
+    start = unchanged / "__init__.py"
+    start.write_text(start.read_text().replace("isaaclab.envs:ManagerBasedRLEnv", "balance_own.envs:OwnEnv"))
+    for name in [name for name in sys.modules if name.partition(".")[0] == "balance_own"]:
+        del sys.modules[name]
+    gymnasium.registry.pop("Template-Cartpole-v0", None)
+    why = "rlcli runs the configuration, without the methods of the task's own environment class"
+    assert notes() == [f"entry_point: ignored: {why}"]
+
+
 def test_agent_and_package_that_need_a_missing_library_are_left_out(unchanged, caplog):
     (unchanged / "agents" / "other.py").write_text("import a_missing_library\n")
     start = unchanged / "__init__.py"
