@@ -49,7 +49,8 @@ class TermReader(ObjectReader):
     """Reader of the terms of all sections."""
 
     def __init__(self, scene: SceneReader, report: Report, cfg: Any = None, data: Mapping[str, Any] = {}) -> None:
-        from rlcli_isaaclab.terms import TermContext, file_text
+        from rlcli_isaaclab.terms import TermContext
+        from rlcli_isaaclab.user_files import file_text
 
         super().__init__(scene, report, TermContext(cfg, scene.frames))
         self.data = data

@@ -6,7 +6,6 @@ import copy
 import functools
 import inspect
 import re
-import sys
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,19 +13,18 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import mujoco
 import torch
 from torch import Tensor
 
 from rlcli.config.schema import Names, Number, StrictModel
 from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, SignatureError
-from rlcli.registry import is_framework
 from rlcli.sim.selection import Selection
 from rlcli_isaaclab.config_class import to_dict
 from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
 from rlcli_isaaclab.settings import to_plain
 from rlcli_isaaclab.substeps import Substeps
+from rlcli_isaaclab.user_files import file_text, source_text, unset_simple
 
 _RESERVED = {name for model in SECTIONS.values() for name in model.model_fields} | {"params"}
 _PLAIN: dict[Any, Any] = {float: Number, int: int, bool: bool, str: str}
@@ -82,7 +80,7 @@ class UserTerm:
         self.__name__, self.__module__ = function.__name__, function.__module__
         self.target = functools.partial(_bind_term, self)
         if section == "events" and "set_coms(" in file_text(function):
-            self.target.prepare = _unset_simple  # type: ignore[attr-defined]
+            self.target.prepare = unset_simple  # type: ignore[attr-defined]
         call = function.__call__ if self.is_class else function
         declared = list(inspect.signature(call).parameters.values())
         takes_env_ids = section in ("events", "curriculum")
@@ -235,7 +233,7 @@ class _Bound:
 
     def __init__(self, function: Any, section: str, env: Any, params: dict[str, Any]) -> None:
         self.term, self._section, self._env, self.params = function, section, env, params
-        self._reads_reset = section == "observations" and "hasattr(env" in _source(function)
+        self._reads_reset = section == "observations" and "hasattr(env" in source_text(function)
 
     def __call__(self, selection: Selection | None = None) -> Any:
         if selection is not None:
@@ -259,30 +257,6 @@ class _Bound:
         if self._section == "observations" and value.dim() == 3:
             return value.flatten(1)  # as Isaac Lab does for a term with a history
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
-
-
-def file_text(function: Any) -> str:
-    """Return the text of the file that defines a function."""
-    file = getattr(sys.modules.get(function.__module__), "__file__", None)
-    return _text(file) if file and file.endswith(".py") and not is_framework(function.__module__) else ""
-
-
-@functools.cache
-def _text(file: str) -> str:
-    return Path(file).read_text(encoding="utf-8", errors="replace")
-
-
-def _unset_simple(spec: mujoco.MjSpec, params: Mapping[str, Any]) -> None:
-    """Clear the `simple` flag of all bodies, with which MuJoCo assumes the centre of mass at the frame's origin."""
-    for body in spec.bodies:
-        body.simple = 0
-
-
-def _source(function: Any) -> str:
-    try:
-        return inspect.getsource(function)
-    except (OSError, TypeError):
-        return ""
 
 
 class _BoundObject:
