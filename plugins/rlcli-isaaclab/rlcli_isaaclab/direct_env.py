@@ -50,7 +50,8 @@ class DirectRLEnv(gymnasium.Env):
         if managed is None:
             raise TaskError("a DirectRLEnv cannot be created by itself", hint="use `rlcli train`, or rlcli.make_env")
         if isinstance(managed, _Shell):
-            self.cfg, self.managed, self.sim, self.scene = cfg, managed, managed.sim, managed.scene
+            for name, value in {"cfg": cfg, "sim": managed.sim, "scene": managed.scene, "managed": managed}.items():
+                self.__dict__[name] = value
             self._setup_scene()
             raise _Recorded(self)
         self.cfg, self.managed, self.render_mode = cfg, managed, render_mode

@@ -120,7 +120,11 @@ def _randomize_prop_by_op(
     data: Tensor, distribution_parameters: Any, dim_0_ids: Any, dim_1_ids: Any, operation: str, distribution: str
 ) -> Tensor:
     """Draw new values of some rows and columns, in place. Isaac Lab's name for a function that user's events call."""
-    samplers = {"uniform": sample_uniform, "log_uniform": sample_log_uniform, "gaussian": sample_gaussian}
+    samplers: dict[str, Any] = {
+        "uniform": sample_uniform,
+        "log_uniform": sample_log_uniform,
+        "gaussian": sample_gaussian,
+    }
     if operation not in ("add", "scale", "abs") or distribution not in samplers:
         raise NotImplementedError(f"unknown operation '{operation}' or distribution '{distribution}'")
     rows = torch.arange(len(data), device=data.device) if dim_0_ids is None else torch.as_tensor(dim_0_ids)
