@@ -198,7 +198,7 @@ class Robot:
 
 
 def _home(spec: mujoco.MjSpec) -> np.ndarray | None:
-    """Return `qpos` of the keyframe home or stand, else of the first one, else of the numeric `init_qpos`, else None."""
+    """Return `qpos` of the keyframe home or stand, else of the first one, else of the numeric `init_qpos`."""
     keys = sorted(spec.keys, key=lambda key: key.name not in ("home", "stand", "standing"))
     start = next((numeric for numeric in spec.numerics if numeric.name == "init_qpos"), None)  # a habit of Gymnasium
     if keys:

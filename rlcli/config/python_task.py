@@ -8,6 +8,7 @@ function that is not a term of `rlcli.mdp` becomes one of the task's own terms u
 import functools
 import inspect
 import logging
+import sysconfig
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -84,7 +85,7 @@ def load(source: TaskSource, models: Mapping[str, Any] | None = None) -> PythonT
         raise
     except Exception as error:
         require_module(error)
-        message = f"{source.python}: {type(error).__name__}: {error}{_location(error)}"
+        message = f"{source.python}: {type(error).__name__}: {error}{error_location(error)}"
         raise TaskError(message, hint=_hint(error)) from error
     return task
 
@@ -257,6 +258,8 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         for name, kwargs in registrations.items()
         if _module_of(kwargs[CONFIGURATION]).startswith(module.__name__)
     }
+    if wanted in registrations:  # the configuration may belong to another package
+        found[wanted] = registrations[wanted]
     if wanted and wanted not in found:
         known = did_you_mean(wanted, found) or f"it registers {listing(found)}"
         raise TaskError(f"{source.root} does not register '{wanted}'", hint=known)
@@ -278,10 +281,18 @@ def _with_environment(value: Any, kwargs: Mapping[str, Any]) -> Any:
 def _registered_agents(kwargs: Mapping[str, Any]) -> dict[str, Any]:
     ending = "_cfg_entry_point"
     return {
-        key.removesuffix(ending).replace("_", "-"): _object(value)
+        key.removesuffix(ending).replace("_", "-"): _agent_object(value)
         for key, value in kwargs.items()
         if key.endswith(ending) and key != CONFIGURATION
     }
+
+
+def _agent_object(entry: object) -> Any:
+    """Import an agent; return the error if a library that it imports is not installed: another agent may be used."""
+    try:
+        return _object(entry)
+    except ModuleNotFoundError as error:
+        return error
 
 
 def _is_entry(entry: object, module: str, attribute: str) -> bool:
@@ -320,7 +331,9 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
                 raise
             task.notes.append(Note("", f"agents.{name}", "ignored", "; ".join(map(str, error.problems))))
             continue
-        if data is None:
+        if isinstance(agent, ModuleNotFoundError):
+            task.notes.append(Note("", f"agents.{name}", "ignored", str(agent)))
+        elif data is None:
             what = str(agent) if isinstance(agent, str | FilePath) else type(agent).__name__
             task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}: write a mapping"))
         else:
@@ -349,14 +362,19 @@ def _report_choice(message: str) -> None:
     _log.info(message)
 
 
-def _location(error: BaseException) -> str:
+_LIBRARIES = tuple(path for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib")))
+"""Folders of Python's and of installed libraries."""
+
+
+def error_location(error: BaseException) -> str:
     """Return ` (file:line)` of the code that raised an error, if possible of the task's own code."""
     frames = [
         (frame.f_code.co_filename, line, is_framework(str(frame.f_globals.get("__name__", ""))))
         for frame, line in traceback.walk_tb(error.__traceback__)
         if not frame.f_code.co_filename.startswith("<")
     ]
-    own = [frame for frame in frames if not frame[2]] or frames
+    other = [frame for frame in frames if not frame[2]] or frames
+    own = [frame for frame in other if not frame[0].startswith(_LIBRARIES)] or other
     return f" ({own[-1][0]}:{own[-1][1]})" if own else ""
 
 

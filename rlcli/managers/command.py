@@ -213,7 +213,7 @@ class CommandManager(TensorState):
         drawn = selection.stream(term.stream ^ when)
         steps = drawn.uniform(low, high).double() / self._step_dt
         # the slack absorbs rounding: 0.1 s at 0.02 s are 5 steps
-        selection.write(self._steps_left[number], (steps * (1.0 - 1e-6)).ceil_().long())
+        selection.write(self._steps_left[number], (steps * (1.0 - 1e-6)).ceil_().clamp_(min=1).long())
         term.instance.resample(drawn)
 
 

@@ -118,7 +118,8 @@ class EventManager(TensorState):
         stream = selection.stream(term.stream ^ timer)
         drawn = stream.uniform_of_first(low, high) if _is_global(term) else stream.uniform(low, high)
         steps = drawn.double() / self._step_dt
-        return (steps * (1.0 - 1e-6)).ceil_().long()  # the slack absorbs rounding: 0.1 s at 0.02 s are 5 steps
+        # the slack absorbs rounding: 0.1 s at 0.02 s are 5 steps
+        return (steps * (1.0 - 1e-6)).ceil_().clamp_(min=1).long()
 
 
 def _derives(term: BoundTerm) -> bool:

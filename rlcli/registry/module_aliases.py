@@ -134,7 +134,23 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
             return module, _alias_module(form, first, file) or _above_alias(form, name, file)
     if in_tree:
         return importlib.import_module(f"{own}.{rest}" if rest else own), sys.modules[own]
+    if first not in sys.modules:
+        _import_folder_above(first, Path(file))
     return None, None
+
+
+def _import_folder_above(name: str, file: Path) -> None:
+    """Import a folder above a file as a package, for imports from the repository's root: `source.robot.mdp`."""
+    folder = next((parent for parent in file.parents if parent.name == name), None)
+    spec = PathFinder.find_spec(name)
+    if folder is None or (spec is not None and str(folder) not in (spec.submodule_search_locations or ())):
+        return
+    package_tree(name, folder, name)
+    sys.path.append(str(folder.parent))
+    try:
+        importlib.import_module(name)
+    finally:
+        sys.path.remove(str(folder.parent))
 
 
 def _above_alias(form: Format, name: str, file: str) -> Any:

@@ -8,11 +8,11 @@ from rlcli.config.schema import GroundConfig, LightsConfig
 
 
 def add_ground_plane(spec: mujoco.MjSpec, ground: GroundConfig) -> None:
-    """Add a ground plane at height 0."""
+    """Add a ground plane."""
     add_materials(spec)
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[ground.size / 2, ground.size / 2, 1.0],
-        material="ground", friction=[ground.friction, 0.005, 0.0001],
+        material="ground", friction=[ground.friction, 0.005, 0.0001], pos=[0.0, 0.0, ground.height],
     )  # fmt: skip
 
 

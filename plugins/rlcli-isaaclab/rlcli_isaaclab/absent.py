@@ -199,15 +199,16 @@ class NoEffect:
 
     def __call__(self, *args: Any, **settings: Any) -> Any:
         """Report the first call, and do nothing."""
-        _report_once(self._name)
+        report_once(f"{self._name} has no effect: rlcli's lights and colours do not change")
         return self
 
 
 @functools.cache
-def _report_once(name: str) -> None:
+def report_once(text: str) -> None:
+    """Print a warning, once in a process."""
     import logging
 
-    logging.getLogger("rlcli.isaaclab").warning("%s has no effect: rlcli's lights and colours do not change", name)
+    logging.getLogger("rlcli.isaaclab").warning("%s", text)
 
 
 def _log(*texts: Any) -> None:

@@ -59,6 +59,11 @@ def _numbers(value: Any) -> Any:
     return value
 
 
+_RL_GAMES_SCHEDULES = {
+    "adaptive": "adaptive", "linear": "linear", **dict.fromkeys(("constant", "identity", "fixed", "None"), "constant")
+}  # fmt: skip
+
+
 def _read_rl_games(top: Node) -> dict[str, Any]:
     params = top.node("params")
     network, config, space = params.node("network"), params.node("config"), params.node("network").node("space")
@@ -76,7 +81,10 @@ def _read_rl_games(top: Node) -> dict[str, Any]:
     space.skip("continuous")
     if continuous.data.get("fixed_sigma") is False:
         continuous.note("approximated", "fixed_sigma", "the standard deviation never depends on the state")
-    kl = config.get("lr_schedule", "constant") == "adaptive"
+    schedule = config.get("lr_schedule") or "constant"
+    if schedule not in _RL_GAMES_SCHEDULES:
+        top.report.problem((*config.key, "lr_schedule"), f"unknown schedule '{schedule}'", "write adaptive or linear")
+    kl = schedule == "adaptive"
     clip = config.get("clip_value", False)
     found: dict[str, Any] = {
         "dialect": "rl_games",
@@ -97,7 +105,7 @@ def _read_rl_games(top: Node) -> dict[str, Any]:
         "clip_value": "larger" if clip else None,
         "reward_scale": config.node("reward_shaper").get("scale_value", 1.0),
         "max_grad_norm": config.get("grad_norm", 1.0) if config.get("truncate_grads", False) else None,
-        "schedule": "adaptive" if kl else "constant",
+        "schedule": _RL_GAMES_SCHEDULES.get(schedule, "constant"),
         "desired_kl": config.get("kl_threshold", 0.008) if kl else None,
         "kl_grain": {"standard": "epoch", "standard_epoch": "iteration"}.get(config.get("schedule_type"), "minibatch"),
         "actor": shape,
@@ -109,14 +117,29 @@ def _read_rl_games(top: Node) -> dict[str, Any]:
     _rl_games_parts(network, config, found)
     bound = params.node("env").get("clip_actions")
     found["action_bound"] = float(bound) if bound is not None and math.isfinite(bound) else None
+    if found["action_bound"] not in (None, 1.0) and config.get("clip_actions", True):
+        params.node("env").note("approximated", "clip_actions", "actions are clipped to the bound, not scaled by it")
     params.node("env").note("ignored", "clip_observations", "observations are not clipped")
     config.skip("name", "env_name", "device", "device_name", "ppo", "print_stats", "score_to_win", "save_best_after")
     config.skip("num_actors", "multi_gpu", "player", "full_experiment_name", "seq_len", "seq_length", "grad_norm")
-    config.skip("kl_threshold", "value_bootstrap", "use_diagnostics", "games_to_track", "mixed_precision")
+    config.skip(
+        "kl_threshold", "value_bootstrap", "use_diagnostics", "games_to_track", "mixed_precision", "clip_actions"
+    )
     params.skip("seed", "load_checkpoint", "load_path", "algo", "model", "player")
     network.skip("name", "separate")
+    _mark_false(config, "value_bootstrap", "rlcli always bootstraps at a time-out")
+    _mark_false(network, "separate", _SEPARATE)
     top.skip("pbt")
     return found
+
+
+_SEPARATE = "actor and critic are always separate networks"
+
+
+def _mark_false(node: Node, key: str, why: str) -> None:
+    """Report a setting that rlcli does not have if it is false."""
+    if node.data.get(key) is False:
+        node.report.entries[(*node.key, key)] = ("approximated", why)
 
 
 def _rl_games_parts(network: Node, config: Node, found: dict[str, Any]) -> None:
@@ -127,11 +150,14 @@ def _rl_games_parts(network: Node, config: Node, found: dict[str, Any]) -> None:
             network.report.problem(rnn.key, f"'{rnn.get('name')}' has no counterpart in rlcli", "write name: lstm")
         found["rnn"] = {"hidden": rnn.get("units", 64), "layers": rnn.get("layers", 1)}
         rnn.skip("before_mlp")
+        _mark_false(rnn, "before_mlp", "the RNN is always before the MLP")
         rnn.note("approximated", "concat_input", "the MLP receives only the RNN's output, not the observations")
         rnn.note("approximated", "layer_norm", "rlcli has no layer normalization")
     if "cnn" in network:
         cnn = network.node("cnn")
         layers = cnn.get("convs") or []
+        if any(layer.get("padding", 0) for layer in layers):
+            network.report.problem((*cnn.key, "convs"), "rlcli's convolutions have no padding", "write padding: 0")
         found["cnn"] = _cnn([(c["filters"], c["kernel_size"], c["strides"]) for c in layers])
         cnn.skip("type", "initializer", "regularizer", "activation")
     if "central_value_config" in config:
@@ -155,6 +181,10 @@ def _read_skrl(top: Node) -> dict[str, Any]:
     critic, _ = _skrl_network(value)
     rollouts = agent.require("rollouts") or 1
     scheduler = agent.get("learning_rate_scheduler")
+    if scheduler not in (None, "KLAdaptiveLR"):
+        top.report.problem(
+            ("agent", "learning_rate_scheduler"), f"'{scheduler}' has no counterpart in rlcli", "write KLAdaptiveLR"
+        )
     found: dict[str, Any] = {
         "num_steps": rollouts,
         "max_iterations": max(1, math.ceil(top.node("trainer").get("timesteps", 100_000) / rollouts)),
@@ -183,17 +213,14 @@ def _read_skrl(top: Node) -> dict[str, Any]:
         found["clip_value_range"] = agent.get("value_clip")
     if cnn:
         found["cnn"] = cnn
-    if agent.data.get("time_limit_bootstrap") is False:
-        agent.report.entries[("agent", "time_limit_bootstrap")] = (
-            "approximated",
-            "rlcli always bootstraps at a time-out",
-        )
+    _mark_false(agent, "time_limit_bootstrap", "rlcli always bootstraps at a time-out")
     agent.skip("state_preprocessor_kwargs", "value_preprocessor_kwargs", "random_timesteps", "learning_starts")
     agent.skip("kl_threshold", "experiment", "mixed_precision", "learning_rate_scheduler_kwargs")
     for model in (policy, value):
         model.skip("class", "clip_actions", "clip_log_std", "min_log_std", "max_log_std", "output", "network")
     top.skip("seed", "memory", "trainer")
     models.skip("separate")
+    _mark_false(models, "separate", _SEPARATE)
     return found
 
 

@@ -12,8 +12,11 @@ from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.actuators import JointCommand
 from rlcli.scene.entity import Entity
 from rlcli.scene.jacobian import Jacobian
+from rlcli.scene.model_fields import DERIVED_FROM
 from rlcli.sim.rotations import rotate
-from rlcli_isaaclab.substeps import update_state
+from rlcli.sim.selection import Selection
+from rlcli_isaaclab.absent import report_once
+from rlcli_isaaclab.substeps import Substeps, update_state
 from rlcli_isaaclab.utils.math import skew_symmetric_matrix
 
 
@@ -61,6 +64,33 @@ class BodyWrench:
     def __init__(self, env: VecEnv, entity: Entity) -> None:
         self._env, self._entity = env, entity
         self._local: Tensor | None = None
+        self._is_global = False
+        self.is_applied = False
+        """Whether something calls `apply` before each physics step."""
+
+    @property
+    def local(self) -> Tensor:
+        """Force and torque on each body, which act until they change. (num_envs, bodies, 6) [N, N m]"""
+        if self._local is None:
+            shape = (self._env.num_envs, len(self._entity.names["Bodies"]), 6)
+            self._local = torch.zeros(shape, device=self._env.device)
+            self.start()
+        return self._local
+
+    def start(self) -> None:
+        """Let the environment call `apply` before each physics step, unless the task's own code does."""
+        if not self.is_applied:
+            self.is_applied = True
+            _WrenchSteps(self._env, f"forces on {self._entity.name}", self)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the forces, for a checkpoint."""
+        return {} if self._local is None else {"wrench": self._local.clone()}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore the forces."""
+        if "wrench" in state:
+            self.local.copy_(state["wrench"])
 
     def set_forces_and_torques(
         self,
@@ -73,14 +103,13 @@ class BodyWrench:
         **other: Any,
     ) -> None:
         """Replace forces [N] and torques [N m]. (rows, bodies, 3) each"""
-        count = len(self._entity.names["Bodies"])
-        if self._local is None:
-            self._local = torch.zeros(self._env.num_envs, count, 6, device=self._env.device)
+        local = self.local
+        count = local.shape[1]
         rows = torch.arange(self._env.num_envs) if env_ids is None else torch.as_tensor(env_ids)
         bodies = torch.arange(count) if body_ids is None or isinstance(body_ids, slice) else torch.as_tensor(body_ids)
         for part, values in ((slice(0, 3), forces), (slice(3, 6), torques)):
             if values is not None:
-                self._local[rows[:, None], bodies.reshape(1, -1), part] = values
+                local[rows[:, None], bodies.reshape(1, -1), part] = values
         self._is_global = is_global
 
     def reset(self, env_ids: Any) -> None:
@@ -100,6 +129,14 @@ class BodyWrench:
         self._env.engine.field("xfrc_applied")[:, self._entity.body_ids] = world.to(torch.float64)
 
 
+class _WrenchSteps(Substeps):
+    """Caller of `BodyWrench.apply`. A new episode starts without forces, as in Isaac Lab."""
+
+    def reset(self, selection: Selection) -> None:
+        """Remove the forces of new episodes."""
+        self._code.reset(selection.env_ids())  # type: ignore[attr-defined]
+
+
 class PhysxView:
     """The values of PhysX's view of an asset that have a counterpart in MuJoCo."""
 
@@ -114,13 +151,78 @@ class PhysxView:
         hint = did_you_mean(name, known) or f"rlcli has {listing(known)}; for others use `data`"
         raise TaskError(f"root_physx_view.{name} cannot be used: rlcli has no PhysX", hint=hint)
 
-    def _bodies(self, field: str) -> Tensor:
-        values = torch.as_tensor(getattr(self._env.engine.model, field)[self._entity.body_ids], dtype=torch.float32)
-        return values.expand(self._env.num_envs, *values.shape).clone()
+    def _model_values(self, field: str, kind: str = "Bodies") -> Tensor:
+        """Return a model field in every environment, on the CPU as PhysX does. (num_envs, elements, ...)"""
+        return self._env.engine.expand(field)[:, self._entity.ids[kind]].float().cpu()
+
+    def _write_model(self, field: str, values: Tensor, indices: Any, kind: str = "Bodies") -> None:
+        """Write the rows `indices` of values of every environment to a model field. (num_envs, elements, ...)"""
+        target = self._env.engine.expand(field)
+        rows = torch.as_tensor(indices, dtype=torch.int64, device=target.device)
+        ids = torch.as_tensor(self._entity.ids[kind], dtype=torch.int64, device=target.device)
+        target[rows[:, None], ids] = values.to(target)[rows]
+        if field in DERIVED_FROM:
+            self._env.engine.set_constants()
 
     def get_masses(self) -> Tensor:
         """Return masses of the bodies. (num_envs, bodies) [kg]"""
-        return self._bodies("body_mass")
+        return self._model_values("body_mass")
+
+    def set_masses(self, masses: Tensor, indices: Any) -> None:
+        """Set the masses of some environments; inertias stay. (num_envs, bodies) [kg]"""
+        self._write_model("body_mass", masses, indices)
+
+    def get_inertias(self) -> Tensor:
+        """Return moments of inertia along the axes of `get_coms`, as matrices row by row. (num_envs, bodies, 9)"""
+        return torch.diag_embed(self._model_values("body_inertia")).flatten(2)
+
+    def set_inertias(self, inertias: Tensor, indices: Any) -> None:
+        """Set the moments of inertia of some environments. (num_envs, bodies, 9) [kg m^2]
+
+        Raises:
+            TaskError: for a product of inertia: MuJoCo stores the principal moments.
+        """
+        matrices = inertias.unflatten(-1, (3, 3))
+        moments = matrices.diagonal(dim1=-2, dim2=-1)
+        if not torch.equal(torch.diag_embed(moments), matrices):
+            raise TaskError("root_physx_view.set_inertias: rlcli sets only xx, yy and zz", hint="leave the others at 0")
+        self._write_model("body_inertia", moments, indices)
+
+    def get_coms(self) -> Tensor:
+        """Return centres of mass [m] and principal axes (x, y, z, w) in the bodies' frames. (num_envs, bodies, 7)"""
+        quat = self._model_values("body_iquat").roll(-1, dims=-1)
+        return torch.cat([self._model_values("body_ipos"), quat], dim=-1)
+
+    def set_coms(self, coms: Tensor, indices: Any) -> None:
+        """Set centres of mass and principal axes of some environments. (num_envs, bodies, 7)
+
+        Raises:
+            TaskError: if the model was compiled without the products that a moved centre of mass needs.
+        """
+        if self._env.engine.model.body_simple[self._entity.body_ids].any():
+            hint = "write the call into the file of an event's function, where rlcli looks for the call"
+            raise TaskError("root_physx_view.set_coms cannot be used here", hint=hint)
+        self._write_model("body_ipos", coms[..., :3], indices)
+        self._write_model("body_iquat", coms[..., 3:].roll(1, dims=-1), indices)
+
+    @property
+    def max_shapes(self) -> int:
+        """Number of geoms."""
+        return len(self._entity.ids["Geoms"])
+
+    def get_material_properties(self) -> Tensor:
+        """Return static and dynamic friction, which are equal, and restitution 0 of each geom. (num_envs, geoms, 3)"""
+        friction = self._model_values("geom_friction", "Geoms")[..., 0]
+        return torch.stack([friction, friction, torch.zeros_like(friction)], dim=-1)
+
+    def set_material_properties(self, materials: Tensor, indices: Any) -> None:
+        """Set the dynamic friction of the geoms of some environments. (num_envs, geoms, 3)"""
+        if bool(materials[..., 2].any()) or not torch.equal(materials[..., 0], materials[..., 1]):
+            report_once("root_physx_view.set_material_properties: MuJoCo has one friction, the dynamic one, and no"
+                        " restitution")  # fmt: skip
+        friction = self._model_values("geom_friction", "Geoms")
+        friction[..., 0] = materials[..., 1].cpu()
+        self._write_model("geom_friction", friction, indices, "Geoms")
 
     def get_dof_limits(self) -> Tensor:
         """Return position limits of the joints. (num_envs, joints, 2) [m or rad]"""

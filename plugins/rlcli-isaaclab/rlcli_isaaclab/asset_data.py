@@ -51,6 +51,8 @@ class Data:
     def __init__(self, env: VecEnv, entity: Entity) -> None:
         self._env, self._entity = env, entity
         self.joint_names, self.body_names = list(entity.joint_names), list(entity.names["Bodies"])
+        self.default_joint_stiffness, self.default_joint_damping = self._gains(1), self._gains(2)
+        """Gains before any event. (num_envs, joints) each [N/m or N m/rad, N s/m or N m s/rad]"""
 
     @property
     def _data(self) -> EntityData:
@@ -67,6 +69,18 @@ class Data:
             known = [n for n in (*dir(type(self)), *dir(self._data), *_DATA_NAMES) if not n.startswith("_")]
             hint = did_you_mean(name, known) or f"its attributes: {listing(known, 60)}"
             raise AttributeError(f"data has no '{name}'; {hint}") from None
+
+    def _gains(self, column: int) -> Tensor:
+        """Return stiffness (column 1) or damping (2) of the joints, as the model and the actuators have it."""
+        model, entity = self._env.engine.model, self._entity
+        found = torch.zeros(self._env.num_envs, len(self.joint_names), device=self._env.device)
+        if column == 2:
+            found += torch.as_tensor(model.dof_damping[entity.dof_columns.cpu()], dtype=torch.float32).to(found.device)
+        for joint, actuator in (*entity.actuators_of("position"), *entity.actuators_of("velocity")):
+            found[:, joint] -= float(model.actuator_biasprm[actuator, column])
+        for actuators in entity.actuators:
+            found[:, actuators.joints] = actuators.stiffness if column == 1 else actuators.damping
+        return found
 
     def _expand_to_envs(self, row: Tensor) -> Tensor:
         return row if row.dim() == 3 else row.expand(self._env.num_envs, *row.shape)
@@ -116,6 +130,17 @@ class Data:
         """Masses of the bodies in the model. (num_envs, bodies) [kg]"""
         masses = self._env.engine.model.body_mass[self._entity.body_ids]
         return torch.as_tensor(masses, dtype=torch.float32).expand(self._env.num_envs, -1).clone()
+
+    @property
+    def joint_armature(self) -> Tensor:
+        """Armature of the joints. (num_envs, joints) [kg or kg m^2]"""
+        return self._env.engine.expand("dof_armature")[:, self._entity.dof_columns].float()
+
+    @property
+    def default_inertia(self) -> Tensor:
+        """Moments of inertia in the model, as matrices row by row. (num_envs, bodies, 9) [kg m^2]"""
+        moments = torch.as_tensor(self._env.engine.model.body_inertia[self._entity.body_ids], dtype=torch.float32)
+        return torch.diag_embed(moments).flatten(1).expand(self._env.num_envs, -1, -1).clone()
 
     @property
     def body_com_quat_w(self) -> Tensor:

@@ -19,6 +19,9 @@ def configclass(cls: type[T]) -> type[T]:
     """Turn a class into a class of settings: its members are all names except methods and nested classes."""
     own = inspect.get_annotations(cls)
     assigned = [name for name, value in vars(cls).items() if name in own or _is_setting(cls, name, value)]
+    if hasattr(cls, "__settings__"):  # a subclass of a class that takes any settings (sim.py)
+        cls._fixed = {**cls._fixed, **{name: vars(cls)[name] for name in assigned}}  # type: ignore[attr-defined]
+        return cls
     names = [*(name for name in own if name not in assigned), *assigned]
     cls.__annotations__ = {name: own.get(name, Any) for name in names}
     for name in names:

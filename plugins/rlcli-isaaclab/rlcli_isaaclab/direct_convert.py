@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,17 +31,21 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
         ConfigError: if the task cannot be expressed in rlcli.
     """
     report = Report()
-    _require_values(cfg)
+    original = cfg
+    _rename_spaces(original)
+    _require_values(original, "decimation", "episode_length_s", "scene")
+    cfg = copy.deepcopy(original)
+    setup, env = record(env_class, cfg)
+    _require_values(cfg, "action_space", "observation_space")
     actions = shape_of(cfg.action_space, "action_space")
     observations = shape_of(cfg.observation_space, "observation_space")
-    setup, env = record(env_class, cfg)
     names = _names(setup, env)
-    cfg.rlcli_names = names
+    original.rlcli_names = names
     scene_data: dict[str, Any] = {"num_envs": cfg.scene.num_envs, "env_spacing": cfg.scene.env_spacing}
     for name, (_, settings) in zip(names, setup.created, strict=True):
         scene_data[name] = to_dict(settings)
-    for index, (path, settings) in enumerate(setup.spawned):
-        scene_data[f"spawned_{index}"] = {"prim_path": path, "spawn": to_dict(settings)}
+    for index, (path, settings, pose) in enumerate(setup.spawned):
+        scene_data[f"spawned_{index}"] = {"prim_path": path, "spawn": to_dict(settings), "init_state": pose}
     declared = to_dict(cfg.scene)
     scene_data |= {key: value for key, value in declared.items() if key not in scene_data}
     scene = SceneReader(Node(scene_data, ("scene",), report), root, models)
@@ -61,7 +66,7 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
     config["sim"] |= scene.integrator()
     terms = TermReader(scene, report, cfg)
     events = {name: term for member in top.node("events").nodes() for name, term in terms.read_terms("events", *member)}
-    hook = _Hooks(env_class, cfg, any(word in source for word in _BODY_FORCES))
+    hook = _Hooks(env_class, original, any(word in source for word in _BODY_FORCES))
     config |= {
         "actions": {"action": {"func": hook("action", actions)}},
         "observations": {"policy": {"observation": {"func": hook("policy", observations)}}},
@@ -90,8 +95,8 @@ class _Hooks:
         return HookTerm(hook, self._env_class, self._cfg, shape, self._forces)
 
 
-def _require_values(cfg: Any) -> None:
-    """Check that every setting without a default is set; older files have `num_actions` for `action_space`."""
+def _rename_spaces(cfg: Any) -> None:
+    """Set the spaces of older files, which have `num_actions` for `action_space`."""
     for space, number in (
         ("action_space", "num_actions"),
         ("observation_space", "num_observations"),
@@ -99,11 +104,11 @@ def _require_values(cfg: Any) -> None:
     ):
         if getattr(cfg, number, None) and (is_missing(getattr(cfg, space)) or getattr(cfg, space) is None):
             setattr(cfg, space, getattr(cfg, number))
-    missing = [
-        name
-        for name in ("decimation", "episode_length_s", "scene", "action_space", "observation_space")
-        if is_missing(getattr(cfg, name))
-    ]
+
+
+def _require_values(cfg: Any, *names: str) -> None:
+    """Check that settings without a default are set."""
+    missing = [name for name in names if is_missing(getattr(cfg, name))]
     if missing:
         raise ConfigError([Problem("configuration", name, "missing; give it a value") for name in missing])
 

@@ -49,6 +49,11 @@ class DirectRLEnv(gymnasium.Env):
         managed = MANAGED.get(None)
         if managed is None:
             raise TaskError("a DirectRLEnv cannot be created by itself", hint="use `rlcli train`, or rlcli.make_env")
+        if isinstance(managed, _Shell):
+            for name, value in {"cfg": cfg, "sim": managed.sim, "scene": managed.scene, "managed": managed}.items():
+                self.__dict__[name] = value
+            self._setup_scene()
+            raise _Recorded(self)
         self.cfg, self.managed, self.render_mode = cfg, managed, render_mode
         self.sim = SimpleNamespace(
             device=str(managed.device), cfg=cfg.sim, has_gui=lambda: False, has_rtx_sensors=lambda: False,
@@ -275,15 +280,24 @@ def _environment_class(cfg: Any) -> type[DirectRLEnv]:
 
 
 def record(env_class: type[DirectRLEnv], cfg: Any) -> tuple[Setup, Any]:
-    """Call `_setup_scene` without a simulation. Return what it creates, and the environment that created it."""
-    env = env_class.__new__(env_class)
-    shell = _Shell(cfg)
-    for name, value in {"cfg": cfg, "sim": shell.sim, "scene": shell.scene, "managed": shell}.items():
-        env.__dict__[name] = value
+    """Create an environment without a simulation, up to the end of `_setup_scene`: the rest needs a simulation.
+
+    Return what `_setup_scene` creates, and the environment. The task's `__init__` may change the configuration.
+    """
     setup = Setup()
-    with running(setup):
-        env._setup_scene()
-    return setup, env
+    with running(setup), building(_Shell(cfg)):
+        try:
+            env_class(cfg)
+        except _Recorded as recorded:
+            return setup, recorded.env
+    raise TaskError(f"{env_class.__name__}.__init__ does not call super().__init__(cfg, ...)", hint="add the call")
+
+
+class _Recorded(BaseException):
+    """End of the part of `__init__` that needs no simulation. No `except Exception` of the task catches it."""
+
+    def __init__(self, env: DirectRLEnv) -> None:
+        self.env = env
 
 
 class _Shell:

@@ -58,6 +58,8 @@ class DirectRunner:
         self._substeps = Substeps(managed, "direct task", self)
         with building(managed):
             self.lab: DirectRLEnv = term.env_class(cfg)
+        for asset in self.lab.scene.articulations.values():
+            asset.start_wrenches(by_task=True)
         self.action_noise = noise_model(cfg.action_noise_model, managed)
         self.observation_noise = noise_model(cfg.observation_noise_model, managed)
         self._memory = AttributeState(self.lab, excluded=("cfg", "managed", "sim", "scene"))

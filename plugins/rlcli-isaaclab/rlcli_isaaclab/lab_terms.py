@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rlcli_isaaclab.managers import ManagerTermBase
-from rlcli_isaaclab.utils.math import sample_uniform
+from rlcli_isaaclab.utils.math import quat_apply_inverse, sample_uniform
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +36,15 @@ def action_rate_l2_clamped(env: Any) -> Tensor:
     """Sum of the squared changes of the actions, at most 1000. (num_envs,)"""
     manager = env.action_manager
     return (manager.action - manager.prev_action).square().sum(dim=1).clamp(-1000.0, 1000.0)
+
+
+def fingers_contact_force_b(env: Any, contact_sensor_names: list[str], asset_cfg: Any = None) -> Tensor:
+    """Return forces on the sensors' bodies, of filtered objects or of everything, root frame. (num_envs, 3 k) [N]"""
+    robot = env.scene["robot" if asset_cfg is None else asset_cfg.name]
+    data = [env.scene.sensors[name].data for name in contact_sensor_names]
+    forces = [d.net_forces_w if d.force_matrix_w is None else d.force_matrix_w.sum(dim=2) for d in data]
+    force = torch.cat(forces, dim=1)
+    return quat_apply_inverse(robot.data.root_link_quat_w[:, None].expand(-1, force.shape[1], -1), force).flatten(1)
 
 
 class reset_joints_within_limits_range(ManagerTermBase):  # noqa: N801  (Isaac Lab's name)
@@ -86,6 +95,7 @@ def _always(params: Mapping[str, Any]) -> bool:
 LAB_TERMS: dict[str, LabTerm] = {
     "last_action": LabTerm(last_action_of_term, lambda params: params.get("action_name") is not None),
     "reset_joints_within_limits_range": LabTerm(reset_joints_within_limits_range, _always),
+    "fingers_contact_force_b": LabTerm(fingers_contact_force_b, _always),
     "action_l2_clamped": LabTerm(action_l2_clamped, _always),
     "action_rate_l2_clamped": LabTerm(action_rate_l2_clamped, _always),
 }

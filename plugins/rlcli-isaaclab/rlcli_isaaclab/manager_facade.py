@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rlcli.errors import did_you_mean, listing
 from rlcli.scene.names import NameProblem
+from rlcli_isaaclab.absent import absence
 
 
 class ManagerFacade:
@@ -82,7 +83,7 @@ class ObservationManagerFacade(ManagerFacade):
     @property
     def active_terms(self) -> Any:
         """Names of the terms of each group, in order."""
-        return {name: [term.name for term in group.terms] for name, group in self._manager.groups.items()}
+        return {name: [p.term.name for p in group.pipelines] for name, group in self._manager.groups.items()}
 
 
 class TerminationManagerFacade(ManagerFacade):
@@ -111,7 +112,22 @@ class CommandManagerFacade(ManagerFacade):
     def get_term(self, name: str) -> Any:
         """Return a command term; for the user's own command, the user's object."""
         term = _find_term(self._manager.terms, name, "command")
-        return getattr(term, "term", term)
+        return term.term if hasattr(term, "term") else BuiltinCommand(term)
+
+
+class BuiltinCommand:
+    """A command of rlcli, whose attributes differ from those of Isaac Lab's class."""
+
+    def __init__(self, term: Any) -> None:
+        self._term = term
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        if not hasattr(self._term, name):
+            hint = "call `env.command_manager.get_term(...)` in the file of a term, where rlcli looks for the call"
+            raise absence(f"attribute '{name}' of the built-in command", hint=hint)
+        return getattr(self._term, name)
 
 
 class RewardManagerFacade(ManagerFacade):
@@ -127,6 +143,11 @@ class RewardManagerFacade(ManagerFacade):
         if name not in found:
             raise NameProblem(f"no reward '{name}'", did_you_mean(name, found) or f"rewards: {listing(found)}")
         return RewardSettings(found[name].config, self._tunable.get((*found[name].path, "weight")))
+
+    @property
+    def _episode_sums(self) -> dict[str, Tensor]:
+        """Sums of the weighted terms over the running episodes. (num_envs,) each"""
+        return {term.name: row for term, row in zip(self._manager.terms, self._manager._sums, strict=True)}
 
     def set_term_cfg(self, name: str, cfg: Any) -> None:
         """Set the weight of a term to that of the settings."""

@@ -10,12 +10,16 @@ import functools
 import importlib
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from rlcli.config.term_signatures import SECTIONS, Parameter, builtin_terms
 from rlcli.errors import did_you_mean
 from rlcli_isaaclab.config_class import MISSING, config_subclass, configclass
 from rlcli_isaaclab.curricula import modify_env_param, modify_term_cfg
 from rlcli_isaaclab.managers import ActionTermCfg, CommandTermCfg, SceneEntityCfg
 from rlcli_isaaclab.table import TERMS, Entry
+from rlcli_isaaclab.utils.math import sample_gaussian, sample_log_uniform, sample_uniform
 
 
 class MdpFunction:
@@ -110,6 +114,26 @@ def find_term(name: str) -> tuple[str, str]:
         if section not in ("actions", "success") and ours in builtin_terms(section):
             return section, ours
     raise KeyError(f"Isaac Lab's term '{name}' has no counterpart in rlcli")
+
+
+def _randomize_prop_by_op(
+    data: Tensor, distribution_parameters: Any, dim_0_ids: Any, dim_1_ids: Any, operation: str, distribution: str
+) -> Tensor:
+    """Draw new values of some rows and columns, in place. Isaac Lab's name for a function that user's events call."""
+    samplers: dict[str, Any] = {
+        "uniform": sample_uniform,
+        "log_uniform": sample_log_uniform,
+        "gaussian": sample_gaussian,
+    }
+    if operation not in ("add", "scale", "abs") or distribution not in samplers:
+        raise NotImplementedError(f"unknown operation '{operation}' or distribution '{distribution}'")
+    rows = torch.arange(len(data), device=data.device) if dim_0_ids is None else torch.as_tensor(dim_0_ids)
+    columns = torch.arange(data.shape[1], device=data.device)[dim_1_ids]
+    drawn = samplers[distribution](*distribution_parameters, (len(rows), len(columns)), device=data.device)
+    rows = rows.to(data.device)[:, None]
+    old = data[rows, columns]
+    data[rows, columns] = {"add": old + drawn, "scale": old * drawn, "abs": drawn}[operation]
+    return data
 
 
 @functools.cache

@@ -83,6 +83,9 @@ def module_of(name: str, file: str) -> ModuleType | None:
     if not top.startswith("isaaclab"):
         return absent_module(name)
     if name not in _modules():
+        moved = [m for m in _modules() if m.startswith(f"{top}.") and m.endswith("." + name.rpartition(".")[2])]
+        if len(moved) == 1:  # earlier versions of Isaac Lab 2 have some modules in other packages
+            return _lab_module(moved[0])
         near = did_you_mean(name, sorted(_modules()))
         what = f"Isaac Lab 2.3.2 has no module '{name}'"
         raise ModuleNotFoundError(f"{what}; {near}" if near else what, name=name)
@@ -236,4 +239,4 @@ def _definitions() -> dict[str, tuple[str, Any]]:
 def public_names(module: str) -> list[str]:
     """Return the names that `from module import *` imports: those of the module and the modules below it."""
     below = [names for name, names in _table().items() if f"{name}.".startswith(f"{module}.")]
-    return sorted({name for names in below for name in names if name != "logger"})
+    return sorted({name for names in below for name in names if name != "logger" and not name.startswith("_")})

@@ -24,8 +24,7 @@ class ObjectReader:
 
     def __init__(self, scene: SceneReader, report: Report, context: Any) -> None:
         self.scene, self.report, self.context = scene, report, context
-        self.driven_joints: dict[str, dict[str, str]] = {}
-        """Entity -> joint -> what an action commands: effort, motor, velocity or position."""
+        self.driven_joints = scene.driven_joints
 
     def record_driven_joints(self, actions: Node) -> None:
         """Record which joints the actions drive, and how."""

@@ -158,14 +158,21 @@ def _gravity(event: EventParameters) -> EventConfigs:
 
 def _gains(event: EventParameters) -> EventConfigs:
     stiffness, damping = (event.range(f"{name}_distribution_params") for name in ("stiffness", "damping"))
-    native, explicit = event.scene.actuators_of_joints(event.name, event.selected("joint"))
+    found = event.scene.gains_of_joints(event.name, event.selected("joint"))
     sampling, parts = {**event.entity(), **event.sampling("abs")}, EventConfigs()
-    gains = {key: pair for key, pair in (("kp", stiffness), ("kv", damping)) if pair is not None}
-    if native and gains:
-        parts["native"] = {"func": "randomize_actuator_gains", "actuators": native, **gains, **sampling}
+    gains = {key: pair for key, pair in (("kp", stiffness), ("kv", damping)) if pair is not None and found[key]}
+    for names in dict.fromkeys(str(found[key]) for key in gains):  # one event if the same actuators have both gains
+        both = {key: pair for key, pair in gains.items() if str(found[key]) == names}
+        name = "native" if len(both) == len(gains) else f"native_{next(iter(both))}"
+        actuators = found[next(iter(both))]
+        parts[name] = {"func": "randomize_actuator_gains", "actuators": actuators, **both, **sampling}
+    if stiffness is not None and sampling["operation"] != "scale" and found["kp"] != found["kv"]:
+        event.approximate("stiffness_distribution_params", "joints without stiffness keep 0")
+    if damping is not None and found.get("damping"):
+        parts["joint"] = {"func": "randomize_joint_damping", "joints": found["damping"], "range": damping, **sampling}
     gains = {key: pair for key, pair in (("stiffness", stiffness), ("damping", damping)) if pair is not None}
-    if explicit and gains:
-        parts["explicit"] = {"func": "randomize_pd_gains", "joints": explicit, **gains, **sampling}
+    if found.get("explicit") and gains:
+        parts["explicit"] = {"func": "randomize_pd_gains", "joints": found["explicit"], **gains, **sampling}
     if not parts:
         event.params.report.problem(
             event.key, f"no actuator of '{event.name}' has a gain to randomize; remove the event"

@@ -58,11 +58,34 @@ class Asset:
 
     instantaneous_wrench_composer = permanent_wrench_composer
 
+    @property
+    def _external_force_b(self) -> Tensor:
+        """Forces on the bodies. (num_envs, bodies, 3) [N]"""
+        return self._wrench.local[..., :3]
+
+    @_external_force_b.setter
+    def _external_force_b(self, value: Tensor) -> None:
+        self._wrench.local[..., :3] = value
+
+    @property
+    def _external_torque_b(self) -> Tensor:
+        """Torques on the bodies. (num_envs, bodies, 3) [N m]"""
+        return self._wrench.local[..., 3:]
+
+    @_external_torque_b.setter
+    def _external_torque_b(self, value: Tensor) -> None:
+        self._wrench.local[..., 3:] = value
+
     def set_external_force_and_torque(
         self, forces: Tensor, torques: Tensor, body_ids: Any = None, env_ids: Any = None, **frame: Any
     ) -> None:
         """Apply forces [N] and torques [N m] to bodies, in their own frames, until they change. (rows, bodies, 3)"""
         self._wrench.set_forces_and_torques(forces, torques, body_ids=body_ids, env_ids=env_ids, **frame)
+
+    def start_wrenches(self, by_task: bool = False) -> None:
+        """Apply forces on bodies before each physics step; `by_task`: the task's own code calls `apply_wrenches`."""
+        self._wrench.is_applied |= by_task
+        self._wrench.start()
 
     def apply_wrenches(self) -> None:
         """Write the forces on bodies for the next physics step."""

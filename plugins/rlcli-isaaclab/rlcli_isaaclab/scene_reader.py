@@ -34,6 +34,8 @@ class SceneReader:
         """Frame transformers, and lights (None), which only the user's terms read."""
         self._models: dict[str, Any] = {}
         self._joint_settings: dict[str, JointSettings] = {}
+        self.driven_joints: dict[str, dict[str, str]] = {}
+        """Entity -> joint -> what an action commands: effort, motor, velocity or position."""
 
     def read(self) -> dict[str, Any]:
         """Return the task's `scene`."""
@@ -156,24 +158,35 @@ class SceneReader:
             return []
         return [geom for geom, body in model["geoms"] if body in chosen]
 
-    def actuators_of_joints(self, entity: str, joints: list[str] | None) -> tuple[Any, Any]:
-        """Return MuJoCo's own actuators of the joints (None: all), and the joints with an explicit actuator model."""
+    def gains_of_joints(self, entity: str, joints: list[str] | None) -> dict[str, Any]:
+        """Return where the gains of the joints (None: all) are.
+
+        `kp` and `kv` are MuJoCo's actuators with that gain, `damping` the joints whose damping is their own, and
+        `explicit` the joints with an explicit actuator model.
+        """
         from rlcli.scene.names import NameProblem, match
 
         model = self._models.get(entity)
         if model is None:
-            return ".*", None
+            return {"kp": ".*", "kv": ".*"}
         names: list[str] = model["joint"]
         try:
             chosen = [names[index] for index in match(joints or ".*", names, "joint")]
             actuators = self.entities[entity].get("actuators", {}).values()
             explicit = [names[index] for actuator in actuators for index in match(actuator["joints"], names, "joint")]
         except NameProblem:
-            return ".*", None  # the environment reports wrong joint names of an actuator when it is built
+            return {"kp": ".*", "kv": ".*"}  # the environment reports wrong joint names of an actuator when it is built
         settings = self._joint_settings.get(entity, [])
-        moved = {n: settings_of(n, settings) for n in chosen if n not in explicit}
-        native = [n for n, values in moved.items() if values.get("stiffness") or values.get("damping")]
-        return [model["actuators"].get(n, n) for n in native], [n for n in chosen if n in explicit]
+        native = {n: settings_of(n, settings) for n in chosen if n not in explicit}
+        damped = self.damped_joints(entity, self.driven_joints.get(entity, {}))
+        kp = [model["actuators"].get(n, n) for n, values in native.items() if values.get("stiffness")]
+        kv = [model["actuators"].get(n, n) for n, v in native.items() if v.get("stiffness") or v.get("damping")]
+        return {
+            "kp": kp,
+            "kv": [n for n in kv if n not in damped],
+            "damping": [n for n in native if n in damped],
+            "explicit": [n for n in chosen if n in explicit],
+        }
 
     def damped_joints(self, entity: str, driven: Mapping[str, str]) -> list[str]:
         """Return the joints whose implicit actuator becomes a damping of the joint, as its stiffness is zero.

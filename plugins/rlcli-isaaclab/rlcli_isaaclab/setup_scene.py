@@ -24,8 +24,8 @@ class Setup:
         self._bind = bind
         self.created: list[tuple[Any, Any]] = []
         """Object and configuration of each asset, sensor and terrain."""
-        self.spawned: list[tuple[str, Any]] = []
-        """Path and configuration of what is spawned without an object."""
+        self.spawned: list[tuple[str, Any, dict[str, Any]]] = []
+        """Path, configuration and pose of what is spawned without an object."""
 
     def add(self, created: Any, cfg: Any) -> None:
         """Store an object; if the simulation exists, bind the object to its entity, sensor or terrain."""
@@ -76,7 +76,8 @@ class Spawn:
         self, prim_path: str, cfg: Any, translation: Any = None, orientation: Any = None, **other: Any
     ) -> None:
         """Store what is spawned."""
-        current_setup().spawned.append((prim_path, cfg))
+        pose = {"pos": translation or (0.0, 0.0, 0.0), "rot": orientation or (1.0, 0.0, 0.0, 0.0)}
+        current_setup().spawned.append((prim_path, cfg, pose))
 
 
 spawn_ground_plane, spawn_light, spawn_from_usd = map(Spawn, ("spawn_ground_plane", "spawn_light", "spawn_from_usd"))

@@ -20,7 +20,9 @@ class _OpenSettings:
 
     def __init__(self, *values: Any, **settings: Any) -> None:
         positional = dict(zip(getattr(self, "_order", ()), values, strict=False))
-        vars(self).update({**self._fixed, **positional, **settings})
+        vars(self).update({**copy.deepcopy(self._fixed), **positional, **settings})
+        if hasattr(self, "__post_init__"):
+            self.__post_init__()
 
     def replace(self, **changes: Any) -> Any:
         """Return a copy with some members changed."""

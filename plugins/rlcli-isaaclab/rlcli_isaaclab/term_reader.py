@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rlcli.config.term_signatures import Signature, SignatureError, builtin_terms, snake_case
 from rlcli.errors import ConfigError, Problem, did_you_mean, listing
+from rlcli_isaaclab import command_terms
 from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.curricula import ChangedSetting, modify_env_param
@@ -30,8 +32,17 @@ from rlcli_isaaclab.table import (
 )
 from rlcli_isaaclab.term_values import builtin_name, is_entity, is_plain, triple
 
+_READS_COMMAND = "command_manager.get_term("
 _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
 """Prefixes of the modules whose functions are in `table.py`."""
+
+
+def _functions(data: Any) -> Iterator[Any]:
+    """Yield the user's functions and classes in the settings of all terms."""
+    for value in data.values() if isinstance(data, Mapping) else ():
+        if inspect.isfunction(value) or inspect.isclass(value):
+            yield value
+        yield from _functions(value)
 
 
 class TermReader(ObjectReader):
@@ -39,10 +50,13 @@ class TermReader(ObjectReader):
 
     def __init__(self, scene: SceneReader, report: Report, cfg: Any = None, data: Mapping[str, Any] = {}) -> None:
         from rlcli_isaaclab.terms import TermContext
+        from rlcli_isaaclab.user_files import file_text
 
         super().__init__(scene, report, TermContext(cfg, scene.frames))
         self.data = data
         self._user_terms: dict[Any, Any] = {}
+        self.reads_commands = any(_READS_COMMAND in file_text(function) for function in _functions(data))
+        """Whether the user's code reads or changes the object of a command, which must then be Isaac Lab's class."""
         self.stubs: dict[str, tuple[str, dict[str, Any]]] = {}
         """Functions whose code is not in the imported files: name -> (section, parameters)."""
 
@@ -52,6 +66,9 @@ class TermReader(ObjectReader):
         kind = kind_of(class_type)
         entry = COMMANDS.get(kind)
         own = isinstance(class_type, type) and not class_type.__module__.startswith("rlcli_isaaclab")
+        if self.reads_commands and hasattr(command_terms, kind):
+            node = Node({**node.data, "class_type": getattr(command_terms, kind)}, node.key, node.report)
+            own = True
         if entry is None or entry.name is None or own:
             return self._read_user_command(kind, node)
         times = finite_times(node.require("resampling_time_range"))

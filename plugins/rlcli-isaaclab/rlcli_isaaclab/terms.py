@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
+import re
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
 from rlcli_isaaclab.settings import to_plain
 from rlcli_isaaclab.substeps import Substeps
+from rlcli_isaaclab.user_files import file_text, source_text, unset_simple
 
 _RESERVED = {name for model in SECTIONS.values() for name in model.model_fields} | {"params"}
 _PLAIN: dict[Any, Any] = {float: Number, int: int, bool: bool, str: str}
@@ -77,6 +79,8 @@ class UserTerm:
         self.is_class = isinstance(function, type)
         self.__name__, self.__module__ = function.__name__, function.__module__
         self.target = functools.partial(_bind_term, self)
+        if section == "events" and "set_coms(" in file_text(function):
+            self.target.prepare = unset_simple  # type: ignore[attr-defined]
         call = function.__call__ if self.is_class else function
         declared = list(inspect.signature(call).parameters.values())
         takes_env_ids = section in ("events", "curriculum")
@@ -218,12 +222,18 @@ def entity_data(settings: Any) -> dict[str, Any]:
     return data
 
 
+_CHECKS_FOR_LIST = re.compile(r"isinstance\([\w.]+\.(joint|body)_ids, list\)")
+"""Code that tells a list of ids, as Isaac Lab has it, from a slice. rlcli has tensors, which a GPU need not copy."""
+_AFTER_RESET = {"rewards": ("reward_manager", torch.float32), "terminations": ("termination_manager", torch.bool)}
+"""Sections whose terms Isaac Lab first calls in the first step: their manager, and the type of their values."""
+
+
 class _Bound:
     """The user's function, bound to an environment and parameters."""
 
     def __init__(self, function: Any, section: str, env: Any, params: dict[str, Any]) -> None:
         self.term, self._section, self._env, self.params = function, section, env, params
-        self._reads_reset = section == "observations" and "hasattr(env" in _source(function)
+        self._reads_reset = section == "observations" and "hasattr(env" in source_text(function)
 
     def __call__(self, selection: Selection | None = None) -> Any:
         if selection is not None:
@@ -234,19 +244,19 @@ class _Bound:
         if self._reads_reset:  # the first value has the shape of all values: let the reset make what the term reads
             self._reads_reset = False
             self._env.run_own_reset_events()
-        value = self.term(self._env, **self.params)
+        manager, dtype = _AFTER_RESET.get(self._section, ("num_envs", None))
+        try:
+            value = self.term(self._env, **self.params)
+        except Exception:
+            if hasattr(self._env.managed, manager):
+                raise
+            # the check of shapes calls the term before the first reset, which creates what the function needs
+            return torch.zeros(self._env.num_envs, device=self._env.device, dtype=dtype)
         if self._section == "observations" and value.dim() == 1:
             return value.unsqueeze(1).float()  # a group that is not concatenated may have such terms
         if self._section == "observations" and value.dim() == 3:
             return value.flatten(1)  # as Isaac Lab does for a term with a history
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
-
-
-def _source(function: Any) -> str:
-    try:
-        return inspect.getsource(function)
-    except (OSError, TypeError):
-        return ""
 
 
 class _BoundObject:
@@ -314,6 +324,7 @@ class _BoundAction(_BoundObject):
         self.size = term.action_dim
         self.elements = tuple(f"{name}[{i}]" for i in range(self.size))
         self.sinks = (f"action {name}",)
+        term._asset.start_wrenches(by_task=True)
         self._substeps = Substeps(managed, f"action {name}", self)
 
     def process(self, action: Tensor) -> None:
@@ -404,12 +415,20 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
     facade.use(term.context)
     if term.section == "curriculum":
         facade.open_weights()  # before the reward manager is created, which fixes the weights otherwise
+    if any(word in file_text(term.function) for word in ("external_force", "wrench_composer")):
+        for asset in facade.scene.articulations.values():
+            asset.start_wrenches()
     values: dict[str, Any] = {key: _resolved(value, facade.scene) for key, value in term.objects.items()}
     for key, value in params.items():
         if isinstance(value, EntityModel):
             value = SceneEntityCfg(**value.model_dump())
             facade.scene.resolve(value)
         values[term.original[key]] = value
+    if _CHECKS_FOR_LIST.search(file_text(term.function)):
+        for chosen in values.values():
+            for key in ("joint_ids", "body_ids"):
+                if isinstance(chosen, SceneEntityCfg) and isinstance(getattr(chosen, key), Tensor):
+                    setattr(chosen, key, getattr(chosen, key).tolist())
     if not term.is_class:
         return _Bound(term.function, term.section, facade, values)
     with building(env):

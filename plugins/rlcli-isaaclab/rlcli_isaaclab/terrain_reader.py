@@ -46,14 +46,20 @@ _OTHER_KEYS = {
 
 def read_ground(item: Node, spawn: Node) -> dict[str, Any]:
     """Return `scene.ground` for a ground plane."""
-    item.skip("prim_path", "collision_group", "debug_vis", "class_type", "init_state")
+    item.skip("prim_path", "collision_group", "debug_vis", "class_type")
+    init = item.node("init_state")
+    x, y, height = (as_float(value) for value in init.get("pos", (0.0, 0.0, 0.0)))
+    init.skip("rot", "class_type")
+    if (x, y) != (0.0, 0.0):
+        init.note("approximated", "pos", "the middle of the plane is at x = y = 0")
     spawn.skip("func", "visible", "color", "usd_path", "semantic_tags", "copy_from_source")
     size = as_float(max(spawn.get("size", (PLANE_SIZE, PLANE_SIZE))))
-    return {"size": size, **read_friction(spawn.node("physics_material"))}
+    level = {"height": height} if height else {}
+    return {"size": size, **level, **read_friction(spawn.node("physics_material"))}
 
 
 def read_friction(material: Node) -> dict[str, float]:
-    """Return `friction`, the sliding friction; empty for Isaac Lab's default of 0.5, which is also rlcli's."""
+    """Return `friction`, the sliding friction; empty for Isaac Lab's default of 0.5, which becomes rlcli's default."""
     material.skip("func", "restitution_combine_mode", "friction_combine_mode", "improve_patch_friction")
     material.skip("compliant_contact_stiffness", "compliant_contact_damping")
     static = material.get("static_friction", 0.5)

@@ -113,7 +113,9 @@ def settings_of(value: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
     value.__rlcli_environment__(kwargs["entry_point"])
     setup, env = record(_environment_class(value), value)
     made = zip(_names(setup, env), setup.created, strict=True)
-    return {"scene": {name: to_dict(cfg) for name, (_, cfg) in made}, "rest": to_dict(value)}
+    scene = {name: to_dict(cfg) for name, (_, cfg) in made}
+    scene |= {f"spawned_{i}": {"prim_path": path, "spawn": to_dict(c)} for i, (path, c, _) in enumerate(setup.spawned)}
+    return {"scene": scene, "rest": to_dict(value)}
 
 
 def train(reference: str, folder: Path) -> None:

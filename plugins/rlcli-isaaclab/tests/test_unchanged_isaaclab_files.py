@@ -171,6 +171,19 @@ def test_direct_task_steps_and_observes_once_per_step(direct):
     assert lab.applied == 18  # before every physics step
 
 
+def test_direct_task_that_prepares_values_before_the_simulation(direct):
+    text = DIRECT.replace("    observation_space = 3", "    observation_space = 0\n    drop = (0.0, 0.0, -2.0)")
+    start = "        super().__init__(cfg, render_mode, **kwargs)\n"
+    own = "        cfg.observation_space += 3\n        self.task = cfg\n"
+    text = text.replace(start, own + start).replace("Articulation(self.cfg.", "Articulation(self.task.")
+    text = text.replace("cfg=GroundPlaneCfg())", "cfg=GroundPlaneCfg(), translation=self.task.drop)")
+    direct.write_text(text)
+    env = make_env(resolve(find_task(f"{direct}:PoleEnvCfg")), seed=0)
+    assert env.reset()["policy"].shape == (4, 3)
+    model = env.engine.model
+    assert model.geom_pos[model.geom_type == 0].tolist() == [[0.0, 0.0, -2.0]]  # the ground plane
+
+
 def test_direct_task_saves_and_restores_its_tensors(direct):
     resolved = resolve(find_task(f"{direct}:PoleEnvCfg"))
     env, other = make_env(resolved, seed=0), make_env(resolved, seed=0)
@@ -319,6 +332,27 @@ def test_agent_file_of_each_library_is_read(direct, library):
         assert agent.reward_scale == 0.5
     if library == "rl_games":
         assert any("surprise" in note.key for note in resolved.notes if note.status == "ignored")
+
+
+def test_rl_games_settings_without_counterpart_are_reported(direct):
+    registered(direct.parent, ["rl_games"])
+    file = direct.parent / "rl_games.yaml"
+    file.write_text(
+        AGENTS["rl_games.yaml"].replace("lr_schedule: adaptive", "lr_schedule: linear, value_bootstrap: False")
+    )
+    resolved = resolve(find_task(str(direct.parent)))
+    assert resolved.agent.schedule == "linear"
+    approximated = {note.key.rpartition(".")[2] for note in resolved.notes if note.status == "approximated"}
+    assert {"separate", "value_bootstrap"} <= approximated
+    layers = "cnn: {type: conv2d, convs: [{filters: 4, kernel_size: 3, strides: 1, padding: 1}]}, mlp:"
+    file.write_text(AGENTS["rl_games.yaml"].replace("mlp:", layers).replace("schedule: adaptive", "schedule: cosine"))
+    with pytest.raises(ConfigError) as caught:
+        resolve(find_task(str(direct.parent)))
+    found = {problem.path: problem.message for problem in caught.value.problems}
+    assert found == {
+        "params.config.lr_schedule": "unknown schedule 'cosine'",
+        "params.network.cnn.convs": "rlcli's convolutions have no padding",
+    }
 
 
 def test_registration_chooses_agent_and_file_reference_uses_the_same(direct):

@@ -1,4 +1,4 @@
-"""Write `rlcli_isaaclab/names.json`: the public names of each module of Isaac Lab, read from its files without import.
+"""Write `rlcli_isaaclab/names.json`: the names of each module of Isaac Lab, read from its files without import.
 
 Usage: python names.py FOLDER, where FOLDER is Isaac Lab's `source`.
 """
@@ -25,19 +25,19 @@ def main(source: Path) -> None:
             if package == "isaaclab_tasks" and "utils" not in parts and "mdp" not in parts:
                 names = {}
             else:
-                names = dict(sorted(public_names(ast.parse(file.read_text(encoding="utf-8"))).items()))
+                names = dict(sorted(names_of(ast.parse(file.read_text(encoding="utf-8"))).items()))
             table[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = names
     target = Path(__file__).parent.parent / "rlcli_isaaclab" / "names.json"
     rows = [f"{json.dumps(module)}: {json.dumps(names)}" for module, names in sorted(table.items())]
     target.write_text("{\n" + ",\n".join(rows) + "\n}\n", encoding="utf-8")
 
 
-def public_names(tree: ast.Module) -> dict[str, Any]:
+def names_of(tree: ast.Module) -> dict[str, Any]:
     """Return name -> function, class or value for what a module defines itself; settings of a configuration class."""
     found: dict[str, Any] = {}
     for node in tree.body:
         for kind, word in KINDS.items():
-            if isinstance(node, kind) and not node.name.startswith("_"):
+            if isinstance(node, kind) and not node.name.startswith("__"):
                 is_settings = isinstance(node, ast.ClassDef) and node.name.endswith("Cfg")
                 found[node.name] = settings(node) if is_settings else word
         targets = (

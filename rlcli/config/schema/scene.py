@@ -26,10 +26,12 @@ Color = tuple[_Channel, _Channel, _Channel]
 
 
 class GroundConfig(StrictModel):
-    """A ground plane at z = 0."""
+    """A ground plane."""
 
     size: Positive = 100.0
     """Edge length of the plane [m]."""
+    height: Number = 0.0
+    """Height of the plane [m], z in the world frame."""
     friction: NotNegative = 1.0
     """Coefficient of sliding friction."""
 

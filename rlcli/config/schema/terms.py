@@ -77,7 +77,7 @@ class EventConfig(TermConfig):
     mode: Literal["startup", "reset", "interval"]
     """startup: once at the start; reset: when an episode starts; interval: repeatedly."""
     interval_range_s: SecondsRange | None = None
-    """[low, high] time between two events [s], drawn for each environment; required by mode interval."""
+    """[low, high] time between two events [s], drawn for each environment; required by mode interval. 0: every step."""
     global_time: bool = False
     """Mode interval: true: one timer for all environments, which resets do not restart."""
     min_steps_between: Annotated[int, Field(ge=0)] = 0
@@ -272,8 +272,8 @@ class CommandConfig(TermConfig):
     """A command for the policy, for example a target velocity, which is sampled again from time to time."""
 
     resampling_time_s: SecondsRange
-    """[low, high] time until the next sample [s], drawn for each environment. Each episode starts with a new
-    command."""
+    """[low, high] time until the next sample [s], drawn for each environment; 0: every step. Each episode starts with a
+    new command."""
 
 
 class CurriculumConfig(TermConfig):

@@ -11,6 +11,8 @@ from rlcli_isaaclab.config_class import MISSING, configclass, to_dict
 from rlcli_isaaclab.runtime import ManagerBasedRLEnv
 from rlcli_isaaclab.sim import SimulationCfg
 
+_OWN_CLASS = "isaaclab.envs:ManagerBasedRLEnv"
+
 
 @configclass
 class ViewerCfg:
@@ -47,6 +49,10 @@ class ManagerBasedEnvCfg:
     export_io_descriptors: bool = False
     log_dir: Any = None
 
+    def __rlcli_environment__(self, entry: Any) -> None:
+        """Store the class of the environment that a registration names."""
+        self._rlcli_class = entry
+
     def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
         """Return this configuration as a task of rlcli, with the models that the user gives."""
         from rlcli.config.python_task import PythonTask
@@ -54,6 +60,10 @@ class ManagerBasedEnvCfg:
         from rlcli_isaaclab.settings import Report
 
         report = Report()
+        entry = getattr(self, "_rlcli_class", _OWN_CLASS)
+        if entry not in (_OWN_CLASS, ManagerBasedRLEnv):
+            why = "rlcli runs the configuration, without the methods of the task's own environment class"
+            report.entries[("entry_point",)] = ("ignored", why)
         data = task(to_dict(self), report, root, models=models, cfg=self)
         return PythonTask(data, notes=report.user_notes())
 
