@@ -145,7 +145,7 @@ def _import_folder_above(name: str, file: Path) -> None:
     spec = PathFinder.find_spec(name)
     if folder is None or (spec is not None and str(folder) not in (spec.submodule_search_locations or ())):
         return
-    package_tree(name, folder, name)
+    register_package(name, folder, name)
     sys.path.append(str(folder.parent))
     try:
         importlib.import_module(name)
