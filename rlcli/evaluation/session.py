@@ -173,7 +173,7 @@ def open_session(request: PolicyRequest, check: Callable[[Resolved], None] = lam
     env = make_env(policy.resolved, seed=derive(policy.seed, "evaluation"))
     session = Session(env, make(env), policy)
     home = request.runs_dir or default_runs_dir() if policy.run is None else policy.run.folder
-    CrashDumper(env, home / "dumps")
+    CrashDumper(env, home / "dumps", parents=policy.run is None)
     return session
 
 

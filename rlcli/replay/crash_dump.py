@@ -35,10 +35,11 @@ class CrashDumper(StepObserver):
     Args:
         env: the environment; its engine is set to keep the last calls.
         folder: folder of the dump; created with the dump.
+        parents: as for `write_trajectory`.
     """
 
-    def __init__(self, env: Environment, folder: Path) -> None:
-        self._env, self._folder = env, folder
+    def __init__(self, env: Environment, folder: Path, *, parents: bool = False) -> None:
+        self._env, self._folder, self._parents = env, folder, parents
         if env.engine.replayable is not None:
             env.engine.replayable.record_calls(CALLS)
         env.observers.add(self)
@@ -55,7 +56,7 @@ class CrashDumper(StepObserver):
             message += "; there is no dump: steps on a GPU cannot be replayed"
         else:
             try:
-                file = write_dump(env, found, pending, self._folder)
+                file = write_dump(env, found, pending, self._folder, self._parents)
                 message += f"; dump {file}; to replay it: rlcli replay {shlex.quote(str(file))}"
             except MachineError as error:
                 message += f"; there is no dump: {error.message}"
@@ -135,7 +136,7 @@ def describe_traces(
     return worlds, tensors
 
 
-def write_dump(env: Environment, found: list[Divergence], pending: bool, folder: Path) -> Path:
+def write_dump(env: Environment, found: list[Divergence], pending: bool, folder: Path, parents: bool) -> Path:
     """Write the last engine calls of environments that diverged.
 
     Args:
@@ -143,6 +144,7 @@ def write_dump(env: Environment, found: list[Divergence], pending: bool, folder:
         found: the divergences.
         pending: whether the engine has not made the call that diverges yet.
         folder: folder of the file; created if it does not exist.
+        parents: as for `write_trajectory`.
 
     Raises:
         MachineError: if the disk reports an error.
@@ -156,5 +158,5 @@ def write_dump(env: Environment, found: list[Divergence], pending: bool, folder:
     worlds, tensors = describe_traces(traces, engine.model, env.resolved, constants, diverged=True)
     header = Header.of(env).model_copy(update={"kind": "crash", "worlds": worlds, "follows_constants": constants})
     file = folder / f"step-{env.common_step:012d}.safetensors"
-    write_trajectory(file, header, tensors)
+    write_trajectory(file, header, tensors, parents=parents)
     return file

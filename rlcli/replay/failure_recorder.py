@@ -178,7 +178,7 @@ class FailureRecorder(StepObserver):
                 )
                 parts = {"kind": "failure", "episodes": [kept.episode], "worlds": worlds, "failure": failure}
                 header = self._header.model_copy(update={**parts, "follows_constants": kept.follows_constants})
-                write_trajectory(self._folder / name, header, tensors | kept.tensors)
+                write_trajectory(self._folder / name, header, tensors | kept.tensors, parents=False)
             if batch.returns:  # needed after a resumption, even if no episode is recorded yet
                 self._folder.mkdir(exist_ok=True)
                 recent = _RecentReturns(step=batch.step, returns=batch.returns)

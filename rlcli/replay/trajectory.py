@@ -304,8 +304,15 @@ class Trajectory:
         return CheckpointError(message, hint=f"install the version that made it: {words}")
 
 
-def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor]) -> None:
+def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor], *, parents: bool = True) -> None:
     """Write a file; its folder is created if it does not exist.
+
+    Args:
+        file: the file to write.
+        header: description of the recording.
+        tensors: the recording, by name.
+        parents: whether the folders above are created, too. In a run they are not: a run that was moved away during
+            its training must not be created again.
 
     Raises:
         MachineError: if the disk reports an error.
@@ -316,7 +323,7 @@ def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor]) 
     }
     document["sha256"] = content_digest(copies, document)
     with disk_errors(file.parent):
-        file.parent.mkdir(exist_ok=True)  # not `parents=True`: a run that was moved away must not be created again
+        file.parent.mkdir(parents=parents, exist_ok=True)
     write_atomic(file, safetensors.torch.save(copies, metadata={"rlcli": json.dumps(document)}))
 
 

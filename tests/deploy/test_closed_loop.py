@@ -264,7 +264,7 @@ def test_verify_rejects_formula_with_index_out_of_range(copied, tmp_path, capfd)
     tamper(copied, change)
     asked = ["export", "--checkpoint", str(copied), "--format", "numpy", "--output", str(tmp_path / "p.py"), "--verify"]
     assert main(asked) == 5
-    assert "do not fit the model" in capfd.readouterr().err
+    assert "does not fit the model" in capfd.readouterr().err
 
 
 def test_verify_outside_run_is_usage_error(newest, tmp_path, capfd):

@@ -572,8 +572,8 @@ def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
     ("weights", "output"),
     [
         ({}, "must have an actor"),
-        ({"actor.0.weight": torch.zeros(1, 4)}, "only linear layers with a bias"),
-        ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(3)}, "only linear layers with a bias"),
+        ({"actor.0.weight": torch.zeros(1, 4)}, "use linear layers with a bias"),
+        ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(3)}, "use linear layers with a bias"),
         ({"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1)}, "depends on the state"),
         ({"actor.1.weight": torch.zeros(1, 4), "actor.1.bias": torch.zeros(1)}, "rlcli reads linear layers 0, 2, 4"),
         ({"actor.x.weight": torch.zeros(1, 4), "actor.x.bias": torch.zeros(1)}, "the layers x; number them 0, 2, 4"),
@@ -582,7 +582,7 @@ def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
         (
             {"actor.0.weight": torch.zeros(8, 4), "actor.0.bias": torch.zeros(8), "actor.2.weight": torch.zeros(1, 9),
              "actor.2.bias": torch.zeros(1), "std": torch.ones(1)},
-            "8 outputs, 9 inputs",
+            "a layer with 8 outputs is followed by one with 9 inputs",
         ),
         (
             {"actor.0.weight": torch.zeros(1, 6), "actor.0.bias": torch.zeros(1), "std": torch.ones(1),

@@ -98,6 +98,7 @@ NERVOUS = edited(CRITTER_TASK, terminations={"tilt": {"func": "bad_orientation",
 
 
 def recorder_of(env, folder, **config):
+    folder.mkdir(exist_ok=True)
     return FailureRecorder(env, AutopsyConfig(**{"seconds": 0.2, "keep": 20, **config}), folder, None)
 
 
@@ -257,7 +258,7 @@ def test_disk_error_ends_the_recording_but_not_the_training(tmp_path, monkeypatc
     env = build("cartpole", 4, "episode_length_s=0.1")
     kept = recorder_of(env, tmp_path)
 
-    def full(file, header, tensors):
+    def full(file, header, tensors, **_):
         raise MachineError(f"cannot write {file}: No space left on device")
 
     monkeypatch.setattr(failure_recorder, "write_trajectory", full)

@@ -234,7 +234,7 @@ def test_mismatched_parameters_raise_value_error(env):
     made = sensors()
     with pytest.raises(ValueError, match="3 elements; select 4"):
         rewards.feet_slide(env, **bound(env, {"entity": "robot", "bodies": "leg_[fb]l|torso", "sensor": "feet"}, made))
-    with pytest.raises(ValueError, match="exactly one site, found 4"):
+    with pytest.raises(ValueError, match="exactly one site; 4 are selected"):
         rewards.object_ee_distance(env, std=1.0, **bound(
             env, {"entity": "robot", "sites": "leg.*", "object": "object"}, made))  # fmt: skip
     with pytest.raises(ValueError, match=r"one framequat sensor \(4 columns\) in sensors; selected: 3 columns"):
@@ -245,7 +245,7 @@ def test_mismatched_parameters_raise_value_error(env):
         rewards.GaitReward(env, std=1.0, max_err=1.0, velocity_threshold=1.0, **bound(
             env, {"entity": "robot", "sensor": "feet", "command": "velocity"}, made),
             synced_feet_pairs=(("leg", "leg_br"), ("leg_fr", "leg_bl")))  # fmt: skip
-    with pytest.raises(ValueError, match=r"std has 3 values; give one, or 4 \(one per joint\)"):
+    with pytest.raises(ValueError, match=r"std has 3 values; give one number, or a list of 4 \(one per joint\)"):
         rewards.Posture(env, entity=env.entities["robot"], joints=slice(0, 4), std=[1.0, 2.0, 3.0])
 
 

@@ -178,7 +178,7 @@ def test_special_file_is_not_a_task(tmp_path, kind):
     else:
         file.symlink_to("/dev/zero" if kind == "device" else tmp_path / "nothing")
     assert "task.yaml' is not a regular file" in failure(str(tmp_path))
-    assert "'/dev/zero' is a pipe or a device, not a task's folder" in failure("/dev/zero")
+    assert "'/dev/zero' is a device or pipe, not a task's folder" in failure("/dev/zero")
 
 
 def test_folder_files_do_not_shadow_modules(tmp_path):
@@ -262,5 +262,5 @@ def test_trainer_plugin_has_own_settings(plugins):
 )
 def test_broken_trainer_plugin_is_reported(plugins, algorithm, said):
     plugins("mine", TRAINER, entry_points="[rlcli.trainers]\nmine = mine:SPEC\n")
-    with pytest.raises(TaskError, match=f"plugin mine 1.0.*: .*{said}"):
+    with pytest.raises(TaskError, match=f"plugin mine.*: .*{said}"):
         with_algorithm(algorithm)

@@ -180,7 +180,7 @@ def test_play_episode_equals_the_evaluation(coin, cli):
     [
         (["--env", "3"], "--env needs --episode"),
         (["--episode", "3"], "--episode needs --env"),
-        (["--env", "3", "--episode", "0", "--num-envs", "3"], "--env 3: only 3 environments"),
+        (["--env", "3", "--episode", "0", "--num-envs", "3"], "--env 3 does not exist: --num-envs is 3"),
         (["--env", "3", "--episode", "0", "--record-mode", "failed"], "--record-mode"),
     ],
 )

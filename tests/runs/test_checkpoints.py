@@ -287,7 +287,7 @@ def test_steps_are_sorted_and_other_folders_ignored(tmp_path):
     for name in ("000000000002", "000000000010", "1000000000000", "5", "²", "notes", ".tmp-1-x"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "manifest.json").touch()
-    (tmp_path / "000000000099").mkdir()  # no manifest: not complete
+    (tmp_path / "000000000099").mkdir()  # no manifest: damaged
     (tmp_path / "latest").touch()
-    assert checkpoint_reader.steps(tmp_path) == [2, 10, 1000000000000]
+    assert checkpoint_reader.steps(tmp_path) == [2, 10, 99, 1000000000000]
     assert checkpoint_reader.steps(tmp_path / "nowhere") == []

@@ -140,4 +140,4 @@ def test_damaged_run_is_reported_instead_of_the_shipped_policy(cli, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 1)
     (only_run() / "run.json").write_text("{")
     done = cli("play", "cartpole", *NUMBERS)
-    assert (done.code, "there is no run of cartpole" in done.err) == (5, True), done.err
+    assert (done.code, "there is no valid run of cartpole" in done.err) == (5, True), done.err

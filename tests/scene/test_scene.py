@@ -414,7 +414,7 @@ def test_missing_user_model_raises_missing_model_error(tmp_path, monkeypatch):
     assert "RLCLI_MODELS is not set; no Python package 'no_such_package_here' is installed" in missing.value.message
     assert missing.value.hint == (
         "set RLCLI_MODELS to a folder that holds arm/arm.xml,"
-        " or install the package no_such_package_here, which contains it"
+        " or install the distribution that has the package no_such_package_here"
     )
 
 

@@ -79,7 +79,7 @@ def _temporary_folder(tmp_path, monkeypatch):
 
 
 def train(name, *words, code=0):
-    assert main(["train", *SMALL, "--name", name, *words]) == code
+    assert main(["train", *SMALL, "--name", name, *map(str, words)]) == code
     (run,) = Path("runs").glob(f"*/*-{name}")
     return run
 

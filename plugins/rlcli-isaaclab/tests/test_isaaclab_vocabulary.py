@@ -345,7 +345,7 @@ MASS = {"asset_cfg": Pick("robot"), "mass_distribution_params": (0.0, 1.0), "ope
         ("events", "randomize_actuator_gains",
          {"asset_cfg": Pick("cabinet"), "stiffness_distribution_params": (1.0, 2.0)}, "no actuator of 'cabinet'"),
         ("curriculum", "modify_reward_weight", {"term_name": "acton_l2", "weight": 1.0, "num_steps": 3},
-         "'rewards.acton_l2.weight' does not exist.*did you mean 'action_l2'"),
+         "cannot change 'rewards.acton_l2.weight'.*did you mean 'action_l2'"),
         ("curriculum", "modify_term_cfg", {"address": "rewards.action_l2.wieght", "modify_fn": max},
          "'rewards.action_l2.wieght' names no setting that rlcli can change during training"),
     ],

@@ -5,6 +5,7 @@ import inspect
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -157,21 +158,34 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
     app.command(name, cls=HelpCommand, help=text, epilog=examples, **settings)(run)
 
 
+@dataclass(frozen=True)
+class _StrictNumber:
+    """Annotation of a number for pydantic, which this module does not import: the list of commands needs none."""
+
+    least: float | None
+    most: float | None
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], Any]) -> Any:
+        from pydantic_core import core_schema
+
+        bounds = {key: value for key, value in (("ge", self.least), ("le", self.most)) if value is not None}
+        schema = {**handler(source), "strict": True, **bounds}
+        return core_schema.no_info_before_validator_function(_read, schema)
+
+
+def _read(value: object) -> object:
+    number = read_number(value) if isinstance(value, str) else None
+    return value if number is None or abs(number) == math.inf else number
+
+
 def _with_strict_number(parameter: inspect.Parameter) -> inspect.Parameter:
     """Return a parameter of a command; a number has the same form as in a task file."""
-    from pydantic import BeforeValidator, Field
-
     kind, *infos = get_args(parameter.annotation) or (None,)
     kind = next((number for number in (int, float) if kind in (number, number | None)), None)
     if kind is None or not infos:
         return parameter
     info = infos[0]
-
-    def read(value: Any) -> Any:
-        number = read_number(value) if isinstance(value, str) else None
-        return value if number is None or abs(number) == math.inf else number
-
-    strict: Any = Annotated[kind, Field(strict=True, ge=info.min, le=info.max), BeforeValidator(read)]
+    strict: Any = Annotated[kind, _StrictNumber(info.min, info.max)]
     if isinstance(info, OptionInfo):  # an argument is shown with its name
         info.metavar = info.metavar or METAVARS[kind]
     return parameter.replace(annotation=Annotated[strict | None, info])

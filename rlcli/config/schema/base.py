@@ -1,5 +1,6 @@
 """Number types and the base class of all configuration models."""
 
+import functools
 import math
 import re
 import sys
@@ -49,18 +50,19 @@ def _nonzero(message: str) -> AfterValidator:
     return AfterValidator(check)
 
 
+def _within(smallest: float, largest: float, value: float) -> float:
+    if not smallest <= value <= largest:
+        raise ValueError(f"{value:g} is out of range; allowed: {smallest:g} to {largest:g}")
+    return value
+
+
 def _limits(smallest: float, largest: float) -> AfterValidator:
     """Return a validator that refuses numbers beyond which quotients, integers or 32-bit numbers overflow.
 
     The reference pages do not list these limits, because no sensible number reaches them.
     """
-
-    def check(value: float) -> float:
-        if not smallest <= value <= largest:
-            raise ValueError(f"{value:g} is out of range; allowed: {smallest:g} to {largest:g}")
-        return value
-
-    return AfterValidator(check)
+    # not a local function: worker processes receive types that contain it
+    return AfterValidator(functools.partial(_within, smallest, largest))
 
 
 Number = Annotated[float, _FractionString(), _limits(-1e38, 1e38)]

@@ -168,7 +168,7 @@ def test_commands_have_number_options():
 
 
 @pytest.mark.parametrize("path", LEAVES, ids=ids)
-@pytest.mark.parametrize("number", ["1_0", "0x1", "1e1 ", "٤", "inf", "nan", ""])
+@pytest.mark.parametrize("number", ["1_0", "0x1", "1e1 ", "٤", "inf", "nan"])
 def test_number_options_refuse_what_files_refuse(path, number, capsys):
     for option in number_options(path):
         assert main([*path, f"{option}={number}"]) == 2
