@@ -22,7 +22,8 @@ from rlcli.registry import TASKS, catalog, find_task
 SECONDS = 10
 CODES = (0, 2, 3, 4, 7)
 PLACE = re.compile(
-    r"^error: .*(task\.yaml|override '|--\w+|No such option|\.py|more\.yaml|[Uu]nexpected|[Ii]nvalid|no task|a word of the command line)"
+    r"^error: .*(task\.yaml|override '|--\w+|No such option|\.py|more\.yaml|[Uu]nexpected|[Ii]nvalid|no task"
+    r"|a word of the command line)"
 )
 
 
