@@ -5,7 +5,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from rlcli.config.schema.base import Count, Positive, StrictModel, Threads, _FractionString, _limits
+from rlcli.config.schema.base import Count, Positive, StrictModel, Threads, _FractionString, _Limits
 from rlcli.safe_text import float_or_nan
 
 
@@ -52,7 +52,7 @@ class AgentConfig(StrictModel):
     """Changes of the task for this agent: keys of the task with other values."""
     max_iterations: Count | None = None
     """Number of training iterations; null: no limit, then `max_steps` is needed."""
-    max_steps: Annotated[int, Field(ge=1), _limits(1, 2**62)] | None = None
+    max_steps: Annotated[int, Field(ge=1), _Limits(1, 2**62)] | None = None
     """Number of environment steps of the training, summed over all environments; null: no limit."""
     save_interval: Count | None = None
     """Iterations between two checkpoints; null: a checkpoint every 60 s and one at the end."""

@@ -1,9 +1,9 @@
 """Number types and the base class of all configuration models."""
 
-import functools
 import math
 import re
 import sys
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Annotated, Any, ClassVar
 
@@ -50,27 +50,32 @@ def _nonzero(message: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-def _within(smallest: float, largest: float, value: float) -> float:
-    if not smallest <= value <= largest:
-        raise ValueError(f"{value:g} is out of range; allowed: {smallest:g} to {largest:g}")
-    return value
-
-
-def _limits(smallest: float, largest: float) -> AfterValidator:
-    """Return a validator that refuses numbers beyond which quotients, integers or 32-bit numbers overflow.
+@dataclass(frozen=True)
+class _Limits:
+    """Annotation that refuses numbers beyond which quotients, integers or 32-bit numbers overflow.
 
     The reference pages do not list these limits, because no sensible number reaches them.
     """
-    # not a local function: worker processes receive types that contain it
-    return AfterValidator(functools.partial(_within, smallest, largest))
+
+    smallest: float
+    largest: float
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        # an `AfterValidator` would take pydantic several times as long, to inspect the signature of each validator
+        return core_schema.no_info_after_validator_function(self._check, handler(source))
+
+    def _check(self, value: float) -> float:
+        if not self.smallest <= value <= self.largest:
+            raise ValueError(f"{value:g} is out of range; allowed: {self.smallest:g} to {self.largest:g}")
+        return value
 
 
-Number = Annotated[float, _FractionString(), _limits(-1e38, 1e38)]
-Positive = Annotated[float, Field(gt=0), _FractionString(), _limits(1e-38, 1e38)]
-NotNegative = Annotated[float, Field(ge=0), _FractionString(), _limits(0.0, 1e38)]
-Seconds = Annotated[float, Field(gt=0), _FractionString(), _limits(0.0, 1e9)]
+Number = Annotated[float, _FractionString(), _Limits(-1e38, 1e38)]
+Positive = Annotated[float, Field(gt=0), _FractionString(), _Limits(1e-38, 1e38)]
+NotNegative = Annotated[float, Field(ge=0), _FractionString(), _Limits(0.0, 1e38)]
+Seconds = Annotated[float, Field(gt=0), _FractionString(), _Limits(0.0, 1e9)]
 """Time that is divided by the control period: with `sim.dt` of at least 1e-9 the number of steps fits 64 bits."""
-Count = Annotated[int, Field(ge=1), _limits(1, 2**31 - 1)]
+Count = Annotated[int, Field(ge=1), _Limits(1, 2**31 - 1)]
 Width = Annotated[int, Field(ge=1, le=2**24)]
 """Number of columns of a layer of a network."""
 Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=100)]
@@ -84,7 +89,7 @@ Quaternion = Annotated[
 ]
 Direction = Annotated[Vec3, _nonzero("a direction must not be zero; straight down is [0, 0, -1]")]
 Range = Annotated[tuple[Number, Number], AfterValidator(_check_order)]
-_SecondsOrZero = Annotated[float, Field(ge=0), _FractionString(), _limits(0.0, 1e9)]
+_SecondsOrZero = Annotated[float, Field(ge=0), _FractionString(), _Limits(0.0, 1e9)]
 SecondsRange = Annotated[tuple[_SecondsOrZero, _SecondsOrZero], AfterValidator(_check_order)]
 ShareRange = Annotated[tuple[Share, Share], AfterValidator(_check_order)]
 _Steps = Annotated[int, Field(ge=0, le=1000)]

@@ -14,7 +14,7 @@ from rlcli.config.schema.base import (
     Threads,
     Vec3,
     _FractionString,
-    _limits,
+    _Limits,
 )
 from rlcli.config.schema.scene import SceneConfig
 from rlcli.config.schema.terms import (
@@ -32,7 +32,7 @@ from rlcli.config.schema.terms import (
 class SimConfig(StrictModel):
     """Physics simulation."""
 
-    dt: Annotated[float, Field(gt=0, le=0.1), _FractionString(), _limits(1e-9, 0.1)]
+    dt: Annotated[float, Field(gt=0, le=0.1), _FractionString(), _Limits(1e-9, 0.1)]
     """Physics time step [s]."""
     render_interval: Count = 1
     """Physics steps between two frames of a video. Videos have at most one frame for each environment step."""

@@ -19,7 +19,7 @@ from rlcli.config.schema.base import (
     Share,
     StepRange,
     StrictModel,
-    _limits,
+    _Limits,
 )
 
 Columns = Number | Annotated[list[Number], Field(min_length=1)]
@@ -292,7 +292,7 @@ class SuccessConfig(TermConfig):
     at_least: Number | None = None
     """Smallest value of the term with which the condition holds."""
 
-    hold_s: Annotated[NotNegative, _limits(0.0, 1e9)] = 1.0
+    hold_s: Annotated[NotNegative, _Limits(0.0, 1e9)] = 1.0
     """How long the condition must hold before the time-out [s]."""
 
 
