@@ -26,9 +26,8 @@ from rlcli.rl.acting import trained_policy
 from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.policy_ref import choose
 from rlcli.runs.restore import require_fit
-from rlcli.runs.run import MAX_SEED
 from rlcli.runs.run_ref import default_runs_dir
-from rlcli.safe_text import shorten
+from rlcli.safe_text import MAX_SEED, shorten
 from rlcli.training.job import Job, TrainingResult
 from rlcli.training.launch import TrainingRequest, broadcast_job, process_device, setup_job
 from rlcli.training.runner import run_training

@@ -9,6 +9,9 @@ UNSAFE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2028
 """Characters that must not reach a terminal: control characters except tab and newline, line separators, marks that
 change the direction of text, and single surrogates."""
 
+MAX_SEED = 2**62
+"""Largest seed that a command line or a program may give."""
+
 
 def shorten(value: object, limit: int, mark: str = "...") -> str:
     """Return a value as text of at most `limit` characters; `mark` replaces the part that is cut off."""

@@ -290,7 +290,9 @@ class TaskCheck:
             return spec, _AnyAgent
         model = load_entry(replace(entry, value=spec.algorithms[algorithm]), type)
         if not issubclass(model, AgentConfig):
-            raise TaskError(f"plugin {entry.distribution}: {model.__name__} must be a subclass of AgentConfig")
+            raise TaskError(
+                f"plugin {entry.distribution} {entry.version}: {model.__name__} must be a subclass of AgentConfig"
+            )
         return spec, model
 
     def task(self) -> TaskConfig | None:

@@ -23,6 +23,7 @@ from rlcli.config import strict_yaml
 from rlcli.errors import CheckpointError, MachineError, UsageError
 from rlcli.runs.atomic_io import disk_error, disk_errors, to_json, write_atomic
 from rlcli.runs.safe_io import FileModel, PrintableText, check_json, read_file, read_json, refuse_links, require_inside
+from rlcli.safe_text import MAX_SEED
 
 _log = logging.getLogger(__name__)
 CONFIG = "config.yaml"
@@ -32,7 +33,6 @@ STUDY = "study.json"
 WAITING = "waiting"
 """State of a run of a study that has not started yet."""
 LOCK = ".lock"
-MAX_SEED = 2**62
 MAX_NAME = 200
 """Longest `--name`; with the time of a run in front it is a part of a path, which has at most 255 bytes."""
 _TASK = re.compile(r"(?!\.{1,2}$)[^/\\:]{1,255}")

@@ -9,8 +9,9 @@ from pydantic import Field
 
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.runs.atomic_io import disk_errors, to_json, write_atomic
-from rlcli.runs.run import MAX_SEED, STUDY, WAITING, initialize_run, new_folder
+from rlcli.runs.run import STUDY, WAITING, initialize_run, new_folder
 from rlcli.runs.safe_io import FileModel, check_json, read_json
+from rlcli.safe_text import MAX_SEED
 
 _MAX_SEEDS = 1000
 _LIMIT = 1024 * 1024

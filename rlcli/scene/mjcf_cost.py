@@ -38,7 +38,7 @@ def element_cost(name: str, attributes: dict[str, str]) -> float:
     return 1.0 + stored / 100 + sum(len(value) for value in attributes.values()) / 10_000
 
 
-def float_or_nan(text: str) -> float:
+def mjcf_number(text: str) -> float:
     """Return the number that a text of an MJCF spells; NaN for any other text."""
     try:
         return float(text)
@@ -50,5 +50,5 @@ def number_of(text: str | None) -> float:
     """Return a number, which may end in MuJoCo's K, M, G, T, P or E; 0 for text that MuJoCo will refuse."""
     text = (text or "").strip()
     factor = {"k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40, "p": 2**50, "e": 2**60}.get(text[-1:].lower(), 1)
-    value = float_or_nan(text[:-1] if factor != 1 else text)
+    value = mjcf_number(text[:-1] if factor != 1 else text)
     return 0.0 if math.isnan(value) else min(value * factor, ENDLESS)

@@ -26,7 +26,7 @@ from rlcli.errors import one_line
 from rlcli.machine import memory_error, python_command, read_plain
 from rlcli.registry import chosen_model, model_file
 from rlcli.safe_text import shorten
-from rlcli.scene.mjcf_cost import ENDLESS, element_cost, float_or_nan, number_of
+from rlcli.scene.mjcf_cost import ENDLESS, element_cost, mjcf_number, number_of
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 _MAX_TEXT = 16 * 1024 * 1024
@@ -378,7 +378,7 @@ def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str])
         if key in _NAMES or key.startswith("file") or name in ("text", "config") or not _NOT_FINITE.search(value):
             continue
         for word in value.split():
-            number = float_or_nan(word)
+            number = mjcf_number(word)
             if (math.isnan(number) and _NOT_FINITE.match(word)) or (math.isinf(number) and "range" not in key):
                 raise BadModel(f'{file}:{line}: {name} {key}="{shorten(value, 40)}" is not finite; give a number')
 

@@ -262,5 +262,5 @@ def test_trainer_plugin_has_own_settings(plugins):
 )
 def test_broken_trainer_plugin_is_reported(plugins, algorithm, said):
     plugins("mine", TRAINER, entry_points="[rlcli.trainers]\nmine = mine:SPEC\n")
-    with pytest.raises(TaskError, match=f"plugin mine.*: .*{said}"):
+    with pytest.raises(TaskError, match=f"plugin mine 1.0.*: .*{said}"):
         with_algorithm(algorithm)

@@ -10,6 +10,7 @@ from rlcli.cli.ui import options
 from rlcli.cli.ui.completion import tasks
 from rlcli.cli.ui.console import console
 from rlcli.errors import Stopped, UsageError, require_known
+from rlcli.safe_text import MAX_SEED
 
 if TYPE_CHECKING:
     from rlcli.training.launch import TrainingRequest
@@ -40,7 +41,7 @@ def command(
     seeds: Annotated[str, typer.Option(metavar="SEEDS")] = "0..2",
     until: Annotated[str | None, typer.Option(metavar="KEY=X")] = None,
     agent: options.Agent = None,
-    seed: Annotated[int, typer.Option(min=0, max=options.MAX_SEED)] = 42,
+    seed: Annotated[int, typer.Option(min=0, max=MAX_SEED)] = 42,
     num_envs: options.NumEnvs = None,
     max_iterations: options.MaxIterations = None,
     max_steps: options.MaxSteps = None,

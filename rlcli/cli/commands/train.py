@@ -14,6 +14,7 @@ from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import choice
 from rlcli.errors import Stopped, UsageError
 from rlcli.formats import log_notes
+from rlcli.safe_text import MAX_SEED
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
@@ -27,7 +28,7 @@ def command(
     task: options.OptionalTask = None,
     overrides: options.Overrides = None,
     agent: options.Agent = None,
-    seed: Annotated[int | None, typer.Option(min=-1, max=options.MAX_SEED)] = None,
+    seed: Annotated[int | None, typer.Option(min=-1, max=MAX_SEED)] = None,
     seeds: Annotated[str | None, typer.Option(metavar="SEEDS")] = None,
     jobs: Annotated[int | None, typer.Option(min=1)] = None,
     num_envs: options.NumEnvs = None,

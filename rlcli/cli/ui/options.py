@@ -17,11 +17,10 @@ from rlcli.cli.ui.completion import agents, checkpoints, runs, tasks, words
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.help_text import METAVARS, HelpCommand, read_docstring
 from rlcli.errors import MachineError, UsageError
-from rlcli.safe_text import read_number
+from rlcli.safe_text import MAX_SEED, read_number
 
 CHOOSE = "auto"
 """Value of an option that is given without its value (`--video`)."""
-MAX_SEED = 2**62
 
 
 def choice(metavar: str, *names: str, help: str | None = None) -> Any:

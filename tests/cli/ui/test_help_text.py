@@ -176,6 +176,13 @@ def test_number_options_refuse_what_files_refuse(path, number, capsys):
 
 
 @pytest.mark.parametrize("path", LEAVES, ids=ids)
+def test_number_options_refuse_an_empty_value(path, capsys):
+    for option in number_options(path):
+        assert main([*path, f"{option}="]) == 2
+        assert "there is an empty word at" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("path", LEAVES, ids=ids)
 def test_whole_numbers_have_no_fraction(path, capsys):
     for option in number_options(path, "INTEGER"):
         assert main([*path, f"{option}=8.0"]) == 2
