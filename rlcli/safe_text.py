@@ -30,6 +30,9 @@ _given: list[str] = []
 def remember_given(words: Iterable[str]) -> None:
     """Store long and unprintable words of the command line and of its environment variables; messages shorten them."""
     parts = {part for word in map(str, words) for part in (word, str(Path(word)), *word.split("=", 1))}
+    parts |= {part.strip() for part in parts}
+    # typer escapes control characters in its messages
+    parts |= {re.sub("[\x00-\x1f\x7f-\x9f]", lambda found: rf"\x{ord(found[0]):02x}", part) for part in parts}
     parts |= set(map(printable, parts))
     _given[:] = sorted((part for part in parts if len(part) > 200 or not part.isprintable()), key=len, reverse=True)
 

@@ -113,7 +113,7 @@ def _variables() -> Check:
     texts = [", ".join(f"{name}={value}" for name, value in variables.items()) or "none"]
     hints = []
     if unknown := unknown_wanted():
-        texts.append(f"{plugins_chosen_by()} names distributions that are not installed: {', '.join(unknown)}")
+        texts.append(f"{plugins_chosen_by()} names distributions that are not installed: {unknown}")
         hints.append("write the names of distributions, as list-tasks prints them")
     for name, reason in harmful_variables(variables, available_cores()).items():
         texts.append(f"{name}: {reason}")

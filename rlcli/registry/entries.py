@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import TaskError, did_you_mean, listing
+from rlcli.safe_text import shorten
 from rlcli.settings import setting, settings_file
 
 TASKS = "rlcli.tasks"
@@ -142,14 +143,15 @@ def unreadable_distributions() -> list[Broken]:
     return list(found.values())
 
 
-def unknown_wanted() -> list[str]:
-    """Return the names in RLCLI_PLUGINS or the user's settings that are not installed plugins."""
+def unknown_wanted() -> str:
+    """Return the names in RLCLI_PLUGINS or the user's settings that are not installed plugins, listed for a message."""
     wanted = _enabled_distributions()
     if not wanted:
-        return []
+        return ""
     entries = [entry for group in GROUPS for entry in catalog(group, hidden=True)[0]]
     installed = {_normalized(entry.distribution) for entry in entries}
-    return sorted(wanted - installed - {OWN})
+    unknown = sorted(wanted - installed - {OWN})
+    return listing((f"'{shorten(name, 40)}'" for name in unknown), limit=4) if unknown else ""
 
 
 def plugins_chosen_by() -> str:

@@ -246,7 +246,7 @@ def open_sweep(
             _require_same(storage or folder, known, settings)
         study.set_user_attr(_SETTINGS, settings)
         write_atomic(folder / STUDY, to_json(record))
-    return Sweep(folder, settings, parameters, study)
+    return Sweep(folder, record, parameters, study)
 
 
 def read_sweep(folder: Path, storage: str | None = None) -> Sweep:

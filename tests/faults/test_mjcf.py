@@ -202,7 +202,7 @@ NAMED = {
     ),
     "a mesh of 20,000 rows": (
         model(asset='<mesh name="m" builtin="supersphere" params="20000 1 1"/>'),
-        "too large: as",
+        "the model is too large: its cost is",
     ),
     "a plugin of a flex without a name": (
         model(

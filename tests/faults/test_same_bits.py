@@ -83,7 +83,7 @@ def test_partial_reset_does_not_depend_on_order_or_grouping(task, order, folder)
 PROCESS = """
 import json, sys, pathlib, torch
 torch.set_num_threads(1)
-from same_bits import TASKS, rollout_hashes, make, other_work
+from support.same_bits import TASKS, rollout_hashes, make, other_work
 for work in other_work().values():
     work()
 torch.set_num_threads(1)

@@ -128,6 +128,14 @@ def test_unreachable_storage_is_machine_error_without_password(cli):
     assert "secret" not in result.err
 
 
+def test_sweep_prints_the_best_trial_and_how_to_train_with_its_settings(cli):
+    short = ("--trials", 1, "--max-iterations", 1, "--episodes", 4)
+    result = cli("sweep", "cartpole", *SMALL, *RATE, *short)
+    assert result.code == 0, result.err
+    assert "best: trial 0" in result.err
+    assert "rlcli train cartpole --config runs/cartpole/sweep-sweep/best.yaml" in result.err
+
+
 @pytest.mark.slow
 def test_same_sweep_is_joined_and_other_settings_are_refused(cli):
     first = cli("sweep", "cartpole", *SMALL, *RATE, "--trials", 1, "--max-iterations", 1, "--episodes", 4, "--json")

@@ -62,10 +62,10 @@ def command(
 
 
 def _warn_of_unknown_plugins() -> None:
-    for name in unknown_wanted():
+    if unknown := unknown_wanted():
         console.warn(
-            f"{plugins_chosen_by()} names '{name}', but no installed distribution of that name has tasks or trainers;"
-            " correct the name"
+            f"{plugins_chosen_by()} names {unknown}, but no installed distributions of these names have tasks or"
+            " trainers; correct the names"
         )
 
 
