@@ -413,9 +413,8 @@ class TaskCheck:
                 self.problem((key, *path), message, hint)
         for section in SECTIONS:
             if section != "success" and data.get(section):
-                self.problem(
-                    (section,), f"a direct task has no {section} terms; its class implements them: delete this section"
-                )
+                text = f"a direct task has no {section} terms; its class implements them: delete this section"
+                self.problem((section,), text)
 
 
 def _filled(task: TaskConfig, terms: Mapping[Path, TermConfig | None], params: dict[str, Any] | None) -> TaskConfig:
