@@ -11,6 +11,7 @@ import pytest
 import torch
 from support.worlds import actions, build
 
+pytestmark = pytest.mark.warp
 N, STEPS = 16, 25
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl")
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from support.worlds import PENDULUM, build, clone, results_of_env, same, write
+from support.worlds import ENGINES, PENDULUM, build, clone, results_of_env, same, write
 
 CODE = '''
 import torch
@@ -96,6 +96,7 @@ def test_repeated_episode_draws_the_same(task):
     assert goals(again, 1) == goals(results[10:], 1)[:9]
 
 
+@pytest.mark.warp
 def test_gpu_and_cpu_draw_the_same(task):
     host, device = (rollout(task, 5, 25, f"sim.engine={engine}")[1] for engine in ("batch", "warp"))
     for row in range(5):
@@ -112,7 +113,7 @@ def test_state_dict_restores_draws(task):
     assert all(same(results_of_env(expected, row), results_of_env(found, row)) for row in range(3))
 
 
-@pytest.mark.parametrize("engine", ["batch", "warp"])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_episode_metrics_are_values_of_last_step(task, engine):
     env, results = rollout(task, 4, 10, f"sim.engine={engine}")
     ended = results[-1].episodes.ended()

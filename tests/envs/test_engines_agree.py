@@ -6,6 +6,7 @@ import pytest
 import torch
 from support.worlds import actions, build, critter, pendulum
 
+pytestmark = pytest.mark.warp
 N = 8
 SHORT = {  # episodes of about ten steps
     "cartpole": ("episode_length_s=0.16",),

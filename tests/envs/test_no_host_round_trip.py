@@ -7,6 +7,8 @@ from support.worlds import CRITTER, CRITTER_TASK, build, dump, write
 
 from rlcli.testing.host_sync import HostSyncError, HostSyncGuard
 
+pytestmark = pytest.mark.warp
+
 
 def every_term():
     """Return the critter's task with the remaining terms of the library."""

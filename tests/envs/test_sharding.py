@@ -19,6 +19,7 @@ from rlcli.envs.sharding.training_env import make_training_env
 from rlcli.errors import ConfigError, DivergedError, MachineError, TaskError
 from rlcli.registry import find_task
 
+pytestmark = pytest.mark.processes
 TASKS = [
     *("ant", "ant-direct", "ball-balance", "biped-velocity", "cart-double-pendulum", "cartpole", "cartpole-direct"),
     *("crazyflie", "hand-reorient", "humanoid", "humanoid-direct", "ingenuity", "lift-cube", "open-drawer"),

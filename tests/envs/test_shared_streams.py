@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from support.worlds import ENGINES
 
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
@@ -60,7 +61,7 @@ def rollout(task, *overrides, shared_streams=0, steps=50):
     return torch.stack(seen)
 
 
-@pytest.mark.parametrize("engine", ["batch", "warp"])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_shared_streams_repeat_those_of_fewer_envs(noisy, engine):
     steps = 50 if engine == "batch" else 12
     settings = (f"sim.engine={engine}", "episode_length_s=0.1")

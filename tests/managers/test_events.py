@@ -9,13 +9,12 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.fault_sizes import amount
-from support.worlds import CRITTER_TASK, PENDULUM_TASK, actions, build, critter, dump, edited, pendulum
+from support.worlds import CRITTER_TASK, ENGINES, PENDULUM_TASK, actions, build, critter, dump, edited, pendulum
 
 from rlcli.config.load import resolve
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
 
-ENGINES = ["batch", "warp"]
 LONG = ["batch", pytest.param("warp", marks=pytest.mark.slow)]  # slow without a GPU
 DAMPING = {"func": "randomize_joint_damping", "operation": "set"}
 

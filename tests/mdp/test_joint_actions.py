@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from support.worlds import PENDULUM, PENDULUM_TASK, build, dump, write
+from support.worlds import ENGINES, PENDULUM, PENDULUM_TASK, build, dump, write
 
 from rlcli.errors import ConfigError
 from rlcli.scene.jacobian import Jacobian
@@ -179,7 +179,7 @@ def test_jacobian_matches_mujoco(tmp_path):
         assert np.allclose(ours[i, 3:], angular[:, [2, 0, 1, 4, 3]], atol=1e-6)
 
 
-@pytest.mark.parametrize("engine", ["batch", "warp"])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_inverse_kinematics_reaches_position(tmp_path, engine):
     term = {"func": "differential_inverse_kinematics", "joints": ["slide", "shoulder", "elbow"], "bodies": ["hand"],
             "mode": "position"}  # fmt: skip

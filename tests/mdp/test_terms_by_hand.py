@@ -9,7 +9,7 @@ import torch
 from support.mdp_numbers import states
 from support.mdp_table import OBSERVATIONS, REWARDS, ROWS, SUCCESS, TERMINATIONS
 from support.mdp_worlds import bound, hand_made, put, sensors
-from support.worlds import build, edited, write
+from support.worlds import ENGINES, build, edited, write
 
 from rlcli.config.term_signatures import builtin_terms
 from rlcli.errors import ConfigError
@@ -126,7 +126,7 @@ SWING = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("engine", ["batch", "warp"])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_joint_wrench_and_acceleration_follow_newton(tmp_path, engine):
     """A pendulum of 2 kg, 0.5 m from its joint; the angle is below the horizontal."""
     env = build(write(tmp_path / "swing", edited("{}", **SWING), arm_xml=PENDULUM), 3, f"sim.engine={engine}")
@@ -151,7 +151,7 @@ def test_joint_wrench_and_acceleration_follow_newton(tmp_path, engine):
 FALLING = '<mujoco><worldbody><body name="b"><freejoint/><geom size="0.1" mass="1"/><body name="out" pos="0.3 0 0"><joint name="j" axis="0 0 1" armature="1000"/><geom size="0.01" mass="0.001"/></body></body></worldbody></mujoco>'  # noqa: E501
 
 
-@pytest.mark.parametrize("engine", ["batch", "warp"])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_spinning_body_acceleration_is_gravity_plus_centripetal(tmp_path, engine):
     task = {**SWING, "observations": {"policy": {"z": {"func": "base_pos_z"}}},
             "rewards": {"acc": {"func": "body_lin_acc_l2", "weight": 1.0, "bodies": "b"}}}  # fmt: skip

@@ -15,6 +15,7 @@ from rlcli.mdp import observations, rewards
 from rlcli.scene.entity import Entity
 from rlcli.testing.host_sync import HostSyncGuard
 
+pytestmark = pytest.mark.warp
 torch.set_num_threads(1)
 
 

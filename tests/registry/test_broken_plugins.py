@@ -14,6 +14,7 @@ from support.broken_plugins import BROKEN
 from rlcli.registry import catalog
 from rlcli.registry.probe import probe
 
+pytestmark = pytest.mark.processes
 BUILT_IN = {"cartpole", "cartpole-direct", "ant-direct"}
 TRAIN = ("train", "good-task", "--num-envs", "2", "--max-iterations", "1", "--logger", "none")
 

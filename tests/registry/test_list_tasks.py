@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from support.broken_plugins import MODEL, TASK
 
+pytestmark = pytest.mark.processes
 HEAVY = ["torch", "mujoco", "numpy", "stable_baselines3"]
 
 

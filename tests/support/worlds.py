@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import torch
 import yaml
 from torch import Tensor
@@ -15,6 +16,9 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.registry import find_task
 
 torch.set_num_threads(1)
+
+ENGINES = ("batch", pytest.param("warp", marks=pytest.mark.warp))
+"""Names of the engines, for tests that run on each."""
 
 CRITTER = """
 <mujoco model="critter">
