@@ -283,6 +283,8 @@ REWARDS = [
     (r.object_is_lifted, {**GRIP, **THING, "minimal_height": 0.2, "held_within": 1.2}, lambda s:
      (s.thing[2] - s.origin[2] > 0.2) * (norm(s.thing - s.grip) <= 1.2)),
     (r.object_ee_distance, {**GRIP, **THING, "std": 0.5}, lambda s: 1 - np.tanh(norm(s.thing - s.grip) / 0.5)),
+    (r.grasp_object, {**GRIP, **THING, "joints": "finger", "threshold": 1.2, "open_joint_pos": 0.04}, lambda s:
+     (0.04 - s.arm[2]) * (norm(s.thing - s.grip) <= 1.2)),
     (r.object_goal_distance, {**ARM, **THING, "command": "pose", "std": 0.5, "minimal_height": 0.2}, lambda s:
      (1 - np.tanh(norm(s.thing - s.goal) / 0.5)) * (s.thing[2] - s.origin[2] > 0.2)),
     (r.object_goal_distance,

@@ -76,6 +76,24 @@ def object_ee_distance(
     return _near(_distance_to_object(entity, sites, object), std)
 
 
+def grasp_object(
+    env: ManagedEnv,
+    *,
+    entity: Entity = "robot",
+    joints: Joints,
+    sites: Sites,
+    object: Entity = "object",
+    threshold: float,
+    open_joint_pos: float,
+) -> Tensor:
+    """Sum of (open_joint_pos - position) of the finger `joints` where a site is within `threshold` of an object, else 0 [m].
+
+    (num_envs,)
+    """
+    closed: Tensor = (open_joint_pos - entity.data.joint_pos_of(joints)).sum(dim=1)
+    return closed * (_distance_to_object(entity, sites, object) <= threshold)
+
+
 def object_goal_distance(
     env: ManagedEnv,
     *,
