@@ -182,13 +182,13 @@ class _Drive:
     """Factor from the value of a joint to the control; None: 1."""
 
     def controls_for(self, values: Tensor) -> Tensor:
-        """Return the controls (ctrl) of the k actuators that command joint values. (n, num_dof) -> (n, k)"""
+        """Return the controls (ctrl) of the k actuators for given values of the joints. (n, num_dof) -> (n, k)"""
         driven = values if self.joints is None else values[:, self.joints]
         return driven if self.factor is None else driven * self.factor
 
 
 def _make_drive(entity: Entity, kind: str) -> _Drive | None:
-    """Return the actuators of this kind, or None if the entity has none.
+    """Return an entity's actuators of a kind (motor, position, velocity); None if it has none.
 
     A gear multiplies forces and lengths: a joint's force is divided by the gear, a joint's target is multiplied by it.
     """

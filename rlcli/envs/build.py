@@ -29,7 +29,7 @@ __all__ = ["grid"]
 
 @dataclass(frozen=True, slots=True)
 class Simulation:
-    """Parts of an environment that are built from its compiled scene; for their meaning see `VecEnv`."""
+    """Parts of an environment that are built from its compiled scene; `VecEnv` has attributes of the same names."""
 
     engine: Engine
     data: SimData

@@ -29,9 +29,9 @@ class SuccessCondition:
         self._low, self._high = config.at_least, config.at_most
         self.bounded = (self._low, self._high) != (None, None)
         if self.bounded == (first.dtype == torch.bool):
-            what = "a truth value; remove at_most and at_least"
-            what = what if self.bounded else "a number; add at_most or at_least"
-            raise term.error(f"'{config.func}' returns {what}")
+            if self.bounded:
+                raise term.error(f"'{config.func}' returns a truth value; remove at_most and at_least")
+            raise term.error(f"'{config.func}' returns a number; add at_most or at_least")
         self.hold_steps = math.ceil(config.hold_s / step_dt - 1e-6)  # the slack absorbs rounding
         self.steps = torch.zeros_like(lengths, dtype=torch.float32)
         """Number of consecutive steps in which the condition holds. (num_envs,)"""
@@ -54,7 +54,7 @@ class SuccessCondition:
         return value >= self._low if self._high is None else (value >= self._low) & (value <= self._high)
 
     def describe(self, env_id: int, step_dt: float) -> str:
-        """Return name, newest value, bound and how long the condition has held."""
+        """Return a text with name, newest value, bound and how long the condition has held in one environment."""
         bound = f" {float(self.value[env_id]):.3g}, {bound_text(self.term.config.model_dump())}" if self.bounded else ""
         held = float(self.steps[env_id]) * step_dt
         return f"{self.name}{bound}: " + (f"has held for {held:.1f} s" if held else "fails")
@@ -66,7 +66,7 @@ class SuccessCondition:
 
 
 class EpisodeCounters(TensorState):
-    """Counters of all environments, also in the form of fields, which selections read and write fastest."""
+    """Counters of steps and episodes of all environments; `*_field` is the fastest form of a tensor for writing."""
 
     def __init__(self, shard: Shard, device: torch.device) -> None:
         num_envs = shard.count
@@ -82,7 +82,7 @@ class EpisodeCounters(TensorState):
         self.conditions: list[SuccessCondition] = []
 
     def attach(self, engine: Engine) -> None:
-        """Make the fields (the form in which the engine's selections access tensors), once the engine exists."""
+        """Make the attributes `*_field` with `Engine.as_field`, once the engine exists."""
         self._as_field = engine.as_field
         self.id_field, self.length_field = engine.as_field(self.ids), engine.as_field(self.lengths)
         self.index_field = engine.as_field(self.indices)
@@ -112,7 +112,12 @@ class EpisodeCounters(TensorState):
             condition.count()
 
     def succeeded(self, ended: Selection, timed_out: Tensor) -> dict[str, Any]:
-        """Return the fields `success`, `conditions` and `condition_values` of `Episodes`. timed_out (n,) bool"""
+        """Return the attributes `success`, `conditions` and `condition_values` of `Episodes`, by name.
+
+        Args:
+            ended: the environments whose episode ends.
+            timed_out: which of these episodes end by time-out alone. (n,) bool
+        """
         if not self.conditions:
             return {"success": None}
         held = {each.name: ended.read_view(each.field) >= each.hold_steps for each in self.conditions}
@@ -121,7 +126,7 @@ class EpisodeCounters(TensorState):
         return {"success": success, "conditions": held, "condition_values": values}
 
     def end(self, terminated: Tensor, truncated: Tensor) -> tuple[Field, Field]:
-        """Count the episodes that end. Return where an episode ends, and where it ends by time-out alone."""
+        """Count the episodes that end; return masks of them, and of those that end by time-out alone. (num_envs,)"""
         failed, late = self._as_field(terminated), self._as_field(truncated)
         finished = failed | late
         self.index_field += finished  # before the selection, whose random numbers depend on this counter

@@ -1,7 +1,7 @@
-"""`python -m rlcli.envs.describe_plugins GROUP FILE NAME...`: load tasks, trainers or formats, and describe them.
+"""Program that loads plugins and describes them; `rlcli list-tasks` runs it in a process of its own.
 
-One line of JSON per name is appended to FILE.
-`--index DISTRIBUTION` prints the `index.json` that a distribution ships for `list-tasks`.
+`python -m rlcli.envs.describe_plugins GROUP FILE NAME...` appends a line of JSON to FILE for each named task, trainer
+or format. `--index DISTRIBUTION` prints the `index.json` that a distribution ships for `list-tasks`.
 """
 
 from __future__ import annotations

@@ -256,7 +256,7 @@ class DirectEnv(VecEnv):
         return {f"Task/{name}": value for name, value in self._extra_tensors()}
 
     def step_metrics(self) -> dict[str, Tensor]:
-        """Return the task's `extras` with one row for each environment. (num_envs,) each
+        """Return the values of the task's `extras` for each environment, by name. (num_envs,) each
 
         A tensor without such rows, or a number, gives the same value for all environments.
         """
@@ -267,7 +267,7 @@ class DirectEnv(VecEnv):
         return found
 
     def episode_dependencies(self) -> list[str]:
-        """Return the task itself: its class may keep any state, and use any random generator."""
+        """Return the direct task: its episodes may depend on earlier ones, because its class may keep any state."""
         return [*super().episode_dependencies(), f"the class {type(self.task).__name__}"]
 
     def _before_full_reset(self) -> None:
@@ -333,7 +333,7 @@ class DirectEnv(VecEnv):
         self._mark_reset(selection)
 
     def _mark_reset(self, selection: Selection) -> None:
-        """Mark the environments that start a new episode."""
+        """Set the task's buffers for environments that start a new episode, and store that they were reset."""
         selection.write(self.task.progress_buf, 0)
         selection.write(self.task.reset_buf, 1)
         selection.write(self._fresh_field, True)
@@ -381,8 +381,8 @@ class DirectEnv(VecEnv):
     def _reset_stale(self, env_ids: Tensor) -> None:
         """Replace the task's `reset_idx`, for calls by the task itself.
 
-        OIGE tasks call it at the start of `pre_physics_step` for each environment whose flag is set. Environments that
-        the framework has just reset only get their flags cleared; all others are reset.
+        Tasks of OmniIsaacGymEnvs call it at the start of `pre_physics_step` where `reset_buf` is set. If the framework
+        has just reset an environment, only its `reset_buf` is cleared; all others are reset.
         """
         stale = env_ids[~self._fresh[env_ids]]
         self.task.reset_buf[env_ids] = 0

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class DivergenceGuard:
-    """Checks of one vectorised environment for divergence and values that are not finite, and recovery."""
+    """Checks of a vectorised environment for divergence and values that are not finite; recovery from divergence."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
@@ -169,7 +169,7 @@ class DivergenceGuard:
         self._any_quarantined = True
 
     def _describe(self, number: int) -> Divergence:
-        """Return the first out-of-bounds value that an event or a reset has written in one environment."""
+        """Describe the first out-of-bounds value that an event or a reset has written in environment `number`."""
         env = self._env
         columns, field = env.sim.qpos[number], "qpos"
         if bool((columns.abs() <= STATE_LIMIT).all()):

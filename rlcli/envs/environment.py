@@ -96,7 +96,7 @@ class Environment(Protocol):
 
     @property
     def causes(self) -> dict[str, int]:
-        """Number of diverged simulations by cause: see `Divergence.cause`."""
+        """Number of diverged simulations since the start, by cause: see `Divergence.cause`."""
 
     @property
     def divergences(self) -> int:
@@ -114,19 +114,20 @@ class Environment(Protocol):
         return []
 
     def extras(self) -> dict[str, float]:
-        """Return further values to log: the task's values of the last step, and new divergences by cause."""
+        """Return further values to log: those of the task (`extras`, curriculum), and new divergences by cause."""
 
     def step_metrics(self) -> dict[str, Tensor]:
-        """Return one value per environment, for evaluation and for observers (`StepObserver.on_step`). (num_envs,) each
+        """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each
 
-        They are of the state before resets. `Episodes.metrics` has the metrics of commands, as means over episodes.
+        They describe the state before resets; evaluations and `StepObserver.on_step` read them. The metrics of command
+        terms are in `Episodes.metrics`.
         """
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of everything that the next steps depend on, at a step boundary."""
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Restore the state returned by `state_dict()`, and return the observations of that moment.
+        """Restore the state returned by `state_dict()`; return its observations by group, (num_envs, d) each.
 
         Raises:
             KeyError: if a tensor is missing.
@@ -140,7 +141,7 @@ class Environment(Protocol):
         """Return the objects whose attributes a step may change: class terms, a direct task."""
 
     def episode_dependencies(self) -> list[str]:
-        """Return the parts of the configuration that make an episode depend on earlier ones; empty: none is known."""
+        """Return parts of the configuration through which an episode depends on earlier ones; empty: none known."""
 
     def is_playing(self) -> bool:
         """Return False while the environment is paused; `step` then raises an error."""

@@ -91,7 +91,7 @@ class ManagedEnv(VecEnv):
         return [*itertools.chain(*self._bound.values(), *self._observations.values())]
 
     def episode_dependencies(self) -> list[str]:
-        """Return the terms that make an episode depend on earlier ones.
+        """Return the paths of the terms through which an episode depends on earlier ones.
 
         Such a term draws random numbers that depend on the training step, keeps state beyond a reset, or is a class of
         the task, which may do both.
@@ -214,7 +214,7 @@ class ManagedEnv(VecEnv):
         return selection
 
     def _select_by_step(self, mask: Field) -> Selection | None:
-        """Return a selection whose random numbers depend on the current step."""
+        """Return a selection of environments by a mask; its random numbers depend on the current step."""
         return self.engine.select(mask, self.seed, self._counters.common_step.expand(self.num_envs).contiguous())
 
     def _compute_observations(self) -> dict[str, Tensor]:

@@ -33,7 +33,7 @@ _PAIRS, _STEPS = 64, 4
 
 @dataclass(frozen=True, slots=True)
 class ColumnMap:
-    """Permutation of columns with signs. (d,) each"""
+    """Mirror image of vectors with d columns: column i of the image is `sign[i]` x column `index[i]`."""
 
     index: Tensor
     sign: Tensor
@@ -136,14 +136,14 @@ class _MirrorTest:
             halves = torch.stack([obs[group] for obs in observed]).chunk(2, dim=1)
             maps[group] = self._observation_map(group, *(half.flatten(0, 1) for half in halves))
         if all(each.is_identity for each in (self._action, *maps.values())):
-            raise TaskError("everything moves in the plane of the mirror: each state is its own mirror image")
+            raise TaskError("the mirror changes nothing: everything moves in the x-z plane, so symmetry has no effect")
         return MirrorMaps(maps, self._action)
 
     def _draw(self, *shape: int) -> Tensor:
         return torch.randn(_PAIRS, *shape, generator=self._random)
 
     def _action_map(self) -> ColumnMap:
-        """Return the map of actions that drive one joint with each column."""
+        """Return the mirror map of the action, each of whose columns must drive one joint."""
         index: list[int] = []
         sign: list[int] = []
         for term in self._env.action_manager.terms:
@@ -197,7 +197,7 @@ class _MirrorTest:
         env.sim.forward_moved()
 
     def _compare_motion(self, before: Tensor) -> None:
-        """Compare the changes of the joint velocities. before (num_envs, nv)"""
+        """Compare the changes of the joint velocities with those of the mirror images. before (num_envs, nv)"""
         env, model = self._env, self._env.engine.model
         qpos, qvel = (env.engine.field(name) for name in ("qpos", "qvel"))
         image_qpos, image = qpos[_PAIRS:].clone(), qvel[_PAIRS:].clone()
@@ -220,7 +220,8 @@ class _MirrorTest:
 
     def _require(self, error: Tensor, what: str) -> None:
         if not float(error) <= self._tolerance:
-            raise TaskError(f"{what} by {float(error):.2%}, more than tolerance {self._tolerance:.2%}")
+            found = f"{float(error):.2%}; symmetry.tolerance allows {self._tolerance:.2%}"
+            raise TaskError(f"mirrored environments disagree: {what} by {found}")
 
     def _observation_map(self, group: str, own: Tensor, images: Tensor) -> ColumnMap:
         index, sign, start = [], [], 0
@@ -250,12 +251,16 @@ class _MirrorTest:
         for column, image in enumerate(images.unbind(1)):
             place = f"column {column} of observation '{name}'"
             if image.max() == image.min():
-                raise TaskError(f"{place} is {float(image[0]):g} in all tested states: its mirror image is unknown")
+                raise TaskError(
+                    f"the sign of {place} in the mirror is unknown: it is {float(image[0]):g} in all tested states;"
+                    " leave the column out, or make it vary"
+                )
             errors = torch.stack([_relative(image[:, None] - s * own, image[:, None].expand_as(own)) for s in (1, -1)])
             fits = (errors <= self._tolerance).nonzero().tolist()
             if len(fits) != 1:
-                nearest = f"no column of the term, the nearest is {float(errors.min()):.2%} away"
-                raise TaskError(f"the mirror image of {place} matches {'several columns' if fits else nearest}")
+                nearest = f"equals no column of the term (the nearest differs by {float(errors.min()):.2%})"
+                matches = "equals several columns of the term: leave out the equal ones" if fits else nearest
+                raise TaskError(f"the mirror image of {place} {matches}")
             found.append((fits[0][1], 1.0 - 2.0 * fits[0][0]))
         return found
 
@@ -267,7 +272,7 @@ def _relative(difference: Tensor, values: Tensor) -> Tensor:
 
 
 def _ray_partners(pipeline: Pipeline) -> list[int] | None:
-    """Return the mirror image of each ray, if a term has one column for each ray of its sensor."""
+    """Return the index of each ray's mirror image, if the term has one column for each ray of its sensor; else None."""
     call = pipeline.term.instance
     parameters = getattr(call, "keywords", None) or vars(call)
     for sensor in parameters.values():

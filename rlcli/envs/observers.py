@@ -26,15 +26,19 @@ class StepObserver:
         """Run on the state from which rewards and terminations are computed, before any reset."""
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
-        """Run when simulations have diverged, while `engine.recorded_calls` still returns the calls before that.
+        """Run when simulations have diverged, before a reset drops the calls that `engine.recorded_calls` returns.
 
         Args:
-            found: the first divergences.
-            pending: whether the next engine call is the one that fails, because an event or a reset wrote bad values.
+            found: environment and cause of the first ones; see `rlcli.sim.divergence_report.Divergence`.
+            pending: whether an event or a reset wrote bad values with which the next engine call would fail.
         """
 
     def on_step(self, record: StepRecord) -> None:
-        """Run after rewards and terminations are computed, before any reset."""
+        """Run after rewards and terminations are computed, before any reset.
+
+        Args:
+            record: observations, actions, rewards and ended episodes of the step (`rlcli.envs.step.StepRecord`).
+        """
 
 
 _Observer = TypeVar("_Observer", bound=StepObserver)

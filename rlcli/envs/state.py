@@ -53,7 +53,7 @@ def _own_state(env: VecEnv) -> dict[str, Tensor]:
 
 
 def _parts(env: VecEnv) -> dict[str, _Stateful]:
-    """Return the parts with a state of their own, except the engine, by the prefix of their keys."""
+    """Return the parts of an environment that have a state, by the prefix of their keys in it; not the engine."""
     parts: dict[str, _Stateful] = {f"actuator.{name}.": model for name, model in env.actuators.items()}
     if env.terrain is not None:
         parts["terrain."] = env.terrain

@@ -187,7 +187,7 @@ class VecEnv(Workflow):
         return action
 
     def _simulate(self) -> Tensor | None:
-        """Run the physics of a step, and return where it diverged."""
+        """Run the physics of a step; return the environments that diverged, (num_envs,) bool, or None."""
         start = time.perf_counter()
         if self.physics_override is not None:
             self.physics_override()
@@ -206,8 +206,8 @@ class VecEnv(Workflow):
         """End the episodes that are terminated or truncated; return None three times if none ends.
 
         Returns:
-            A selection of the environments whose episode ends, their last observations (None if not wanted), and a
-            record of the episodes.
+            A selection of the environments whose episode ends; their last observations, None if they are not
+            needed; and the returns, lengths, ... of the episodes.
         """
         finished, timed_out = self._counters.end(terminated, truncated)
         ended = self._select(finished)
@@ -305,7 +305,7 @@ class VecEnv(Workflow):
 
     @property
     def causes(self) -> dict[str, int]:
-        """Number of diverged simulations by cause: see `Divergence.cause`."""
+        """Number of diverged simulations since the start, by cause: see `Divergence.cause`."""
         return dict(self._guard.causes)
 
     def compute_efforts(self) -> None:
@@ -314,7 +314,7 @@ class VecEnv(Workflow):
             actuator.compute()
 
     def extras(self) -> dict[str, float]:
-        """Return further values to log: the task's values of the last step, and new divergences by cause."""
+        """Return further values to log: those of the task (`extras`, curriculum), and new divergences by cause."""
         return {**means(self.metric_values()), **self.divergence_metrics()}
 
     def divergence_metrics(self) -> dict[str, float]:

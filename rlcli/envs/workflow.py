@@ -58,10 +58,10 @@ class Workflow(Environment):
 
     @abstractmethod
     def _episode_returns_and_causes(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        """Return returns, reward terms and causes of the episodes that end. (n,) each"""
+        """Return returns, reward terms and causes (the latter two by name) of the episodes that end. (n,) each"""
 
     def _episode_metrics(self, ended: Selection) -> dict[str, Tensor]:
-        """Return metrics of the episodes that end, as means over their steps. (n,) each"""
+        """Return metrics of the episodes that end, as means over their steps, by name. (n,) each"""
         return {}
 
     def _reward_terms(self) -> Tensor:
@@ -88,7 +88,7 @@ class Workflow(Environment):
         """Prepare for a reset of all environments."""
 
     def _raise_for_term(self, what: str) -> None:
-        """Raise a `DivergedError` that names the term of a value that is not finite, if it is known."""
+        """Raise a `DivergedError` that names the term which made `what` (such as the reward) not finite, if known."""
 
     def _restore_observations(self) -> dict[str, Tensor]:
         """Return the observations of a state that has just been loaded."""
@@ -114,14 +114,14 @@ class Workflow(Environment):
         return []
 
     def episode_dependencies(self) -> list[str]:
-        """Return the parts of the configuration that make an episode depend on earlier ones; empty: none is known."""
+        """Return parts of the configuration through which an episode depends on earlier ones; empty: none known."""
         return ["scene.terrain"] if self.terrain is not None else []
 
     def step_metrics(self) -> dict[str, Tensor]:
-        """Return one value per environment, for evaluation and for observers (`StepObserver.on_step`). (num_envs,) each
+        """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each
 
-        The values describe the state before resets. `Episodes.metrics` has the metrics of commands, as means over
-        episodes.
+        They describe the state before resets; evaluations and `StepObserver.on_step` read them. The metrics of command
+        terms are in `Episodes.metrics`.
         """
         return {}
 

@@ -45,7 +45,7 @@ class AttributeState:
         self._changed: set[str] = set()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the attributes' current values, as tensors by their path."""
+        """Return copies of the attributes' values as tensors, by their path (`name`, or `helper.name`)."""
         tensors = (found for attribute, value in self._attributes() for found in _tensors(attribute, value))
         state = {path: tensor.clone() for path, tensor in tensors}
         values = dict(self._plain())
@@ -80,7 +80,7 @@ class AttributeState:
         return [f"{owner}.{attribute} ({type(value).__name__})" for attribute, value in unsaved]
 
     def _attributes(self) -> Iterator[tuple[str, Any]]:
-        """Yield the attributes by their path: those of the object, and of objects of the task's own classes."""
+        """Yield path and value of each attribute of the object and of its helper objects."""
         seen: set[int] = set()
 
         def visit(holder: object, path: str) -> Iterator[tuple[str, Any]]:
@@ -94,7 +94,7 @@ class AttributeState:
         yield from visit(self._owner, "")
 
     def _plain(self) -> Iterator[tuple[str, str]]:
-        """Yield the attributes that can be written as JSON."""
+        """Yield the path and the JSON text of each attribute that can be written as JSON."""
         for attribute, value in self._attributes():
             with contextlib.suppress(NotSerializableError, RecursionError):
                 yield attribute, json.dumps(_to_json(value))
@@ -110,11 +110,16 @@ class AttributeState:
         for step in path:
             holder = vars(holder).get(step)
             if not _is_helper(holder):
-                raise ValueError(f"'{attribute}' does not exist in {type(self._owner).__name__}")
+                raise ValueError(
+                    f"the saved '{attribute}' is no attribute of {type(self._owner).__name__}; its code has changed"
+                )
         on_class = getattr(type(holder), name, None)  # a method or a property is not state
         allowed = name.isidentifier() and not name.startswith("__") and (bool(path) or name not in self._excluded)
         if not allowed or not _is_saved_kind(on_class) or not _is_saved_kind(vars(holder).get(name)):
-            raise ValueError(f"'{attribute}' is not a saved attribute of {type(self._owner).__name__}")
+            raise ValueError(
+                f"the file has '{attribute}', which {type(self._owner).__name__} does not save: the file is damaged, or"
+                " the code has changed"
+            )
         return holder, name
 
     def _put(self, attribute: str, value: Any) -> None:
@@ -146,13 +151,15 @@ class AttributeState:
         if _write_into(current, value):
             return
         if not (current is None or isinstance(current, Tensor | np.ndarray)):
-            raise ValueError(f"'{path}' is not a tensor in {type(self._owner).__name__}")
+            raise ValueError(
+                f"the saved '{path}' is a tensor, but not in {type(self._owner).__name__}: its code has changed"
+            )
         if isinstance(container, dict):
             container[key] = value.clone()
         elif isinstance(container, list):
             container[int(key) : int(key) + 1] = [value.clone()]
         else:
-            raise ValueError(f"'{path}' does not exist in {type(self._owner).__name__}")
+            raise ValueError(f"the saved '{path}' is no value in {type(self._owner).__name__}: its code has changed")
 
 
 def _item(container: object, key: str) -> Any:
@@ -222,7 +229,7 @@ def _from_json(written: object) -> Any:
     if kind == "scalar":
         dtype = np.dtype(content[0])
         if dtype.kind not in "biuf":
-            raise ValueError(f"the saved value has the type '{content[0]}', expected a numeric type")
+            raise ValueError(f"a saved value has the type '{content[0]}', which is no number: the file is damaged")
         return dtype.type(content[1])
     if kind == "dict":
         return {_from_json(key): _from_json(item) for key, item in content[0]}
@@ -231,7 +238,7 @@ def _from_json(written: object) -> Any:
 
 
 def _is_saved_kind(value: object) -> bool:
-    """Return whether values of this type are saved."""
+    """Return whether a value is of a type that is saved (numbers, texts, containers, tensors, random generators)."""
     generators = torch.Generator | np.random.Generator | random.Random
     plain = (*_SCALARS, *_SEQUENCES, dict)
     return type(value) in plain or isinstance(value, Tensor | np.ndarray | np.generic | generators)
@@ -245,7 +252,9 @@ def _require_valid_position(attribute: str, state: Mapping[str, Any]) -> None:
     inner = state.get("state")
     pos = inner.get("pos", 0) if isinstance(inner, dict) else 0
     if not 0 <= int(pos) <= 624 or not 0 <= int(state.get("buffer_pos", 0)) <= 4:
-        raise ValueError(f"'{attribute}': the saved position of the numpy generator is outside of its buffer")
+        raise ValueError(
+            f"'{attribute}': the saved position of the numpy generator is outside of its buffer: the file is damaged"
+        )
 
 
 def _is_helper(value: object) -> bool:

@@ -110,7 +110,11 @@ class CommandManager(TensorState):
         return [replace(knob, name=f"{knob.term}.{knob.name}") if counts[knob.name] > 1 else knob for knob in found]
 
     def hold(self, name: str, value: float | None) -> None:
-        """Set a column of the commands from the next step on; None: return to the term's own values.
+        """Set a column of a command in every environment, from the next step on.
+
+        Args:
+            name: name of the column's knob.
+            value: the value to hold; None: return to the values that the term draws.
 
         Raises:
             UsageError: for an unknown name, or a value that is not finite.
@@ -149,16 +153,16 @@ class CommandManager(TensorState):
         return found
 
     def get_command(self, name: str) -> Tensor:
-        """Return the command of a term. (num_envs, k)"""
+        """Return the present command of a term, by its name in `commands:`. (num_envs, k)"""
         return self.get_term(name).command
 
     def get_term(self, name: str) -> CommandTerm:
-        """Return the command term of a name."""
+        """Return a command term by its name in `commands:`."""
         term: CommandTerm = self._by_name[name].instance
         return term
 
     def measure(self) -> None:
-        """Add the metrics of this step to the sums over the episode, before commands are resampled."""
+        """Add the terms' metrics of this step to their sums over the episode, before commands are resampled."""
         if not self._measured:
             return
         terms = {term.name: term for _, term, _ in self._measured}
@@ -167,7 +171,7 @@ class CommandManager(TensorState):
         self._steps += 1.0
 
     def episode(self, ended: Selection) -> dict[str, Tensor]:
-        """Return the means of the metrics over the episodes that end. (n,) each"""
+        """Return the means of the metrics over the episodes that end, by `TERM/METRIC`. (n,) each"""
         if not self._measured:
             return {}
         means = ended.read_view(self._sums) / ended.read_view(self._steps).clamp(min=1.0)[:, None]
@@ -189,9 +193,11 @@ class CommandManager(TensorState):
             self._resample(number, selection, _FIRST)
 
     def compute(self, select: Select, running: Tensor) -> None:
-        """Count one step of the `running` episodes (1 or 0), resample commands that are due, and update all commands.
+        """Count a step of the resampling timers, resample commands that are due, and update all commands.
 
-        `select` returns the environments of a mask; their random numbers depend on the current step.
+        Args:
+            select: returns the environments where a mask is true; their random numbers depend on the current step.
+            running: 1 where an episode is running, 0 where it has just begun: its timer does not count yet. (num_envs,)
         """
         for number, term in enumerate(self.terms):
             left = self._steps_left[number]

@@ -18,7 +18,7 @@ Callback = Callable[[Selection], None]
 
 
 class EventManager(TensorState):
-    """Manager of the event terms. Each environment has its own interval timers, unless `global_time` is true.
+    """Manager of the event terms. Each environment has its own interval timers, except those with `global_time: true`.
 
     After events that change masses, inertias or the like, the engine recomputes the constants that derive from them.
     """
@@ -58,7 +58,7 @@ class EventManager(TensorState):
         self._derive_constants(self._startup, all_envs)
 
     def before_full_reset(self, all_envs: Selection) -> None:
-        """Clear the steps at which reset events fired, and draw the global timers, before all environments are reset.
+        """Before a reset of all environments, forget when reset events fired, and draw the timers with `global_time`.
 
         The random numbers of `all_envs` depend on the current step.
         """
@@ -68,7 +68,7 @@ class EventManager(TensorState):
                 all_envs.write(left, self._draw(term, all_envs, _FIRST))
 
     def reset(self, selection: Selection, step: Tensor) -> None:
-        """Fire the reset events of new episodes at a `step` of training, and start their interval timers."""
+        """Fire the reset events of new episodes, and start their interval timers; `step` is the training step."""
         for reset in self._term_resets:
             reset(selection)
         for term, fired_at in self._resets:
@@ -85,10 +85,13 @@ class EventManager(TensorState):
                 selection.write(left, self._draw(term, selection, _FIRST))
 
     def interval(self, select: Select, running: Tensor, fired: Callback) -> None:
-        """Count one step of the `running` episodes (1 or 0), and fire the events that are due.
+        """Count a step of the interval timers, and fire the events that are due.
 
-        `select` returns the environments of a mask; their random numbers depend on the current step. `fired` is called
-        after each event with its environments. Global timers also count steps in which no episode is running.
+        Args:
+            select: returns the environments where a mask is true; their random numbers depend on the current step.
+            running: 1 where an episode is running, 0 where it has just begun: its timers do not count yet, except
+                those with `global_time`. (num_envs,)
+            fired: called after each event with its environments.
         """
         for instance in self._updating:
             instance.update(select, running)
@@ -102,7 +105,7 @@ class EventManager(TensorState):
                 fired(due)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the interval timers, and the steps at which reset events fired."""
+        """Return the interval timers, and the training steps at which reset events fired last."""
         return {"steps_left": self._steps_left, "fired_at": self._fired_at}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:

@@ -20,7 +20,7 @@ from rlcli.sim.state_cache import is_finite
 
 @dataclass(slots=True)
 class _Group:
-    """Pipelines of a group's terms, the group's buffers, and the columns of each term in each buffer."""
+    """Observation group: pipelines of its terms, its buffers, and the columns of each term in each buffer."""
 
     pipelines: list[Pipeline]
     buffers: list[Tensor]
@@ -83,7 +83,7 @@ class ObservationManager(TensorState):
         return self._final
 
     def recompute_last(self) -> dict[str, Tensor]:
-        """Compute the observations of the last `compute` again, after `load_state_dict`."""
+        """Return the observations of the last `compute` again, after `load_state_dict`."""
         result, draws = {}, self._draws(np.uint64(0))
         for name, group in self.groups.items():
             if not _has_memory(group):
@@ -92,7 +92,7 @@ class ObservationManager(TensorState):
         return result
 
     def reset(self, selection: Selection) -> None:
-        """Start new episodes: histories and delays start at their first value."""
+        """Start new episodes: histories and delays begin with the first value of the new episode."""
         self._fresh = selection
         for reset in self._term_resets:
             reset(selection)
@@ -102,7 +102,7 @@ class ObservationManager(TensorState):
         return self.groups[group].pipelines
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the state of the pipelines, and the last observations of groups that depend on earlier steps."""
+        """Return the tensors of the pipelines, and the last observations of groups that depend on earlier steps."""
         tensors = {
             f"{name}.{pipeline.term.name}.{key}": tensor
             for name, group in self.groups.items()

@@ -28,7 +28,7 @@ _BIAS, _LAG, _REDRAW, _REDRAWN = (np.uint64(0x4F42_5330 + i) for i in range(4))
 
 
 class Stage:
-    """Base class of the operations on an observation term's value."""
+    """Base class of the operations on an observation term's value: noise, scale, delay ..."""
 
     def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         """Change the value (num_envs, k) in place.
@@ -89,7 +89,7 @@ class Pipeline:
         return bool(self.tensors())
 
     def write(self, view: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
-        """Compute the term and write it to its columns. view (num_envs, size)"""
+        """Compute the observation of the term and write it to `view`, its columns in the group. (num_envs, size)"""
         value = view if self._value is None else self._value
         raw = self.term.call()
         value.copy_(raw if raw.dim() == 2 else raw.reshape(value.shape))
@@ -139,12 +139,15 @@ class Pipeline:
         return self._context.tunable.get((*self.term.path, *key.split(".")), value)
 
     def _columns(self, key: str, value: float | list[float]) -> Tensor:
-        """Return a setting with one value for all columns, or one for each. () or (width,)"""
+        """Return a setting of the term as a tensor: one value for all columns, or one for each. () or (width,)"""
         setting = self._setting(key, value)
         if not isinstance(setting, Tensor):
             setting = torch.tensor(value, dtype=torch.float32, device=self._context.device)
         if setting.dim() == 1 and len(setting) != self.width:
-            raise self.term.error(f"has {len(setting)} values; give 1 or {self.width}", *key.split("."))
+            raise self.term.error(
+                f"has {len(setting)} values; give 1, or one for each of the term's columns ({self.width})",
+                *key.split("."),
+            )
         return setting
 
     def _modifier(self, number: int, config: schema.ModifierConfig) -> Stage:
@@ -160,7 +163,7 @@ class Pipeline:
         return _Constant("add", self._columns(f"{key}.offset", config.offset))
 
     def _sampler(self, key: str, config: schema.NoiseConfig) -> Sampler:
-        """Return a function that draws from a distribution for the rows of a selection. -> (rows, width)"""
+        """Return a function that draws the noise for the environments of a selection. -> (rows, width)"""
         shape = (self.width,)
         if isinstance(config, schema.UniformNoiseConfig):
             low, high = (in_place(self._columns(f"{key}.{end}", getattr(config, end))) for end in ("low", "high"))
@@ -190,7 +193,7 @@ class _Noise(Stage):
 
 
 class _Constant(Stage):
-    """Operation with a constant operand, which a curriculum may change."""
+    """Scaling by a factor, or addition of an offset; a curriculum may change this number."""
 
     def __init__(self, operation: str, operand: Tensor) -> None:
         self._operation, self._operand = _OPERATIONS[operation], operand
@@ -200,7 +203,7 @@ class _Constant(Stage):
 
 
 class _Bias(_Constant):
-    """Operation with an operand that is sampled once for each episode."""
+    """Addition of a bias (or scaling by it, ...) that is sampled once for each episode."""
 
     def __init__(self, sampler: Sampler, operation: str, stream: np.uint64, bias: Tensor) -> None:
         super().__init__(operation, bias)
@@ -223,7 +226,7 @@ class _Clip(Stage):
 
 
 class _Filter(Stage):
-    """Base class of filters that keep values `past`, (num_envs, m, k), which are 0 at the start of an episode."""
+    """Base class of filters. `past`: values of earlier steps, 0 at the start of an episode. (num_envs, m, k)"""
 
     _past: Tensor
 

@@ -90,7 +90,7 @@ class RewardManager(TensorState):
 
     @property
     def step_terms(self) -> Tensor:
-        """Weighted value of each term in the last step, without a copy. (terms, num_envs)"""
+        """Weighted value of each term in the last step; the next step overwrites it. (terms, num_envs)"""
         return self._values
 
     def values(self) -> dict[str, Tensor]:
@@ -106,7 +106,7 @@ class RewardManager(TensorState):
         total.masked_fill_(diverged, self._divergence_reward)
 
     def episode(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the returns of the episodes that end, and the share of each term in them. (n,) each"""
+        """Return the returns of the episodes that end, and each term's share of the return, by its name. (n,) each"""
         sums = ended.read(self._sums_by_env).contiguous()  # so that rounding does not depend on the number of rows
         shares = {term.name: column for term, column in zip(self.terms, sums.unbind(1), strict=True)}
         returns = sums.sum(dim=1)
@@ -138,5 +138,5 @@ class RewardManager(TensorState):
 
 
 def _is_tunable(weight: float | Tensor) -> bool:
-    """Return whether a curriculum changes a weight."""
+    """Return whether a curriculum changes the weight: it is then a tensor."""
     return isinstance(weight, Tensor)

@@ -33,7 +33,7 @@ SENSORS = {"ContactSensor": "contact", "RaySensor": "rays", "CameraSensor": "cam
 
 @dataclass(frozen=True, slots=True)
 class BoundTerm:
-    """A term with its parameters resolved. Managers call `call()`, or `call(selection)` for events and curricula."""
+    """Term with its parameters resolved. Managers call `call()`, or `call(selection)` for events and curricula."""
 
     name: str
     path: Path
@@ -58,7 +58,7 @@ class BoundTerm:
         return ShapeError([self.resolved.problem((*self.path, *keys), message)])
 
     def require_finite(self, values: Tensor, what: str) -> None:
-        """Check that values of the term are finite. values (num_envs, ...)
+        """Check that values of the term are finite; `what` is their name in the message. values (num_envs, ...)
 
         Raises:
             DivergedError: with the number of environments and the first of them.
@@ -71,7 +71,7 @@ class BoundTerm:
             )
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what the term keeps from step to step; empty for a term without state."""
+        """Return the tensors that the term keeps from step to step; empty for a term without state."""
         if hasattr(self.call, "state_dict"):
             state: dict[str, Tensor] = self.call.state_dict()
             return state
@@ -103,7 +103,7 @@ class EnvContext:
 
 
 class TermEnv(Protocol):
-    """Interface that a binder needs of an environment. Terms get the same object as `env`."""
+    """Part of an environment that `Binder` uses. Terms get the whole environment as their argument `env`."""
 
     device: torch.device
 
@@ -128,7 +128,7 @@ class Binder:
         self._open_addresses()
 
     def bind(self, section: str, path: Path, config: TermConfig) -> BoundTerm | None:
-        """Return a bound term, or None if a name in it does not resolve."""
+        """Return a configured term with its names resolved to objects and indices; None if one does not exist."""
         signature = self.signature(section, config)
         params, elements = self._resolve(signature, path, config)
         if params is None:
@@ -146,13 +146,13 @@ class Binder:
         return BoundTerm(name, path, config, self.resolved, call, elements, draws, memory)
 
     def signature(self, section: str, config: TermConfig) -> Signature:
-        """Return the signature of a configured term."""
+        """Return the signature (parameters and their types) of the function or class of a configured term."""
         signature = self.resolved.vocabulary.find(section, config.func)
         assert signature is not None  # the validation of the configuration has already looked it up
         return signature
 
     def bind_all(self, section: str) -> list[BoundTerm]:
-        """Return the bound terms of a section, in order."""
+        """Return the bound terms of a section of the task, such as `rewards`, in order."""
         terms = self._bind_each(section, (section,), getattr(self.resolved.task, section))
         if section == "commands":
             self._commands = {term.name: term for term in terms}

@@ -43,6 +43,9 @@ class TunableValues:
 
         Terms that are bound after this call read the tensor instead of the fixed value.
 
+        Args:
+            address: dotted path of the setting, such as `rewards.alive.weight`.
+
         Raises:
             NameProblem: if the address does not name a number, or a list of numbers, that may change.
         """

@@ -107,7 +107,7 @@ class _AffineJointAction(_ScaledJointAction):
             self.command += self._offset
 
     def _each(self, value: float | Tensor) -> tuple[float, ...]:
-        """Return the value of each column, which is the same in all environments."""
+        """Return a setting as one number for each column; all environments have the same."""
         if isinstance(value, Tensor):
             return tuple((value[0] if value.dim() == 2 else value).tolist())
         return (value,) * self.size

@@ -38,7 +38,7 @@ class NullCommand(Term):
 
 @dataclass(kw_only=True, eq=False)
 class _VelocityCommand(EntityTerm, TensorState):
-    """Base class of velocity commands: `_drawn` has the samples, `command` the values after heading and standing.
+    """Base class of velocity commands: drawn velocities, 0 where the robot is to stand still.
 
     rel_standing: fraction of the commands that are zero, so that the robot is to stand.
     """
@@ -59,7 +59,7 @@ class _VelocityCommand(EntityTerm, TensorState):
         selection.write(self._stands, selection.uniform(0.0, 1.0) < self.rel_standing)
 
     def update(self) -> None:
-        """Compute the command of this step: zero where the robot is to stand."""
+        """Compute the command of this step: the drawn velocity, or zero where the robot is to stand."""
         self.command.copy_(self._drawn)
         self._control_heading()
         self.command.mul_(~self._stands[:, None])

@@ -14,11 +14,11 @@ from rlcli.sim.selection import Selection
 
 @dataclass(kw_only=True, eq=False)
 class Stages(Term):
-    """Schedule that sets the number at `address` to the next of the `values` at each of the `steps`.
+    """Schedule that sets a setting (`address`) to the next of the `values` at each of the `steps`.
 
-    Before the first step the setting keeps its value. `steps` are numbers of calls of `env.step` since the training
-    began, in rising order. Isaac Lab: modify_reward_weight, modify_env_param, modify_term_cfg; mjlab:
-    reward_curriculum, termination_curriculum, commands_vel.
+    address: path of the setting, such as `rewards.alive.weight`. Before the first step it keeps its value. `steps` are
+    numbers of calls of `env.step` since the training began, in rising order. Isaac Lab: modify_reward_weight,
+    modify_env_param, modify_term_cfg; mjlab: reward_curriculum, termination_curriculum, commands_vel.
     """
 
     address: Address
@@ -43,10 +43,10 @@ class Stages(Term):
 
 @dataclass(kw_only=True, eq=False)
 class Interpolate(Term):
-    """Schedule that moves the number at `address` linearly from its configured value to `to`.
+    """Schedule that moves a setting (`address`) linearly from its configured value to `to`.
 
-    It moves between `begin` and `end`, which are numbers of calls of `env.step` since the training began. Lists are
-    interpolated element by element.
+    address: path of the setting, such as `rewards.alive.weight`. It moves between `begin` and `end`, which are numbers
+    of calls of `env.step` since the training began. Lists are interpolated element by element.
     """
 
     address: Address
@@ -70,11 +70,13 @@ class Interpolate(Term):
 
 @dataclass(kw_only=True, eq=False)
 class TerrainLevels(EntityTerm):
-    """Terrain levels: robots that walk far move up, robots that walk too little move down. -> levels (num_envs,)
+    """Terrain difficulty (levels): robots that walk far move up, those that walk too little down. -> (num_envs,)
 
-    A robot moves up one level if its episode ends more than half a patch (along x) from the environment's origin. It
-    moves down if it covers less than half of the distance of `command` (a velocity, x and y first); without a command,
-    less than `least` [m]. A robot that moves up from the last level gets a random level. Isaac Lab: terrain_levels_vel.
+    A robot moves up one level if its episode ends farther from the environment's origin than half the length of a
+    terrain patch along x. It moves down if it covers less than half of the distance of `command` (a velocity, x and y
+    first); without a command, less than `least` [m]. A robot that moves up from the last level gets a random level.
+
+    Isaac Lab: terrain_levels_vel.
     """
 
     command: Command | None = None
@@ -102,7 +104,8 @@ class TerrainLevels(EntityTerm):
 
 def _require_shape(what: str, shape: torch.Size, address: Tensor) -> None:
     if shape != address.shape:
-        raise ValueError(f"{what} has shape {tuple(shape)}; the setting at `address` has shape {tuple(address.shape)}")
+        wanted = tuple(address.shape)
+        raise ValueError(f"{what} has shape {tuple(shape)}; give shape {wanted}, that of the setting at `address`")
 
 
 def _length_xy(vector: Tensor) -> Tensor:

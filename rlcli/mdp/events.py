@@ -172,7 +172,7 @@ def reset_scene_to_default(env: ManagedEnv, selection: Selection) -> None:
 
 @dataclass(eq=False)
 class RandomizeTerrainLevel(Term):
-    """Random terrain level for each episode, on the environment's own terrain type.
+    """Random terrain level (difficulty) for each episode, on the environment's own terrain type.
 
     Declare it before the event that places the robot. mjlab: `randomize_terrain`, which draws the terrain type, too.
     """
@@ -245,7 +245,12 @@ class ApplyBodyImpulse(BodyTerm, TensorState):
         selection.write(self._steps_left, (steps * (1.0 - 1e-6)).ceil_().long())
 
     def update(self, select: Callable[[Tensor], Selection | None], running: Tensor) -> None:
-        """Count one step where an episode is `running` (1 or 0), and remove the wrenches whose time is over."""
+        """Count a step where an episode is running, and remove the wrenches whose time is over.
+
+        Args:
+            select: returns the environments where a mask is true.
+            running: 1 where an episode is running, 0 where it has just begun. (num_envs,)
+        """
         acting = self._steps_left > 0
         self._steps_left -= running * acting
         over = select(acting & (self._steps_left <= 0))

@@ -289,7 +289,10 @@ def fingers_contact_force_b(env: ManagedEnv, *, entity: Entity = "robot", sensor
 
 
 def ee_pos(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> Tensor:
-    """Positions of sites from the environment's origin, world frame [m]. (num_envs, 3 k)  Also `ee_frame_pos`."""
+    """Positions of sites from the environment's origin, world frame [m]. (num_envs, 3 k)
+
+    Isaac Lab: `ee_frame_pos`.
+    """
     return (entity.data.site_pos_w[:, sites] - env.origins[:, None]).flatten(1)
 
 
@@ -311,7 +314,10 @@ def ee_velocity(env: ManagedEnv, *, entity: Entity = "robot", sites: Sites) -> T
 def object_position_in_robot_root_frame(
     env: ManagedEnv, *, entity: Entity = "robot", object: Entity = "object"
 ) -> Tensor:
-    """Position of an object relative to the root of `entity`, in its frame [m]. (num_envs, 3)  Also `object_pos_b`."""
+    """Position of an object relative to the root of `entity`, in its frame [m]. (num_envs, 3)
+
+    Isaac Lab: also `object_pos_b`.
+    """
     return rotate_inverse(entity.data.root_quat_w, object.data.root_pos_w - entity.data.root_pos_w)
 
 

@@ -189,7 +189,7 @@ class OrientationRandomization(DrawingTerm):
 
 
 def matching_elements(elements: list[Any], params: dict[str, Any], key: str, kind: str) -> list[Any]:
-    """Return the MJCF elements that match a term's patterns; none if a pattern is wrong, which binding reports."""
+    """Return the elements that match the patterns under a term's `key`; none for a wrong pattern (reported later)."""
     prefix = f"{params['entity']}/"
     of_entity = [element for element in elements if element.name.startswith(prefix)]
     try:
@@ -200,7 +200,13 @@ def matching_elements(elements: list[Any], params: dict[str, Any], key: str, kin
 
 
 def unset_simple(spec: mujoco.MjSpec, params: dict[str, Any], key: str) -> None:
-    """Clear the `simple` flag of the selected bodies, with which MuJoCo assumes the inertial frame to be the body's."""
+    """Clear the `simple` flag of bodies: with it, MuJoCo takes the body's frame as the inertial frame.
+
+    Args:
+        spec: the model.
+        params: parameters of the term.
+        key: the parameter with the names or patterns of the bodies.
+    """
     for body in matching_elements(spec.bodies, params, key, "body"):
         body.simple = 0
 
@@ -216,7 +222,13 @@ def require_supported(
 ) -> None:
     """Check that every selected element can be randomised.
 
-    The message is the kind of element, `problem` (as in `without kp`) and the names.
+    Args:
+        entity: the entity.
+        kind: kind of element, such as `Actuators`.
+        index: index of the selected elements.
+        supported: whether an element can be randomised, for each element of this kind.
+        problem: what is wrong with an element that cannot, such as `without kp`.
+        hint: what the user can do.
 
     Raises:
         NameProblem: with the names of the elements that cannot, and of those that can.

@@ -1,4 +1,4 @@
-"""Base classes of dataclass terms. Their fields are the keys of the YAML, in the order of the fields.
+"""Base classes of terms that are dataclasses. Their fields are the keys of the term in the YAML.
 
 A dataclass takes the fields of its last base first, so the base that has `entity` and the selected elements comes last.
 """

@@ -46,7 +46,7 @@ def all_columns(masks: Tensor) -> Tensor:
 
 
 def single(values: Tensor, kind: str) -> Tensor:
-    """Return the only element of (num_envs, 1, ...).
+    """Return the only element of (num_envs, 1, ...); `kind` is its name in the message, such as `site`.
 
     Raises:
         ValueError: if there is not exactly one element.
@@ -118,7 +118,7 @@ def is_moving(entity: Entity, command: Command, velocity_threshold: float) -> Te
 
 
 def goal_in_world(entity: Entity, command: Command) -> Tensor:
-    """Return the position of a pose command in the world frame; the command is in the root's. (num_envs, 3) [m]"""
+    """Return the goal position of a pose command, converted from the root's into the world frame. (num_envs, 3) [m]"""
     data = entity.data
 
     def compute() -> Tensor:
@@ -129,7 +129,7 @@ def goal_in_world(entity: Entity, command: Command) -> Tensor:
 
 
 def goal_quat_in_world(entity: Entity, command: Command) -> Tensor:
-    """Return the quaternion of a pose command in the world frame; the command is in the root's. (num_envs, 4)"""
+    """Return the goal quaternion of a pose command, turned from the root's into the world frame. (num_envs, 4)"""
     return _once(entity, command, ("goal quat",), lambda: multiply(entity.data.root_quat_w, command.command[:, 3:7]))
 
 
@@ -153,7 +153,7 @@ def angle_to_goal(entity: Entity, bodies: Columns, command: Command) -> Tensor:
 
 
 def _once(entity: Entity, command: Command, key: tuple[object, ...], compute: Callable[[], Tensor]) -> Tensor:
-    """Return a value that is computed once for all terms of a step; do not write to the value."""
+    """Return `compute()`, which runs once for all terms of a step; do not write to the value. `key`: its name."""
     value: Tensor = entity.sim.once_per_goal((entity.name, id(command), *key), command.command, compute)
     return value
 

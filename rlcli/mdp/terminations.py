@@ -59,8 +59,8 @@ def joint_vel_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints:
 def joint_effort_out_of_limit(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """End the episode where the command of any actuator exceeds its effort limit. (num_envs,)
 
-    MuJoCo's own actuators: from the present state and controls. Isaac Lab: explicit actuators only, of the last
-    substep.
+    The command of MuJoCo's own actuators follows from the present state and controls. Isaac Lab: explicit actuators
+    only, with values of the last substep.
     """
     return any_column(entity.data.withheld_effort[:, joints] > 0.0)
 

@@ -15,7 +15,7 @@ _Size = Annotated[int, Field(ge=1, le=4096)]
 
 
 class ImageSpec(BaseModel):
-    """Columns of one image in an observation, in the order (channels, rows, columns)."""
+    """Place of an image in an observation vector, which has its pixels in the order (channels, rows, columns)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -55,9 +55,13 @@ class CnnSpec(BaseModel):
         end = 0
         for image in self.pictures:
             if image.start < end:
-                raise ValueError("the images overlap or are not sorted by their first column")
+                raise ValueError(
+                    "`pictures` must be sorted by `start`, and their columns of the observation must not overlap"
+                )
             if image.shape[0] % image.steps:
-                raise ValueError(f"{image.shape[0]} channels are not a multiple of {image.steps} steps")
+                raise ValueError(
+                    f"the {image.shape[0]} channels of an image must be a multiple of its {image.steps} steps"
+                )
             end = image.stop
             self.sizes(image)
         return self
@@ -78,19 +82,21 @@ class CnnSpec(BaseModel):
         for number, (channels, kernel, stride) in enumerate(layers):
             _, rows, columns = sizes[-1]
             if min(rows, columns) < kernel:
-                sizes_text = f"a kernel of {kernel} x {kernel} for an input of {rows} x {columns} pixels"
-                raise ValueError(f"layer {number} has {sizes_text}")
+                raise ValueError(
+                    f"the kernel of layer {number} ({kernel} x {kernel} pixels) is larger than its input"
+                    f" ({rows} x {columns} pixels)"
+                )
             sizes.append((channels, (rows - kernel) // stride + 1, (columns - kernel) // stride + 1))
         return sizes
 
     def features(self, columns: int) -> int:
-        """Return the number of features of an observation with `columns` columns."""
+        """Return the number of outputs of the CNN for an observation with `columns` columns."""
         kept = columns - sum(math.prod(image.shape) for image in self.pictures)
         return kept + sum(math.prod(self.sizes(image)[-1]) for image in self.pictures)
 
 
 class Cnn(nn.Module):
-    """CNN of an observation. Its outputs are the features of all images, then the other columns.
+    """CNN over the images of an observation. Its outputs are their features, then the other columns.
 
     Args:
         spec: the images and the layers.

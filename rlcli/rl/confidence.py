@@ -22,7 +22,7 @@ _BLOCK = 2**21
 
 
 def proportion(hits: int, count: int) -> dict[str, float]:
-    """Return the rate hits / count with its Wilson score interval (Wilson 1927)."""
+    """Return the `rate` hits / count with its Wilson score interval from `low` to `high` (Wilson 1927)."""
     z = NORMAL
     rate = hits / count
     middle = (rate + z * z / (2 * count)) / (1 + z * z / count)
@@ -32,7 +32,7 @@ def proportion(hits: int, count: int) -> dict[str, float]:
 
 
 def mean(values: Sequence[float]) -> dict[str, float | None]:
-    """Return the mean with Student's t interval; a single value has no interval."""
+    """Return `mean` and `std` with Student's t interval from `low` to `high`, which are None for a single value."""
     count = len(values)
     middle = math.fsum(values) / max(1, count)  # exact: the result does not depend on the order of the episodes
     if count < 2:
@@ -59,7 +59,10 @@ def student_quantile(freedom: int) -> float:
 
 
 def difference(left: Sequence[float], right: Sequence[float]) -> dict[str, float | None]:
-    """Return the mean of left - right over pairs with its percentile bootstrap interval (Efron 1979)."""
+    """Return the `mean` of left - right over pairs, with its percentile bootstrap interval from `low` to `high`.
+
+    The interval (Efron 1979) is None for a single pair.
+    """
     gaps = np.asarray(left, dtype=np.float64) - np.asarray(right, dtype=np.float64)
     middle = float(gaps.mean())
     if len(gaps) < 2:
@@ -69,7 +72,7 @@ def difference(left: Sequence[float], right: Sequence[float]) -> dict[str, float
 
 
 def improvement(left: Sequence[float], right: Sequence[float]) -> dict[str, float | None]:
-    """Return the probability that a random episode of `left` exceeds a random episode of `right`, with an interval.
+    """Return the `probability` that a random episode of `left` exceeds one of `right`, with its interval `low`, `high`.
 
     A pair of equal values counts one half. This is the statistic of Mann and Whitney (1947) as a probability of
     improvement (Agarwal et al. 2021). The bootstrap interval resamples episodes with the same index in the two lists

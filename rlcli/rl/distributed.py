@@ -39,7 +39,7 @@ class ProcessGroup:
         return self.rank == 0
 
     def seed(self, seed: int, purpose: str) -> int:
-        """Return the seed of this process: `seed` on rank 0, a derived seed on the other ranks."""
+        """Return the seed of this process for a purpose: `seed` on rank 0, a seed derived from it on other ranks."""
         if self.is_rank_zero:
             return seed
         from rlcli.random import derive
@@ -185,7 +185,7 @@ def _exit_code(codes: Sequence[int]) -> int:
 
 
 def _communicate(operation: str, *arguments: Any) -> None:
-    """Call a collective operation of `torch.distributed`.
+    """Call a collective operation (such as `all_reduce`) of `torch.distributed`.
 
     Raises:
         MachineError: if another process is gone.
@@ -196,4 +196,4 @@ def _communicate(operation: str, *arguments: Any) -> None:
         getattr(dist, operation)(*arguments)
     except RuntimeError as error:
         hint = "read the message of that process; --resume continues from the last checkpoint"
-        raise MachineError("another process of this run is gone", hint=hint) from error
+        raise MachineError("another process of this training has ended, so this one stops, too", hint=hint) from error

@@ -71,13 +71,13 @@ class PartMemory:
         return [(network, part, part_of) for network in range(2) for part, part_of in enumerate(self.split(rows))]
 
     def gradients_of(self, network: int, part: int) -> list[Tensor]:
-        """Return the (transposed) tensors to write the gradients of one network and part to."""
+        """Return the (transposed) tensors for the gradients of one network (0: actor, 1: critic) and part."""
         return self._views[part][self._ends[network] : self._ends[network + 1]]
 
     def sum_parts(self, rows: int, out: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Add up the parts of a minibatch: write its gradients to `out`; return the statistics of actor and critic.
+        """Add up the parts of a minibatch: write its gradients to `out`; return its statistics (`OutputGradient`).
 
-        The statistics have the shapes (columns,) and ().
+        Those of the actor are (columns,), that of the critic is ().
         """
         parts = len(self.split(rows))
         torch.sum(self._gradients[:parts], dim=0, out=self._sum)
@@ -101,7 +101,7 @@ class PartGradients:
     def compute(
         self, task: tuple[int, int, slice], inputs: Sequence[Tensor], output_gradients: Sequence[OutputGradient]
     ) -> None:
-        """Write the gradients of one of `PartMemory.tasks`. Each sequence is (actor's, critic's)."""
+        """Write the gradients of one of `PartMemory.tasks`; both sequences are (the actor's, the critic's)."""
         network, part, rows = task
         mlp = self._passes[network]
         gradient, numbers = output_gradients[network](rows, mlp.forward(inputs[network][rows]))
@@ -131,7 +131,7 @@ class MlpGradients:
     def __call__(
         self, obs: Tensor, critic_obs: Tensor, actor_gradient: OutputGradient, critic_gradient: OutputGradient
     ) -> tuple[Tensor, Tensor]:
-        """Write the gradients of a minibatch; return the summed statistics of both networks. Inputs (n, d), (n, c)"""
+        """Write the gradients of a minibatch; return the sums of both networks' statistics (see `OutputGradient`)."""
         tasks = deque(self._memory.tasks(len(obs)))
 
         def work(thread: PartGradients) -> None:

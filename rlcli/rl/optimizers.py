@@ -64,15 +64,15 @@ def _require_slots(optimizer: torch.optim.Optimizer, state: Mapping[int, Mapping
     owned = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     for number, slots in state.items():
         if not 0 <= number < len(owned):
-            raise ValueError(f"trainer: the optimiser has no parameter {number}; it has {len(owned)}")
+            raise ValueError(f"trainer: the saved optimiser state is of parameter {number}; there are {len(owned)}")
         parameter = owned[number]
         missing = _SLOTS.get(type(optimizer).__name__, set()) - set(slots)
         if missing:
-            raise ValueError(f"trainer: the optimiser's state of parameter {number} has no {sorted(missing)[0]}")
+            raise ValueError(f"trainer: the saved optimiser state of parameter {number} lacks {sorted(missing)[0]}")
         for name, value in slots.items():
             expected = () if name == "step" else tuple(parameter.shape)
             if tuple(value.shape) != expected or not value.is_floating_point():
                 raise ValueError(
-                    f"trainer: the optimiser's {name} of parameter {number} is {value.dtype} {tuple(value.shape)},"
-                    f" expected {expected}"
+                    f"trainer: the saved optimiser state {name} of parameter {number} is {value.dtype}"
+                    f" {tuple(value.shape)}, the present agent needs {expected}"
                 )

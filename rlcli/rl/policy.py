@@ -60,13 +60,16 @@ class PolicySpec(BaseModel):
     @model_validator(mode="after")
     def _bounded(self) -> PolicySpec:
         if not self.kind.startswith("gaussian-") and self.action_bound is None:
-            raise ValueError(f"kind {self.kind} needs action_bound; set it")
+            raise ValueError(f"`kind: {self.kind}` needs a number in `action_bound`")
         if (self.kind == "gaussian-lstm") != bool(self.memory):
-            raise ValueError("memory and kind gaussian-lstm need each other: set both or neither")
+            raise ValueError("`kind: gaussian-lstm` needs `memory`, and no other kind may have it")
         if (self.kind == "gaussian-cnn") != (self.vision is not None):
-            raise ValueError("vision and kind gaussian-cnn need each other: set both or neither")
+            raise ValueError("`kind: gaussian-cnn` needs `vision`, and no other kind may have it")
         if self.vision is not None and self.vision.stop > self.observation_size:
-            raise ValueError(f"an image ends at column {self.vision.stop} of {self.observation_size}")
+            raise ValueError(
+                f"an image of `vision` ends at column {self.vision.stop}, but `observation_size` is"
+                f" {self.observation_size}"
+            )
         return self
 
 
@@ -288,7 +291,7 @@ def size_of(policy: Policy) -> int:
 
 
 def filled(policy: Policy, weights: Mapping[str, Tensor]) -> Policy:
-    """Load weights into the result of `blank_policy`; return the policy in evaluation mode.
+    """Load the weights of a policy that `blank_policy` has made; return it in evaluation mode.
 
     Raises:
         CheckpointError: if the weights do not fit, or a weight is not finite.

@@ -47,7 +47,7 @@ class EpisodeStatistics:
         self.total = 0
 
     def add(self, episodes: Episodes | None) -> None:
-        """Add the episodes that ended in a step; `replace(episodes, mask=...)` counts only some of them."""
+        """Add the episodes that ended in a step; with `episodes.mask`, only those where it is true."""
         if episodes is None:
             return
         values = {"return": episodes.returns, **{f"term.{k}": v for k, v in episodes.reward_terms.items()}}
@@ -68,7 +68,7 @@ class EpisodeStatistics:
         self._sums[names].addmv_(matrix, weight)
 
     def all_reduce(self, process_group: ProcessGroup) -> None:
-        """Sum the statistics over all processes, once an episode has ended in each of them."""
+        """Sum the statistics over all processes; as long as one of them has no finished episode, change nothing."""
         own = len(self._sums)
         (total,) = process_group.sum(own)
         if own and total == own * process_group.world_size:

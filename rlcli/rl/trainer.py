@@ -34,7 +34,7 @@ class TrainerState:
     values: dict[str, Any] = field(default_factory=dict)
     """Plain JSON."""
     logs: dict[str, Rows] = field(default_factory=dict)
-    """Name of a log -> its rows."""
+    """Name of data that only grows, such as a replay buffer -> its rows."""
 
 
 @dataclass(slots=True)
@@ -72,7 +72,7 @@ class Trainer(Protocol):
         """Return the current policy, with a copy of the weights."""
 
     def state(self) -> TrainerState:
-        """Return a copy of the state; the rows of its logs can be read until the end of the next iteration."""
+        """Return a copy of the state; the rows of its `logs` can be read until the end of the next iteration."""
 
     def load(self, state: TrainerState) -> None:
         """Restore the state returned by `state()`."""

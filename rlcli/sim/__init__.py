@@ -1,1 +1,4 @@
-"""Physics engines that step many worlds of one model (one per environment), and selections of these worlds."""
+"""Physics engines that step many worlds of one model, one per environment.
+
+A `Selection` is some of these worlds, such as those to reset.
+"""

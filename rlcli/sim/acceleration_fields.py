@@ -1,4 +1,4 @@
-"""Fields and sensors that MuJoCo computes in the acceleration stage of a step."""
+"""Fields and sensors that MuJoCo computes in the acceleration stage of a step: forces and accelerations."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ _BODY_FORCE_SENSORS = [
 
 
 def computes_body_forces(model: mujoco.MjModel) -> bool:
-    """Return whether a step computes `cacc`, `cfrc_int` and `cfrc_ext`: only for sensors that need them."""
+    """Return whether MuJoCo computes `cacc`, `cfrc_int`, `cfrc_ext` in a step: only if a sensor needs them."""
     return bool(np.isin(model.sensor_type, _BODY_FORCE_SENSORS).any())
 
 
 def add_body_forces(spec: mujoco.MjSpec) -> None:
-    """Add a dummy sensor to the model, for which MuJoCo computes `cacc`, `cfrc_int` and `cfrc_ext`."""
+    """Add a dummy sensor to the model, so that MuJoCo computes `cacc`, `cfrc_int` and `cfrc_ext` in each step."""
     kind, body = mujoco.mjtSensor.mjSENS_FRAMEANGACC, mujoco.mjtObj.mjOBJ_BODY
     spec.add_sensor(name="body_forces", type=kind, objtype=body, objname="world")
 
 
 def force_sensor_columns(model: mujoco.MjModel) -> list[int]:
-    """Return the columns of `sensordata` that the acceleration stage computes."""
+    """Return the columns of `sensordata` that the acceleration stage computes, such as those of force sensors."""
     acceleration = int(mujoco.mjtStage.mjSTAGE_ACC)
     return sensor_columns(model, np.flatnonzero(model.sensor_needstage == acceleration).tolist())
 
 
 def sensor_columns(model: mujoco.MjModel, sensors: list[int]) -> list[int]:
-    """Return the columns of some sensors in `sensordata`."""
+    """Return the columns of `sensordata` that belong to the sensors with the given ids."""
     starts, sizes = model.sensor_adr, model.sensor_dim
     return [column for s in sensors for column in range(int(starts[s]), int(starts[s] + sizes[s]))]

@@ -93,7 +93,7 @@ class BatchEngine(BatchWorlds):
         """Do nothing: a CPU has no streams."""
 
     def field(self, name: str) -> Tensor:
-        """Return a live view of an MjData field; from now on, `step` computes the stage of a derived field."""
+        """Return a live view of an MjData field. From now on `step` computes it, if it is a derived one (xpos, ...)."""
         if name not in self._fields:
             if name not in DATA_FIELDS:
                 hint = did_you_mean(name, DATA_FIELDS) or "see mujoco/mjdata.h"
@@ -118,7 +118,7 @@ class BatchEngine(BatchWorlds):
         return self._fields[name]
 
     def _bind(self, name: str) -> Tensor:
-        """Return a field as a tensor; a field of the state as a view of the state, so that two can be joined."""
+        """Return an MjData field as a tensor; a field of the state, such as qpos, is a view of `_state`."""
         values = self._batch.bind(name)
         if name not in STATE_FIELDS:
             return torch.from_numpy(values)
@@ -126,7 +126,7 @@ class BatchEngine(BatchWorlds):
         return self._state.as_strided(values.shape, strides, self.state_layout.columns(name).start)
 
     def step(self, nstep: int, *, derive: bool = True) -> None:
-        """Advance every world by `nstep` physics steps; without `derive`, derived fields keep their values."""
+        """Advance every world by `nstep` physics steps; then, with `derive`, update derived fields such as xpos."""
         self.history.record(nstep)
         try:
             with without_profiler:
@@ -204,7 +204,7 @@ class BatchEngine(BatchWorlds):
         return bad, causes
 
     def forward(self, selection: Selection) -> None:
-        """Compute the derived fields in use of the selected worlds."""
+        """Compute the derived fields (xpos, ...) that have been requested with `field`, in the selected worlds."""
         if self._external is not None:
             selection.write(self._external, 0.0)  # no contact has acted on a start state yet
         if self._forward_stage == _NONE:
@@ -217,7 +217,7 @@ class BatchEngine(BatchWorlds):
             field[index] = values
 
     def _forces(self, selection: Selection) -> list[tuple[Tensor, Any]]:
-        """Return the fields in use of the acceleration stage, and the index of the selected worlds' values in each."""
+        """Return each field in use with forces or accelerations, and the index of the selected worlds' values in it."""
         ids = ids_of(selection)
         return [
             (field, ids if name in ACCELERATION_FIELDS else (ids[:, None], self._force_sensors))
@@ -239,7 +239,7 @@ class BatchEngine(BatchWorlds):
         return tensor.numpy()
 
     def select(self, mask: Field, seed: int, counters: Field) -> IdSelection | None:
-        """Return a selection of the worlds where `mask` is true; None if there is none."""
+        """Return a selection of the worlds where `mask` is true, None if there is none; see `Engine.select`."""
         ids = np.asarray(mask).nonzero()[0]
         if not len(ids):
             return None
@@ -248,7 +248,7 @@ class BatchEngine(BatchWorlds):
     def rays(
         self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None
     ) -> Tensor:
-        """Return distances from points to the first geom along unit directions, -1 for none. (rows, rays) [m]"""
+        """Return distances from points to the first geom along unit directions, -1 without a hit. (rows, rays) [m]"""
         visible = None if groups is None else np.array([g in groups for g in range(mujoco.mjNGROUP)], dtype=np.uint8)
         ids = None if selection is None else ids_of(selection).astype(np.int32)
         start, along = points.double().numpy(), directions.double().numpy()
@@ -266,8 +266,8 @@ class BatchEngine(BatchWorlds):
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of the worlds' state.
 
-        They include the fields in use (requested with `field`) of the last substep, which MuJoCo's mj_forward cannot
-        compute from the state.
+        They include the forces and accelerations of the last substep that have been requested with `field`: MuJoCo's
+        mj_forward cannot compute them from the state.
         """
         substep = {f"substep.{name}": value.clone() for name, value in self._fields.items() if self._of_substep(name)}
         return {**super().state_dict(), **substep}
@@ -292,7 +292,7 @@ class BatchEngine(BatchWorlds):
         """Do nothing: Python frees threads and memory."""
 
     def _forward_all(self) -> None:
-        """Compute the fields in use of every world from its state; fields of the last substep keep their values."""
+        """Compute the derived fields in use of every world from its state; forces stay those of the last substep."""
         saved = {name: value.clone() for name, value in self._fields.items() if self._of_substep(name)}
         with engine_call():
             self._batch.forward(stage=self._forward_stage)
@@ -300,13 +300,13 @@ class BatchEngine(BatchWorlds):
             self._fields[name].copy_(value)
 
     def _only_of_acceleration_stage(self, name: str) -> bool:
-        """Return whether only the acceleration stage writes the field; for `sensordata`, all of its sensors."""
+        """Return whether MuJoCo computes the whole field (for `sensordata`: every sensor) in the acceleration stage."""
         if name == "sensordata":
             return len(self._force_sensors) == int(self.model.nsensordata)
         return name in ACCELERATION_FIELDS
 
     def _of_substep(self, name: str) -> bool:
-        """Return whether the field has values of the last substep, which the state does not determine."""
+        """Return whether the field, such as a force, is one of the last substep: the state does not determine it."""
         if name in ACCELERATION_FIELDS or (name == "sensordata" and self._force_sensors):
             return True
         return bool(self._substep_fields) and name not in STATE_FIELDS

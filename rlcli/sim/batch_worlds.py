@@ -42,7 +42,7 @@ _MIN_STATES_PER_ENV = 3
 
 
 class BatchWorlds:
-    """Base of the CPU engine: its worlds (one per environment), their own model fields and their states.
+    """Base class of the CPU engine: its worlds, their states, and the model fields that differ between worlds.
 
     Raises:
         DeviceError: for more worlds than the machine's memory holds.
@@ -79,35 +79,35 @@ class BatchWorlds:
         return name in MODEL_FIELDS
 
     def expand(self, name: str) -> Tensor:
-        """Return a model field with values of its own for every world, live and writable. (num_envs, ...)"""
+        """Give every world its own values of a model field; return them, live and writable. (num_envs, ...)"""
         if name not in MODEL_FIELDS:
             hint = did_you_mean(name, MODEL_FIELDS) or f"fields that can: {listing(sorted(MODEL_FIELDS))}"
-            raise ValueError(f"'{name}' cannot differ between environments; {hint}")
+            raise ValueError(f"model field '{name}' cannot differ between environments; {hint}")
         values = torch.from_numpy(self._batch.expand(name))
         if not values.is_floating_point():
             self._skip_nothing()
         return values
 
     def expanded(self, name: str) -> Tensor | None:
-        """Return a model field that has a value for each world; None if all worlds share the model's value."""
+        """Return a model field for which each world has its own values; None if all worlds share the model's."""
         return self.expand(name) if name in self._expanded else None
 
     def expanded_fields(self) -> list[str]:
-        """Return the names of the model fields that have a value for each world."""
+        """Return the names of the model fields for which each world has its own values (see `Engine.expand`)."""
         return list(self._expanded)
 
     def set_constants(self, selection: Selection | None = None) -> None:
-        """Recompute the constants that MuJoCo derives from model fields."""
+        """Recompute the constants that MuJoCo derives from model fields such as masses (mj_setConst)."""
         with engine_call():
             self._batch.set_const(None if selection is None else ids_of(selection).astype(np.int32))
         self.own_constants = True
 
     def own_model_fields(self, env: int) -> dict[str, NDArray[Any]]:
-        """Return copies of one world's values of the expanded model fields."""
+        """Return copies of one world's values of the model fields that differ between worlds, by name."""
         return {name: np.array(values[env]) for name, values in self._expanded.items()}
 
     def load_model_field(self, name: str, values: Tensor) -> None:
-        """Expand a model field and set its values, which were read from a file.
+        """Give every world its own values of a model field, which were read from a file.
 
         Raises:
             ValueError: for values of another shape or type, or that could make MuJoCo read outside of its arrays.
@@ -115,30 +115,33 @@ class BatchWorlds:
         target = self.expand(name)
         require_matching_tensors({name: values}, {name: target}, "model field")
         if not target.dtype.is_floating_point and name not in _FLAGS and not torch.equal(target, values):
-            raise ValueError(f"model field '{name}' is part of the model's structure and must not change")
+            raise ValueError(f"model field '{name}' is not as saved; restore the MJCF with which the state was saved")
         target.copy_(values)
 
     def write_own_model(self, env: int, model: mujoco.MjModel) -> None:
-        """Write the model of one world into a copy of the model, with the disable flags of the original model."""
+        """Write one world's values of all model fields into `model`, a copy of the engine's model.
+
+        The disable flags of `model` stay those of the engine's model.
+        """
         self._batch.get_model(env, model)
         if "opt.disableflags" not in self._expanded:
             model.opt.disableflags = self._disable_flags
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
-        """Record the last calls of `step`: `calls` of them, or as many as fit into `memory` bytes."""
+        """Record the states before the last `calls` calls of `step`, or of as many calls as fit into `memory` bytes."""
         self._new_history(self.history.width, calls, memory)
 
     def recorded_calls(self, env: int) -> list[Call]:
-        """Return the recorded calls of a world in its present episode, the oldest first."""
+        """Return the recorded calls of `step` in a world's present episode, the oldest first."""
         return self.history.calls_of(env)
 
     def state_row(self, env: int) -> NDArray[np.float64]:
-        """Return a copy of a world's integration state. (nstate,)"""
+        """Return a copy of a world's integration state (mjSTATE_INTEGRATION). (nstate,)"""
         row: NDArray[np.float64] = self._rows[env].copy()
         return row
 
     def state_rows(self, envs: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return copies of the integration states of some worlds. (n, nstate)"""
+        """Return copies of the integration states (mjSTATE_INTEGRATION) of the worlds `envs`. (n, nstate)"""
         return self._rows[envs]
 
     def set_state_row(self, env: int, row: NDArray[np.float64]) -> None:
@@ -204,7 +207,7 @@ class BatchWorlds:
         self.history = StateHistory(self._rows, width, self._default, calls, memory=memory, count=count)
 
     def _skip_nothing(self) -> None:
-        """From now on, compute everything that the flags of the original model do not disable."""
+        """Stop skipping work: from now on, compute everything that the flags of the original model do not disable."""
         if self._skips:
             self._skips = False
             expand_disable_flags(self._batch)[:] = self._disable_flags

@@ -41,9 +41,9 @@ class Capacity:
 
 
 def required_capacity(model: mujoco.MjModel, contacts: int | None = None, constraints: int | None = None) -> Capacity:
-    """Return the capacity that a model needs.
+    """Return the numbers of contacts and constraint rows for which each world of a model needs memory.
 
-    It is the smaller one of the model's upper bound and a multiple of the maximum of a random simulation.
+    Each is the smaller one of an upper bound and a multiple of the maximum in random simulations.
 
     Args:
         model: the compiled model.
@@ -58,7 +58,7 @@ def required_capacity(model: mujoco.MjModel, contacts: int | None = None, constr
 
 
 def _upper_bound(model: mujoco.MjModel) -> tuple[int, int]:
-    """Return the contacts of all pairs of geoms that may touch, and the rows of contacts, joints and equalities."""
+    """Return upper bounds of the number of contacts and of constraint rows in a world."""
     contacts = rows = 0
     for a, b in colliding_pairs(model):
         kinds = tuple(sorted((_G(model.geom_type[a]), _G(model.geom_type[b])), key=int))

@@ -1,4 +1,4 @@
-"""Column indices that select a view if possible, and a cache of such views."""
+"""Indices of columns (of joints, ...) in a tensor: slices where possible, since they give views instead of copies."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _consecutive(first: int, stop: int) -> slice:
 
 
 def id_tensor(ids: NDArray[np.integer[Any]], device: torch.device) -> Tensor:
-    """Return ids of MuJoCo as an index tensor. int64"""
+    """Return ids of bodies, joints, ... in MuJoCo's model as a tensor for indexing. int64"""
     return torch.from_numpy(ids.astype(np.int64)).to(device)
 
 

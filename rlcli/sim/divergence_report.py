@@ -62,7 +62,7 @@ class Divergence:
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One call of `Engine.step`, as one environment sees it."""
+    """Record of a call of `Engine.step` in one environment."""
 
     state: States
     """Integration state before the call. (nstate,)"""
@@ -71,9 +71,9 @@ class Call:
 
 
 class StateHistory:
-    """Ring buffer of the states before the last engine calls.
+    """Ring buffer of the states before the last calls of `Engine.step`, from which replays start.
 
-    Only the leading columns, which the environment writes, are recorded; the others have the values of `default`.
+    Only the first `width` columns are recorded; the environment does not change the others from `default`.
 
     Args:
         state: state rows of the engine, live. (n, nstate)
@@ -114,7 +114,7 @@ class StateHistory:
         self._episode_start[:] = self.count
 
     def start_episodes(self, envs: NDArray[np.int64]) -> None:
-        """Start new episodes of some environments; their earlier calls are dropped."""
+        """Start new episodes of the environments `envs`; their earlier calls are dropped."""
         self._episode_start[envs] = self.count
 
     def last_state(self, env: int) -> States:
@@ -128,7 +128,7 @@ class StateHistory:
         return self.calls_between(env, int(self._episode_start[env]), self.count)
 
     def calls_between(self, env: int, first: int, stop: int) -> list[Call]:
-        """Return the calls of an environment with numbers from `first` up to `stop`, if the ring still has them."""
+        """Return the calls number `first` to `stop` - 1 of an environment, as far as the buffer still has them."""
         first = max(first, self._oldest, self.count - self.calls)
         numbers = range(first, min(stop, self.count))
         return [Call(self._state(env, number), self._nstep[number % self.calls]) for number in numbers]
@@ -140,7 +140,7 @@ class StateHistory:
 
 
 class StateLayout:
-    """Columns of each field in an integration state.
+    """Columns of each field (qpos, qvel, ...) in an integration state.
 
     Args:
         model: the compiled model.
@@ -160,12 +160,12 @@ class StateLayout:
         return list(self._columns.items())
 
     def nonfinite_fields(self, state: States) -> list[str]:
-        """Return the fields of a state that are not finite, inputs of the simulation first."""
+        """Return the names of the fields of a state that are not finite, inputs of the simulation first."""
         names = [name for name in _INPUTS_FIRST if name in self._columns]
         return [name for name in names if not np.isfinite(state[self._columns[name]]).all()]
 
     def element_at(self, name: str, index: int) -> str:
-        """Return the element that an index of a field belongs to, such as `joint 'swing'`."""
+        """Return the element of the model to which an index of a field belongs, as `joint 'swing'`."""
         m = self._model
         if name == "qpos" and 0 <= index < m.nq:
             joint = int(np.searchsorted(m.jnt_qposadr, index, side="right")) - 1
@@ -196,7 +196,7 @@ class DivergenceReporter:
     max_velocity: float
 
     def nonfinite_field(self, env: int) -> str:
-        """Return the first field that is not finite: a model field of the world, else a field of its state."""
+        """Return the name of the first field that is not finite: a model field of the world, or one of its state."""
         return [*self._nonfinite_model_fields(env), *self.layout.nonfinite_fields(self.states[env])][0]
 
     def describe(self, env: int, cause: str, before: States, error: str) -> Divergence:

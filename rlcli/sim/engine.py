@@ -57,17 +57,17 @@ class EngineView(Protocol):
         """
 
     def expanded_fields(self) -> list[str]:
-        """Return the names of the model fields that have a value for each world."""
+        """Return the names of the model fields for which each world has its own values (see `Engine.expand`)."""
 
 
 class ReplayableView(EngineView, Protocol):
-    """View of an engine with integration states on the CPU: steps from a stored state can be repeated bit for bit."""
+    """Part of a CPU engine for replays: steps from a stored integration state can be repeated bit for bit."""
 
     state_layout: StateLayout
 
     @property
     def step_stage(self) -> int:
-        """Stage (mjtStage) up to which a call recomputes the derived fields in use after its last physics step."""
+        """Stage (mjtStage) up to which `step` recomputes derived fields, such as xpos, after its last physics step."""
 
     @property
     def own_constants(self) -> bool:
@@ -78,19 +78,19 @@ class ReplayableView(EngineView, Protocol):
         """States before the last calls of `step`."""
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
-        """Record the last calls of `step`: `calls` of them, or as many as fit into `memory` bytes."""
+        """Record the states before the last `calls` calls of `step`, or of as many calls as fit into `memory` bytes."""
 
     def recorded_calls(self, env: int) -> list[Call]:
-        """Return the recorded calls of a world in its present episode, the oldest first."""
+        """Return the recorded calls of `step` in a world's present episode, the oldest first."""
 
     def state_row(self, env: int) -> NDArray[np.float64]:
-        """Return a copy of a world's integration state. (nstate,)"""
+        """Return a copy of a world's integration state (mjSTATE_INTEGRATION). (nstate,)"""
 
     def state_rows(self, envs: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return copies of the integration states of some worlds. (n, nstate)"""
+        """Return copies of the integration states (mjSTATE_INTEGRATION) of the worlds `envs`. (n, nstate)"""
 
     def own_model_fields(self, env: int) -> dict[str, NDArray[Any]]:
-        """Return copies of one world's values of the expanded model fields."""
+        """Return copies of one world's values of the model fields that differ between worlds, by name."""
 
 
 class Engine(EngineView, Protocol):
@@ -102,7 +102,7 @@ class Engine(EngineView, Protocol):
 
     @property
     def described_divergences(self) -> list[Divergence]:
-        """First divergences of the last call of `diverged`; on an `asynchronous` engine, the first since the start."""
+        """First divergences that the last call of `diverged` found; on a GPU, the first one since the start."""
 
     def use_torch_stream(self) -> None:
         """Launch on torch's current CUDA stream from now on; called before a step."""
@@ -111,35 +111,35 @@ class Engine(EngineView, Protocol):
         """Return whether a model field may differ between worlds."""
 
     def expand(self, name: str) -> Tensor:
-        """Return a model field with values of its own for every world, live and writable. (num_envs, ...)
+        """Give every world its own values of a model field; return them, live and writable. (num_envs, ...)
 
         After a write to masses, inertias, positions and the like, call `set_constants`.
         """
 
     def expanded(self, name: str) -> Tensor | None:
-        """Return a model field that has a value for each world; None if all worlds share the model's value."""
+        """Return a model field for which each world has its own values; None if all worlds share the model's."""
 
     def set_constants(self, selection: Selection | None = None) -> None:
         """Recompute the constants that MuJoCo derives from model fields, after a write to expanded fields.
 
         Args:
-            selection: the worlds; None: all. An `asynchronous` engine always recomputes all worlds.
+            selection: the worlds; None: all. A GPU engine always recomputes all worlds.
         """
 
     def step(self, nstep: int, *, derive: bool = True) -> None:
-        """Advance every world by `nstep` physics steps; without `derive`, derived fields keep their values."""
+        """Advance every world by `nstep` physics steps; then, with `derive`, update derived fields such as xpos."""
 
     def diverged(self, motion_is_finite: bool = False) -> Tensor | None:
         """Return the worlds that diverged in the last `step`, (num_envs,) bool; None for none. Call it once per step.
 
-        An `asynchronous` engine has already put these worlds back into the state that they had before the step.
+        A GPU engine has already put these worlds back into the state that they had before the step.
 
         Args:
             motion_is_finite: whether the caller has checked that all positions and velocities are finite.
         """
 
     def forward(self, selection: Selection) -> None:
-        """Compute the derived fields of the selected worlds from their state."""
+        """Compute the derived fields (xpos, ...) of the selected worlds from their state."""
 
     def reset(self, selection: Selection) -> None:
         """Put the selected worlds into the default state; `forward` then computes their derived fields."""
@@ -148,7 +148,7 @@ class Engine(EngineView, Protocol):
         """Set the joint state that `reset` restores. (nq,), (nv,)"""
 
     def as_field(self, tensor: Tensor) -> Field:
-        """Return the memory of a tensor in the form that selections of this engine read and write fastest."""
+        """Return a tensor as selections write it fastest: on a CPU as a NumPy array of the same memory."""
 
     def select(self, mask: Field, seed: int, counters: Field) -> Selection | None:
         """Return a selection of the worlds where `mask` is true; None if it is known to be empty.
@@ -162,7 +162,7 @@ class Engine(EngineView, Protocol):
     def rays(
         self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None
     ) -> Tensor:
-        """Return distances from points to the first geom along unit directions, -1 for none. (rows, rays) [m]
+        """Return distances from points to the first geom along unit directions, -1 without a hit. (rows, rays) [m]
 
         Args:
             points: start points, world frame; one row per world, or per row of `selection`. (rows, rays, 3) float32
@@ -204,14 +204,14 @@ class ReplayableEngine(Engine, ReplayableView, Protocol):
         """Set the integration state and the derived fields of a world to those of an MjData."""
 
     def load_model_field(self, name: str, values: Tensor) -> None:
-        """Expand a model field and set its values, which were read from a file.
+        """Give every world its own values of a model field, which were read from a file.
 
         Raises:
             ValueError: for values of another shape or type, or that could make MuJoCo read outside of its arrays.
         """
 
     def write_own_model(self, env: int, model: mujoco.MjModel) -> None:
-        """Write one world's values of the expanded fields into `model`, a copy of the engine's model.
+        """Write one world's values of all model fields into `model`, a copy of the engine's model.
 
         The disable flags of `model` stay those of the engine's model.
         """

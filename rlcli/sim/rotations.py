@@ -85,10 +85,10 @@ def axes(quat: Tensor) -> Tensor:
 @functools.lru_cache
 @torch.inference_mode(False)  # tensors that can be used in both modes
 def _axis_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the constants of `axes`, in which each element of the axes is s1 a b + s2 c d + offset.
+    """Return the constants of `axes`, which computes each of its elements as s1 a b + s2 c d + offset.
 
-    They are the columns of the quaternion (36,): the left factors of the first and of the second products, then the
-    right factors; the scales of the products (18,); and the offsets of the sums (9,).
+    They are the columns of the quaternion to multiply (36,): all a, all c, all b, all d; the scales s1 and s2 (18,);
+    and the offsets (9,).
     """
     first, second = (
         ["yy", "xy", "xz", "xy", "xx", "yz", "xz", "yz", "xx"],
@@ -104,7 +104,7 @@ def _axis_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def roll_pitch_yaw(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the angles of `from_euler`, pitch in [-pi/2, pi/2], the others in [-pi, pi] [rad]. (..., 4) -> (...)"""
+    """Return the angles about the fixed axes x, y (within +-pi/2) and z, see `from_euler` [rad]. (..., 4) -> (...)"""
     w, x, y, z = quat.unbind(-1)
     roll = atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = torch.asin((2.0 * (w * y - z * x)).clamp_(-1.0, 1.0))

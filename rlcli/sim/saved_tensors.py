@@ -32,7 +32,7 @@ def mean_of(values: Tensor) -> Tensor:
 
 
 def means(values: Mapping[str, Tensor]) -> dict[str, float]:
-    """Return the means of some tensors as floats."""
+    """Return the mean of each tensor as a float, by the same names."""
     return {name: float(mean_of(value)) if value.dim() else float(value) for name, value in values.items()}
 
 
@@ -55,7 +55,7 @@ def require_matching_tensors(saved: Mapping[str, Tensor], own: Mapping[str, Tens
     for name, value in own.items():
         found = saved.get(name)
         if found is not None and (found.shape != value.shape or found.dtype != value.dtype):
-            raise ValueError(f"{what}: '{name}' is {_text(found)}, expected {_text(value)}")
+            raise ValueError(f"{what}: the saved '{name}' is {_text(found)}, the present task needs {_text(value)}")
 
 
 def require_in_range(value: Tensor, low: int, high: int, what: str) -> None:
@@ -65,7 +65,8 @@ def require_in_range(value: Tensor, low: int, high: int, what: str) -> None:
         ValueError: with their smallest and largest value.
     """
     if value.numel() and not bool(((value >= low) & (value <= high)).all()):
-        raise ValueError(f"'{what}' has values {int(value.min())} to {int(value.max())}; allowed are {low} to {high}")
+        found = f"{int(value.min())} to {int(value.max())}"
+        raise ValueError(f"the saved '{what}' has values {found}; allowed are {low} to {high}: the file is damaged")
 
 
 def _text(value: Tensor) -> str:

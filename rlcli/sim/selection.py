@@ -50,7 +50,7 @@ def one_column(columns: Columns, count: int, parameter: str) -> int:
 
 
 class Selection(Protocol):
-    """Some environments, one row each, in order. `shape` is the shape of one row's random numbers."""
+    """Some of the environments, such as those to reset, one row each; `shape` is that of one row's random numbers."""
 
     @property
     def count(self) -> int | Tensor:
@@ -72,7 +72,7 @@ class Selection(Protocol):
         """Return a copy of the rows of a (num_envs, ...) tensor."""
 
     def read_view(self, field: Field, columns: Columns = ALL) -> Tensor:
-        """Return the rows, or the tensor itself: do not write to the result, and do not use it after a write."""
+        """Return the rows, if possible as a view: do not write to the result, and do not use it after a write."""
 
     def write(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
         """Set the rows of a (num_envs, ...) tensor."""
@@ -93,7 +93,7 @@ class Selection(Protocol):
         """Return the indices of the environments; on a GPU this forces a host sync. (rows,) int64"""
 
     def stream(self, stream: np.uint64) -> Selection:
-        """Return a selection of the same rows that draws for another purpose (a result of `rlcli.random.stream`)."""
+        """Return a selection of the same rows with another random stream, a result of `rlcli.random.stream`."""
 
 
 def _as_array(values: Any) -> Any:
@@ -200,7 +200,7 @@ class IdSelection:
         return self._with(self.ids[chosen], self.counters[chosen], self.stream_key)
 
     def union(self, other: IdSelection) -> IdSelection:
-        """Return a selection of the rows of this selection and of another one; a row in both keeps its counter here."""
+        """Return a selection of the rows of this and another one; rows of both keep the counters of this one."""
         ids, first = np.unique(np.concatenate([self.ids, other.ids]), return_index=True)
         counters = np.concatenate([self.counters, other.counters])[first]
         return self._with(ids, counters, self.stream_key)
@@ -210,7 +210,7 @@ class IdSelection:
         return torch.from_numpy(self.ids)
 
     def stream(self, stream: np.uint64) -> IdSelection:
-        """Return a selection of the same rows that draws for another purpose (a result of `rlcli.random.stream`)."""
+        """Return a selection of the same rows with another random stream, a result of `rlcli.random.stream`."""
         other = self._with(self.ids, self.counters, stream)
         other._keys = self._row_keys()
         return other

@@ -20,7 +20,7 @@ FIELDS_OF_SKIPPED_WORK = frozenset(
 
 
 def skippable_flags(model: mujoco.MjModel) -> int:
-    """Return the disable flags (mjtDisableBit) that do not change a bit of the model's states.
+    """Return the disable flags (mjtDisableBit) that can be set without changing a bit of the model's states.
 
     The flags are valid as long as no integer field of the model changes: integers decide which geoms may touch.
     """

@@ -117,7 +117,7 @@ class SimData:
         return total
 
     def derived_field(self, name: str) -> Tensor:
-        """Return a derived field in float32, cast once per step. (num_envs, ...)"""
+        """Return a derived MjData field, such as xpos, in float32, cast once per step. (num_envs, ...)"""
         self.forward_moved()
         stamp, value = self._derived.get(name, (-1, None))
         if stamp != self.stamp or value is None:
@@ -126,7 +126,7 @@ class SimData:
         return value
 
     def once_per_goal(self, key: tuple[object, ...], command: Tensor, compute: Callable[[], Tensor]) -> Tensor:
-        """Return a value of the state and a command, which is computed once for all terms of a step."""
+        """Return `compute()`, cached under `key` until the state or the command changes, for all terms of a step."""
         # torch counts its own writes to a tensor; commands that managers write through numpy change `command_stamp`
         writes = 0 if command.is_inference() else command._version
         stamps = (self.stamp, self.command_stamp, writes)

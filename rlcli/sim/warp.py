@@ -91,7 +91,7 @@ class WarpEngine(WarpWorlds):
                 wp.set_stream(wp.stream_from_torch(stream), self._device)
 
     def step(self, nstep: int, *, derive: bool = True) -> None:
-        """Advance every world by `nstep` physics steps; without `derive`, derived fields keep their values."""
+        """Advance every world by `nstep` physics steps; then, with `derive`, update derived fields such as xpos."""
         with self._launching():
             if self.device.type != "cuda" or torch.cuda.is_current_stream_capturing():
                 self._advance(nstep, derive)
@@ -113,7 +113,7 @@ class WarpEngine(WarpWorlds):
         return self._diverged
 
     def forward(self, selection: Selection) -> None:
-        """Compute the derived fields in use; those of the acceleration stage only in the selected worlds.
+        """Compute the derived fields (xpos, ...) in use; forces and accelerations only in the selected worlds.
 
         The present state of the selected worlds is saved, and restored if they diverge in the next step.
         """
@@ -145,11 +145,11 @@ class WarpEngine(WarpWorlds):
         self._default_qvel.copy_(qvel)
 
     def as_field(self, tensor: Tensor) -> Tensor:
-        """Return a tensor in the form of this engine's fields, which is the tensor itself."""
+        """Return the tensor itself, which selections of this engine read and write."""
         return tensor
 
     def select(self, mask: Field, seed: int, counters: Field) -> MaskSelection:
-        """Return a selection of the worlds where `mask` is true; only the device can find out whether it is empty."""
+        """Return a selection of the worlds where `mask` is true, which may be empty; see `Engine.select`."""
         assert isinstance(mask, Tensor)
         assert isinstance(counters, Tensor)
         return MaskSelection(mask, seed, counters, shared_streams=self.shared_streams)
@@ -157,7 +157,7 @@ class WarpEngine(WarpWorlds):
     def rays(
         self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None
     ) -> Tensor:
-        """Return distances from points to the first geom along unit directions, -1 for none. (num_envs, rays) [m]"""
+        """Return distances from points to the first geom along unit directions, -1 if none. (num_envs, rays) [m]"""
         self.field("geom_xpos")  # bind it, so that every step updates the geoms' positions
         shape = (self.num_envs, points.shape[1])
         distance = torch.empty(shape, device=points.device)

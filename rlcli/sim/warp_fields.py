@@ -31,7 +31,7 @@ KINEMATICS, VELOCITY, FORCE = range(3)
 
 
 class FieldStages:
-    """Lookup of the stages of a step that compute each field of a model's worlds."""
+    """Lookup of the stages of a MuJoCo step that compute each MjData field of a model."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         force_columns = force_sensor_columns(model)
@@ -42,7 +42,7 @@ class FieldStages:
         self._sensors_need_only_motion = _MOTION_SENSORS.issuperset(other_sensors.tolist())
 
     def stages_of(self, name: str) -> set[int]:
-        """Return the groups of derived fields that a field belongs to."""
+        """Return the stages that compute a field (KINEMATICS, VELOCITY, FORCE); none for a field of the state."""
         if name in (*STATE, *INPUTS):
             return set()
         if name == "sensordata":

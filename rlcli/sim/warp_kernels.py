@@ -37,7 +37,7 @@ def mix(x: wp.uint64) -> wp.uint64:
 
 @wp.func
 def unit(start: wp.uint64, counter: wp.int64, stream: wp.uint64, env: int, index: int) -> float:
-    """Return the number of an index in a random stream, in [0, 1), with the bits of `rlcli.random.uniform`."""
+    """Return number `index` of a random stream, in [0, 1), with the same bits as `rlcli.random.uniform`."""
     key = mix(mix(wp.uint64(env) * _GOLDEN + start) + wp.uint64(counter) * _GOLDEN)
     word = mix(key + wp.uint64(index + 1) * _GOLDEN + stream)
     return wp.float32(word >> wp.uint64(40)) * _TO_UNIT

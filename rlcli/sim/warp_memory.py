@@ -52,7 +52,7 @@ def put_on_device(
 
 
 def overflow_error(found: int, capacity: Capacity) -> DivergedError:
-    """Return the error for exceeded capacities; `found` has a bit of `OVERFLOW_SETTINGS` for each."""
+    """Return the error for exceeded capacities; the bits of `found` are keys of `OVERFLOW_SETTINGS`."""
     settings = {setting for bit, setting in OVERFLOW_SETTINGS.items() if found & int(bit)}
     kinds = " and ".join(bit.name.lower() for bit in OVERFLOW_SETTINGS if found & int(bit) and bit.name)
     now = {"contacts_per_env": capacity.contacts, "constraints_per_env": capacity.constraints}

@@ -1,4 +1,4 @@
-"""Worlds of the GPU engine (one per environment): own model fields, fields of the data, and saved states."""
+"""Worlds of the GPU engine (one per environment): model fields that differ, fields of the data, and saved states."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _HOLDING_EQUALITIES = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WEL
 
 
 class WarpWorlds:
-    """Base of the GPU engine: its worlds on a device of Warp, their own model fields and their states.
+    """Base class of the GPU engine: its worlds, their states, and the model fields that differ between worlds.
 
     Raises:
         ConfigError: for a model that MuJoCo Warp cannot run.
@@ -83,13 +83,13 @@ class WarpWorlds:
         return attribute in _batched_fields(owner) and getattr(owner, attribute, None) is not None
 
     def expand(self, name: str) -> Tensor:
-        """Return a model field with values of its own for every world, live and writable. (num_envs, ...)"""
+        """Give every world its own values of a model field; return them, live and writable. (num_envs, ...)"""
         if name not in self._expanded:
             owner, attribute = self._owner(name)
             if not self.can_expand(name):
                 known = sorted(_batched_fields(owner))
                 hint = did_you_mean(attribute, known) or f"fields that can: {listing(known)}"
-                raise ValueError(f"'{name}' cannot differ between environments; {hint}")
+                raise ValueError(f"model field '{name}' cannot differ between environments; {hint}")
             array = getattr(owner, attribute)
             values = np.repeat(array.numpy()[:1], self.num_envs, axis=0)
             wide = wp.array(values, dtype=array.dtype, device=self._device)
@@ -99,11 +99,11 @@ class WarpWorlds:
         return self._expanded[name]
 
     def expanded(self, name: str) -> Tensor | None:
-        """Return a model field that has a value for each world; None if all worlds share the model's value."""
+        """Return a model field for which each world has its own values; None if all worlds share the model's."""
         return self._expanded.get(name)
 
     def expanded_fields(self) -> list[str]:
-        """Return the names of the model fields that have a value for each world."""
+        """Return the names of the model fields for which each world has its own values (see `Engine.expand`)."""
         return list(self._expanded)
 
     def set_constants(self, selection: Selection | None = None) -> None:
@@ -116,13 +116,15 @@ class WarpWorlds:
             mjw.set_const(self._model, self._data)
 
     def field(self, name: str) -> Tensor:
-        """Return a live view of an MjData field; from now on, `step` computes the stage of a derived field."""
+        """Return a live view of an MjData field. From now on `step` computes it, if it is a derived one (xpos, ...)."""
         if name not in self._fields:
             array = getattr(self._data, name, None)
             if not isinstance(array, wp.array) or array.ndim == 0 or array.shape[0] != self.num_envs:
                 names = [f.name for f in dataclasses.fields(self._data)]
                 if name in names:
-                    raise ValueError(f"field '{name}' of MuJoCo Warp's data has no value for each environment")
+                    raise ValueError(
+                        f"field '{name}' of mujoco_warp.Data has no row for each environment; use a field that has one"
+                    )
                 hint = did_you_mean(name, names) or "see mujoco_warp.Data"
                 raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {hint}")
             saved = self._substep_values()
@@ -160,7 +162,9 @@ class WarpWorlds:
         """Restore the state returned by `state_dict()`, and compute derived fields again."""
         for name, values in substate(state, "model.").items():
             if not values.is_floating_point() and self.expanded(name) is None:
-                raise ValueError(f"model field '{name}' is part of the model's structure and must not change")
+                raise ValueError(
+                    f"model field '{name}' is not as saved; restore the MJCF with which the state was saved"
+                )
             require_matching_tensors({name: values}, {name: self.expand(name)}, "engine")
             self.expand(name).copy_(values)
         substep = substate(state, "substep.")
@@ -231,7 +235,7 @@ class WarpWorlds:
             mjw.sensor_vel(m, d)
 
     def _of_substep(self) -> list[str]:
-        """Return the fields in use that have values of the last substep, which the state does not determine."""
+        """Return the fields in use that the state does not determine, such as forces: they are of the last substep."""
         stages = {name: self._stages.stages_of(name) for name in self._fields}
         return [name for name, groups in stages.items() if FORCE in groups or (self._substep_fields and groups)]
 
@@ -241,7 +245,7 @@ class WarpWorlds:
         return {name: self._fields[name].clone() for name in names if name in self._fields}
 
     def _owner(self, name: str) -> tuple[Any, str]:
-        """Return the structure of MuJoCo Warp that has a model field, and the field's name in it."""
+        """Return the structure of MuJoCo Warp (Model or Option) that has a model field, and the field's name in it."""
         return (self._model.opt, name[4:]) if name.startswith("opt.") else (self._model, name)
 
     def _launching(self) -> wp.ScopedDevice:
@@ -258,6 +262,6 @@ class WarpWorlds:
 
 
 def _batched_fields(owner: Any) -> set[str]:
-    """Return the array fields of a dataclass of MuJoCo Warp that have a row for each world."""
+    """Return the names of the arrays in a dataclass of MuJoCo Warp that have a row for each world."""
     shapes = {field.name: getattr(field.type, "shape", ()) for field in dataclasses.fields(owner)}
     return {name for name, shape in shapes.items() if next(iter(shape), None) == "*"}

@@ -68,7 +68,7 @@ def compare_trajectories(
 
 
 def _difference(env: VecEnv, output: str, a: Tensor, b: Tensor, when: str) -> tuple[str, str]:
-    """Return where two tensors differ first, and both values there, as texts."""
+    """Return two texts: where two tensors of the output `output` differ first, and both values there."""
     index = (a != b).nonzero()[0].tolist()
     row, column = index[0], index[1:]
     group = output.split("'")[1] if "'" in output else ""
@@ -98,7 +98,7 @@ def _start(env: VecEnv, obs: dict[str, Tensor]) -> Tensor:
 
 
 class _EnvPair:
-    """Two environments with the same seed and equal states until their actions or their episodes' ends differ.
+    """Two environments, `kept` and `ended`, with equal states until their actions or their episodes' ends differ.
 
     Args:
         subject: the task.
@@ -125,7 +125,7 @@ class _EnvPair:
 
 
 def _env_pair(subject: TaskUnderTest) -> _EnvPair:
-    """Return a pair after some steps; in the next step some episodes of `ended` end and those of `kept` continue."""
+    """Return two environments in equal states; in the next step some episodes of `ended` end, of `kept` none."""
     pair = _EnvPair(subject)
     pair.step(5)
     expire_episodes(pair.ended, _ENDING)

@@ -99,7 +99,7 @@ class Rollout:
 
 
 def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollout:
-    """Run a fixed policy for some steps from a reset, or until an error is raised, and record the rollout."""
+    """Reset, run a policy of `FIXED_POLICIES` for some steps or until an error, and record the rollout."""
     act, limits = FIXED_POLICIES[policy](env, bound), policy == "random"
     steps_of: defaultdict[str, list[Tensor]] = defaultdict(list)
     terms: defaultdict[str, list[Tensor]] = defaultdict(list)
@@ -198,7 +198,7 @@ class _PhysicsObserver(StepObserver):
 
 
 class RolloutEvidence:
-    """Rollouts of the fixed policies, recorded on first use, and environments for further measurements."""
+    """Data that lint rules read: rollouts of the fixed policies, recorded on first use; and new environments."""
 
     def __init__(self, subject: TaskUnderTest, seconds: float | None) -> None:
         self.subject = subject

@@ -1,4 +1,7 @@
-"""Checks that a task gives equal results elsewhere: other threads, environments, engines, restored checkpoints."""
+"""Checks that a task gives equal results with other threads, numbers of environments, engines, after a restore.
+
+Further checks: the shipped policy fits the task, the columns are as recorded, no Python loop runs over environments.
+"""
 
 from __future__ import annotations
 
@@ -163,7 +166,7 @@ def _groups(record: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
 
 
 def _changed(then: list[dict[str, Any]] | None, now: list[dict[str, Any]] | None) -> str | None:
-    """Return the first difference between two lists of terms as text."""
+    """Return the first difference between the recorded and the present terms as text; None if they are equal."""
     if then is None or now is None:
         return "is new" if then is None else "is gone"
     before, after = _columns(then), _columns(now)

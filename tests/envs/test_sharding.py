@@ -107,7 +107,7 @@ def test_split_covers_all_envs_with_two_sizes(total, shards):
 
 
 def test_split_refuses_shards_of_one():
-    with pytest.raises(ValueError, match="5 environments cannot be split into 3"):
+    with pytest.raises(ValueError, match="5 environments are too few for 3 workers"):
         split(5, 3)
 
 

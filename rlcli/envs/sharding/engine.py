@@ -62,7 +62,7 @@ class ShardedEngine:
 
     @property
     def step_stage(self) -> int:
-        """Stage (mjtStage) up to which a call recomputes the derived fields in use after its last physics step."""
+        """Stage (mjtStage) up to which `step` recomputes derived fields, such as xpos, after its last physics step."""
         return self._local.step_stage
 
     @property
@@ -90,30 +90,30 @@ class ShardedEngine:
         return torch.cat(self._shards.call_all(_field, name))
 
     def expanded_fields(self) -> list[str]:
-        """Return the names of the model fields that have a value for each world."""
+        """Return the names of the model fields for which each world has its own values (see `Engine.expand`)."""
         return self._local.expanded_fields()
 
     def record_calls(self, calls: int, memory: int = HISTORY_MEMORY) -> None:
-        """Record the last calls of `step`: `calls` of them, or as many as fit into `memory` bytes."""
+        """Record the states before the last `calls` calls of `step`, or of as many calls as fit into `memory` bytes."""
         width = self.num_envs * self.history.width * 8
         self._shards.call_all(_record_calls, max(1, min(calls, memory // max(1, width))))
 
     def recorded_calls(self, env: int) -> list[Call]:
-        """Return the recorded calls of a world in its present episode, the oldest first."""
+        """Return the recorded calls of `step` in a world's present episode, the oldest first."""
         return list(self._shards.call_one(env, _recorded_calls))
 
     def state_row(self, env: int) -> NDArray[np.float64]:
-        """Return a copy of a world's integration state. (nstate,)"""
+        """Return a copy of a world's integration state (mjSTATE_INTEGRATION). (nstate,)"""
         row: NDArray[np.float64] = self._shards.call_one(env, _state_row)
         return row
 
     def state_rows(self, envs: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return copies of the integration states of some worlds. (n, nstate)"""
+        """Return copies of the integration states (mjSTATE_INTEGRATION) of the worlds `envs`. (n, nstate)"""
         states: NDArray[np.float64] = np.concatenate(self._shards.call_all(_all_states))[envs]
         return states
 
     def own_model_fields(self, env: int) -> dict[str, NDArray[Any]]:
-        """Return copies of one world's values of the expanded model fields."""
+        """Return copies of one world's values of the model fields that differ between worlds, by name."""
         return dict(self._shards.call_one(env, _own_model_fields))
 
 

@@ -169,11 +169,11 @@ class ShardedEnv(Environment):
         """Do nothing: a CPU raises errors in the step."""
 
     def extras(self) -> dict[str, float]:
-        """Return further values to log: the task's values of the last step, and new divergences by cause."""
+        """Return further values to log: those of the task (`extras`, curriculum), and new divergences by cause."""
         return {**means(self._metric_values()), **sums(self.call_all(_divergence_metrics))}
 
     def step_metrics(self) -> dict[str, Tensor]:
-        """Return one value per environment; see `Environment.step_metrics`. (num_envs,) each"""
+        """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each"""
         parts = self.call_all(_step_metrics)
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
@@ -207,7 +207,7 @@ class ShardedEnv(Environment):
 
     @property
     def causes(self) -> dict[str, int]:
-        """Number of diverged simulations by cause."""
+        """Number of diverged simulations since the start, by cause."""
         return sums(self.call_all(_causes))
 
     @property
@@ -224,7 +224,7 @@ class ShardedEnv(Environment):
         return self.local.unsaved_state()
 
     def episode_dependencies(self) -> list[str]:
-        """Return the parts of the configuration that make an episode depend on earlier ones."""
+        """Return the parts of the configuration through which an episode depends on earlier ones."""
         return self.local.episode_dependencies()
 
     def close(self) -> None:
@@ -337,7 +337,7 @@ class ShardedEnv(Environment):
         return {name: self._joined_metric([part[name] for part in parts]) for name in parts[0]}
 
     def _joined_metric(self, parts: Sequence[Tensor]) -> Tensor:
-        """Return the values of all environments; for one value per shard, the mean over environments."""
+        """Return a metric's values of all environments; if each shard has a single value, the mean of these."""
         if parts[0].dim():
             return join(parts)
         counts = torch.tensor([shard.count for shard in self._shards], dtype=torch.float64)

@@ -47,7 +47,7 @@ class Stage(enum.IntEnum):
 
 
 class Needs(enum.Flag):
-    """Kinds of observers of the main process for which a shard must stop in its step."""
+    """Kinds of observers in the main process for which a shard must stop in the middle of its step."""
 
     AFTER_PHYSICS = enum.auto()
     ON_DIVERGENCE = enum.auto()
@@ -64,7 +64,7 @@ class Needs(enum.Flag):
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Names of the columns (the values) of finished episodes in shared memory."""
+    """Names of the values of a finished episode (reward terms, causes, ...), which are columns in shared memory."""
 
     terms: tuple[str, ...]
     causes: tuple[str, ...]
@@ -80,13 +80,13 @@ class Columns:
 
     @property
     def count(self) -> int:
-        """Number of columns in shared memory, with those that every episode has."""
+        """Number of columns in shared memory, including those of every episode (return, length, ...)."""
         named = (self.terms, self.causes, self.metrics, self.conditions, self.condition_values)
         return _FIXED_COLUMNS + sum(len(part) for part in named) + bool(self.conditions)
 
 
 def counter_specs(total: int) -> dict[str, ArraySpec]:
-    """Return shapes and types of the shared tensors that are needed first, while environments are built."""
+    """Return shape and type of the episode counters, the shared tensor that is needed while environments are built."""
     return {"counters": ArraySpec((2, total), torch.int64)}
 
 
@@ -119,9 +119,9 @@ class ShardRunner:
         env: the environments of the shard.
         number: index of the shard.
         arrays: the shared tensors.
-        stop: called with a stage and its content at each stage that an observer of the main process needs, and at the
-            end. It returns when the shard may continue.
-        check: called before the end of each step and reset.
+        stop: called with a stage, and the data for its observers, at each stage that an observer of the main process
+            needs, and at the end. It returns when the shard may continue.
+        check: called before the end of each step and reset; it may raise an error.
     """
 
     def __init__(
@@ -291,7 +291,7 @@ def read_episodes(
 
 
 def _with_causes(part: NDArray[np.float64], names: Columns, widest: Columns) -> NDArray[np.float64]:
-    """Return a shard's columns with a column of zeros for each cause that only another shard has."""
+    """Return a shard's values of episodes, with zeros for each cause (such as a divergence) that it does not have."""
     begin = _FIXED_COLUMNS + len(names.terms)
     own = dict(zip(names.causes, part[begin:], strict=False))
     none = np.zeros_like(part[0])

@@ -216,7 +216,7 @@ class _PortableError:
         return _PortableError(RuntimeError, (f"{type(error).__name__}: {error}",), {}, trace)
 
     def rebuild(self) -> BaseException:
-        """Return the exception; one that is a bug has the worker's traceback as a note."""
+        """Return the exception again; if it is a bug, the worker's traceback is added to it as a note."""
         error = self.kind.__new__(self.kind)
         error.args = self.arguments
         error.__dict__.update(self.attributes)

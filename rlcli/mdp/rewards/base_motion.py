@@ -1,4 +1,4 @@
-"""Reward terms of the robot's root body (its base): survival, posture, tracking, progress. (num_envs,) each."""
+"""Reward terms of survival, and of the robot's root body (its base): posture, progress, tracking. (num_envs,) each."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.selection import Selection
 from rlcli.task import Bodies, Sensors, reads_body_forces
 
+# --- survival ---
+
 
 def is_alive(env: ManagedEnv) -> Tensor:
     """1 unless the episode was terminated in this step. A time-out counts as alive. (num_envs,)"""
@@ -25,6 +27,31 @@ def is_alive(env: ManagedEnv) -> Tensor:
 def is_terminated(env: ManagedEnv) -> Tensor:
     """1 where the episode was terminated in this step. A time-out does not count. (num_envs,)"""
     return env.termination_manager.terminated
+
+
+@dataclass(kw_only=True, eq=False)
+class IsTerminatedTerm(Term):
+    """Number of the terminations `terms` that ended the episode in this step; 0 on a time-out. (num_envs,)
+
+    terms: names or regexes of terminations.
+    """
+
+    terms: str | list[str] = ".*"
+
+    def __post_init__(self) -> None:
+        known = [name for name, config in self.env.config.terminations.items() if config is not None]
+        self._names = [known[position] for position in match(self.terms, known, "termination")]
+
+    def __call__(self) -> Tensor:
+        """Return the value of the reward term. (num_envs,)"""
+        manager = self.env.termination_manager
+        fired = torch.zeros_like(manager.terminated, dtype=torch.float32)
+        for name in self._names:
+            fired = fired + manager.fired[name]
+        return fired * ~manager.time_outs
+
+
+# --- motion and posture of the root ---
 
 
 def lin_vel_z_l2(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
@@ -45,6 +72,52 @@ def flat_orientation_l2(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
 def upright_posture_bonus(env: ManagedEnv, *, entity: Entity = "robot", threshold: float) -> Tensor:
     """1 where the cosine between the root's up axis and the world's is above `threshold`. (num_envs,)"""
     return -entity.data.projected_gravity_b[:, 2] > threshold
+
+
+def base_height_l2(
+    env: ManagedEnv, *, entity: Entity = "robot", target_height: float, sensor: RaySensor | None = None
+) -> Tensor:
+    """Square of the difference between the root's height and `target_height` [m^2]. (num_envs,)
+
+    target_height: above the environment's origin [m]; with a sensor, above the mean height of the points that its rays
+    hit.
+    """
+    ground = env.origins[:, 2] if sensor is None else sensor.hits[:, :, 2].mean(dim=1)
+    return (entity.data.root_pos_w[:, 2] - ground - target_height).square_()
+
+
+def upright(env: ManagedEnv, *, entity: Entity = "robot", std: float) -> Tensor:
+    """exp(-(g_x^2 + g_y^2) / std^2) of gravity's direction g in the root's frame. (num_envs,)  mjlab: `upright`."""
+    return _bell(entity.data.projected_gravity_b[:, :2].square().sum(dim=1), std)
+
+
+def base_motion_penalty(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
+    """0.8 v_z^2 + 0.2 (|w_x| + |w_y|) of the root, in its own frame [m/s, rad/s]. (num_envs,)"""
+    data = entity.data
+    return 0.8 * data.root_lin_vel_b[:, 2].square() + 0.2 * data.root_ang_vel_b[:, :2].abs().sum(dim=1)
+
+
+def base_orientation_penalty(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
+    """sqrt(g_x^2 + g_y^2) of gravity's direction g in the root's frame: 0 upright, 1 on its side. (num_envs,)"""
+    return length(entity.data.projected_gravity_b[:, :2])
+
+
+def lin_vel_xyz_exp(env: ManagedEnv, *, entity: Entity = "robot", std: float) -> Tensor:
+    """exp(-|v|^2 / std^2) of the root's linear velocity v; std [m/s]. (num_envs,)"""
+    return _bell(entity.data.root_lin_vel_w.square().sum(dim=1), std)
+
+
+def ang_vel_xyz_exp(env: ManagedEnv, *, entity: Entity = "robot", std: float) -> Tensor:
+    """exp(-|w|^2 / std^2) of the root's angular velocity w; std [rad/s]. (num_envs,)"""
+    return _bell(entity.data.root_ang_vel_b.square().sum(dim=1), std)
+
+
+def yaw_aligned(env: ManagedEnv, *, entity: Entity = "robot", std: float = 0.5) -> Tensor:
+    """exp(-yaw^2 / std^2) of the root; std [rad]. (num_envs,)"""
+    return _bell(roll_pitch_yaw(entity.data.root_quat_w)[2].square(), std)
+
+
+# --- way to a target point ---
 
 
 def move_to_target_bonus(
@@ -100,78 +173,7 @@ class ProgressReward(EntityTerm, TensorState):
         return self._target_xy + self.env.origins[:, :2] - position
 
 
-# --- episodes and actions ---
-
-
-@dataclass(kw_only=True, eq=False)
-class IsTerminatedTerm(Term):
-    """Number of the terminations `terms` that ended the episode in this step; 0 on a time-out. (num_envs,)
-
-    terms: names or regexes of terminations.
-    """
-
-    terms: str | list[str] = ".*"
-
-    def __post_init__(self) -> None:
-        known = [name for name, config in self.env.config.terminations.items() if config is not None]
-        self._names = [known[position] for position in match(self.terms, known, "termination")]
-
-    def __call__(self) -> Tensor:
-        """Return the value of the reward term. (num_envs,)"""
-        manager = self.env.termination_manager
-        fired = torch.zeros_like(manager.terminated, dtype=torch.float32)
-        for name in self._names:
-            fired = fired + manager.fired[name]
-        return fired * ~manager.time_outs
-
-
-# --- the root ---
-
-
-def base_height_l2(
-    env: ManagedEnv, *, entity: Entity = "robot", target_height: float, sensor: RaySensor | None = None
-) -> Tensor:
-    """Square of the difference between the root's height and `target_height` [m^2]. (num_envs,)
-
-    target_height: above the environment's origin [m]; with a sensor, above the mean height of the points that its rays
-    hit.
-    """
-    ground = env.origins[:, 2] if sensor is None else sensor.hits[:, :, 2].mean(dim=1)
-    return (entity.data.root_pos_w[:, 2] - ground - target_height).square_()
-
-
-def upright(env: ManagedEnv, *, entity: Entity = "robot", std: float) -> Tensor:
-    """exp(-(g_x^2 + g_y^2) / std^2) of gravity's direction g in the root's frame. (num_envs,)  mjlab: `upright`."""
-    return _bell(entity.data.projected_gravity_b[:, :2].square().sum(dim=1), std)
-
-
-def base_motion_penalty(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
-    """0.8 v_z^2 + 0.2 (|w_x| + |w_y|) of the root, in its own frame [m/s, rad/s]. (num_envs,)"""
-    data = entity.data
-    return 0.8 * data.root_lin_vel_b[:, 2].square() + 0.2 * data.root_ang_vel_b[:, :2].abs().sum(dim=1)
-
-
-def base_orientation_penalty(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
-    """sqrt(g_x^2 + g_y^2) of gravity's direction g in the root's frame: 0 upright, 1 on its side. (num_envs,)"""
-    return length(entity.data.projected_gravity_b[:, :2])
-
-
-def lin_vel_xyz_exp(env: ManagedEnv, *, entity: Entity = "robot", std: float) -> Tensor:
-    """exp(-|v|^2 / std^2) of the root's linear velocity v; std [m/s]. (num_envs,)"""
-    return _bell(entity.data.root_lin_vel_w.square().sum(dim=1), std)
-
-
-def ang_vel_xyz_exp(env: ManagedEnv, *, entity: Entity = "robot", std: float) -> Tensor:
-    """exp(-|w|^2 / std^2) of the root's angular velocity w; std [rad/s]. (num_envs,)"""
-    return _bell(entity.data.root_ang_vel_b.square().sum(dim=1), std)
-
-
-def yaw_aligned(env: ManagedEnv, *, entity: Entity = "robot", std: float = 0.5) -> Tensor:
-    """exp(-yaw^2 / std^2) of the root; std [rad]. (num_envs,)"""
-    return _bell(roll_pitch_yaw(entity.data.root_quat_w)[2].square(), std)
-
-
-# --- bodies ---
+# --- motion of any bodies ---
 
 
 @reads_body_forces

@@ -194,8 +194,8 @@ def joint_velocity_hinge_penalty(
 def applied_torque_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
     """Sum of the efforts that actuators withhold because of their limits [N or N m]. (num_envs,)
 
-    MuJoCo's own actuators: from the present state and controls. Isaac Lab: explicit actuators only, of the last
-    substep.
+    The efforts of MuJoCo's own actuators follow from the present state and controls. Isaac Lab: explicit actuators
+    only, with values of the last substep.
     """
     return entity.data.withheld_effort[:, joints].sum(dim=1)
 

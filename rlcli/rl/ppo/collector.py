@@ -237,7 +237,7 @@ class Collector:
 
     @torch.no_grad()
     def complete_images(self) -> None:
-        """Complete the mirror images of the samples, after the advantages.
+        """Compute action, mean, value, ... of the samples' mirror images, after the advantages of the samples.
 
         As in Mittal et al. 2024, the probability of a mirrored action is that of the action: a symmetric policy has
         this probability.
@@ -263,7 +263,7 @@ class Collector:
         return critic_obs if self.critic_normalizer is None else self.critic_normalizer(critic_obs)
 
     def _concatenated(self, obs: Mapping[str, Tensor]) -> Tensor:
-        """Return the critic's observation groups, concatenated by columns."""
+        """Return the observation groups of the critic, side by side. (num_envs, c)"""
         groups = self.networks.critic_groups
         return obs[groups[0]] if len(groups) == 1 else torch.cat([obs[group] for group in groups], dim=-1)
 

@@ -37,7 +37,7 @@ MinibatchGradient = Callable[[PpoConfig, Samples, Tensor, Tensor, Tensor, Tensor
 
 
 class LayerGradients(Protocol):
-    """Computation of the gradients of the layers of both networks."""
+    """Function that computes the gradients of the layers of actor and critic for a minibatch."""
 
     def __call__(self, obs: Tensor, critic_obs: Tensor, objective: Objective) -> tuple[Tensor, Tensor]:
         """Write the gradients; return the statistics of `Objective.mean_gradient` and `value_gradient`, summed over all

@@ -71,7 +71,7 @@ def distributed_gradients(
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """Networks, settings and sizes that each process receives once, before the first update."""
+    """Message that each process receives once, before the first update: networks, settings and sizes."""
 
     actor: Mlp
     critic: Mlp

@@ -75,7 +75,7 @@ class Learner:
             self.minibatch_gradient = AutogradGradient(self._networks, self.gradient_and_kl, self.functions.loss)
 
     def _gradient_computation(self, threads: int) -> MakeLayerGradients:
-        """Return the factory of the layers' gradients, computed by the processes of the environment or by threads."""
+        """Return a factory of `LayerGradients`, computed by the processes of the environment or by threads."""
         env, rollout = self.collector.env, self.collector.rollout
         if env.workers > 1:
             from rlcli.envs.sharding.env import ShardedEnv
@@ -188,7 +188,7 @@ class Learner:
             self.functions.adapt_learning_rate_(self.learning_rate, self._rate_ceiling, kl, self.config)
 
     def _call_all(self, functions: UpdateFunctions) -> None:
-        """Call the functions of an update once with each minibatch size; weights and learning rate do not change."""
+        """Call the functions of an update once with each minibatch size, so that torch compiles them."""
         gradient = AutogradGradient(self._networks, self.gradient_and_kl, functions.loss)
         minibatches = self.collector.rollout.minibatches
         with tf32_matmul(self._tf32):

@@ -13,7 +13,7 @@ from rlcli.sim.state_cache import is_finite
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Columns of one packed tensor, so that one gather makes a minibatch. (..., d) each; scalars (...)"""
+    """Samples of a rollout: columns of one packed tensor, so that one gather makes a minibatch. (..., d) or (...)"""
 
     obs: Tensor
     """Normalised observation of the actor."""
@@ -97,7 +97,7 @@ class RolloutBuffer:
         """Environments of each minibatch; empty without `whole_envs`. (n,) each"""
 
     def move(self, memory: Tensor) -> None:
-        """Use other memory for the minibatches, one after the other. (samples of all minibatches, ...)"""
+        """Store the minibatches one after the other in `memory`. (samples of all minibatches, columns)"""
         self.ordered = memory
         self.minibatches = [Samples.views(part, *self.columns) for part in memory.split_with_sizes(self.sizes)]
         """Samples of each minibatch, views of `ordered`. (n, ...) each"""

@@ -91,7 +91,7 @@ def task_mirror(env: Environment, config: PpoConfig) -> MirrorMaps | None:
 
 
 def minibatch_sizes(env: Environment, config: PpoConfig, total: int) -> list[int]:
-    """Return the number of samples of each minibatch.
+    """Return the number of samples of each minibatch of a rollout of `total` samples.
 
     Raises:
         ConfigError: if the rollout has too few samples.
