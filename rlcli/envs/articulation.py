@@ -119,7 +119,7 @@ class ArticulationView:
         if self._without_motor and bool(efforts[:, self._without_motor].any()):
             names = listing(self._entity.joint_names[j] for j in self._without_motor)
             hint = "give them `actuator: motor` in scene.entities, or set targets"
-            raise TaskError(f"view '{self.name}': no motor drives {names}", hint=hint)
+            raise TaskError(f"view '{self.name}': no motor drives {names}, so efforts cannot act", hint=hint)
         self._command("motor", efforts, indices)
 
     def set_joint_position_targets(self, positions: Tensor, indices: Tensor | None = None) -> None:

@@ -258,7 +258,7 @@ class DirectEnv(VecEnv):
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the values of the task's `extras` for each environment, by name. (num_envs,) each
 
-        A tensor without such rows, or a number, gives the same value for all environments.
+        A number, or a tensor without a row for each environment, gives the same value for all environments.
         """
         found = {}
         for name, value in self._extra_tensors():

@@ -80,9 +80,8 @@ def mirror_maps(resolved: Resolved, groups: Iterable[str], *, tolerance: float) 
     try:
         return _MirrorTest(env, tolerance).run(groups)
     except TaskError as error:
-        raise ConfigError(
-            [resolved.problem(path, str(error), "mend the task, raise symmetry.tolerance or set symmetry: null")]
-        ) from None
+        hint = "make the task symmetric, raise symmetry.tolerance or set symmetry: null"
+        raise ConfigError([resolved.problem(path, str(error), hint)]) from None
     finally:
         env.close()
 
@@ -150,14 +149,17 @@ class _MirrorTest:
             start, elements = len(index), term.instance.elements
             entity: Entity | None = getattr(term.instance, "entity", None)
             if entity is None or not set(elements) <= set(entity.joint_names):
-                raise TaskError(f"action '{term.name}' ({term.config.func}) does not drive one joint with each column")
+                raise TaskError(
+                    f"action '{term.name}' ({term.config.func}) does not drive one joint with each column; use"
+                    " joint actions"
+                )
             for element in elements:
                 joint = int(entity.joint_ids[entity.joint_names.index(element)])
                 partner, own = self._mirrors[entity.name].joints[joint]
                 other = entity.joint_names[entity.joint_ids.tolist().index(partner)]
                 if other not in elements:
                     raise TaskError(
-                        f"action '{term.name}' drives joint '{element}', but not its mirror image '{other}'"
+                        f"action '{term.name}' drives joint '{element}', but not its mirror image '{other}'; add it"
                     )
                 index.append(start + elements.index(other))
                 sign.append(own)
@@ -186,8 +188,10 @@ class _MirrorTest:
         for term in env.command_manager.terms:
             command, signs = term.instance.command, getattr(term.instance, "mirror_signs", None)
             if signs is None:
-                message = f"command '{term.name}' ({term.config.func}) does not say how it is mirrored"
-                raise TaskError(f"{message}; give its class an attribute mirror_signs: +1 or -1 for each column")
+                raise TaskError(
+                    f"command '{term.name}' ({term.config.func}) does not say how it is mirrored; give its class an"
+                    " attribute mirror_signs: +1 or -1 for each column"
+                )
             command[:_PAIRS] = self._draw(command.shape[1])
             if tuple(signs[3:]) == QUATERNION:
                 command[:_PAIRS, 3:] = torch.nn.functional.normalize(command[:_PAIRS, 3:], dim=1)
@@ -243,7 +247,7 @@ class _MirrorTest:
     def _term_map(self, name: str, pipeline: Pipeline, own: Tensor, images: Tensor) -> list[tuple[int, float]]:
         """Return, for each column of a term, the column that its mirror image comes from, and the sign."""
         if len(pipeline.shape) > 1:
-            raise TaskError(f"observation '{name}' is an image, which has no mirror map")
+            raise TaskError(f"observation '{name}' is an image, which has no mirror map; leave it out")
         rays = _ray_partners(pipeline)
         if rays is not None:
             return [(partner, 1.0) for partner in rays]

@@ -111,7 +111,7 @@ class AttributeState:
             holder = vars(holder).get(step)
             if not _is_helper(holder):
                 raise ValueError(
-                    f"the saved '{attribute}' is no attribute of {type(self._owner).__name__}; its code has changed"
+                    f"the saved '{attribute}' is no attribute of {type(self._owner).__name__}: restore its old code"
                 )
         on_class = getattr(type(holder), name, None)  # a method or a property is not state
         allowed = name.isidentifier() and not name.startswith("__") and (bool(path) or name not in self._excluded)
@@ -152,14 +152,14 @@ class AttributeState:
             return
         if not (current is None or isinstance(current, Tensor | np.ndarray)):
             raise ValueError(
-                f"the saved '{path}' is a tensor, but not in {type(self._owner).__name__}: its code has changed"
+                f"the saved '{path}' is a tensor, but not in {type(self._owner).__name__}: restore its old code"
             )
         if isinstance(container, dict):
             container[key] = value.clone()
         elif isinstance(container, list):
             container[int(key) : int(key) + 1] = [value.clone()]
         else:
-            raise ValueError(f"the saved '{path}' is no value in {type(self._owner).__name__}: its code has changed")
+            raise ValueError(f"the saved '{path}' is no value in {type(self._owner).__name__}: restore its old code")
 
 
 def _item(container: object, key: str) -> Any:

@@ -70,7 +70,7 @@ class Interpolate(Term):
 
 @dataclass(kw_only=True, eq=False)
 class TerrainLevels(EntityTerm):
-    """Terrain difficulty (levels): robots that walk far move up, those that walk too little down. -> (num_envs,)
+    """Terrain difficulty (level): robots that walk far move up, those that walk little down. -> levels (num_envs,)
 
     A robot moves up one level if its episode ends farther from the environment's origin than half the length of a
     terrain patch along x. It moves down if it covers less than half of the distance of `command` (a velocity, x and y

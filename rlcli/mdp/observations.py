@@ -192,7 +192,7 @@ def generated_commands(env: ManagedEnv, *, command: Command, columns: list[int] 
     if columns is None:
         return value
     if not columns or not all(0 <= column < value.shape[1] for column in columns):
-        raise ValueError(f"columns is {columns}; give one or more of 0 to {value.shape[1] - 1}, or leave it out")
+        raise ValueError(f"`columns` is {columns}; give one or more of 0 to {value.shape[1] - 1}, or leave it out")
     return torch.stack([value[:, column] for column in columns], dim=1)
 
 

@@ -1,6 +1,6 @@
 """Base classes of terms that are dataclasses. Their fields are the keys of the term in the YAML.
 
-A dataclass takes the fields of its last base first, so the base that has `entity` and the selected elements comes last.
+A dataclass takes the fields of its last base first. So a term names the base with `entity` and its elements last.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ class CnnSpec(BaseModel):
     @model_validator(mode="after")
     def _fits(self) -> CnnSpec:
         if not len(self.channels) == len(self.kernels) == len(self.strides):
-            raise ValueError("give channels, kernels and strides one number for each layer")
+            raise ValueError("channels, kernels and strides must be equally long: one number for each layer")
         end = 0
         for image in self.pictures:
             if image.start < end:

@@ -64,7 +64,7 @@ def _require_slots(optimizer: torch.optim.Optimizer, state: Mapping[int, Mapping
     owned = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     for number, slots in state.items():
         if not 0 <= number < len(owned):
-            raise ValueError(f"trainer: the saved optimiser state is of parameter {number}; there are {len(owned)}")
+            raise ValueError(f"trainer: the saved optimiser state has a parameter {number}; the agent has {len(owned)}")
         parameter = owned[number]
         missing = _SLOTS.get(type(optimizer).__name__, set()) - set(slots)
         if missing:

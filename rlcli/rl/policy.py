@@ -280,8 +280,9 @@ def blank_policy(spec: Mapping[str, object]) -> Policy:
     with torch.device("meta"):
         policy = Policy(checked)
     if size_of(policy) > _MAX_BYTES:
-        message = f"policy.json describes a policy of {size_of(policy):,} bytes"
-        raise CheckpointError(f"{message}; train one of at most {_MAX_BYTES:,} bytes")
+        raise CheckpointError(
+            f"policy.json describes a policy of {size_of(policy):,} bytes; train one of at most {_MAX_BYTES:,} bytes"
+        )
     return policy
 
 

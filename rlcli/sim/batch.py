@@ -248,7 +248,7 @@ class BatchEngine(BatchWorlds):
     def rays(
         self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None
     ) -> Tensor:
-        """Return distances from points to the first geom along unit directions, -1 without a hit. (rows, rays) [m]"""
+        """Return the distance to the first geom on each ray, -1 without a hit; see `Engine.rays`. (rows, rays) [m]"""
         visible = None if groups is None else np.array([g in groups for g in range(mujoco.mjNGROUP)], dtype=np.uint8)
         ids = None if selection is None else ids_of(selection).astype(np.int32)
         start, along = points.double().numpy(), directions.double().numpy()

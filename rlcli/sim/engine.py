@@ -228,8 +228,8 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
     on_cpu = device.partition(":")[0] == "cpu"
     engine = config.engine if config.engine != "auto" else "batch" if on_cpu else "warp"
     if engine == "batch" and not on_cpu:
-        message = f"sim.engine 'batch' runs on a CPU, not on '{device}'"
-        raise ConfigError([Problem("sim", "sim.engine", message, "set sim.engine: auto, or give --device cpu")])
+        hint = "set sim.engine: auto, or give --device cpu"
+        raise ConfigError([Problem("sim", "sim.engine", f"sim.engine 'batch' runs on a CPU, not on '{device}'", hint)])
     if engine == "batch":
         return open_cpu_engine(model, num_envs, config)
     require_device(device)

@@ -35,8 +35,10 @@ def _private(owner: object, name: str) -> Any:
     try:
         return getattr(owner, name)
     except AttributeError:
-        message = f"MuJoCo {mujoco.__version__} has no '{name}', which rlcli uses; MuJoCo {_VERSION} has it"
-        raise DependencyError(message, hint=f'pip install "mujoco=={_VERSION}.*"') from None
+        raise DependencyError(
+            f"MuJoCo {mujoco.__version__} has no '{name}', which rlcli uses; MuJoCo {_VERSION} has it",
+            hint=f'pip install "mujoco=={_VERSION}.*"',
+        ) from None
 
 
 STATE_FIELDS: dict[str, mujoco.mjtState] = _private(mujoco.batch, "_STATE_FIELDS")

@@ -38,7 +38,7 @@ def in_place(tensor: Tensor) -> Any:
 
 
 def one_column(columns: Columns, count: int, parameter: str) -> int:
-    """Return the single column that an index into `count` columns selects.
+    """Return the single column that an index into `count` columns selects; `parameter` is its name in the message.
 
     Raises:
         ValueError: if it selects no column or several.
@@ -69,19 +69,19 @@ class Selection(Protocol):
         """Draw integers in [0, options) with equal probability. (rows, *shape) int64"""
 
     def read(self, field: Field, columns: Columns = ALL) -> Tensor:
-        """Return a copy of the rows of a (num_envs, ...) tensor."""
+        """Return a copy of the selected environments' rows of a (num_envs, ...) tensor."""
 
     def read_view(self, field: Field, columns: Columns = ALL) -> Tensor:
-        """Return the rows, if possible as a view: do not write to the result, and do not use it after a write."""
+        """Return the selected rows, if possible as a view: do not write to it, and do not use it after a write."""
 
     def write(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
-        """Set the rows of a (num_envs, ...) tensor."""
+        """Set the selected environments' rows of a (num_envs, ...) tensor."""
 
     def add(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
-        """Add to the rows of a (num_envs, ...) tensor."""
+        """Add to the selected environments' rows of a (num_envs, ...) tensor."""
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean of a (num_envs,) tensor over the rows. ()"""
+        """Return the mean of a (num_envs,) tensor over the selected environments. ()"""
 
     def where(self, mask: Field) -> Selection | None:
         """Return a selection of the rows where `mask` (num_envs,) is true; None if it is known to be empty."""
@@ -173,21 +173,21 @@ class IdSelection:
         return self._tensor(self._shaped(random.integers(*self._next(math.prod(shape)), options), shape))
 
     def read(self, field: Field, columns: Columns = ALL) -> Tensor:
-        """Return a copy of the rows of a (num_envs, ...) tensor."""
+        """Return a copy of the selected environments' rows of a (num_envs, ...) tensor."""
         return torch.from_numpy(_as_array(field)[_index(self.ids, columns)])
 
     read_view = read
 
     def write(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
-        """Set the rows of a (num_envs, ...) tensor."""
+        """Set the selected environments' rows of a (num_envs, ...) tensor."""
         write_rows(field, self.ids, values, columns)
 
     def add(self, field: Field, values: Tensor | float, columns: Columns = ALL) -> None:
-        """Add to the rows of a (num_envs, ...) tensor."""
+        """Add to the selected environments' rows of a (num_envs, ...) tensor."""
         _as_array(field)[_index(self.ids, columns)] += _as_array(values)
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean of a (num_envs,) tensor over the rows. ()"""
+        """Return the mean of a (num_envs,) tensor over the selected environments. ()"""
         return self.read(values).float().mean()
 
     def where(self, mask: Field) -> IdSelection | None:

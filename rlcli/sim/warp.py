@@ -157,7 +157,7 @@ class WarpEngine(WarpWorlds):
     def rays(
         self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None
     ) -> Tensor:
-        """Return distances from points to the first geom along unit directions, -1 if none. (num_envs, rays) [m]"""
+        """Return the distance to the first geom on each ray, -1 if none; see `Engine.rays`. (num_envs, rays) [m]"""
         self.field("geom_xpos")  # bind it, so that every step updates the geoms' positions
         shape = (self.num_envs, points.shape[1])
         distance = torch.empty(shape, device=points.device)

@@ -74,8 +74,10 @@ def _memory_error(model: mujoco.MjModel, num_envs: int, device: torch.device, ca
     each = sum(_byte_count(value) for value in vars(_make_data(model, sample, capacity)).values()) / sample
     free = wp.device_from_torch(device).free_memory if device.type == "cuda" else 0
     needed, fits = each * num_envs / 2**30, max(1, int(0.8 * free / each))
-    message = f"{num_envs} environments need {needed:.1f} GiB, {free / 2**30:.1f} GiB are free on {device}"
-    return DeviceError(message, hint=f"use at most --num-envs {fits}")
+    return DeviceError(
+        f"{num_envs} environments need {needed:.1f} GiB, {free / 2**30:.1f} GiB are free on {device}",
+        hint=f"use at most --num-envs {fits}",
+    )
 
 
 def _byte_count(value: object) -> int:

@@ -1,4 +1,4 @@
-"""Worlds of the GPU engine (one per environment): model fields that differ, fields of the data, and saved states."""
+"""Worlds of the GPU engine (one per environment): model fields that differ, fields of MjData, saved states."""
 
 from __future__ import annotations
 

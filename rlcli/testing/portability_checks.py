@@ -306,7 +306,7 @@ def _warp_env(subject: TaskUnderTest) -> VecEnv:
         NotRunError: if MuJoCo Warp is not installed, or cannot run this model.
     """
     if subject.resolved.task.sim.engine == "batch":
-        raise NotRunError("the task sets sim.engine: batch")
+        raise NotRunError("the task sets sim.engine: batch, so it never runs on a GPU")
     if find_spec("mujoco_warp") is None:
         raise NotRunError(f"MuJoCo Warp is not installed; {pip_install('rlcli[gpu]')}")
     try:

@@ -108,8 +108,10 @@ def open_task(
         UsageError: for fewer than `NUM_ENVS` environments.
     """
     if num_envs < NUM_ENVS:
-        hint = f"give at least {NUM_ENVS}: some episodes end while others continue"
-        raise UsageError(f"{num_envs} environments are too few", hint=hint)
+        raise UsageError(
+            f"{num_envs} environments are too few",
+            hint=f"give at least {NUM_ENVS}: some episodes end while others continue",
+        )
     name = str(task.resolve()) if isinstance(task, Path) else task
     return TaskUnderTest(find_task(name), agent, overrides, config, num_envs, seed)
 

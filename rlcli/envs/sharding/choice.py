@@ -48,7 +48,7 @@ def number_of_workers(resolved: Resolved, device: str) -> int:
         reason = f"{scene.num_envs} environments are too few; each worker needs two"
     if reason is not None:
         message = f"{scene.workers} workers cannot step this task: {reason}"
-        raise ConfigError([resolved.problem(("scene", "workers"), message, "set scene.workers: 1")])
+        raise ConfigError([resolved.problem(("scene", "workers"), message, "set scene.workers: 1, for one process")])
     return scene.workers
 
 

@@ -27,10 +27,10 @@ class Shards(Protocol):
         """The environment of the first shard."""
 
     def call_all(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
-        """Return `function(env, *arguments)` of every shard, in order."""
+        """Return the results of `function(vec_env, *arguments)`, called in every shard, in order."""
 
     def call_one(self, env: int, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return `function(env, row, *arguments)` of the shard that has an environment, with its row there."""
+        """Return `function(vec_env, row, *arguments)`, called in the shard where environment `env` is a `row`."""
 
 
 class ShardedEngine:

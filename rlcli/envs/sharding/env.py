@@ -245,7 +245,10 @@ class ShardedEnv(Environment):
         return self.local.shard.shared
 
     def call_all(self, function: Callable[..., Any], *arguments: Any) -> list[Any]:
-        """Return `function(env, *arguments)` of every shard, in order; `function` must be defined in a module."""
+        """Return the results of `function(vec_env, *arguments)`, called in every shard, in order.
+
+        `function` must be defined in a module.
+        """
         self._require_whole()
         self._workers.request(worker.CALL, (function, arguments))
         try:
@@ -255,7 +258,7 @@ class ShardedEnv(Environment):
         return [own, *(value for (value,) in values)]
 
     def call_one(self, env: int, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return `function(env, row, *arguments)` of the shard that has an environment, with its row there."""
+        """Return `function(vec_env, row, *arguments)`, called in the shard where environment `env` is a `row`."""
         self._require_whole()
         number = next(n for n, shard in enumerate(self._shards) if env < shard.first + shard.count)
         row = env - self._shards[number].first

@@ -8,7 +8,7 @@ The closed form differentiates the loss of `rlcli.rl.ppo.loss.minibatch_loss` (e
     log pi           = - sum over actions of (z^2 / 2 + log std + log(2 pi) / 2)
     dlog pi/dmean    = z / std
     dlog pi/dlog std = z^2 - 1
-    dL_clip/dlog pi  = r A / n   where r A is the minimum in equation 7, 0 where the clipped product is
+    dL_clip/dlog pi  = r A / n   where r A is the minimum in equation 7, else 0
     dL_value/dvalue  = 2 (value - target) / n
 
 Where a minimum or a maximum has two equal arguments, each gets half of the gradient, as in autograd.

@@ -122,7 +122,7 @@ def adapt_learning_rate_(rate: Tensor, ceiling: Tensor, kl: Tensor, config: PpoC
 
 
 class UpdateFunctions(NamedTuple):
-    """Functions of an update, compiled or not."""
+    """Functions of an update that torch can compile: loss, gradient clipping, adaptive learning rate."""
 
     loss: Callable[..., LossResult] = minibatch_loss
     clip_gradient_: Callable[..., None] = clip_gradient_

@@ -137,7 +137,9 @@ class OffPolicyConfig(Sb3Config):
     @model_validator(mode="after")
     def _sizes(self) -> OffPolicyConfig:
         if self.buffer_size < self.batch_size:
-            raise ValueError(f"buffer_size ({self.buffer_size}) is below batch_size ({self.batch_size}); raise it")
+            raise ValueError(
+                f"buffer_size ({self.buffer_size}) is below batch_size ({self.batch_size}); raise buffer_size"
+            )
         return self
 
 

@@ -255,8 +255,11 @@ class Sb3Trainer(BaseTrainer):
         required["the loss"] = self.model.logger.name_to_value.get("train/loss", 0.0)
         require_finite_learner(required, {}, self.iteration)
         if self._gradients.first is not None:
-            message = f"the gradient of '{self._gradients.first}' is not finite, in iteration {self.iteration};"
-            raise DivergedError(f"{message} the losses are finite", hint=LEARNER_HINT)
+            raise DivergedError(
+                f"the gradient of '{self._gradients.first}' is not finite, in iteration {self.iteration};"
+                " the losses are finite",
+                hint=LEARNER_HINT,
+            )
 
     def _rollout_dependencies(self) -> list[tuple[str, Tensor]]:
         """Return the tensors that a rollout depends on, by name: normaliser and weights."""
