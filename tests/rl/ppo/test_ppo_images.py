@@ -237,7 +237,7 @@ def test_policy_learns_from_images(make_trainer):
 @pytest.mark.parametrize(
     ("overrides", "fragment"),
     [
-        (["agent.cnn.kernels=[9,2]"], "a kernel of 9 x 9 for an input of 8 x 16 pixels"),
+        (["agent.cnn.kernels=[9,2]"], "the kernel of layer 0 (9 x 9 pixels) is larger than its input (8 x 16 pixels)"),
         (["agent.cnn.kernels=[8,2]"], "the kernel of layer 1 (2 x 2 pixels) is larger than its input (1 x 5 pixels)"),
         (["agent.cnn.channels=[4]"], "must have one number for each layer"),
         (["agent.rnn={hidden: 4}"], "cnn and rnn cannot be combined"),
