@@ -42,10 +42,10 @@ def test_maps_of_a_symmetric_robot(tmp_path):
         ("model", 'pos="0 .15 0"', 'pos="0 .2 0"', "joint 'robot/left_hip' has no mirror image"),
         ("model", '"left_knee" axis="0 1 0"', '"left_knee" axis="0 1 1"', "joint 'robot/left_knee' has another type"),
         ("task", "action_rate_l2,", "joint_vel_l2, joints: [left_knee],", "reward 'calm' differs"),
-        ("task", "{func: base_ang_vel}", "{func: joint_vel, joints: [left_hip]}", "observation 'policy.turn' match"),
+        ("task", "{func: base_ang_vel}", "{func: joint_vel, joints: [left_hip]}", "observation 'policy.turn' equals"),
         ("task", "{time_out: {", f"{{{FALL}, time_out: {{", "terminations differ"),
         ("task", "joint_position, ", "joint_position, joints: [left_hip, left_knee, right_hip], ", "not its mirror"),
-        ("task", "{func: base_ang_vel}", "{func: body_pose_w, bodies: [left_shin]}", "observation 'policy.turn' match"),
+        ("task", "{func: base_ang_vel}", "{func: body_pose_w, bodies: [left_shin]}", "policy.turn' equals no column"),
     ],
 )  # fmt: skip
 def test_asymmetry_is_refused_by_name(tmp_path, place, old, new, named):

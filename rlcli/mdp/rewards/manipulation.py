@@ -86,9 +86,9 @@ def grasp_object(
     threshold: float,
     open_joint_pos: float,
 ) -> Tensor:
-    """Sum of (open_joint_pos - position) of the finger `joints` where a site is within `threshold` of an object, else 0 [m].
+    """Sum of (open_joint_pos - position) of the finger `joints`, where a site is near an object [m]. (num_envs,)
 
-    (num_envs,)
+    Near: within `threshold` [m]; elsewhere 0.
     """
     closed: Tensor = (open_joint_pos - entity.data.joint_pos_of(joints)).sum(dim=1)
     return closed * (_distance_to_object(entity, sites, object) <= threshold)
