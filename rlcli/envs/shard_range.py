@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """Consecutive environments, among all environments of a task."""
+    """Part of the environments of a task, which one process steps: consecutive indices."""
 
     first: int
     """Index of the first environment."""
