@@ -1,4 +1,4 @@
-"""Writer of video files. The import is cheap, so that commands can refuse a wrong file name at once."""
+"""Writer of video files. Importing the module is fast, so that commands can refuse a wrong file name at once."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
 
 
 def gif_stride(period: float) -> int:
-    """Return how many images a GIF advances from one frame to the next, for a period [s] between images."""
+    """Return n such that a GIF gets every n-th image, for a period [s] between images (see `VideoWriter`)."""
     strides = range(1, 64)
     return next(
         (k for k in strides if (n := round(100 * period * k)) >= 2 and abs(n / (100 * period * k) - 1) < 0.02), 1

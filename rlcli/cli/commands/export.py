@@ -94,7 +94,7 @@ def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | N
 
 
 def _verify(reference: ReferenceEnv, saved: Checkpoint, file: Path, format_: str, episodes: int) -> ClosedLoopResult:
-    """Run the file in plain MuJoCo, and print the comparison with the evaluation."""
+    """Run the exported file in plain MuJoCo, and print the comparison with the run's evaluation."""
     from rlcli.deploy.closed_loop import verify
 
     verdict = verify(reference, saved, file, format_, episodes)
@@ -107,7 +107,7 @@ def _verify(reference: ReferenceEnv, saved: Checkpoint, file: Path, format_: str
     ]
     console.table(["", "FOUND", "ALLOWED", ""], rows)
     if verdict.differing:
-        console.info(f"metadata and task differ in {listing(verdict.differing[:_MAX_KEYS])}")
+        console.info(f"the exported file and the task differ in {listing(verdict.differing[:_MAX_KEYS])}")
     console.info(
         f"{verdict.episodes} episodes, mean return {verdict.plain_return:.6g} in plain MuJoCo,"
         f" {verdict.evaluation_return:.6g} in the run's evaluation"
@@ -127,7 +127,7 @@ def _report(checkpoint: Path, format_: str, file: Path, size: int, **entries: An
 
 
 def _export_bundle(saved: Checkpoint, run: Run | None, output: Path) -> None:
-    """Write a bundle for rlcli, with the saved evaluation of the checkpoint if the run has one."""
+    """Write a bundle: a folder with the policy for rlcli on another machine, and the checkpoint's saved evaluation."""
     from rlcli.runs.bundle import check_bundle_target, write_bundle
     from rlcli.runs.eval_store import read_evaluation
 
@@ -141,9 +141,9 @@ def _export_bundle(saved: Checkpoint, run: Run | None, output: Path) -> None:
 
 
 def _find(reference: str | None, runs_dir: Path, task: str | None) -> Choice:
-    """Return a checkpoint and the reason for choosing it; a checkpoint folder may be outside a run.
+    """Return the checkpoint that --checkpoint or the task names, and why; its folder may be outside of a run.
 
-    The task is only imported if it has no run: a trained policy is exported without the task's code.
+    The task's code is only imported if the task has no run: a trained policy is exported without it.
     """
     from rlcli.evaluation.session import named_task_or_run
     from rlcli.runs.bundle import is_bundle
