@@ -25,7 +25,9 @@ from rlcli.registry import find_task
 from rlcli.viewer.offscreen import Renderer
 
 Floats = NDArray[np.float32]
+"""Array of float32 numbers."""
 Changes = Mapping[str, Any] | Iterable[str] | TaskConfig | Resolved | None
+"""Changes of a task's configuration, or a whole one: see `cfg` of `open_task`."""
 
 
 def open_task(

@@ -364,7 +364,10 @@ def _meaning(section: str, config: TermConfig, vocabulary: Vocabulary) -> tuple[
 
 
 def _parameters(section: str, config: TermConfig, vocabulary: Vocabulary) -> str:
-    """Return a term's parameters as text, without default entities and selectors that match everything (`.*`)."""
+    """Return a term's parameters as text.
+
+    Selectors that match everything (`.*`) are left out, and default entities that the docstring does not name.
+    """
     signature = vocabulary.find(section, config.func)
     parameters = {p.name: p for p in signature.parameters} if signature else {}
     parts = []
@@ -373,7 +376,9 @@ def _parameters(section: str, config: TermConfig, vocabulary: Vocabulary) -> str
             continue
         parameter = parameters.get(key)
         is_default = parameter is not None and parameter.alias is not None and value == parameter.default
-        if parameter is not None and is_default and (parameter.alias not in SELECTORS or value == ".*"):
+        is_named = signature is not None and f"`{key}`" in signature.description
+        is_trivial = parameter is not None and (parameter.alias not in SELECTORS or value == ".*")
+        if is_default and is_trivial and not is_named:
             continue
         parts.append(f"`{key}` = {text_of(value)}")
     return ", ".join(parts)

@@ -130,6 +130,7 @@ class ConstantNoiseConfig(_NoiseConfig):
 
 
 NoiseConfig = Annotated[UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseConfig, Field(discriminator="kind")]
+"""Noise of an observation: uniform, gaussian or constant, as `kind` says."""
 
 
 class ScaleModifierConfig(StrictModel):
@@ -180,6 +181,7 @@ ModifierConfig = Annotated[
     | IntegratorModifierConfig,
     Field(discriminator="kind"),
 ]
+"""Modifier of an observation, such as a filter; `kind` says which."""
 
 
 class DelayConfig(StrictModel):
