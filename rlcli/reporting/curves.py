@@ -200,7 +200,7 @@ def gather(runs: Sequence[Run]) -> tuple[list[Curve], list[str]]:
 def iqm(values: Array) -> Array:
     """Return the interquartile mean over n runs. (n, p) -> (p,)
 
-    It leaves out the lowest and the highest quarter of the runs (rounded down), so it is the mean of fewer than four.
+    The lowest and the highest quarter of the runs (rounded down) are left out; with fewer than four runs none is.
     """
     count = len(values)
     cut = int(_TRIM * count)
@@ -223,7 +223,10 @@ def interval(values: Array, resamples: int = RESAMPLES) -> tuple[Array, Array]:
 
 
 def align(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array] | None:
-    """Interpolate lines (x, y) to the same x within their common range; return x (p,) and values (runs, p)."""
+    """Interpolate the lines (x, y) of runs to common points; return x (p,) and values (runs, p).
+
+    None if the lines have no common range of x.
+    """
     first = lines[0][0]
     if all(np.array_equal(x, first) for x, _ in lines):
         return first, np.stack([y for _, y in lines])

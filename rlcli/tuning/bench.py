@@ -282,7 +282,7 @@ class Bench:
         self._compare(best)
 
     def _sizes(self, setting: Setting) -> Iterator[Setting]:
-        """Yield settings with half and twice the environments, but equal samples per iteration (another horizon)."""
+        """Yield settings with half and twice the environments and equal samples per iteration: other rollouts."""
         if setting.horizon is None:
             return
         samples = setting.num_envs * setting.horizon

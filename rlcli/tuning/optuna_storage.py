@@ -175,7 +175,7 @@ def _database(url: str) -> optuna.storages.BaseStorage:
         raise DependencyError(f"--storage needs the driver {driver}", hint=f"pip install {driver}") from None
     except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError, ValueError, LookupError) as error:
         message = f"--storage '{without_password(url)}' is not the URL of a database: {_first_line(error)}"
-        raise UsageError(message, hint="as in postgresql+psycopg://user@host/name") from None
+        raise UsageError(message, hint="write a URL such as postgresql+psycopg://user@host/name") from None
     except (sqlalchemy.exc.SQLAlchemyError, OSError) as error:
         message = f"--storage {without_password(url)} cannot be reached: {_first_line(error)}"
         raise MachineError(message, hint="start the database, or correct the URL") from None

@@ -49,7 +49,8 @@ def check_parameters(request: TrainingRequest, parameters: Sequence[Parameter], 
     names = [key for key, term in groups.get(group, {}).items() if term is not None]
     if names and name not in names:
         hint = did_you_mean(name, names) or f"its terms: {listing(names)}"
-        raise UsageError(f"--objective {objective.key}: the task has no such term", hint=hint)
+        kind = "reward" if group == "reward_terms" else "termination"
+        raise UsageError(f"--objective {objective.key}: the task has no {kind} '{name}'", hint=hint)
     return resolved
 
 

@@ -69,7 +69,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         return self._pixels()
 
     def _compose(self, model: mujoco.MjModel, data: mujoco.MjData, origin: Sequence[float]) -> None:
-        """Put a model in a state into the scene to render, and move the camera to the environment's origin."""
+        """Fill the scene from a model and its state, and move the camera to the environment's origin."""
         self._camera.lookat[:] = np.add(self._lookat, origin)
         travelled = np.zeros(3)
         if self._followed is not None:

@@ -58,7 +58,8 @@ class TrainingVideos(StepObserver):
         except Exception as error:  # a full disk, a driver, an encoder, or the task's own code must not stop training
             kind = type(error).__name__
             if kind not in self._warned:
-                _log.warning(f"no video {file.name}: {' '.join(str(error).split()) or kind}; training continues")
+                reason = " ".join(str(error).split()) or kind
+                _log.warning(f"the video {file.name} was not written: {reason}; training continues")
             self._warned.add(kind)
             return None
         return file

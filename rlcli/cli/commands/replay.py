@@ -1,4 +1,4 @@
-"""`rlcli replay`: simulate a trajectory file again and compare it bit by bit."""
+"""`rlcli replay`: simulate a recording, crash dump or failure case again and compare it bit by bit."""
 
 from __future__ import annotations
 

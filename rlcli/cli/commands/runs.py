@@ -121,4 +121,4 @@ def size(count: int) -> str:
         if value < 1000 or unit == "GB":
             return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
         value /= 1000
-    raise AssertionError("GB takes all sizes")
+    raise AssertionError("bug in rlcli: no unit is large enough")

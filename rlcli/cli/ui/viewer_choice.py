@@ -128,11 +128,11 @@ def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn
             console.info(f"viewer: {name} does not work: {error.message}{f'; {error.hint}' if error.hint else ''}")
             continue
         return True
-    raise AssertionError("the list of viewers is never empty")
+    raise AssertionError("bug in rlcli: there is no viewer to try")
 
 
 def _open(session: Session, name: str, reason: str, port: int | None, drawn: int) -> None:
-    """Show the policy until the viewer is closed, then print the JSON document."""
+    """Show the policy in the viewer `name` until it is closed, then print the JSON document."""
     module, _, function = VIEWERS[name].partition(":")
     run: Viewer = getattr(importlib.import_module(module), function)
     playback, address = _playback(session), None
