@@ -34,9 +34,13 @@ class Entry:
     """An entry point: the facts that are available without importing anything."""
 
     name: str
+    """Name of the task, trainer or format."""
     value: str
+    """Object that the entry point names, `module:attribute`."""
     distribution: str
+    """Installed package (its name for pip) that has the entry point."""
     version: str
+    """Version of the package."""
 
     @property
     def qualified(self) -> str:
@@ -55,6 +59,7 @@ class Broken:
 
     distribution: str
     reason: str
+    """Error of reading the metadata."""
 
 
 def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], list[Broken]]:

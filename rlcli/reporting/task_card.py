@@ -40,6 +40,7 @@ class Column:
 
     title: str
     kind: str = TEXT
+    """`code` (names), `number` or `text` (sentences)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +49,10 @@ class Table:
 
     title: str
     note: str
+    """Sentence above the table; may be empty."""
     columns: tuple[Column, ...]
     rows: tuple[tuple[str, ...], ...]
+    """Cells of each row, one for each column."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +60,13 @@ class Card:
     """Content of a task card: name, summary, facts and tables."""
 
     name: str
+    """Name of the task."""
     summary: str
+    """One line on what the policy does."""
     facts: tuple[tuple[str, str], ...]
+    """(name, value) of single values, such as the control period."""
     tables: tuple[Table, ...]
+    """One table for each section of the task: observations, actions, rewards, ..."""
 
 
 def task_card(resolved: Resolved, layout: Mapping[str, Any] | None = None) -> Card:

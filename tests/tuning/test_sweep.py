@@ -85,7 +85,7 @@ def test_objective_reads_evaluation_document():
     assert Objective("success").read(document) == 0.5
     assert Objective("return").read(document) == 3.0
     assert Objective("reward_terms.alive").read(document) == 2.0
-    with pytest.raises(UsageError, match="not in the results"):
+    with pytest.raises(UsageError, match="has no such result"):
         Objective("length").read(document)
 
 

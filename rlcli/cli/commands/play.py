@@ -100,7 +100,7 @@ def _check_record(record: Path | None, mode: str, video: Path | None, commands: 
     if record is not None and video is not None:
         raise UsageError("--record and --video cannot be combined", hint="`rlcli replay FILE --video` renders FILE")
     if record is not None and commands:
-        raise UsageError("--record cannot be combined with --command", hint="leave out one of them")
+        raise UsageError("--record cannot be combined with --command", hint="leave out --record or --command")
     check_record(record, mode)
 
 
