@@ -412,10 +412,22 @@ def _python_page(package: griffe.Object | griffe.Alias, module_name: str) -> Ite
     members = {name: _resolved(module.all_members[name]) for name in public_names(module_name)}
     for name, member in members.items():
         yield from _member(member, name, "##")
-    yield from _types(package, members.values())
+    aliases = _aliases(module)
+    if aliases:
+        rows = (f"| `{alias.name}` | {_cell(_one_line(alias.docstring.value))} |" for alias in aliases)
+        yield "## Type aliases\n"
+        yield "\n".join(["| alias | meaning |", "| --- | --- |", *rows]) + "\n"
+    yield from _types(package, [*members.values(), *aliases])
+
+
+def _aliases(module: Any) -> list[Any]:
+    """Return the type aliases of a module that have a docstring."""
+    attributes = (member for member in module.members.values() if not member.is_alias and member.is_attribute)
+    return [member for member in attributes if str(member.annotation) == "TypeAlias" and member.docstring]
 
 
 _PARAGRAPH = "\n\n"
+"""What separates the first paragraph of a docstring from the others."""
 
 
 def _resolved(member: Any) -> Any:
@@ -423,9 +435,8 @@ def _resolved(member: Any) -> Any:
     return member.final_target if member.is_alias else member
 
 
-def _types(package: griffe.Object | griffe.Alias, members: Iterable[Any]) -> Iterator[str]:
-    """Yield what the types of rlcli in signatures of a page are; classes of the page itself are left out."""
-    members = list(members)
+def _types(package: griffe.Object | griffe.Alias, members: list[Any]) -> Iterator[str]:
+    """Yield what the types of rlcli in signatures of a page are; members of the page itself are left out."""
     public = {
         _resolved(package[module.removeprefix("rlcli.")].all_members[name]).path: f"{_file_name(module)}#{_slug(name)}"
         for module in MODULES
