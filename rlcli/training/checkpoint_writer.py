@@ -306,7 +306,7 @@ def drop_rows(checkpoints: Path, aside: Path | None = None) -> None:
 
 
 def remove_temporary_files(checkpoints: Path) -> None:
-    """Remove the temporary files of killed processes."""
+    """Remove the temporary files that killed processes have left in the folder of a run."""
     for leftover in checkpoints.glob(".tmp-*"):
         shutil.rmtree(leftover, ignore_errors=True)
     run = checkpoints.parent

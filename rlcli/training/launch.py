@@ -165,7 +165,7 @@ def run_record(request: TrainingRequest, resolved: Resolved, device: str) -> dic
 
         choice = choose(request.init_from, request.runs, resolved.source, any_task=True)
         initial = choice.folder
-        _log.info("weights of %s (%s)", initial, choice.why)
+        _log.info("starting with the weights of %s (%s)", initial, choice.why)
     return {
         "seed": request.seed,
         "device": device,

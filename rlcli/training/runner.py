@@ -137,7 +137,7 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
     for note in [] if loop.health is None or loop.reached else loop.health.notes(loop.metrics):
         _log.info("%s", note)
     for finding in run.findings() if job.writes else ():
-        _log.warning("at the end: %s", finding)
+        _log.warning("at the end of the training: %s", finding)
 
 
 def _open_writer(job: Job, env: Environment) -> CheckpointWriter:

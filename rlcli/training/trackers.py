@@ -39,10 +39,10 @@ _TIMEOUT_S = 60.0
 
 
 class Logger(Protocol):
-    """Logger of the metrics of every iteration."""
+    """Protocol of loggers, which receive the metrics of every iteration of a training."""
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Record one iteration."""
+        """Record the metrics of one iteration."""
 
     def close(self, state: str) -> None:
         """Flush and close, with the state of the run: finished, stopped, diverged or failed."""
@@ -286,7 +286,7 @@ class Trackio(_LibraryRun):
 
 
 class _StoredTracker(FileModel):
-    """Entry of a tracker in run.json."""
+    """Entry of a tracker in run.json: the run's identifier in the tracker, and the last step that it has."""
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,128}$")]
     step: Annotated[int, Field(ge=0, le=2**53)]

@@ -91,7 +91,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """Speed of training iterations with a setting."""
+    """Speed of training iterations with a setting (sizes and threads)."""
 
     setting: Setting
     alike: bool
@@ -154,7 +154,7 @@ class _Training:
     """Part -> duration [s], for each iteration."""
 
     def iterate(self) -> None:
-        """Run one iteration."""
+        """Run one training iteration and keep its durations."""
         self.seconds.append(self.trainer.iterate().seconds)
 
     def row(self, setting: Setting, *, alike: bool) -> Trained:
@@ -315,7 +315,7 @@ class Bench:
 
     @contextlib.contextmanager
     def _open_training(self, setting: Setting) -> Iterator[_Training]:
-        """Context with a training that has started."""
+        """Context with a training in the given setting, ready for `iterate`."""
         trainer, env = make_trainer(self._resolve(self.changes(setting)), 42, "cpu", setting.torch_threads)
         with contextlib.closing(env):
             trainer.start()

@@ -163,7 +163,7 @@ def _choices(text: str, key: str, words: str) -> Parameter:
 
 
 def _load(text: str, value: str) -> Any:
-    """Read a value of `--param` as YAML."""
+    """Read a value of the option `--param` (whose text is for messages) as YAML."""
     try:
         return strict_yaml.load_value(value)
     except YamlError as error:

@@ -62,7 +62,7 @@ class Trial:
     _lock: FileLock
 
     def release(self) -> None:
-        """Let another process claim the trial."""
+        """Release the trial's lock, so that another process can continue it."""
         self._lock.release()
 
 
@@ -175,7 +175,7 @@ class Sweep:
         return self.folder / PRESET
 
     def release(self) -> None:
-        """Let other processes resume the unfinished trials."""
+        """Release the locks of this process's unfinished trials, so that other processes can continue them."""
         for trial in self._claimed.values():
             trial.release()
         self._claimed.clear()

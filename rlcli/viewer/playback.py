@@ -158,7 +158,7 @@ class Playback:
         self._due = 0.0
 
     def show(self, shown: int) -> None:
-        """Show another environment; indices wrap around."""
+        """Show the environment with an index, which wraps around: -1 is the last environment."""
         self.shown = shown % self.env.num_envs
         self.history.clear_curves()
         self._push = None

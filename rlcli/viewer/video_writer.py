@@ -97,7 +97,7 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
             self._temporary.unlink(missing_ok=True)
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Append an image. (height, width, 3)"""
+        """Append an image to the video. (height, width, 3)"""
         self._added += 1
         if (self._added - 1) % self._stride:
             return

@@ -243,7 +243,7 @@ class _View(LiveView):
         self._rows: list[list[str]] = []
 
     def announce(self, current: str) -> None:
-        """Show which setting is measured next."""
+        """Show the description of what is measured next."""
         self._current = current
         self._draw()
 

@@ -63,7 +63,8 @@ def command(
         return
     reference = _open_reference(chosen, saved, file, task) if verify else None
     done = export(saved, file, format, None if reference is None else reference.deployment)
-    console.info(f"equal to the policy on {done.observations} observations: difference <= {done.max_difference:.1e}")
+    limit = f"difference <= {done.max_difference:.1e}"
+    console.info(f"the exported file equals the policy on {done.observations} observations: {limit}")
     verdict = None if reference is None else _verify(reference, saved, done.file, format, episodes)
     entries = {"observations": done.observations, "max_difference": done.max_difference, "metadata": done.metadata}
     verified = None if verdict is None else verdict.record()
@@ -98,9 +99,9 @@ def _verify(reference: ReferenceEnv, saved: Checkpoint, file: Path, format_: str
     from rlcli.deploy.closed_loop import verify
 
     verdict = verify(reference, saved, file, format_, episodes)
-    for source, terms in (("the metadata", verdict.by_metadata), ("the task's own code", verdict.by_task)):
+    for source, terms in (("formulas of the metadata", verdict.by_metadata), ("the task's code", verdict.by_task)):
         if terms:
-            console.info(f"computed by {source}: {', '.join(terms)}")
+            console.info(f"terms that are computed by {source}: {', '.join(terms)}")
     rows = [
         [name, f"{found:.2e}", f"{allowed:g}", "holds" if held else "FAILS"]
         for name, found, allowed, held in verdict.rows()

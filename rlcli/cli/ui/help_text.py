@@ -76,11 +76,11 @@ class _PanelHelp:
 
 
 class HelpCommand(_PanelHelp, TyperCommand):
-    """Command with help in panels."""
+    """Command of typer whose help is in panels."""
 
 
 class HelpGroup(_PanelHelp, TyperGroup):
-    """Group of commands with help in panels."""
+    """Group of typer's commands whose help is in panels."""
 
 
 def _panel(parameter: Any) -> str:

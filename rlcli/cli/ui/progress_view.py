@@ -54,7 +54,7 @@ class LiveView:
                 self._live.__exit__(*error)
 
     def update(self, lines: Sequence[str], *, refresh: bool = False) -> None:
-        """Replace the lines of the live block."""
+        """Replace the lines of the live block; `refresh` draws it at once."""
         from rich.text import Text
 
         self._live.update(Text("\n".join(lines)), refresh=refresh)
