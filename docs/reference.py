@@ -400,8 +400,9 @@ def _python_index() -> Iterator[str]:
     )
     yield "| module | contents | names |\n| --- | --- | --- |"
     for module, title in MODULES.items():
-        names = ", ".join(f"`{name}`" for name in public_names(module))
-        yield f"| [`{module}`]({_file_name(module)}) | {title} | {names} |"
+        page = _file_name(module)
+        names = ", ".join(f"[`{name}`]({page}#{_slug(name)})" for name in public_names(module))
+        yield f"| [`{module}`]({page}) | {title} | {names} |"
 
 
 def _python_page(package: griffe.Object | griffe.Alias, module_name: str) -> Iterator[str]:

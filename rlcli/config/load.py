@@ -1,6 +1,6 @@
 """Loading of a configuration: read the task's files and the command line, merge them, validate the result.
 
-This is phase 1 of a command: it runs before any heavy import. Precedence: schema default < task < the agent's `task:`
+Commands do this first, before torch and MuJoCo are imported. Precedence: schema default < task < the agent's `task:`
 patch < the task's `play:` patch (play and eval only) < `--config` < overrides < flags. All mistakes are reported at
 once, each with its file and line.
 """

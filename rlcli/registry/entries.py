@@ -17,8 +17,11 @@ from rlcli.safe_text import shorten
 from rlcli.settings import setting, settings_file
 
 TASKS = "rlcli.tasks"
+"""Entry-point group of plugins with tasks."""
 TRAINERS = "rlcli.trainers"
+"""Entry-point group of plugins with trainers."""
 FORMATS = "rlcli.formats"
+"""Entry-point group of plugins with formats of other frameworks' task files."""
 GROUPS = (TASKS, TRAINERS, FORMATS)
 """The groups of entry points that plugins offer."""
 OWN = "rlcli"
