@@ -254,7 +254,10 @@ def _term_tables(task: TaskConfig, vocabulary: Vocabulary) -> Iterable[Table]:
     def table(
         section: str, note: str, titles: tuple[str, ...], cells: Callable[[Any, str, str], tuple[str, ...]]
     ) -> Table:
-        """Return the table of a section; `cells` returns a row's cells between name and parameters."""
+        """Return the table of a section.
+
+        `cells(config, meaning, unit)` returns the cells of a term's row between its name and its parameters.
+        """
         terms = getattr(task, section)
         rows = [
             (name, *cells(config, *_meaning(section, config, vocabulary)), _parameters(section, config, vocabulary))

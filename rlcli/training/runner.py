@@ -156,7 +156,8 @@ def _record_begin(job: Job, trainer: Trainer, env: Environment, budget: Budget) 
     """Write the start of the training into run.json, and whether a resumed run would give the same bits."""
     unsaved = env.unsaved_state()
     if unsaved:
-        _log.warning("a resumed run may differ, because no checkpoint can store %s", ", ".join(unsaved))
+        names = ", ".join(unsaved)
+        _log.warning(f"a resumed run may differ from an uninterrupted one: no checkpoint can store {names}")
     exact = not unsaved and env.device.type == "cpu"
     job.run.update(state="running", since=datetime.now(UTC).isoformat(), iterations=budget.iterations(trainer))
     job.run.update(resumes_exactly=exact, **_provenance(job, trainer, env))

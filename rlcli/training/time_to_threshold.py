@@ -1,4 +1,4 @@
-"""Option `--until success=X`: when an evaluation during the training has reached the threshold X."""
+"""Option `--until KEY=X`: the threshold that ends a training, and the time that a training took to reach it."""
 
 from __future__ import annotations
 
