@@ -587,7 +587,7 @@ def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
         (
             {"actor.0.weight": torch.zeros(1, 6), "actor.0.bias": torch.zeros(1), "std": torch.ones(1),
              "memory_a.rnn.weight_hh_l0": torch.zeros(18, 6), "memory_a.rnn.weight_ih_l0": torch.zeros(18, 4)},
-            "must be an LSTM",
+            "the RNN is no LSTM",
         ),
         (
             {"actor.0.weight": torch.zeros(1, 4), "actor.0.bias": torch.zeros(1), "std": torch.ones(1),
