@@ -199,8 +199,7 @@ def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:
             raise CheckpointError(f"{where}: '{name[:60]}' is an expanded view; save a copy: tensor.clone()")
         total += 4 * value.numel()  # several tensors may share the numbers of the file
         if total > limit:
-            message = f"{where} has more than {limit:,} bytes of tensors, a quarter of the free memory"
-            raise CheckpointError(f"{message}; close other programs")
+            raise CheckpointError(f"{where} has over {limit:,} bytes, a quarter of the free memory; free some memory")
         named[name] = value.detach().to(torch.float32).clone(memory_format=torch.contiguous_format)
         if not bool(named[name].isfinite().all()):
             raise CheckpointError(f"{where}: '{name[:60]}' contains NaN or infinity; choose an older file")
@@ -219,8 +218,7 @@ def _layers(weights: Mapping[str, Tensor], prefix: str, file: Path) -> list[_Lay
         raise CheckpointError(f"{file}: the layers {prefix}* are named {found}; name them 0, 2, 4, ...")
     if sorted(map(int, numbers)) != list(range(0, 2 * len(numbers), 2)):
         found = ", ".join(sorted(numbers, key=int))[:200]
-        message = f"only linear layers {prefix}0, {prefix}2, {prefix}4, ... can be imported, found {found}"
-        raise CheckpointError(f"{file}: {message}")
+        raise CheckpointError(f"{file}: only linear layers {prefix}0, 2, 4, ... can be imported, found {found}")
     return [_layer(weights, f"{prefix}{number}", file) for number in sorted(numbers, key=int)]
 
 
@@ -275,15 +273,13 @@ def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[
     for name, value in below(weights, prefix).items():
         kind, _, layer = name.rpartition("_l")
         if kind not in ("weight_ih", "weight_hh", "bias_ih", "bias_hh") or not (layer.isdecimal() and len(layer) < 3):
-            message = f"{prefix}{name[:60]} is no parameter of an LSTM; no other RNN can be imported"
-            raise CheckpointError(f"{file}: {message}")
+            raise CheckpointError(f"{file}: {prefix}{name[:60]} is not of an LSTM; no other RNN can be imported")
         lstm[f"memory.layers.{layer}.{kind}"] = value
     cells: list[int] = []
     while (recurrent := lstm.get(f"memory.layers.{len(cells)}.weight_hh")) is not None:
         # an LSTM has four gates: weight_hh is (4 x cells, cells)
         if recurrent.dim() != 2 or len(recurrent) != 4 * recurrent.shape[1] or not recurrent.numel():
-            message = "the RNN is no LSTM; no other RNN can be imported"
-            raise CheckpointError(f"{file}: {message}; train a policy with an LSTM")
+            raise CheckpointError(f"{file}: the RNN is no LSTM; train a policy with an LSTM or without an RNN")
         cells.append(recurrent.shape[1])
     if not cells:
         return {}, lstm
@@ -296,8 +292,7 @@ def _empirical_normalizer(stats: Mapping[str, Tensor], file: Path) -> dict[str, 
     """Convert RSL-RL's observation normaliser (divides by std + 1e-2) to rlcli's (divides by sqrt(var + 1e-8))."""
     mean, std = stats.get("_mean"), stats.get("_std")
     if mean is None or std is None or mean.shape != std.shape or mean.dim() != 2 or len(mean) != 1:
-        message = "`_mean` and `_std` of the observation normaliser must have shape (1, observations)"
-        raise CheckpointError(f"{file}: {message}; choose an undamaged file")
+        raise CheckpointError(f"{file}: `_mean` and `_std` of the normaliser must have shape (1, observations)")
     deviation = std[0].double() + _NORMALIZER_EPS
     return _normalizer(mean[0], (deviation.square() - 1e-8).clamp(min=0.0), stats)
 
