@@ -74,7 +74,9 @@ def card(task: str) -> str:
     layout = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
     _, _, text = markdown(task_card(resolved, layout), level=2).partition("\n\n")
     summary = "Observations, actions, rewards and terminations"
-    return f"<details>\n<summary>{summary}</summary>\n\n{text.rstrip()}\n\n</details>\n"
+    terms, schema = "[Terms](../terms/index.md)", "[Task schema](../task-schema.md)"
+    links = f"{terms} explains the parameters of each term, {schema} other keys."
+    return f"<details>\n<summary>{summary}</summary>\n\n{text.rstrip()}\n\n{links}\n\n</details>\n"
 
 
 def rows_of(zoo: Path, task: str) -> list[dict[str, Any]]:

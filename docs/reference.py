@@ -400,8 +400,9 @@ def _python_index() -> Iterator[str]:
     )
     yield "| module | contents | names |\n| --- | --- | --- |"
     for module, title in MODULES.items():
-        names = ", ".join(f"`{name}`" for name in public_names(module))
-        yield f"| [`{module}`]({_file_name(module)}) | {title} | {names} |"
+        page = _file_name(module)
+        names = ", ".join(f"[`{name}`]({page}#{_slug(name)})" for name in public_names(module))
+        yield f"| [`{module}`]({page}) | {title} | {names} |"
 
 
 def _python_page(package: griffe.Object | griffe.Alias, module_name: str) -> Iterator[str]:
@@ -409,9 +410,71 @@ def _python_page(package: griffe.Object | griffe.Alias, module_name: str) -> Ite
     yield f"# {MODULES[module_name]}\n"
     yield f"Module `{module_name}`.\n"
     yield from _docstring_parts(module.docstring)
-    for name in public_names(module_name):
-        member = module.all_members[name]
-        yield from _member(member.final_target if member.is_alias else member, name, "##")
+    members = {name: _resolved(module.all_members[name]) for name in public_names(module_name)}
+    for name, member in members.items():
+        yield from _member(member, name, "##")
+    aliases = _aliases(module)
+    if aliases:
+        rows = (f"| `{alias.name}` | {_cell(_one_line(alias.docstring.value))} |" for alias in aliases)
+        yield "## Type aliases\n"
+        yield "\n".join(["| alias | meaning |", "| --- | --- |", *rows]) + "\n"
+    yield from _types(package, [*members.values(), *aliases])
+
+
+def _aliases(module: Any) -> list[Any]:
+    """Return the type aliases of a module that have a docstring."""
+    attributes = (member for member in module.members.values() if not member.is_alias and member.is_attribute)
+    return [member for member in attributes if str(member.annotation) == "TypeAlias" and member.docstring]
+
+
+_PARAGRAPH = "\n\n"
+"""What separates the first paragraph of a docstring from the others."""
+
+
+def _resolved(member: Any) -> Any:
+    """Return a member of a module, or what an import of it stands for."""
+    return member.final_target if member.is_alias else member
+
+
+def _types(package: griffe.Object | griffe.Alias, members: list[Any]) -> Iterator[str]:
+    """Yield what the types of rlcli in signatures of a page are; members of the page itself are left out."""
+    public = {
+        _resolved(package[module.removeprefix("rlcli.")].all_members[name]).path: f"{_file_name(module)}#{_slug(name)}"
+        for module in MODULES
+        for name in public_names(module)
+    }
+    rows: dict[str, str] = {}
+    for path in dict.fromkeys(path for member in members for path in _annotated_types(member)):
+        name = path.rpartition(".")[2]
+        if not path.startswith("rlcli.") or name.startswith("_"):
+            continue
+        found = _resolved(package[path.removeprefix("rlcli.")])
+        if found in members:
+            continue
+        text = f"[`{name}`]({public[found.path]})" if found.path in public else f"`{name}` (`{found.module.path}`)"
+        if found.docstring:
+            rows[name] = f"- {text}: {_escaped(_one_line(found.docstring.value.partition(_PARAGRAPH)[0]))}"
+        elif found.is_attribute and found.value is not None:
+            rows[name] = f"- {text}: `{found.value}`"
+    if rows:
+        yield "## Types in the signatures\n"
+        yield "\n".join(rows[name] for name in sorted(rows)) + "\n"
+
+
+def _annotated_types(member: Any) -> Iterator[str]:
+    """Yield the paths of the types in the annotations of a function, an attribute, or the members of a class."""
+    annotations = []
+    if member.is_function:
+        annotations = [*(parameter.annotation for parameter in member.parameters), member.returns]
+    elif member.is_attribute:
+        annotations = [member.annotation]
+    elif member.is_class:
+        for name, inner in member.members.items():
+            if not inner.is_alias and (not name.startswith("_") or name == "__init__"):
+                yield from _annotated_types(inner)
+    for annotation in annotations:
+        if isinstance(annotation, griffe.Expr):
+            yield from (part.canonical_path for part in annotation if isinstance(part, griffe.ExprName))
 
 
 def _member(member: Any, name: str, level: str) -> Iterator[str]:
@@ -424,6 +487,9 @@ def _member(member: Any, name: str, level: str) -> Iterator[str]:
         if constructor is not None and constructor.is_function and not constructor.inherited:
             yield f"```python\n{_signature(constructor, name)}\n```\n"
         yield from _docstring_parts(member.docstring)
+        exit_code = member.all_members.get("exit_code")
+        if exit_code is not None and exit_code.value is not None:
+            yield f"[Exit code](../exit-codes.md) of the command line: {_exit_code(member)}.\n"
         yield from _attributes(member)
         for inner_name, inner in member.members.items():
             if not inner_name.startswith("_") and inner.is_function:
@@ -432,6 +498,11 @@ def _member(member: Any, name: str, level: str) -> Iterator[str]:
         if member.value is not None:
             yield f"```python\n{name} = {member.value}\n```\n"
         yield from _docstring_parts(member.docstring)
+
+
+def _exit_code(error: Any) -> int:
+    value = getattr(importlib.import_module(error.module.path), error.name).exit_code
+    return int(value)
 
 
 def _attributes(member: Any) -> Iterator[str]:

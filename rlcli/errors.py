@@ -48,7 +48,9 @@ class Problem:
     where: str
     path: str
     message: str
+    """What is wrong, and what is allowed."""
     hint: str | None = None
+    """What to do."""
 
     def __post_init__(self) -> None:
         """Make each part one line of limited length."""

@@ -75,12 +75,15 @@ class Translation:
     """Result of a format's `read`: a task file of another framework, translated into the data of an rlcli task."""
 
     data: dict[str, Any]
+    """Content of an equivalent `task.yaml`."""
     origin: Callable[[tuple[str | int, ...]], Origin]
     """Function from a path in `data` to the place in the source file from which the value comes."""
     notes: list[Note]
+    """How each key was translated."""
     agents: dict[str, Any] = field(default_factory=dict)
     """Agents that were read from a separate file: name -> settings."""
     agents_origin: Callable[[tuple[str | int, ...]], Origin] | None = None
+    """The same as `origin` for the paths in `agents`; None without such a file."""
 
 
 @dataclass(slots=True)
@@ -88,8 +91,11 @@ class Imported:
     """Result of an importer: the files that it wrote, and one note for each key of the source."""
 
     folder: Path
+    """Folder of the new task."""
     files: list[Path]
+    """Files that were written."""
     notes: list[Note]
+    """How each key was translated."""
     messages: list[str] = field(default_factory=list)
     """Messages to print: what the user still has to do by hand."""
 
@@ -101,8 +107,10 @@ class Note:
     where: str
     """File and line of the key; empty if unknown."""
     key: str
+    """Dotted key in the source."""
     status: Status
     text: str = ""
+    """What it was translated to, or what is lost."""
 
     def __str__(self) -> str:
         """Return the note on one line."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Keys = NDArray[np.uint64]
+"""Keys of random streams, one 64-bit number for each stream."""
 
 # 0-d arrays instead of scalars: numpy converts each scalar operand to an array, which takes as long as the operation
 _GOLDEN = np.array(0x9E3779B97F4A7C15, np.uint64)

@@ -1,1 +1,1 @@
-"""Adapters of a `VecEnv` to the interfaces of other libraries."""
+"""Adapters that give a `VecEnv` the interface of Gymnasium, Stable-Baselines3 or RSL-RL."""

@@ -25,7 +25,9 @@ from rlcli.registry import find_task
 from rlcli.viewer.offscreen import Renderer
 
 Floats = NDArray[np.float32]
+"""Array of float32 numbers."""
 Changes = Mapping[str, Any] | Iterable[str] | TaskConfig | Resolved | None
+"""Changes of a task's configuration, or a whole one: see `cfg` of `open_task`."""
 
 
 def open_task(
@@ -38,7 +40,7 @@ def open_task(
         num_envs: number of environments.
         cfg: changes of the configuration: a mapping with dotted or nested keys, `{"episode_length_s": 3.0}`; or a list
             of overrides, `["episode_length_s=3.0"]`; or a whole configuration that replaces the task's own.
-        agent: the agent whose patch of the task is applied; None: the default agent.
+        agent: name of the agent whose changes of the task (its `task:` section) are applied; None: the default agent.
         seed: seed of all random numbers, until `reset` gets another one.
         device: cpu, cuda or cuda:N.
     """
@@ -58,7 +60,7 @@ def open_task(
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
-    """Gymnasium vector environment of the observation group `policy`.
+    """Gymnasium `VectorEnv` of a task; its observations are those of the policy (the observation group `policy`).
 
     Each step returns new arrays; observations are float32.
 
@@ -72,7 +74,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
     Args:
         env: the environment.
-        autoreset_mode: the mode, or its value: "SameStep", "NextStep", "Disabled".
+        autoreset_mode: the mode, or its value as text: "SameStep", "NextStep", "Disabled".
         action_bound: limit of the action space (+-) if the task has none; None: unbounded.
         render_mode: "rgb_array" for images of the first environment; None for no images.
     """
@@ -109,9 +111,12 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self._camera = _Camera(env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Start new episodes in all environments, or in those where `options["reset_mask"]` is true. (num_envs, d)
+        """Start new episodes in all environments, or in those where `options["reset_mask"]` is true.
 
         One seed is enough: each environment has its own random stream.
+
+        Returns:
+            Observations (num_envs, d) float32, infos.
 
         Raises:
             ValueError: if the mask is true for an environment whose episode has not ended.
@@ -176,7 +181,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.env.close()
 
     def _start_episodes(self, mask: NDArray[np.bool_]) -> Floats:
-        """Start the next episode in the environments of a mask."""
+        """Start the next episode where the mask is true; return the observations of all environments. (num_envs, d)"""
         if mask.shape != (self.num_envs,):
             raise ValueError(f"reset_mask has shape {mask.shape}; pass shape {(self.num_envs,)}")
         running = np.flatnonzero(mask & ~self.ended).tolist()
@@ -191,7 +196,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return self._last_obs.copy()
 
     def _infos(self, result: StepResult) -> dict[str, Any]:
-        """Return the success of ended episodes; `_success` marks the environments for which it is valid."""
+        """Return the infos of a step: `success` of ended episodes, and `_success`, true where there is a value."""
         if result.episodes is None or result.episodes.success is None:
             return {}
         ended = result.episodes.ended()
@@ -202,7 +207,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         return {"success": success, "_success": known} if known.any() else {}
 
     def _final_infos(self, result: StepResult, infos: dict[str, Any]) -> dict[str, Any]:
-        """Return `final_obs` and `final_info` of the ended episodes in Gymnasium's form for SAME_STEP."""
+        """Return the infos `final_obs` and `final_info` of ended episodes, in the form of Gymnasium's SAME_STEP."""
         if result.episodes is None or result.final_obs is None:
             return {}
         final = _policy_obs(result.final_obs)
@@ -214,7 +219,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """Gymnasium environment of the observation group `policy`.
+    """Gymnasium `Env` of a task; its observations are those of the policy (the observation group `policy`).
 
     Args:
         env: a `VecEnv` with one environment.
@@ -237,7 +242,7 @@ class GymnasiumEnv(gymnasium.Env):
         self.action_space = self._vector.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Start a new episode and return its first observation. (d,)"""
+        """Start a new episode; return its first observation (d,) float32, and infos."""
         super().reset(seed=seed)
         starts_next = self._vector.ended[0] and seed is None  # the `VecEnv` has already reset the environment
         obs, _ = self._vector.reset(seed=seed, options={"reset_mask": [True]} if starts_next else None)
@@ -245,6 +250,9 @@ class GymnasiumEnv(gymnasium.Env):
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Step the environment. action (a,)
+
+        Returns:
+            Observation (d,) float32, reward, terminated, truncated, infos.
 
         Raises:
             RuntimeError: if the episode has ended and `reset` was not called.
@@ -309,7 +317,7 @@ def action_space(env: VecEnv, action_bound: float | None = 1.0) -> spaces.Box:
 
 
 class _Camera:
-    """Renderer of the first environment, opened with the first image."""
+    """Renderer for `render()` of the first environment; it opens OpenGL at the first image."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env

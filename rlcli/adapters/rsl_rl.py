@@ -12,7 +12,7 @@ from rlcli.rl.statistics import EpisodeStatistics
 
 
 class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
-    """RSL-RL environment with all observation groups of a `VecEnv`.
+    """Environment for RSL-RL's runners, with all observation groups of a `VecEnv`.
 
     The first call of `get_observations` starts the first episodes. `extras["time_outs"]` marks episodes that were
     truncated and not terminated; RSL-RL then bootstraps from the observation before the step. The last observations of
@@ -36,7 +36,7 @@ class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
 
     @property
     def episode_length_buf(self) -> Tensor:
-        """Number of steps of the current episodes. (num_envs,) int64"""
+        """Number of steps of each environment's current episode. (num_envs,) int64"""
         return self.unwrapped.episode_length_buf
 
     @episode_length_buf.setter
@@ -44,7 +44,7 @@ class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types
         self.unwrapped.episode_length_buf.copy_(value)
 
     def reset(self) -> tuple[TensorDict, dict[str, Any]]:
-        """Start new episodes in all environments."""
+        """Start new episodes in all environments; return the observations by group, and empty extras."""
         self._obs = self.observations(self.unwrapped.reset())
         return self._obs, {}
 

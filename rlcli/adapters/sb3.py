@@ -1,4 +1,4 @@
-"""Environments of a task for scripts that use Stable-Baselines3 directly."""
+"""Environments of a task for scripts that train with Stable-Baselines3 themselves, without `rlcli train`."""
 
 from typing import Any
 

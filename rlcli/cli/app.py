@@ -1,4 +1,4 @@
-"""The commands of `rlcli`, and the conversion of errors into messages and exit codes."""
+"""Main function of `rlcli`: builds the commands, and converts errors into messages and exit codes."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _root(
 
 @functools.cache
 def build(only: str | None = None) -> typer.Typer:
-    """Return the app with all commands, or with one; modules of commands import nothing heavy."""
+    """Return the typer app with all commands, or only with the command `only`, which is faster."""
     app = typer.Typer(
         cls=HelpGroup,
         context_settings=_SETTINGS,
@@ -126,7 +126,7 @@ def _with_values(arguments: list[str]) -> list[str]:
 
 
 def _command_name(arguments: list[str]) -> str | None:
-    """Return the command on the command line, if it exists."""
+    """Return the name of the command on the command line; None if there is no such command."""
     word = next((word for word in arguments if not word.startswith("-")), "").replace("_", "-")
     return word if word in COMMANDS or word in GROUPS else None
 
@@ -174,7 +174,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _require_folder_and_output() -> None:
-    """Check that the current folder exists and that stdout is open; libraries would stop with obscure errors.
+    """Check that the current folder exists and that stdout is open: without them libraries fail with obscure errors.
 
     Raises:
         MachineError: if the folder was deleted, or the parent process closed stdout.
@@ -258,7 +258,7 @@ def _usage_hint(error: ClickException, arguments: list[str]) -> str | None:
 
 
 def _hint_for_option(name: str, arguments: list[str]) -> str | None:
-    """Return what to write for an unknown option: the override of a setting, or an option of rlcli."""
+    """Return what to write instead of an unknown option `--NAME`: `KEY=VALUE`, or an option of rlcli; None: unknown."""
     keys = _matching_settings(name)
     if not keys:
         return _FOREIGN_OPTIONS.get(name)
@@ -272,7 +272,7 @@ def _hint_for_option(name: str, arguments: list[str]) -> str | None:
 
 
 def _matching_settings(option: str) -> list[str]:
-    """Return the settings that the user may mean by an unknown option: its name is a key, or the last part of a key.
+    """Return the keys of the configuration that an unknown option may mean: they are or end with its name.
 
     The list is empty if more than three keys end with the name.
     """
@@ -289,7 +289,7 @@ def _matching_settings(option: str) -> list[str]:
 
 
 def _agent_models() -> set[type[BaseModel]]:
-    """Return the models of the settings of rlcli's own trainers."""
+    """Return the pydantic models of the agent settings of rlcli's own trainers."""
     specs = [load_entry(entry, TrainerSpec) for entry in catalog(TRAINERS)[0] if entry.distribution == OWN]
     return {load_object(model) for spec in specs for model in spec.algorithms.values()}
 

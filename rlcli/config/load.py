@@ -1,6 +1,6 @@
 """Loading of a configuration: read the task's files and the command line, merge them, validate the result.
 
-This is phase 1 of a command: it runs before any heavy import. Precedence: schema default < task < the agent's `task:`
+Commands do this first, before torch and MuJoCo are imported. Precedence: schema default < task < the agent's `task:`
 patch < the task's `play:` patch (play and eval only) < `--config` < overrides < flags. All mistakes are reported at
 once, each with its file and line.
 """
@@ -32,12 +32,18 @@ class Resolved:
     """A validated configuration with the origin of each value."""
 
     source: TaskSource
+    """Where the task comes from."""
     task: TaskConfig
+    """Configuration of the task, with the changes of the agent, files and overrides."""
     agent: AgentConfig | None
+    """Settings of the chosen agent; None for a task without agents."""
     agent_name: str | None
     trainer: TrainerSpec | None
+    """Trainer of the agent; None without an agent."""
     layers: Layers
+    """The files, flags and overrides that set the values."""
     vocabulary: Vocabulary
+    """Signatures of the terms that the task may name."""
     notes: tuple[Note, ...] = ()
     """How each key was translated, if the task is in another framework's format; else empty."""
     format: Format | None = None

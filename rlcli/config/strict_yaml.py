@@ -24,7 +24,9 @@ MAX_ITEMS = 20_000
 MAX_SCALAR = 16 * 1024
 
 Path = tuple[str | int, ...]
+"""Keys and list indices that lead to a value in a YAML document."""
 Mark = tuple[int, int]
+"""Line and column of a value in a YAML document."""
 
 _OCTAL = re.compile(r"[-+]?0[0-9]+\Z")
 _NOT_FINITE = re.compile(r"[-+]?\.(inf|nan)\Z", re.IGNORECASE)

@@ -34,7 +34,7 @@ Answer = tuple[dict[str, Any] | None, str]
 
 
 def check_isolated(timeout_s: float) -> list[Check]:
-    """Return the checks of torch, MuJoCo, graphics and GPUs."""
+    """Run the checks of torch, MuJoCo, graphics and GPUs in separate processes; return their results."""
     backends = ["cgl", "glfw"] if sys.platform == "darwin" else ["egl", "osmesa", "glfw"]
     with ThreadPoolExecutor(available_cores()) as pool:
         compute = pool.submit(run_isolated, "compute", timeout_s)
@@ -45,7 +45,12 @@ def check_isolated(timeout_s: float) -> list[Check]:
 
 
 def compute_checks(answer: dict[str, Any] | None, reason: str) -> list[Check]:
-    """Check that torch and MuJoCo can be imported and compute."""
+    """Return the checks that torch and MuJoCo can be imported and compute.
+
+    Args:
+        answer: result of the separate process; None: it failed.
+        reason: why it failed.
+    """
     if answer is None:
         hint = REINSTALL if "mujoco" in reason.lower() else "pip install --upgrade --force-reinstall torch"
         hint = BUSY if reason.startswith(_LATE) else hint
@@ -67,7 +72,7 @@ def compute_checks(answer: dict[str, Any] | None, reason: str) -> list[Check]:
 
 
 def gpu_checks(gpu: Answer | None) -> list[Check]:
-    """Check that driver, torch and Warp fit together. `gpu` is None if there is no driver."""
+    """Return the checks that the GPU's driver, torch and Warp fit together. `gpu` is None if there is no driver."""
     if gpu is None:
         return [Check("gpu", "ok", "no GPU; the CPU engine needs none")]
     answer, reason = gpu
@@ -115,7 +120,11 @@ def shared_memory_check(free: int) -> Check:
 
 
 def graphics_check(answers: dict[str, Answer]) -> Check:
-    """Check which OpenGL backends can render an image, and which one rlcli would use."""
+    """Return the check of OpenGL: which backends can render an image, and which one rlcli would use.
+
+    Args:
+        answers: name of a backend (egl, osmesa, ...) -> result of its separate process.
+    """
     works = [name for name, (answer, _) in answers.items() if answer is not None]
     fails = {name: reason for name, (answer, reason) in answers.items() if answer is None}
     text = f"{', '.join(works) or 'nothing'} can render"
@@ -144,7 +153,7 @@ _KNOWN = ("enable", "enabled", "on", "true", "1", "glx", "wgl", "cgl")
 
 
 def run_isolated(check_name: str, timeout_s: float) -> Answer:
-    """Run a check in a separate process (`isolated_process.py`) and return its result, or None and the reason."""
+    """Run a check of `isolated_process.py` in a separate process; return (result, ""), or (None, why it failed)."""
     command = python_command("-m", "rlcli.doctor.isolated_process", check_name)
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     try:

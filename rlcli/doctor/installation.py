@@ -42,7 +42,13 @@ def metadata_checks() -> list[Check]:
 
 
 def entry_checks(group: str, timeout_s: float, stop: threading.Event) -> list[Check]:
-    """Load every task, trainer or format in another process and return one check for each."""
+    """Load every plugin of an entry-point group in another process and return one check for each.
+
+    Args:
+        group: `rlcli.tasks`, `rlcli.trainers` or `rlcli.formats`.
+        timeout_s: time limit for each plugin [s].
+        stop: set to stop early.
+    """
     kind = group.rpartition(".")[2].removesuffix("s")
     entries, _ = catalog(group)
     without = {"MUJOCO_GL"}  # a wrong value stops MuJoCo from starting; `graphics_check` reports it once
@@ -70,7 +76,10 @@ def version(name: str) -> str | None:
 
 
 def violates_bounds(wanted: str, found: str) -> bool:
-    """Return whether a version is outside of bounds such as `>=4.0,<5`. Bounds of an unknown form are ignored."""
+    """Return whether the version `found` is outside of the bounds `wanted`, such as `>=4.0,<5`.
+
+    Bounds of an unknown form are ignored.
+    """
     have = release_numbers(found)
     for part in wanted.split(","):
         match = _BOUND.fullmatch(part)
@@ -127,7 +136,7 @@ def _mujoco_packages() -> Check:
 
 
 def _copies(name: str) -> dict[str, str]:
-    """Return every installation of a distribution (folder -> version); the first is the one that Python imports."""
+    """Return every installation of a package (folder -> version); Python imports the first one."""
     found: dict[str, str] = {}
     for distribution in metadata.distributions(name=name):
         folder = Path(str(getattr(distribution, "_path", "?"))).parent
@@ -139,7 +148,7 @@ def _copies(name: str) -> dict[str, str]:
 
 
 def _extras() -> list[Check]:
-    """Return one check for each extra: its packages, whether they are installed, and how to install them."""
+    """Return one check for each extra of rlcli, such as `rlcli[export]`: whether its packages are installed."""
     wanted: dict[str, list[tuple[str, str]]] = {}
     for name, bounds, extra in _requirements("rlcli"):
         if extra is not None and extra not in _NO_EXTRAS and name != "rlcli":
@@ -165,7 +174,7 @@ def _listed(versions: dict[str, str | None]) -> str:
 
 
 def _requirements(distribution: str) -> list[tuple[str, str, str | None]]:
-    """Return name, bounds and extra of every requirement of a distribution.
+    """Return (name, bounds such as `>=4`, extra or None) of every requirement of a package.
 
     Requirements with a condition other than an extra (platform, Python version) are left out.
     """
@@ -187,7 +196,7 @@ def _requirements(distribution: str) -> list[tuple[str, str, str | None]]:
 
 
 def _remedy(entry: Entry, reason: str) -> str:
-    """Return the hint for a broken plugin."""
+    """Return the hint for a plugin that cannot be loaded, for a reason."""
     if entry.distribution == "rlcli":
         return "pip install --upgrade --force-reinstall rlcli"
     late = "; if the machine is busy: `rlcli doctor --probe-timeout 120`" if " within " in reason else ""
@@ -195,6 +204,6 @@ def _remedy(entry: Entry, reason: str) -> str:
 
 
 def _other_owners(entry: Entry, entries: list[Entry]) -> str:
-    """Return the other distributions that have a task of this name; empty for a task of rlcli, which has priority."""
+    """Return the other packages with a task of the same name; empty for a task of rlcli, which has priority."""
     owners = [e.distribution for e in entries if e.name == entry.name and e.distribution != entry.distribution]
     return " and ".join(owners) if entry.distribution != "rlcli" else ""

@@ -54,7 +54,7 @@ def _cores() -> int:
 
 
 def _gpu() -> dict[str, Any]:
-    """Return what driver, torch and Warp report about the GPUs."""
+    """Return what the driver, torch and Warp report about the GPUs, as JSON data."""
     import torch
 
     devices, failure = [], ""
@@ -74,7 +74,7 @@ def _gpu() -> dict[str, Any]:
 
 
 def _driver() -> str | None:
-    """Return the newest CUDA version that the driver supports; None if there is no driver library."""
+    """Return the newest CUDA version that the GPU's driver supports; None if there is no driver."""
     number = ctypes.c_int()  # 1000 * major + 10 * minor
     for name in ("libcuda.so.1", "nvcuda.dll"):
         with contextlib.suppress(OSError, AttributeError):
@@ -84,7 +84,7 @@ def _driver() -> str | None:
 
 
 def _warp() -> dict[str, Any] | None:
-    """Return version, devices and error of Warp; None if it is not installed."""
+    """Return `version`, `devices` and `error` of Warp, which the GPU engine uses; None if it is not installed."""
     if version("warp-lang") is None:
         return None
     found: dict[str, Any] = {"version": version("warp-lang"), "devices": [], "error": ""}
@@ -100,7 +100,10 @@ def _warp() -> dict[str, Any] | None:
 
 
 def _render_image(backend: str) -> dict[str, Any]:
-    """Render an image offscreen with plain MuJoCo, as videos do; rlcli's renderer would take seconds to import."""
+    """Check that an OpenGL backend can render an image without a window.
+
+    It uses MuJoCo alone, because rlcli's own renderer would take seconds to import.
+    """
     if backend == "glfw" and not has_display():
         raise MachineError("there is no display; set DISPLAY, or use MUJOCO_GL=egl")
     os.environ["MUJOCO_GL"] = backend

@@ -25,7 +25,7 @@ LOW_MEMORY_BYTES = 1e9
 
 
 def machine_checks(runs_dir: Path) -> list[Check]:
-    """Return the checks of cores, memory, the runs folder and the encoding of text."""
+    """Return the checks of cores, memory, the runs folder (where trainings are written) and the encoding of text."""
     return [_cores(), memory_check(available_memory(), memory_limit()), _runs_folder(runs_dir), _text()]
 
 
@@ -46,7 +46,7 @@ def memory_check(free: int, limit: int | None) -> Check:
 
 
 def _cores() -> Check:
-    """Report the cores of this process."""
+    """Report how many cores this process may use."""
     cores, quota = available_cores(), core_quota()
     found = f"{cores} of {os.cpu_count()} cores for this process; engine_threads defaults to {cores}"
     details = {"cores": os.cpu_count(), "available": cores, "quota": quota}
@@ -93,7 +93,7 @@ def settings_checks() -> list[Check]:
 
 
 def _file() -> Check:
-    """Check that the settings file is valid."""
+    """Check that the user's settings file is valid."""
     file = settings_file()
     if file is None:
         return Check("settings", "ok", "not read, because of RLCLI_SETTINGS=none", details={"file": None})
@@ -122,7 +122,7 @@ def _variables() -> Check:
 
 
 def harmful_variables(variables: dict[str, str], cores: int) -> dict[str, str]:
-    """Return the environment variables that make training slower, each with the reason."""
+    """Return the environment variables whose values make training slower: name -> reason."""
     found = {}
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         if variables.get(name, "").isdecimal() and int(variables[name]) > cores:

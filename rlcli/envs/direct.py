@@ -56,7 +56,9 @@ class DirectTask:
     def __init__(self, env: DirectEnv, params: StrictModel) -> None:
         self.env = env
         self.cfg: TaskConfig = env.config
+        """Configuration of the task."""
         self.params: Any = params
+        """Values of the section `params:`, an object of `Params`."""
         self.num_envs = env.num_envs
         self.device = env.device
         self.step_dt = env.step_dt

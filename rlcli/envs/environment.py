@@ -23,11 +23,15 @@ class Environment(Protocol):
     """`num_envs` copies of a task that are stepped together, in one process (`VecEnv`) or in several (`ShardedEnv`)."""
 
     resolved: Resolved
+    """Resolved configuration of the task and the agent, with the origin of each value."""
     config: TaskConfig
+    """Configuration of the task: `resolved.task`."""
     seed: int
     """Seed of all random numbers."""
     device: torch.device
+    """Device of all tensors."""
     num_envs: int
+    """Number of environments."""
     step_dt: float
     """Control period [s]."""
     physics_dt: float
@@ -41,6 +45,7 @@ class Environment(Protocol):
     seconds: dict[str, float]
     """Time spent in steps, and in their physics, since the start [s]."""
     observers: Observers
+    """Objects that are called at fixed points of each step, such as recorders."""
     episode_length_buf: Tensor
     """Steps of the running episode. (num_envs,) int64"""
     episode_index: Tensor

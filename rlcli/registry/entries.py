@@ -17,8 +17,11 @@ from rlcli.safe_text import shorten
 from rlcli.settings import setting, settings_file
 
 TASKS = "rlcli.tasks"
+"""Entry-point group of plugins with tasks."""
 TRAINERS = "rlcli.trainers"
+"""Entry-point group of plugins with trainers."""
 FORMATS = "rlcli.formats"
+"""Entry-point group of plugins with formats of other frameworks' task files."""
 GROUPS = (TASKS, TRAINERS, FORMATS)
 """The groups of entry points that plugins offer."""
 OWN = "rlcli"
@@ -34,9 +37,13 @@ class Entry:
     """An entry point: the facts that are available without importing anything."""
 
     name: str
+    """Name of the task, trainer or format."""
     value: str
+    """Object that the entry point names, `module:attribute`."""
     distribution: str
+    """Installed package (its name for pip) that has the entry point."""
     version: str
+    """Version of the package."""
 
     @property
     def qualified(self) -> str:
@@ -55,6 +62,7 @@ class Broken:
 
     distribution: str
     reason: str
+    """Error of reading the metadata."""
 
 
 def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], list[Broken]]:

@@ -10,6 +10,7 @@ class TaskSource:
     """Location of a task: its name, its files, and the references that import its code."""
 
     name: str
+    """Name of the task, as on the command line."""
     root: Path
     """Folder of the task; paths in its configuration are relative to this folder."""
     config: Path

@@ -1,4 +1,4 @@
-"""Short texts for the values of a configuration in a task card."""
+"""Short texts for values of a task's configuration, such as noise and ranges, in the tables of a task card."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,12 +14,12 @@ def number(value: float) -> str:
 
 
 def columns_text(count: int) -> str:
-    """Return the size of an observation or an action as text."""
+    """Return the size of an observation or an action as text, such as `3 numbers`."""
     return f"{count} number{'s' * (count != 1)}"
 
 
 def text_of(value: object) -> str:
-    """Return a value of a configuration as text."""
+    """Return a value of a configuration as text: `yes`, `0.5`, `[1, 2]`, `key: value`."""
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "-"}[value]
     if isinstance(value, int | float):
@@ -34,7 +34,7 @@ def text_of(value: object) -> str:
 
 
 def noise_text(config: UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseConfig | None) -> str:
-    """Return the operation and the distribution of a noise model as text."""
+    """Return the operation and the distribution of a noise model as text, such as `+ uniform [-0.1, 0.1]`."""
     if config is None:
         return ""
     verb = {"add": "+", "scale": "x", "set": "="}[config.operation]
@@ -46,13 +46,13 @@ def noise_text(config: UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseC
 
 
 def modifier_text(settings: Mapping[str, Any]) -> str:
-    """Return the kind and the settings of an observation modifier as text."""
+    """Return the kind and the settings of an observation modifier (such as a filter) as text."""
     rest = {key: value for key, value in settings.items() if key != "kind"}
     return f"{settings['kind'].replace('_', ' ')} {text_of(rest)}".strip()
 
 
 def when_text(config: EventConfig) -> str:
-    """Return the time at which an event happens as text."""
+    """Return when an event of a task happens as text, such as `at every reset`."""
     if config.mode == "interval" and config.interval_range_s is not None:
         timer = ", all together" if config.global_time else ""
         return f"every {span(config.interval_range_s)} s{timer}"
@@ -62,6 +62,6 @@ def when_text(config: EventConfig) -> str:
 
 
 def span(pair: tuple[float, float]) -> str:
-    """Return a range as text."""
+    """Return a range as text, such as `0 to 1`; one number if both ends are equal."""
     low, high = number(pair[0]), number(pair[1])
     return low if low == high else f"{low} to {high}"

@@ -48,18 +48,18 @@ _MAX_DIFFERENCES = 3
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """Metrics of one run, one value for each of its n iterations."""
+    """Metrics of one run, each with one value for each of the run's n iterations."""
 
     run: Run
     axes: dict[str, Array]
-    """Name of an axis -> its values, ascending. (n,)"""
+    """Name of an x axis (steps, iterations or time) -> its values, ascending. (n,)"""
     metrics: dict[str, Array]
     """Metric -> its values; NaN for an iteration without the metric. (n,)"""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Metric over an x axis: the curve, and the ends of its interval."""
+    """Metric over an x axis, ready to plot: its values, and the ends of their 95 % interval."""
 
     x: Array
     middle: Array
@@ -68,13 +68,13 @@ class Line:
     high: Array | None = None
 
     def last(self) -> tuple[float | None, ...]:
-        """Return the last x, the last value, and both ends of its interval (None for a single run)."""
+        """Return the last x, the last value, and both ends of its interval (None, None for a single run)."""
         return tuple(None if end is None else float(end[-1]) for end in (self.x, self.middle, self.low, self.high))
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Learning curves of runs that differ only in their seed; together they are one curve of a figure."""
+    """Group of runs that differ only in their seed, and whose metrics are plotted as one curve."""
 
     label: str
     histories: list[History]
@@ -87,12 +87,12 @@ class Curve:
         return [history.run.record["seed"] for history in self.histories]
 
     def names(self) -> list[str]:
-        """Return the metrics that all runs of the curve have."""
+        """Return the names of the metrics that all runs of the curve have."""
         first, *others = self.histories
         return [name for name in first.metrics if all(name in other.metrics for other in others)]
 
     def line(self, metric: str, axis: str = "steps") -> Line | None:
-        """Return a metric over an axis: of several runs the interquartile mean with its interval.
+        """Return a metric over an axis; for several runs, the interquartile mean over the runs with its 95 % interval.
 
         None if a run does not have the metric, or if the runs have no common range of the axis.
         """
@@ -103,12 +103,15 @@ class Curve:
         return Line(x, values[0]) if len(values) == 1 else Line(x, iqm(values), *interval(values))
 
     def mean(self, metric: str, axis: str = "steps") -> Line | None:
-        """Return the mean of the runs without an interval. Unlike interquartile means, means of shares add up to 1."""
+        """Return the mean of a metric over the runs, without an interval.
+
+        Unlike interquartile means, the means of shares still add up to 1.
+        """
         aligned = self._aligned(metric, axis)
         return None if aligned is None else Line(aligned[0], aligned[1].mean(axis=0))
 
     def _aligned(self, metric: str, axis: str) -> tuple[Array, Array] | None:
-        """Return a metric of all runs at common values of the axis: x (p,) and values (runs, p); None if impossible."""
+        """Return a metric of all runs at p common points of the axis: x (p,), values (runs, p); None if impossible."""
         if any(metric not in history.metrics for history in self.histories):
             return None
         lines = []
@@ -154,7 +157,9 @@ def read_history(run: Run) -> History:
 
 
 def gather(runs: Sequence[Run]) -> tuple[list[Curve], list[str]]:
-    """Return the curves of runs, in the order of the runs, and notes about runs that were left out or cut.
+    """Return the curves of runs, in the order of the runs, and a note for each run that was left out or cut.
+
+    Runs that differ only in their seed become one curve.
 
     Raises:
         CheckpointError: if no run has readable metrics and a readable configuration.
@@ -178,7 +183,8 @@ def gather(runs: Sequence[Run]) -> tuple[list[Curve], list[str]]:
         group.histories[group.histories.index(twin)] = newer
         notes.append(f"{older.run.folder} is left out: {newer.run.folder} has the same seed and is newer")
     if not groups:
-        raise CheckpointError(f"none of {len(runs)} runs has metrics: {notes[0].removeprefix('left out: ')}")
+        first = notes[0].removeprefix("left out: ")
+        raise CheckpointError(f"none of the {len(runs)} runs can be plotted; the first: {first}")
     labels = zip(groups.values(), _labels(list(groups.values())), strict=True)
     curves = [replace(group, label=label) for group, label in labels]
     for curve in curves:
@@ -192,9 +198,9 @@ def gather(runs: Sequence[Run]) -> tuple[list[Curve], list[str]]:
 
 
 def iqm(values: Array) -> Array:
-    """Return the interquartile mean over the first axis. (n, p) -> (p,)
+    """Return the interquartile mean over n runs. (n, p) -> (p,)
 
-    At each end a quarter of the values is cut off, rounded down; with fewer than four values this is the mean.
+    The lowest and the highest quarter of the runs (rounded down) are left out; with fewer than four runs none is.
     """
     count = len(values)
     cut = int(_TRIM * count)
@@ -203,7 +209,7 @@ def iqm(values: Array) -> Array:
 
 
 def interval(values: Array, resamples: int = RESAMPLES) -> tuple[Array, Array]:
-    """Return both ends of the interquartile mean's 95 % interval: percentile bootstrap of runs. (n, p) -> (p,), (p,)"""
+    """Return the ends of the interquartile mean's 95 % interval over n runs (bootstrap). (n, p) -> (p,), (p,)"""
     count = len(values)
     picks = np.random.Generator(np.random.PCG64(0)).integers(0, count, (resamples, count))
     cut = int(_TRIM * count)
@@ -217,7 +223,10 @@ def interval(values: Array, resamples: int = RESAMPLES) -> tuple[Array, Array]:
 
 
 def align(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array] | None:
-    """Interpolate lines (x, y) to the same x within their common range; return x (p,) and values (runs, p)."""
+    """Interpolate the lines (x, y) of runs to common points; return x (p,) and values (runs, p).
+
+    None if the lines have no common range of x.
+    """
     first = lines[0][0]
     if all(np.array_equal(x, first) for x, _ in lines):
         return first, np.stack([y for _, y in lines])
@@ -232,7 +241,7 @@ def align(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array] | None:
 
 
 def _settings(run: Run) -> dict[str, Any]:
-    """Return all settings of a run except its seed: dotted key -> value."""
+    """Return all settings of a run except its seed, to find runs that differ only in the seed: dotted key -> value."""
     task, record = run.record["task"], run.record
     values = {dotted(path): value for path, value in leaves(run.read_config().data)}
     sources = record.get("sources", {}).items()
@@ -248,7 +257,7 @@ def _settings(run: Run) -> dict[str, Any]:
 
 
 def _labels(groups: Sequence[Curve]) -> list[str]:
-    """Return labels that distinguish the groups: task, agent, and the settings that differ.
+    """Return a label for each group of runs: its `--name`, or its task, agent and settings as far as the groups differ.
 
     Settings are compared between groups of the same task, an agent's settings between groups of the same agent.
     """
@@ -286,7 +295,7 @@ def _labels(groups: Sequence[Curve]) -> list[str]:
 
 
 def _chosen_name(group: Curve) -> str:
-    """Return the `--name` of a group's runs, with which their folders or those of their studies end; else ""."""
+    """Return the `--name` of a group's runs, from the end of their folders' names; the empty text without one."""
     folders = (history.run.folder for history in group.histories)
     homes = (folder.parent if (folder.parent / STUDY).is_file() else folder for folder in folders)
     names = {match[1] if (match := _NAMED.fullmatch(home.name)) else "" for home in homes}
@@ -294,7 +303,7 @@ def _chosen_name(group: Curve) -> str:
 
 
 def _short_key(key: str, keys: Sequence[str]) -> str:
-    """Return the last two parts of a key, if they distinguish it from the other keys."""
+    """Return the last two parts of a dotted key if no other of the keys ends with them, else the whole key."""
     end = ".".join(key.split(".")[-2:])
     return end if sum(other == end or other.endswith(f".{end}") for other in keys) == 1 else key
 

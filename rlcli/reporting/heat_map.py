@@ -1,4 +1,4 @@
-"""Heat map of a stress test: one value for each pair of values of two sweeps."""
+"""Heat map of `rlcli stress`: a metric of the policy for each pair of values of two varied parameters."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -27,9 +27,9 @@ class Axis(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class HeatMap:
-    """Heat map with a row for each value of the first sweep and a column for each value of the second.
+    """Heat map with a row for each value of the first varied parameter and a column for each value of the second.
 
-    If there are further sweeps, a cell has the smallest value over all their values.
+    If further parameters are varied, a cell has the smallest metric over all their values.
     """
 
     title: str
@@ -52,8 +52,8 @@ def heat_maps(
     """Return one heat map for each policy; all have the same colour scale.
 
     Args:
-        sweeps: one or more sweeps.
-        values: (name of a policy, its metric at each point of the grid) for each policy.
+        sweeps: the varied parameters, one or more, each with its values.
+        values: (name of a policy, its metric at each combination of the parameters' values) for each policy.
         metric: name of the metric. The scale of `success` is 0 to 1, that of others the range of their values.
     """
     numbers = [number for _, points in values for number in points.values()]
@@ -68,8 +68,8 @@ def heat_map(
 
     Args:
         title: metric and policy.
-        sweeps: one or more sweeps; a single one gives a map with one row.
-        values: the metric at each point of the grid.
+        sweeps: the varied parameters, one or more, each with its values; a single one gives a map with one row.
+        values: the metric at each combination of the parameters' values.
         scale: values at the ends of the colour scale; None: the smallest and the largest value.
     """
     scale = scale or (min(values.values()), max(values.values()))
@@ -89,7 +89,7 @@ def _axis(sweep: Sweep) -> Axis:
 
 
 def draw(file: Path, maps: Sequence[HeatMap]) -> None:
-    """Plot heat maps side by side in one file.
+    """Plot heat maps side by side into one file (.png or .svg).
 
     Raises:
         MachineError: if the file cannot be written.

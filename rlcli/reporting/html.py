@@ -1,4 +1,4 @@
-"""HTML of a run's page: one file without scripts and external resources, with all text escaped."""
+"""HTML of the page of `rlcli report`: one file without scripts and external resources, with all text escaped."""
 
 import base64
 import functools
@@ -34,7 +34,7 @@ def render(page: Page) -> str:
 
 @functools.cache
 def templates() -> jinja2.Environment:
-    """Return the environment of the templates of pages."""
+    """Return the Jinja environment that renders the HTML templates of rlcli."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_TEMPLATES),
         autoescape=True,
@@ -49,7 +49,7 @@ def templates() -> jinja2.Environment:
 
 
 def _clean(value: object) -> Any:
-    """Replace forbidden characters of a text and shorten it; other values, markup and the video stay as they are."""
+    """Replace the characters of a text that HTML forbids, and shorten it; return values of other types as they are."""
     if not isinstance(value, str) or isinstance(value, Markup) or value.startswith("data:video/mp4;base64,"):
         return value
     return shorten(_NOT_SHOWN.sub("\ufffd", value), _MAX_CHARACTERS, "…")

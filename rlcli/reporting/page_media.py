@@ -22,7 +22,7 @@ _MAX_VIDEO_BYTES = 24 * 2**20
 
 
 class PageMedia:
-    """Evaluation and video of one checkpoint. The environment is built when it is first needed.
+    """Adds the evaluation and the video of a checkpoint to a report. The environment is built when it is needed.
 
     Args:
         page: the report to which evaluation and video are added.
@@ -36,10 +36,10 @@ class PageMedia:
         self._name = checkpoint.resolve().name
 
     def add_evaluation(self, *, may_evaluate: bool) -> str:
-        """Add the evaluation to the page; return its origin.
+        """Add the evaluation to the page: the one saved in the run, or else a new one; return its origin.
 
         Returns:
-            `stored`; `made` (evaluated now); an empty text if there is no evaluation.
+            `stored` (saved in the run); `made` (evaluated now); an empty text if there is no evaluation.
         """
         page = self._page
         try:
@@ -60,10 +60,11 @@ class PageMedia:
         return "made"
 
     def add_video(self) -> str:
-        """Add a video to the page; return its origin.
+        """Add a video to the page: the one saved in the run, or else a new one; return its origin.
 
         Returns:
-            `stored`; `made` (recorded now); `older` (of an older checkpoint); an empty text if there is no video.
+            `stored` (saved in the run); `made` (recorded now); `older` (saved, of an older checkpoint); an empty text
+            if there is no video.
         """
         page, file = self._page, self._run.folder / "videos" / f"{self._name}.mp4"
         try:
@@ -107,7 +108,7 @@ class PageMedia:
         return ""
 
     def _read_video(self, file: Path) -> bytes | None:
-        """Return a video of the run; None if the file does not exist.
+        """Return the content of a video file of the run; None if the file does not exist.
 
         Raises:
             CheckpointError: if it is not an MP4, is outside the run's folder, or is too large for a page.

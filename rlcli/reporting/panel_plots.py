@@ -1,4 +1,4 @@
-"""Plots of learning curves, made with matplotlib: without a window, and with the same bytes for the same curves."""
+"""Plots of panels of learning curves with matplotlib: without a window, and with equal bytes for equal curves."""
 
 import importlib.util
 import io
@@ -51,12 +51,12 @@ def check_drawing() -> None:
 
 
 def picture(panels: Sequence[Panel], x_label: str, kind: str, *, title: str = "", note: str = "") -> bytes:
-    """Return a picture of all panels as the content of a file.
+    """Return a picture of all panels (one metric each) as the content of a file.
 
     Args:
         panels: the panels.
         x_label: label of their x axes.
-        kind: one of `FORMATS`.
+        kind: file format, one of `FORMATS`.
         title: text above the panels.
         note: text below the panels.
     """
@@ -80,7 +80,7 @@ def picture(panels: Sequence[Panel], x_label: str, kind: str, *, title: str = ""
 def scatter(
     columns: Sequence[tuple[str, Sequence[Any], bool]], values: Sequence[float], label: str, *, title: str
 ) -> bytes:
-    """Return scatter plots of the trials' results over each of their settings, as SVG.
+    """Return scatter plots of the results of a sweep's trials over each of the varied settings, as SVG.
 
     Args:
         columns: (name, value of each trial, whether the axis is logarithmic) of each setting; values that are not
@@ -181,7 +181,7 @@ def _lines(axes: Any, items: Sequence[Item]) -> None:
 
 
 def _stack(axes: Any, items: Sequence[Item]) -> None:
-    """Plot shares as stacked bands; they are scaled down if several causes of one episode sum to more than 1."""
+    """Plot shares of episodes as stacked bands, scaled down where the sum is above 1 (several causes of an end)."""
     if not items:
         return
     grid = max((item.line.x for item in items), key=len)
@@ -223,7 +223,7 @@ def _compact(value: float, _: int | None = None) -> str:
 
 
 def _look(item: Item) -> tuple[int, int]:
-    """Return the indices of an item's colour and line style."""
+    """Return the indices of an item's colour and line style in the lists of this module."""
     return item.index % len(COLORS), item.index // len(COLORS) % len(_STYLES)
 
 
@@ -240,7 +240,7 @@ def _text(text: str, limit: int = _MAX_LABEL) -> str:
 
 
 def _for_page(svg: str, name: str, label: str) -> str:
-    """Return the SVG element without a fixed size, with ids that begin with `name`, in the page's colours."""
+    """Convert matplotlib's SVG for an HTML page: no fixed size, ids that begin with `name`, the page's colours."""
     head, _, rest = svg[svg.index("<svg") :].partition(">")
     view_box = re.search(r'viewBox="[\d. ]+"', head)
     assert view_box is not None

@@ -26,7 +26,7 @@ _SHARES = ("success_rate",)
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Line or band in a panel of a figure; `index` selects its colour and line style."""
+    """Line or stacked band in a panel, such as one run's return; `index` selects its colour and line style."""
 
     label: str
     line: Line
@@ -35,7 +35,7 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Panel of a figure: a pair of axes with lines or stacked bands."""
+    """Panel of a picture: one pair of axes with lines of a metric, or with stacked bands of shares."""
 
     title: str
     unit: str
@@ -50,10 +50,10 @@ class Panel:
 
 
 def choose(curves: Sequence[Curve], names: Sequence[str] | None = None, axis: str = "steps") -> list[Panel]:
-    """Return the panels of a picture.
+    """Return the panels of a picture of learning curves, one for each metric.
 
     Args:
-        curves: the curves.
+        curves: the curves, each of one run or of runs that differ only in their seed.
         names: metrics, short names, or groups of metrics (the part before the slash); None: the default ones that the
             runs have.
         axis: the x axis, a key of `AXES`.
@@ -106,7 +106,7 @@ def _panel(curves: Sequence[Curve], metric: str, axis: str) -> Panel:
 
 
 def _stacks(curves: Sequence[Curve], metrics: Sequence[str], axis: str) -> list[Panel]:
-    """Return a panel of the terminations for each curve; means over seeds, because their shares add up to 1."""
+    """Return a panel for each curve with the shares of the terminations; means over seeds, so that they sum to 1."""
     panels = []
     for curve in curves:
         items = _items((metric.removeprefix(TERMINATIONS), curve.mean(metric, axis)) for metric in metrics)
@@ -116,5 +116,5 @@ def _stacks(curves: Sequence[Curve], metrics: Sequence[str], axis: str) -> list[
 
 
 def _items(lines: Iterable[tuple[str, Line | None]]) -> list[Item]:
-    """Return the existing lines; a missing one leaves out its colour, so that others keep theirs in all panels."""
+    """Return an item for each line that is not None; the position sets the colour, so that panels agree."""
     return [Item(label, line, index) for index, (label, line) in enumerate(lines) if line is not None]

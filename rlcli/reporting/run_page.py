@@ -1,4 +1,4 @@
-"""Content of a run's page, read from the run's files. If a part cannot be read, the page shows the other parts."""
+"""Content of the page of `rlcli report`, read from a run's files; what cannot be read is left out with a reason."""
 
 import contextlib
 import json
@@ -35,7 +35,7 @@ _MAX_CHARACTERS = 2000
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Value of the configuration and the file, flag or override that it comes from."""
+    """Value of a run's configuration, and where it was set: file and line, flag or override."""
 
     key: str
     value: str
@@ -53,7 +53,7 @@ class Chart:
 
 @dataclass(slots=True)
 class Page:
-    """Content of the page. A missing part has its reason in `missing`."""
+    """Content of a run's page. If a part is missing, `missing` has the reason."""
 
     task: str
     name: str
@@ -108,7 +108,7 @@ def gather_page(run: Run, checkpoint: Path | None) -> Page:
 
 @contextlib.contextmanager
 def _part(page: Page, name: str, failure: str, *errors: type[Exception]) -> Iterator[None]:
-    """Context that reads a part of the page; an error becomes the reason why the part is missing."""
+    """Context in which a part of the page is read; an error of a given type becomes the reason why it is missing."""
     try:
         yield
     except errors as error:
@@ -171,7 +171,7 @@ def _facts(run: Run, curve: Curve | None) -> Iterator[tuple[str, str]]:
 
 
 def _settings(run: Run, document: strict_yaml.Document) -> list[Setting]:
-    """Return every value of a run's configuration and its origin.
+    """Return every value of a run's configuration, and where it was set.
 
     The run records values of the command line and of `--config` files. Other values are compared with the installed
     task: if they are equal, the origin is the line of the installed task; else it is the line of the run's own file.
@@ -194,7 +194,7 @@ def _settings(run: Run, document: strict_yaml.Document) -> list[Setting]:
 
 
 def _installed(run: Run) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return key -> value and key -> origin of the installed task; both are empty if it cannot be loaded."""
+    """Return the installed task's settings: key -> value, and key -> where it is set; empty if it is missing."""
     from rlcli.config.dump import to_data
 
     device = "cuda" if str(run.record.get("device", "")).startswith("cuda") else "cpu"

@@ -40,6 +40,7 @@ class Column:
 
     title: str
     kind: str = TEXT
+    """`code` (names), `number` or `text` (sentences)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +49,10 @@ class Table:
 
     title: str
     note: str
+    """Sentence above the table; may be empty."""
     columns: tuple[Column, ...]
     rows: tuple[tuple[str, ...], ...]
+    """Cells of each row, one for each column."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,13 +60,22 @@ class Card:
     """Content of a task card: name, summary, facts and tables."""
 
     name: str
+    """Name of the task."""
     summary: str
+    """One line on what the policy does."""
     facts: tuple[tuple[str, str], ...]
+    """(name, value) of single values, such as the control period."""
     tables: tuple[Table, ...]
+    """One table for each section of the task: observations, actions, rewards, ..."""
 
 
 def task_card(resolved: Resolved, layout: Mapping[str, Any] | None = None) -> Card:
-    """Return the card of a resolved task; `layout` is the result of `rlcli.envs.vec_env.Layout.record`."""
+    """Return the task card of a resolved configuration.
+
+    Args:
+        resolved: the configuration.
+        layout: sizes and units of the compiled terms, from `rlcli.envs.vec_env.Layout.record`; None leaves them out.
+    """
     source = resolved.source
     return card(resolved.task, resolved.vocabulary, name=source.name, source=source, layout=layout)
 
@@ -82,7 +94,7 @@ def card(
         task: the configuration.
         vocabulary: the signatures of its terms.
         name: the task's name.
-        source: its files; without them (None) the docstrings of a direct task are left out.
+        source: the task's files; None leaves out the docstrings of a direct task.
         layout: sizes, units and elements of the compiled terms; None leaves them out.
     """
     layout = layout or {}
@@ -237,12 +249,15 @@ def _compiled_action(term: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def _term_tables(task: TaskConfig, vocabulary: Vocabulary) -> Iterable[Table]:
-    """Yield the tables of the sections that have one row for each term."""
+    """Yield the tables of the task's sections (rewards, terminations, events, ...), with one row for each term."""
 
     def table(
         section: str, note: str, titles: tuple[str, ...], cells: Callable[[Any, str, str], tuple[str, ...]]
     ) -> Table:
-        """Return a table; `cells` makes the cells between name and parameters of (config, meaning, unit)."""
+        """Return the table of a section.
+
+        `cells(config, meaning, unit)` returns the cells of a term's row between its name and its parameters.
+        """
         terms = getattr(task, section)
         rows = [
             (name, *cells(config, *_meaning(section, config, vocabulary)), _parameters(section, config, vocabulary))
@@ -310,7 +325,7 @@ _HOOKS = {
 
 
 def _direct(task: TaskConfig, source: TaskSource | None) -> Iterable[Table]:
-    """Yield the parameters and the docstrings of a direct task's class, read from its source."""
+    """Yield two tables of a direct task: its parameters, and the docstrings of its class, read from the source."""
     foreign = (leaf for block in task.foreign.values() if block for leaf in leaves(block))
     values = task.params | {dotted(path): value for path, value in foreign}
     described: dict[str, tuple[str, str]] = {}
@@ -332,7 +347,7 @@ def _direct(task: TaskConfig, source: TaskSource | None) -> Iterable[Table]:
 
 
 def _hooks(file: Path, class_name: str) -> list[tuple[str, str, str]]:
-    """Return (what it decides, name, first paragraph of the docstring) for a class and its hooks, bases included."""
+    """Return the rows (what it decides, name, first paragraph of its docstring) for a direct task's class and hooks."""
     docstrings: dict[str, str] = {}
     for source in reversed(ClassSearch().lineage(file, class_name)):  # bases first, so that a class overrides them
         functions = [inner for inner in source.node.body if isinstance(inner, ast.FunctionDef)]
@@ -349,7 +364,7 @@ _UNIT = re.compile(r"\[([^\]]+)\]")
 
 
 def _meaning(section: str, config: TermConfig, vocabulary: Vocabulary) -> tuple[str, str]:
-    """Return a term's docstring without shapes, and its unit."""
+    """Return a term's docstring without shapes, and its unit (empty if it has none)."""
     signature = vocabulary.find(section, config.func)
     if signature is None or not signature.description:
         return f"`{config.func}`", ""
@@ -359,7 +374,10 @@ def _meaning(section: str, config: TermConfig, vocabulary: Vocabulary) -> tuple[
 
 
 def _parameters(section: str, config: TermConfig, vocabulary: Vocabulary) -> str:
-    """Return the parameters of a term without default entities and without selectors of all elements."""
+    """Return a term's parameters as text.
+
+    Selectors that match everything (`.*`) are left out, and default entities that the docstring does not name.
+    """
     signature = vocabulary.find(section, config.func)
     parameters = {p.name: p for p in signature.parameters} if signature else {}
     parts = []
@@ -368,7 +386,9 @@ def _parameters(section: str, config: TermConfig, vocabulary: Vocabulary) -> str
             continue
         parameter = parameters.get(key)
         is_default = parameter is not None and parameter.alias is not None and value == parameter.default
-        if parameter is not None and is_default and (parameter.alias not in SELECTORS or value == ".*"):
+        is_named = signature is not None and f"`{key}`" in signature.description
+        is_trivial = parameter is not None and (parameter.alias not in SELECTORS or value == ".*")
+        if is_default and is_trivial and not is_named:
             continue
         parts.append(f"`{key}` = {text_of(value)}")
     return ", ".join(parts)

@@ -17,8 +17,9 @@ class Budget:
     """
 
     max_iterations: int | None
+    """Iterations of the trainer; None: no limit."""
     max_steps: int | None
-    """Environment steps over all environments."""
+    """Environment steps, counted over all environments; None: no limit."""
 
     def spent(self, trainer: Trainer) -> bool:
         """Return whether the trainer has reached a limit."""

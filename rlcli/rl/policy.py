@@ -41,12 +41,19 @@ class PolicySpec(BaseModel):
         "gaussian-mlp"
     )
     group: Annotated[str, Field(max_length=200)] = "policy"
+    """Observation group that the policy receives."""
     observation_size: Width
+    """Number of observation columns."""
     action_size: Width
+    """Number of action columns."""
     hidden: Layers
+    """Widths of the hidden layers."""
     activation: Literal["elu", "relu", "tanh", "silu"]
+    """Activation of the hidden layers."""
     action_bound: Positive | None
+    """Actions are within +-this value; null: unbounded."""
     normalize: bool = False
+    """Whether observations are normalised by a running mean and variance."""
     normalize_clip: Positive | None = 10.0
     """Normalised observations are clipped to +-this value; null: no clipping."""
     log_std_range: tuple[_LogStd, _LogStd] | None = None
@@ -87,8 +94,11 @@ class Normalizer(nn.Module):
     """Number added to the variance before the square root."""
 
     mean: Tensor
+    """Mean of the observations. (size,)"""
     var: Tensor
+    """Variance of the observations. (size,)"""
     count: Tensor
+    """Number of observations so far. ()"""
 
     def __init__(self, size: int | tuple[()], clip: float | None = 10.0) -> None:
         super().__init__()

@@ -15,10 +15,15 @@ class Finding:
     """Violation of the contract: the check, the place, what was found, and what to do."""
 
     check: str
+    """Name of the check."""
     severity: Literal["error", "warning"]
+    """Only errors fail `rlcli check`."""
     where: str
+    """Part of the task, such as a term or a column."""
     message: str
+    """What was found."""
     hint: str
+    """What to do."""
 
     def __str__(self) -> str:
         """Return the finding as one line."""

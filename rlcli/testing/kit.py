@@ -21,7 +21,9 @@ from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, open_task
 
 Check = Callable[[TaskUnderTest], Iterable[Finding]]
 OnCheck = Callable[[str, "list[Finding] | None"], None]
+"""Function that receives the name of each check and its findings; None: the check did not run."""
 OnNote = Callable[[str, str], None]
+"""Function that receives the name of a check and a remark of it that is no finding."""
 
 _files, _episodes, _portability = step_and_file_checks, episode_checks, portability_checks
 _IN_ORDER: tuple[Check, ...] = (

@@ -28,11 +28,14 @@ class Remark:
     """Finding of a lint rule: a property of a task that makes learning hard."""
 
     rule: str
+    """Name of the rule."""
     severity: Literal["error", "warning"]
     where: str
     """Term, column or setting."""
     message: str
+    """What was found."""
     hint: str
+    """What to do."""
     numbers: dict[str, float] = field(default_factory=dict)
     """Measured values by name."""
 

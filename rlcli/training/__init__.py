@@ -1,1 +1,1 @@
-"""One training, from a configuration or a saved run to the last checkpoint."""
+"""Code that runs one training, from a configuration or a saved run to the last checkpoint."""

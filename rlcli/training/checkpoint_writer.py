@@ -1,6 +1,7 @@
 """Writer of checkpoints in the background, each completely or not at all; it also removes old checkpoints.
 
-A log is data that only grows, such as a replay buffer. Its rows are written once, into files that checkpoints share.
+A log is data of a trainer that only grows, such as a replay buffer. Its rows are written once, into files that all
+checkpoints share.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ _NewRows = list[tuple[int, int, dict[str, Tensor]]]
 
 @dataclass(frozen=True, slots=True)
 class Keep:
-    """Rule for the checkpoints to keep; the first, the best and the newest are always kept."""
+    """Rule that says which checkpoints of a run are kept; the first, the best and the newest always are."""
 
     last: int | None = None
     """Number of newest checkpoints to keep; None: all."""
@@ -49,7 +50,10 @@ class Keep:
 
     @staticmethod
     def from_settings(last: int | None, every: int | None, save_interval: int | None) -> Keep:
-        """Return the rule for the agent's settings; without `last` all checkpoints of a `save_interval` are kept."""
+        """Return the rule for the agent's `keep_last`, `keep_every` and `save_interval`.
+
+        Without `last`, all checkpoints are kept if there is a `save_interval`, else the newest 10.
+        """
         return Keep(_DEFAULT_LAST if last is None and save_interval is None else last, every)
 
 
@@ -91,7 +95,7 @@ class CheckpointWriter:
         return any(every and iteration % every == 0 for every in (save_interval, self._keep.every))
 
     def save(self, state: TrainerState, iteration: int, step: int) -> None:
-        """Wait for the previous checkpoint, copy the new rows of logs, and write the checkpoint in the background.
+        """Wait for the previous checkpoint, copy the state, and write the new checkpoint in the background.
 
         Raises:
             MachineError: if the previous checkpoint could not be written.
@@ -130,7 +134,7 @@ class CheckpointWriter:
             self.wait()
 
     def _copy_new(self, name: str, rows: Rows) -> _NewRows:
-        """Return copies of the rows that are in no file yet, one (start, stop, columns) for each new file."""
+        """Return copies of a log's rows that are in no file yet: (start, stop, columns) for each new file."""
         start = max(rows.first, self._copied.get(name, 0))
         if start >= rows.stop:
             return []
@@ -235,9 +239,14 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
 
 
 def prune(checkpoints: Path, keep: Keep, best: int | None) -> None:
-    """Remove the checkpoints that need not be kept, and the rows of logs that no other checkpoint needs.
+    """Remove the checkpoints that need not be kept, and the rows of logs (replay buffers) that no other one needs.
 
-    A checkpoint is removed by one rename. If a checkpoint cannot be removed, it stays.
+    A checkpoint that cannot be removed stays whole.
+
+    Args:
+        checkpoints: the run's folder of checkpoints.
+        keep: rule for the checkpoints to keep.
+        best: step of the best checkpoint; None: no evaluation has found one.
     """
     saved = steps(checkpoints)
     if keep.last is None or len(saved) <= keep.last + 1:
@@ -254,8 +263,8 @@ def prune(checkpoints: Path, keep: Keep, best: int | None) -> None:
 def drop_after(checkpoints: Path, step: int) -> list[int]:
     """Remove the checkpoints after the step at which training is resumed; return their steps.
 
-    A checkpoint that cannot be read is renamed to `STEP.unreadable` instead. The rows of logs that only it needs are
-    moved into its folder.
+    A checkpoint that cannot be read is renamed to `STEP.unreadable` instead, and the rows of logs (replay buffers) that
+    only it needs are moved into its folder.
     """
     later = [saved for saved in steps(checkpoints) if saved > step]
     removed, aside = [], None
@@ -297,7 +306,7 @@ def drop_rows(checkpoints: Path, aside: Path | None = None) -> None:
 
 
 def remove_temporary_files(checkpoints: Path) -> None:
-    """Remove the temporary files of killed processes."""
+    """Remove the temporary files that killed processes have left in the folder of a run."""
     for leftover in checkpoints.glob(".tmp-*"):
         shutil.rmtree(leftover, ignore_errors=True)
     run = checkpoints.parent
@@ -317,7 +326,7 @@ def _remove(folder: Path) -> None:
 
 
 def _set_aside(folder: Path) -> Path:
-    """Rename a checkpoint so that no reader takes it for one; return its new folder."""
+    """Rename a damaged checkpoint to `STEP.unreadable`, so that it is not read; return the new folder."""
     target, number = folder.with_name(f"{folder.name}.unreadable"), 1
     while os.path.lexists(target):
         number += 1
@@ -327,5 +336,5 @@ def _set_aside(folder: Path) -> Path:
 
 
 def _temporary_folder(parent: Path) -> Path:
-    """Return a new name for a folder that `remove_temporary_files` removes."""
+    """Return a new name for a temporary folder; `remove_temporary_files` removes it if this process is killed."""
     return parent / f".tmp-{os.getpid()}-{secrets.token_hex(4)}"

@@ -1,4 +1,4 @@
-"""Health checks of a training: they read the metrics of its iterations and name what prevents learning."""
+"""Health checks of a training: they read the metrics of its iterations and report what may prevent learning."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _AT = 1e-3
 """Relative distance from a bound at which a value counts as at the bound."""
 
 Found = Iterator[tuple[str, str]]
-"""Message and hint of each problem that a check finds; the hint follows the word "try"."""
+"""Message and hint of each problem that a check finds; the hint is printed after the word "try"."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Cause that may prevent learning."""
+    """Problem that a health check found in a training, and that may prevent learning."""
 
     check: str
     iteration: int
@@ -45,7 +45,7 @@ class Finding:
 
 
 class Health:
-    """Health checks of one training. They run about 40 times in a training, so that an iteration costs nothing.
+    """Health checks of one training. They run about 40 times in a training, so that they take hardly any time.
 
     Args:
         task: the task.
@@ -64,7 +64,7 @@ class Health:
 
     @property
     def progress(self) -> float:
-        """Share of the training that is done."""
+        """Share of the training's iterations that are done, from 0 to 1."""
         return self.iteration / self.iterations
 
     def due(self, iteration: int) -> bool:
@@ -90,7 +90,7 @@ class Health:
         self._suspects = found
 
     def notes(self, metrics: Mapping[str, float]) -> list[str]:
-        """Return a line for each condition of success, with its value and its bound."""
+        """Return one line of text for each success condition of the task, with its value and its bound."""
         lines = []
         for name, condition in self.task.success.items():
             if condition is not None and f"Success/{name}" in metrics:
@@ -100,7 +100,7 @@ class Health:
         return lines
 
     def names(self, prefix: str) -> list[str]:
-        """Return the metrics of a group."""
+        """Return the names of the metrics that begin with a prefix, such as `Episode_Reward/`."""
         return [name for name in self._series if name.startswith(prefix)]
 
     def values(self, name: str) -> list[float]:
@@ -118,7 +118,7 @@ class Health:
         return values[-max(3, len(values) // 8) :]
 
     def change(self, name: str) -> float:
-        """Return the change of a metric since the beginning, divided by its noise or a tenth of its initial value."""
+        """Return a metric's change since the beginning, divided by its noise (at least 10 % of its first value)."""
         before, after = self.first(name), self.last(name)
         if not before:
             return 0.0
@@ -131,12 +131,15 @@ class Health:
         return statistics.median(self.last(name)) if self.values(name) else None
 
     def struggles(self, after: float) -> bool:
-        """Return whether at least the share `after` of the training is done, and success is rare or not defined."""
+        """Return whether learning is slow: a share `after` (0 to 1) of the training is done, and success is still rare.
+
+        A task without success conditions counts as one with rare success.
+        """
         return self.progress >= after and all((self.median(n) or 0.0) < _SOLVED for n in (SUCCESS, "Eval/success_rate"))
 
 
 def probe(trainer: Trainer) -> dict[str, float]:
-    """Return shares of a trainer's newest observations and actions that are at a bound, or do not vary."""
+    """Return the metrics `Health/*`: shares of the newest observations and actions that are at a bound or constant."""
     if not isinstance(trainer, BaseTrainer) or len(trainer.recent_obs) < 2:
         return {}
     found, begin, obs = {}, 0, trainer.recent_obs
@@ -165,7 +168,7 @@ def probe(trainer: Trainer) -> dict[str, float]:
 
 
 def no_reward(health: Health) -> Found:
-    """Check that the mean return is not the same in all iterations."""
+    """Report a mean return that is the same in all iterations."""
     values = health.values(RETURN)
     if len(values) >= (_MIN_ITERATIONS if any(values) else 3) and max(values) - min(values) <= 1e-6 * abs(values[0]):
         what = "every reward is 0" if values[0] == 0.0 else "the reward depends on nothing that the policy changes"
@@ -174,7 +177,7 @@ def no_reward(health: Health) -> Found:
 
 
 def no_progress(health: Health) -> Found:
-    """Check that the return, a reward term, the episode length or a value of a success condition changes."""
+    """Report that neither return, reward terms, episode length nor values of success conditions have changed."""
     watched = [RETURN, LENGTH, *health.names("Episode_Reward/"), *health.names("Success_Value/")]
     if health.struggles(0.15) and all(abs(health.change(name)) < 1.0 for name in watched):
         value = statistics.fmean(health.last(RETURN)) if health.values(RETURN) else 0.0
@@ -184,7 +187,7 @@ def no_progress(health: Health) -> Found:
 
 
 def one_termination(health: Health) -> Found:
-    """Check that episodes do not all end by the same termination, as early as at the beginning of the training."""
+    """Report a termination that ends nearly all episodes, after no more steps than at the beginning of the training."""
     late = {name for name, term in health.task.terminations.items() if term is not None and term.time_out}
     for metric in health.names("Episode_Termination/"):
         name, share = metric.partition("/")[2], health.median(metric)
@@ -197,14 +200,14 @@ def one_termination(health: Health) -> Found:
 
 
 def short_episodes(health: Health) -> Found:
-    """Check that episodes have more than a few steps."""
+    """Report episodes that end after very few steps."""
     length, full = health.median(LENGTH), health.task.max_episode_length
     if length is not None and length <= min(3.0, full / 4):
         yield f"episodes end after {length:.3g} of {full} steps", "`rlcli lint TASK` (early-resets)"
 
 
 def dying_pays(health: Health) -> Found:
-    """Check that the return does not rise while episodes get shorter."""
+    """Report a return that rises while episodes get shorter."""
     if health.struggles(0.1) and health.change(RETURN) > 1.0 and health.values(LENGTH):
         before, after = (statistics.fmean(part) for part in (health.first(LENGTH), health.last(LENGTH)))
         if after < 0.7 * before:
@@ -213,7 +216,7 @@ def dying_pays(health: Health) -> Found:
 
 
 def exploration(health: Health) -> Found:
-    """Check that the standard deviation of actions neither collapses nor explodes."""
+    """Report a standard deviation of actions that has collapsed or exploded."""
     std, begin = health.median("Policy/mean_std"), health.first("Policy/mean_std")
     if std is None or not health.struggles(0.1):
         return
@@ -232,7 +235,7 @@ def _rises(health: Health) -> bool:
 
 
 def update_size(health: Health) -> Found:
-    """Check that an update changes the policy neither too much nor hardly at all."""
+    """Report updates that change the policy too much or hardly at all."""
     kl, target = health.median("Loss/kl"), health.settings.get("desired_kl") or 0.05
     if kl is None or not health.struggles(0.1):
         return
@@ -244,7 +247,7 @@ def update_size(health: Health) -> Found:
 
 
 def learning_rate_floor(health: Health) -> Found:
-    """Check that an adaptive learning rate is not at its lowest value."""
+    """Report an adaptive learning rate that is at its lowest value."""
     rate, (floor, _) = health.median("Loss/learning_rate"), health.settings.get("learning_rate_range", (1e-5, 0.0))
     adaptive = health.settings.get("schedule") == "adaptive"
     if adaptive and rate is not None and rate <= 1.01 * floor and health.struggles(0.1):
@@ -253,7 +256,7 @@ def learning_rate_floor(health: Health) -> Found:
 
 
 def value_function(health: Health) -> Found:
-    """Check that the critic predicts returns."""
+    """Report a critic that does not predict returns."""
     loss, explained = health.median("Loss/value"), health.median("Loss/explained_variance")
     if loss is None or explained is None or not health.struggles(0.15):
         return
@@ -267,7 +270,7 @@ def value_function(health: Health) -> Found:
 
 
 def observations(health: Health) -> Found:
-    """Check that observations vary and are not at their clip."""
+    """Report observations that are constant, or mostly at the limits of their `clip`."""
     for metric in health.names("Health/constant/"):
         if health.median(metric) == 1.0 and health.struggles(0.1):
             name = metric.rpartition("/")[2]
@@ -280,14 +283,14 @@ def observations(health: Health) -> Found:
 
 
 def actions_at_bound(health: Health) -> Found:
-    """Check that mean actions are not all at their bound."""
+    """Report mean actions that are nearly all at their bound."""
     share = health.median("Health/at_bound")
     if share is not None and share > 0.9 and health.struggles(0.15):
         yield f"{share:.0%} of the mean actions are at their bound", "a larger scale of the actions, or a larger bound"
 
 
 def blocked_success(health: Health) -> Found:
-    """Check that no single condition of success blocks success, or never holds and does not approach its bound."""
+    """Report a success condition that blocks success: it holds much less often than the others, or never."""
     for name, condition in health.task.success.items():
         held, values = health.median(f"Success/{name}"), health.values(f"Success_Value/{name}")
         if held is None or condition is None or not health.struggles(0.15):
@@ -310,13 +313,13 @@ def blocked_success(health: Health) -> Found:
 
 
 def _gaps(values: list[float], bounds: Mapping[str, Any]) -> list[float]:
-    """Return minus the distance of each value to its bounds, 0 within them, so that a rise means an approach."""
+    """Return the negative distance of each value to its bounds, 0 within them; it rises as a value comes closer."""
     low, high = bounds.get("at_least"), bounds.get("at_most")
     return [-max((low if low is not None else v) - v, v - (high if high is not None else v), 0.0) for v in values]
 
 
 def _approaches(values: list[float]) -> bool:
-    """Return whether values are higher than they were at half of their history; true for few values."""
+    """Return whether the newest values are higher than those in the middle of the list; true for short lists."""
     part, middle = max(3, len(values) // 8), len(values) // 2
     if len(values) < 4 * part:
         return True

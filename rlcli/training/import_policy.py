@@ -1,4 +1,4 @@
-"""Import of policies that other libraries have saved: their weights become a run with one checkpoint."""
+"""Import of policies saved by Stable-Baselines3 or RSL-RL: the weights become a run with one checkpoint."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _MIN_STD = 1e-6
 
 @dataclass(slots=True)
 class ImportedPolicy:
-    """Policy of another library in rlcli's format of saved policies."""
+    """Policy of another library, converted to rlcli's format of saved policies."""
 
     spec: dict[str, Any]
     """Content of `policy.json`."""
@@ -184,7 +184,7 @@ def create_imported_run(
 def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:
     """Return float32 copies of untrusted tensors; check that they are plain, finite and not larger than the file."""
     if not isinstance(saved, Mapping):
-        raise CheckpointError(f"{where} must contain a mapping of weights; save a state_dict")
+        raise CheckpointError(f"{where} does not contain named weights; save the `state_dict()` of the policy")
     named: dict[str, Tensor] = {}
     total, limit = 0, available_memory() // 4  # bytes
     for name, value in saved.items():
@@ -196,13 +196,13 @@ def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:
             raise CheckpointError(f"{where}: {found}; save it as a dense, real CPU tensor")
         # a stride of 0 makes a large tensor of few numbers: its copy would fill the memory
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
-            raise CheckpointError(f"{where}: '{name[:60]}' has fewer stored numbers than its shape; save value.clone()")
+            raise CheckpointError(f"{where}: '{name[:60]}' is an expanded view; save a copy: tensor.clone()")
         total += 4 * value.numel()  # several tensors may share the numbers of the file
         if total > limit:
-            raise CheckpointError(f"{where} has tensors of more than {limit:,} bytes; free some memory")
+            raise CheckpointError(f"{where} has over {limit:,} bytes, a quarter of the free memory; free some memory")
         named[name] = value.detach().to(torch.float32).clone(memory_format=torch.contiguous_format)
         if not bool(named[name].isfinite().all()):
-            raise CheckpointError(f"{where}: '{name[:60]}' is not finite; choose an older file")
+            raise CheckpointError(f"{where}: '{name[:60]}' contains NaN or infinity; choose an older file")
     return named
 
 
@@ -215,15 +215,15 @@ def _layers(weights: Mapping[str, Tensor], prefix: str, file: Path) -> list[_Lay
     numbers = {n.removeprefix(prefix).partition(".")[0] for n in weights if n.startswith(prefix)}
     if not all(number.isdecimal() and number.isascii() and len(number) < 4 for number in numbers):
         found = ", ".join(sorted(numbers))[:200]
-        raise CheckpointError(f"{file}: {prefix}* has the layers {found}; number them 0, 2, 4, ...")
+        raise CheckpointError(f"{file}: the layers {prefix}* are named {found}; name them 0, 2, 4, ...")
     if sorted(map(int, numbers)) != list(range(0, 2 * len(numbers), 2)):
         found = ", ".join(sorted(numbers, key=int))[:200]
-        raise CheckpointError(f"{file}: {prefix}* has the layers {found}; rlcli reads linear layers 0, 2, 4, ...")
+        raise CheckpointError(f"{file}: only linear layers {prefix}0, 2, 4, ... can be imported, found {found}")
     return [_layer(weights, f"{prefix}{number}", file) for number in sorted(numbers, key=int)]
 
 
 def _layer(weights: Mapping[str, Tensor], name: str, file: Path) -> _Layer:
-    """Return a linear layer of untrusted weights."""
+    """Return the linear layer `name` of untrusted weights, after a check of its shapes."""
     weight, bias = weights.get(f"{name}.weight"), weights.get(f"{name}.bias")
     if weight is None or bias is None or weight.dim() != 2 or bias.shape != weight.shape[:1] or not weight.numel():
         shapes = ["missing" if value is None else tuple(value.shape) for value in (weight, bias)]
@@ -236,9 +236,9 @@ def _layer(weights: Mapping[str, Tensor], name: str, file: Path) -> _Layer:
 def _mlp_policy(
     kind: str, layers: Sequence[_Layer], activation: str, action_bound: float | None, file: Path
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the specification of a policy with these layers, and the weights of its actor."""
+    """Return the content of `policy.json` for a policy with these layers, and the weights of its actor."""
     if not layers:
-        raise CheckpointError(f"{file} has no layers; choose a file with a policy")
+        raise CheckpointError(f"{file} has no layers of a policy; choose another file")
     for (before, _), (after, _) in itertools.pairwise(layers):
         if after.shape[1] != len(before):
             message = f"a layer with {len(before)} outputs is followed by one with {after.shape[1]} inputs"
@@ -258,7 +258,7 @@ def _mlp_policy(
 
 
 def _log_std(weights: Mapping[str, Tensor], names: Mapping[str, str], file: Path) -> Tensor:
-    """Return the log standard deviation of the actions, from the parameter `std` or `log_std` of the file."""
+    """Return the log standard deviation of the actions; `names` has the names of `std` and `log_std` in the file."""
     if names["log_std"] in weights:
         return weights[names["log_std"]]
     if names["std"] not in weights:
@@ -268,18 +268,18 @@ def _log_std(weights: Mapping[str, Tensor], names: Mapping[str, str], file: Path
 
 
 def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the specification and the weights of the LSTM whose names have a prefix; both are empty without one."""
+    """Return the entries of `policy.json` and the weights of the LSTM with a prefix; both empty if there is none."""
     lstm: dict[str, Tensor] = {}
     for name, value in below(weights, prefix).items():
         kind, _, layer = name.rpartition("_l")
         if kind not in ("weight_ih", "weight_hh", "bias_ih", "bias_hh") or not (layer.isdecimal() and len(layer) < 3):
-            raise CheckpointError(f"{file}: {prefix}{name[:60]} is not an LSTM parameter; use an LSTM")
+            raise CheckpointError(f"{file}: {prefix}{name[:60]} is not of an LSTM; no other RNN can be imported")
         lstm[f"memory.layers.{layer}.{kind}"] = value
     cells: list[int] = []
     while (recurrent := lstm.get(f"memory.layers.{len(cells)}.weight_hh")) is not None:
         # an LSTM has four gates: weight_hh is (4 x cells, cells)
         if recurrent.dim() != 2 or len(recurrent) != 4 * recurrent.shape[1] or not recurrent.numel():
-            raise CheckpointError(f"{file}: the RNN must be an LSTM; train one")
+            raise CheckpointError(f"{file}: the RNN is no LSTM; train a policy with an LSTM or without an RNN")
         cells.append(recurrent.shape[1])
     if not cells:
         return {}, lstm
@@ -289,16 +289,16 @@ def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[
 
 
 def _empirical_normalizer(stats: Mapping[str, Tensor], file: Path) -> dict[str, Tensor]:
-    """Convert the normaliser: RSL-RL divides by std + 1e-2, a saved policy by sqrt(var + 1e-8)."""
+    """Convert RSL-RL's observation normaliser (divides by std + 1e-2) to rlcli's (divides by sqrt(var + 1e-8))."""
     mean, std = stats.get("_mean"), stats.get("_std")
     if mean is None or std is None or mean.shape != std.shape or mean.dim() != 2 or len(mean) != 1:
-        raise CheckpointError(f"{file}: the normaliser must have one mean and std per observation")
+        raise CheckpointError(f"{file}: `_mean` and `_std` of the normaliser must have shape (1, observations)")
     deviation = std[0].double() + _NORMALIZER_EPS
     return _normalizer(mean[0], (deviation.square() - 1e-8).clamp(min=0.0), stats)
 
 
 def _normalizer(mean: Tensor, var: Tensor, stats: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors of a saved policy's normaliser; the count is 0 if the file has none."""
+    """Return the tensors of rlcli's observation normaliser; its sample count is 0 if `stats` has none."""
     count = stats.get("count", torch.zeros(())).double().reshape(-1)[:1].sum()
     return {"normalizer.mean": mean.double(), "normalizer.var": var.double(), "normalizer.count": count}
 
@@ -315,7 +315,8 @@ def _vec_normalize(file: Path) -> dict[str, Tensor]:
         raise CheckpointError(message, hint=VEC_NORMALIZE_HINT) from None
     mean, var = stats.get("mean"), stats.get("var")
     if mean is None or var is None or mean.dim() != 1 or mean.shape != var.shape:
-        raise CheckpointError(f"{file} has no 'mean' and 'var' of each observation", hint=VEC_NORMALIZE_HINT)
+        message = f"{file} must contain 'mean' and 'var', each with one number per observation"
+        raise CheckpointError(message, hint=VEC_NORMALIZE_HINT)
     return _normalizer(mean, var, stats)
 
 
@@ -331,6 +332,6 @@ def _checked_policy(
 
 
 def _some_names(weights: Mapping[str, Tensor]) -> str:
-    """Return the first names of the weights, for a message."""
+    """Return up to six names of the weights, for a message."""
     names = [name[:40] for name in list(weights)[:6]]
     return f"found weights: {', '.join(names)}" if names else "found no weights"

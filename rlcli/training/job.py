@@ -1,4 +1,4 @@
-"""`Job`: the run and the settings of a training that is to start. The module imports neither torch nor MuJoCo."""
+"""Data classes for the start and the result of a training. The module imports neither torch nor MuJoCo."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Job:
-    """Locked run with the settings of its training."""
+    """Training that is to start: its run, which this process has locked, and its settings."""
 
     run: Run
     resolved: Resolved
@@ -42,7 +42,7 @@ class Job:
     """Time at which the job was made, by the monotonic clock [s]."""
 
     def message(self) -> dict[str, Any]:
-        """Return the message that rank 0 broadcasts to the other ranks."""
+        """Return the entries that rank 0 broadcasts, from which the other ranks make the same job."""
         return {
             "run": str(self.run.folder),
             "record": self.run.record,
@@ -70,7 +70,7 @@ class TrainingResult:
 
 
 def threads(resolved: Resolved) -> tuple[int, int]:
-    """Return the number of threads of the engine, and of torch in the update."""
+    """Return the number of threads of the physics engine, and of torch in the update of the policy."""
     agent, _ = resolved.require_agent()
     cores = available_cores()
     return resolved.task.sim.engine_threads or cores, agent.torch_threads or min(4, cores)

@@ -1,4 +1,4 @@
-"""Start of a training: create or resume a run on rank 0, and broadcast the job to all ranks."""
+"""Start of a training: create or resume its run on rank 0, and broadcast the job (run and settings) to all ranks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class TrainingRequest:
-    """Training that the command line describes: a task with all changes, or a run to resume."""
+    """Options of `rlcli train`: a task with all changes of its configuration, or a run to resume."""
 
     runs: Path
     """Folder of all runs."""
@@ -64,7 +64,7 @@ class TrainingRequest:
         """Return the configuration and the device of a new run.
 
         Args:
-            changes: overrides in addition to those of the request.
+            changes: overrides (`KEY=VALUE`) in addition to those of the command line.
 
         Raises:
             ConfigError: if the configuration is not valid.
@@ -120,7 +120,7 @@ def broadcast_job(request: TrainingRequest, resolved: Resolved | None, device: s
 
 
 def new_run(request: TrainingRequest, resolved: Resolved, device: str) -> Job:
-    """Create a run and write its folder, before anything heavy is imported; return the job."""
+    """Create a run with its folder, before torch and MuJoCo are imported; return the job."""
     record = run_record(request, resolved, device)
     config = to_yaml(to_data(resolved))
     run = create_run(request.runs, resolved.source.name, request.name, config, record)
@@ -165,7 +165,7 @@ def run_record(request: TrainingRequest, resolved: Resolved, device: str) -> dic
 
         choice = choose(request.init_from, request.runs, resolved.source, any_task=True)
         initial = choice.folder
-        _log.info("weights of %s (%s)", initial, choice.why)
+        _log.info("starting with the weights of %s (%s)", initial, choice.why)
     return {
         "seed": request.seed,
         "device": device,
@@ -290,7 +290,7 @@ def process_device(wanted: str, gpus: int | None) -> str:
 
 
 def _trainer_device(resolved: Resolved, device: str, wanted: str) -> str:
-    """Return the device, or the CPU if the trainer cannot use a GPU and the user gave no device.
+    """Return `device`, or the CPU if the trainer cannot use a GPU and --device (`wanted`) is auto.
 
     Raises:
         UsageError: if the trainer cannot use the device that the user gave.
@@ -357,7 +357,9 @@ def _find_checkpoint(request: TrainingRequest) -> tuple[Run, Path | None, str]:
 
 
 def _require_larger_budget(request: TrainingRequest, run: Run, folder: Path | None) -> None:
-    """Check that a new budget, which counts from the start of the training, leaves something to train.
+    """Check that the new --max-iterations or --max-steps of a resumed run is above what is already done.
+
+    Both count from the start of the training.
 
     Raises:
         UsageError: with the progress of the checkpoint.
@@ -379,7 +381,7 @@ def _require_larger_budget(request: TrainingRequest, run: Run, folder: Path | No
 
 
 def _overrides_in(given: object) -> Any:
-    """Return the entries that overrides have set, of the entry `given` (key -> origin of its value) of run.json."""
+    """Return the part of run.json's entry `given` (key -> origin of its value) that overrides have set."""
     if not isinstance(given, dict):
         return given
     return {key: origin for key, origin in given.items() if str(origin).startswith("override")}

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class LoggerKind:
-    """Logger for `--logger`."""
+    """Entry of `LOGGERS`: where the class of a logger is, and what it needs."""
 
     needs: str
     """Module that must be installed; the extra of rlcli that installs it has the logger's name."""
@@ -47,7 +47,7 @@ LOGGERS = {
 
 
 class JsonLines:
-    """Logger that writes one JSON object per iteration into `metrics.jsonl`, without delay.
+    """Logger that writes one JSON object per iteration into `metrics.jsonl`, and flushes it at once.
 
     Args:
         file: the file.
@@ -63,7 +63,7 @@ class JsonLines:
             self._file = file.open("a", encoding="utf-8", buffering=1)
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Append one line."""
+        """Append one line with the metrics of an iteration; infinite and NaN values are left out."""
         with disk_errors(self._path):
             finite = {name: value for name, value in metrics.items() if math.isfinite(value)}
             self._file.write(json.dumps({"iteration": iteration, "step": step, **finite}) + "\n")
@@ -97,7 +97,7 @@ class TensorBoard:
             self._add(file_version="brain.Event:2")
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Add scalars at the environment step."""
+        """Add the metrics of an iteration as scalars at the environment step."""
         values = [{"tag": name, "simple_value": value} for name, value in metrics.items()]
         self._add(step=step, summary={"value": values})
 
@@ -167,7 +167,10 @@ def open_loggers(
 
 
 def read_metrics(file: Path) -> list[dict[str, Any]]:
-    """Return the rows of a metrics file before the first damaged row; a killed process may leave an incomplete row."""
+    """Return the rows of a `metrics.jsonl` (iteration, step and metrics), up to the first damaged row.
+
+    A killed process may leave an incomplete last row.
+    """
     rows = []
     with file.open("rb") as lines:
         for line in iter(lambda: lines.readline(LONGEST_LINE), b""):
@@ -183,7 +186,7 @@ def _installed(name: str) -> bool:
 
 
 def _last_boundary(file: Path) -> tuple[int, int]:
-    """Return the last iteration and step in a metrics file; (0, 0) without a row."""
+    """Return the iteration and the step of the last row of a `metrics.jsonl`; (0, 0) without a row."""
     try:
         last = read_metrics(file)[-1]
     except (OSError, IndexError):
@@ -192,7 +195,7 @@ def _last_boundary(file: Path) -> tuple[int, int]:
 
 
 def _remove_events_after(file: Path, step: int) -> None:
-    """Remove the events after a step, and an incomplete last event of a killed process."""
+    """Remove from a TensorBoard event file the events after a step, and an incomplete last event."""
     from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
     from tensorboard.compat.proto.event_pb2 import Event
     from tensorboard.summary.writer.record_writer import RecordWriter

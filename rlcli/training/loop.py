@@ -40,8 +40,8 @@ DIVERGED_SHARE = 0.01
 class TrainLoop:
     """Training loop of one run: iterate, log, evaluate and save until the budget is spent or a signal arrives.
 
-    A checkpoint is always of a boundary between two iterations. All ranks reach each boundary together; rank 0 writes
-    the checkpoints.
+    A checkpoint is always the state between two iterations (a boundary). All ranks (processes of the training) reach
+    each boundary together; rank 0 writes the checkpoints.
     """
 
     trainer: Trainer
@@ -73,7 +73,7 @@ class TrainLoop:
         """Train until the budget is spent.
 
         Raises:
-            Stopped: on a signal, after the checkpoint of the last boundary is written; on a second signal at once.
+            Stopped: on a signal, after a checkpoint between two iterations is written; on a second signal at once.
             DivergedError: if the learner or too many environment steps diverge; the last good checkpoint is kept.
             MachineError: if the run cannot be written.
         """
@@ -128,7 +128,7 @@ class TrainLoop:
         return self.reached or budget.spent(self.trainer)
 
     def _check_health(self, metrics: dict[str, float]) -> None:
-        """Run the health checks; log new findings, and write the present ones into run.json."""
+        """Run the health checks; log new problems, and write the present ones into run.json."""
         health = self.health
         if health is None:
             return
@@ -172,7 +172,7 @@ class TrainLoop:
 
     @contextlib.contextmanager
     def _interruptible(self, is_long: bool) -> Iterator[None]:
-        """Let a signal or a divergence end a long iteration, and save the boundary before it.
+        """Let a signal or a divergence end a long iteration, after saving the state before the iteration.
 
         A short iteration is always finished: this takes less time than to copy the trainer's state before it. On a GPU
         and with several ranks every iteration is finished.
@@ -194,7 +194,7 @@ class TrainLoop:
         self._iteration_s = time.monotonic() - begin
 
     def _save(self) -> None:
-        """Save a checkpoint of this boundary, unless it exists."""
+        """Save a checkpoint of the state between two iterations, unless it exists."""
         boundary = self.trainer.iteration, self.trainer.env_steps
         if self.writer.newest != boundary:
             state = self.trainer.state()  # collective: every rank must call it
@@ -223,7 +223,7 @@ class TrainLoop:
 
 
 def _with_rates(report: Report, steps: int) -> dict[str, float]:
-    """Return the metrics of an iteration of `steps` environment steps, with its speed and durations."""
+    """Return the metrics of an iteration of `steps` environment steps, with `Perf/*` for its speed and durations."""
     seconds = report.seconds
     total = max(sum(seconds.values()), 1e-9)
     rates = {
@@ -236,7 +236,7 @@ def _with_rates(report: Report, steps: int) -> dict[str, float]:
 
 
 def _require_stable(diverged: float, trainer: Trainer) -> None:
-    """Check that at most `DIVERGED_SHARE` of the iteration's environment steps have diverged.
+    """Check that at most the share `DIVERGED_SHARE` of the iteration's environment steps has diverged.
 
     Raises:
         DivergedError: if there are more.

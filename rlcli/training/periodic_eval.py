@@ -53,9 +53,9 @@ class PeriodicEval:
         return iteration % self._interval == 0
 
     def run(self, policy: Callable[[], Policy]) -> dict[str, float]:
-        """Evaluate the policy that `policy` returns, and restore the random generators after it.
+        """Evaluate the policy that `policy` returns, and restore the random generators; return the metrics `Eval/*`.
 
-        The policy is built within, because building it draws random weights.
+        The policy is built after the generators are saved, because building it draws random weights.
         """
         with undisturbed():
             if self._env is None:
@@ -79,5 +79,5 @@ class PeriodicEval:
 
 
 def _score(metrics: Mapping[str, Any]) -> tuple[float, float]:
-    """Return the success rate and the mean return of an evaluation; -inf for a missing one."""
+    """Return the success rate and the mean return of an evaluation, to compare evaluations; -inf if one is missing."""
     return metrics.get(_SUCCESS, -math.inf), metrics.get(_RETURN, -math.inf)

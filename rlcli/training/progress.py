@@ -1,4 +1,4 @@
-"""Progress of a training, for display. The module imports nothing heavy, because other commands display it, too."""
+"""Progress of a training, for display by `train`, `watch` and others. The module imports neither torch nor MuJoCo."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _FOREVER_S = 1e10
 
 @dataclass(slots=True)
 class Progress:
-    """Progress of a training after an iteration."""
+    """Progress of a training after an iteration, for display."""
 
     iteration: int
     iterations: int | None
@@ -57,6 +57,6 @@ def progress_from_metrics(rows: Sequence[Mapping[str, Any]], iterations: int | N
 
 
 def _number(row: Mapping[str, Any], name: str) -> float:
-    """Return a metric of an untrusted row; 0 if it is not a number of at least 0."""
+    """Return the metric `name` of a row of an untrusted file; 0 if it is not a number of at least 0."""
     value = row.get(name, 0.0)
     return float(value) if type(value) in (int, float) and value >= 0.0 else 0.0

@@ -50,7 +50,7 @@ class ProgressView(contextlib.AbstractContextManager[Any], Protocol):
 def run_training(
     job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view: ProgressView
 ) -> TrainingResult | None:
-    """Train a job until its budget is spent; record an error of the loop in the run and raise it.
+    """Train until the budget of a job is spent; an error is recorded in run.json and raised again.
 
     Args:
         job: run and settings of the training; the run is unlocked at the end.
@@ -137,7 +137,7 @@ def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view
     for note in [] if loop.health is None or loop.reached else loop.health.notes(loop.metrics):
         _log.info("%s", note)
     for finding in run.findings() if job.writes else ():
-        _log.warning("at the end: %s", finding)
+        _log.warning("at the end of the training: %s", finding)
 
 
 def _open_writer(job: Job, env: Environment) -> CheckpointWriter:
@@ -153,19 +153,21 @@ def _open_writer(job: Job, env: Environment) -> CheckpointWriter:
 
 
 def _record_begin(job: Job, trainer: Trainer, env: Environment, budget: Budget) -> None:
-    """Write the start of the training into run.json, and whether a resumed run is bit-identical."""
+    """Write the start of the training into run.json, and whether a resumed run would give the same bits."""
     unsaved = env.unsaved_state()
     if unsaved:
-        _log.warning("a resumed run may differ, because no checkpoint can store %s", ", ".join(unsaved))
+        names = ", ".join(unsaved)
+        _log.warning(f"a resumed run may differ from an uninterrupted one: no checkpoint can store {names}")
     exact = not unsaved and env.device.type == "cpu"
     job.run.update(state="running", since=datetime.now(UTC).isoformat(), iterations=budget.iterations(trainer))
     job.run.update(resumes_exactly=exact, **_provenance(job, trainer, env))
 
 
 def _provenance(job: Job, trainer: Trainer, env: Environment) -> dict[str, Any]:
-    """Return run.json's entries on the compiled model and the machine.
+    """Return the entries of run.json that describe the compiled model.
 
-    For a resumed run return the entry `resumed` with the values that have changed, or nothing if none has changed.
+    For a resumed run: the entry `resumed` with what has changed in the machine, the versions and the model; an empty
+    mapping if nothing has changed.
     """
     record, device = job.run.record, str(env.device)
     built = built_record(env.engine.model, device)
@@ -190,7 +192,7 @@ def _make_play_env(job: Job, purpose: str, flags: dict[str, Any]) -> VecEnv:
 
     Args:
         job: run and settings of the training.
-        purpose: name from which the seed is derived.
+        purpose: what the environment is for (`evaluation`, `video`); its seed is derived from this text.
         flags: dotted key -> value of further settings.
     """
     resolved = resolve_run(job.run, play=True, flags=flags, named=job.resolved.source)
@@ -198,7 +200,7 @@ def _make_play_env(job: Job, purpose: str, flags: dict[str, Any]) -> VecEnv:
 
 
 def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest, iterations: int) -> PeriodicEval | None:
-    """Return the evaluation between iterations, if the agent has one; only the rank that writes the run evaluates."""
+    """Return the evaluation between iterations, if the agent has one; None on other ranks than 0."""
     run, (agent, _) = job.run, job.resolved.require_agent()
     until = None if agent.until is None else read_threshold(agent.until)
     if (agent.eval_interval is None and until is None) or not job.writes:
@@ -221,7 +223,7 @@ def _periodic_eval(job: Job, writer: CheckpointWriter, stop: StopRequest, iterat
 
 
 def _health(job: Job, iterations: int) -> Health | None:
-    """Return the health checks with the metrics of earlier iterations; only the rank that writes the run checks."""
+    """Return the health checks, with the metrics of a resumed run's earlier iterations; None on other ranks than 0."""
     if not job.writes:
         return None
     agent, _ = job.resolved.require_agent()
@@ -244,7 +246,7 @@ def _report_bar(run: Run, bar: str, reached: bool) -> None:
 
 
 def _training_videos(job: Job, stop: StopRequest) -> TrainingVideos | None:
-    """Return the recorder of videos, if the user wants videos; only the rank that writes the run records."""
+    """Return the recorder of videos, if there is a `--video-every`; None on other ranks than 0."""
     if not job.video_every or not job.writes:
         return None
     # imported here: most trainings do not need OpenGL and the video modules
@@ -257,7 +259,7 @@ def _training_videos(job: Job, stop: StopRequest) -> TrainingVideos | None:
 
 
 def _end_state(error: BaseException) -> tuple[str, str | None]:
-    """Return the state of the run after an error, and the reason for run.json."""
+    """Return the state of the run after an error (stopped, diverged or failed), and the reason for run.json."""
     if isinstance(error, Stopped | KeyboardInterrupt):
         return "stopped", None
     message = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"

@@ -25,9 +25,9 @@ _log = logging.getLogger(__name__)
 
 
 def build_trainer(job: Job, device: str) -> tuple[Trainer, Environment]:
-    """Build the trainer and its environment; start the trainer, or load the checkpoint to resume from.
+    """Build the trainer and its environment; load the checkpoint to resume from, if there is one.
 
-    The changed configuration of a resumed run is written only after everything that may fail.
+    The changed budget of a resumed run is written to its `config.yaml` last, after everything that may fail.
 
     Raises:
         CheckpointError: if a checkpoint does not fit.
@@ -71,18 +71,20 @@ def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int)
 
 
 def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: Environment) -> None:
-    """Load the state of a checkpoint to resume from."""
+    """Load the state of a checkpoint into the trainer and its environment, to resume a training."""
     require_fit(saved, env.layout)
     _load(saved, lambda: trainer.load(state), "the run cannot be resumed", hint="choose another checkpoint: RUN@step:N")
     if (trainer.iteration, trainer.env_steps) != (saved.iteration, saved.step):
-        raise CheckpointError(f"{saved.folder} is corrupt: manifest.json and state.json have different steps")
+        message = f"{saved.folder} is corrupt: manifest.json and state.json have different steps"
+        raise CheckpointError(message, hint="choose another checkpoint: RUN@step:N")
     processes, size = state.values.get("processes", 1), distributed.current().world_size
     if processes != size:
-        _log.info("saved with world size %s, resumed with %s: every environment starts a new episode", processes, size)
+        change = f"saved with {processes} processes, resumed with {size}"
+        _log.info(f"{change}: every environment starts a new episode")
 
 
 def _load(saved: Checkpoint, load: Callable[[], Any], failure: str, hint: str | None = None) -> None:
-    """Call a loader of untrusted data; raise any error of it as a CheckpointError."""
+    """Call a loader of a checkpoint's data; raise any of its errors as a CheckpointError that begins with `failure`."""
     try:
         load()
     except RlcliError:

@@ -1,4 +1,4 @@
-"""Signals that stop a training: the first signal at the next step or boundary, the second one at once."""
+"""Signals (Ctrl-C, SIGTERM) that stop a training: the first one without loss of work, the second one at once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SIGNALS = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGHUP")
 
 
 class Interrupted(KeyboardInterrupt):
-    """Interruption in the middle of an iteration. The work of this iteration is lost."""
+    """Exception that ends an iteration after a signal. The work of this iteration is lost."""
 
 
 @dataclass(slots=True)
@@ -72,7 +72,7 @@ class StopRequest(StepObserver):
             raise Stopped("stopped before training began", exit_code=self.exit_code) from None
 
     def before_step(self) -> None:
-        """Check again before every environment step: other code may have caught the exception of the signal."""
+        """Check for a signal before every environment step: a task may have caught the exception of the signal."""
         self.check()
 
     def check(self) -> None:

@@ -1,4 +1,4 @@
-"""Trainings in subprocesses: `rlcli` commands that are started one after the other and stopped together."""
+"""Trainings in subprocesses, for sweeps and several seeds: `rlcli train` commands that are stopped together."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ POLL_S = 0.1
 
 @dataclass(slots=True)
 class TrainingProcess:
-    """Subprocess that runs a command for one run."""
+    """Subprocess that runs an `rlcli` command (train or eval) for one run."""
 
     run: Path
     """Folder of the run."""
@@ -49,7 +49,7 @@ class TrainingProcess:
                 self.process.terminate()
 
     def has_ended(self) -> bool:
-        """Return whether the process has ended; if so, read its document."""
+        """Return whether the process has ended; if so, read the JSON document that it has printed."""
         if self.process.poll() is None:
             return False
         if not self.document:
@@ -73,7 +73,7 @@ class TrainingProcess:
         """Return the error that the process has printed, or an error with the path of its log."""
         printed = self.document.get("error")
         if not isinstance(printed, dict):
-            error = RlcliError(f"the process ended with exit code {self.exit_code}; see {self.run / LOG}")
+            error = RlcliError(f"rlcli ended with exit code {self.exit_code}; its messages are in {self.run / LOG}")
         else:
             error = RlcliError(str(printed.get("message")).split("\n"))
             error.kind = str(printed.get("kind"))
@@ -98,12 +98,12 @@ def start_command(run: Path, words: Sequence[str]) -> TrainingProcess:
 
 
 def start_training(run: Path, device: str, options: Sequence[str] = ()) -> TrainingProcess:
-    """Start the training of a waiting run, or resume an interrupted run."""
+    """Start the training of a run that has not started yet, or resume an interrupted run."""
     return start_command(run, ["train", "--resume", str(run), "--device", device, *options])
 
 
 def stop_with_parent() -> None:
-    """Send this process SIGTERM when its parent ends, if the parent is `rlcli`."""
+    """End this process with SIGTERM when its parent ends, if the parent is an `rlcli` that runs several trainings."""
     if os.environ.pop(STOP_WITH_PARENT, None) is None:
         return
     pipe = os.dup(0)

@@ -1,4 +1,4 @@
-"""Time that a training takes until an evaluation between its iterations reaches a threshold."""
+"""Option `--until KEY=X`: the threshold that ends a training, and the time that a training took to reach it."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ _METRICS = {"success": "Eval/success_rate", "return": "Eval/mean_reward", "lengt
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """Value that an evaluation must reach."""
+    """Threshold of the option `--until KEY=X`: mean that an evaluation must reach."""
 
     key: str
     """success, return or length."""
     value: float
 
     def reached_by(self, row: Mapping[str, Any]) -> bool:
-        """Return whether the evaluation in a row of metrics reached the threshold."""
+        """Return whether the evaluation in a row of `metrics.jsonl` reached it; false for a row without evaluation."""
         return bool(row.get(_METRICS[self.key], -math.inf) >= self.value)
 
     def is_certain(self, summary: Mapping[str, Any]) -> bool:
-        """Return whether the lower end of the interval in the summary of an evaluation reaches the threshold."""
+        """Return whether the lower end of the 95 % interval in an evaluation's summary reaches the threshold."""
         low = summary[self.key]["low"] if self.key in summary else None
         return low is not None and low >= self.value
 
     def episodes(self, least: int) -> int:
-        """Return a number of episodes, at least `least`, in which the interval can reach a success rate below 1."""
+        """Return how many episodes, at least `least`, give an interval that can reach the threshold."""
         if self.key != "success":
             return max(least, 2)
         from rlcli.rl.confidence import NORMAL  # it imports numpy
@@ -43,7 +43,7 @@ class Threshold:
 
 @dataclass(frozen=True, slots=True)
 class Reached:
-    """Time at which a training reached its threshold."""
+    """Time, step and iteration at which a training reached its threshold."""
 
     seconds: float
     """Sum of all rollouts and updates until then, without evaluations [s]."""
@@ -53,7 +53,7 @@ class Reached:
 
 
 def read_threshold(text: str) -> Threshold:
-    """Return the threshold of the option --until.
+    """Parse the value of the option `--until`, such as `success=0.95`.
 
     Raises:
         UsageError: for a text that `parse_threshold` refuses.
@@ -70,7 +70,7 @@ def training_s(row: Mapping[str, Any]) -> float:
 
 
 def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -> Reached | None:
-    """Return the time at which a training first reached a threshold, from all rows of metrics; None if it did not."""
+    """Return when a training first reached a threshold, from all rows of `metrics.jsonl`; None if it did not."""
     seconds = 0.0
     for row in rows:
         seconds += training_s(row)
@@ -80,6 +80,6 @@ def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -
 
 
 def median(values: Sequence[float | None]) -> float | None:
-    """Return the median over seeds. None, as a value or as the result, means that the threshold was not reached."""
+    """Return the median of times over seeds. None, as a value or result, means that the threshold was not reached."""
     found = statistics.median([math.inf if value is None else value for value in values])
     return found if math.isfinite(found) else None

@@ -39,17 +39,17 @@ _TIMEOUT_S = 60.0
 
 
 class Logger(Protocol):
-    """Logger of the metrics of every iteration."""
+    """Protocol of loggers, which receive the metrics of every iteration of a training."""
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Record one iteration."""
+        """Record the metrics of one iteration."""
 
     def close(self, state: str) -> None:
         """Flush and close, with the state of the run: finished, stopped, diverged or failed."""
 
 
 class Tracker(Logger, Protocol):
-    """Library that stores the metrics of a run."""
+    """Logger that stores the metrics of a run with an experiment tracker such as MLflow."""
 
     id: str
     """Identifier of the run in the library; a resumed run continues it."""
@@ -61,7 +61,7 @@ class FailSafeLogger:
     Args:
         name: name of the logger in messages.
         logger: the logger.
-        last_step: environment steps up to which the logger already has the metrics.
+        last_step: environment steps up to which the logger has the metrics from before the run was resumed.
     """
 
     def __init__(self, name: str, logger: Logger, last_step: int) -> None:
@@ -69,7 +69,7 @@ class FailSafeLogger:
         self._name, self._last_step = name, last_step
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Record one iteration, unless the logger has failed or already has it."""
+        """Record one iteration, unless the logger has failed or has recorded it before."""
         if self._logger is None or step <= self._last_step:
             return
         try:
@@ -99,11 +99,11 @@ class BackgroundTracker:
         self._thread.start()
 
     def write(self, iteration: int, step: int, metrics: dict[str, float]) -> None:
-        """Queue one iteration, or raise the error of an earlier one."""
+        """Queue the metrics of one iteration, or raise the error of the background thread."""
         if self._failure is not None:
             raise self._failure
         if self._rows.qsize() > _MAX_ROWS:
-            raise TimeoutError(f"the queue has more than {_MAX_ROWS} iterations; check the connection")
+            raise TimeoutError(f"more than {_MAX_ROWS} iterations wait for the upload; check the connection")
         self._rows.put((iteration, step, {name: value for name, value in metrics.items() if math.isfinite(value)}))
 
     def close(self, state: str) -> None:
@@ -116,7 +116,7 @@ class BackgroundTracker:
             self._rows.put(state)
             self._thread.join(_TIMEOUT_S)
         if self._thread.is_alive():
-            raise TimeoutError(f"the logger did not finish within {_TIMEOUT_S:g} s; check the connection")
+            raise TimeoutError(f"the upload did not finish within {_TIMEOUT_S:g} s; check the connection")
         if self._failure is not None:
             raise self._failure
 
@@ -178,7 +178,7 @@ class _LibraryRun:
 
 
 class Wandb(_LibraryRun):
-    """Tracker for Weights & Biases: online if the user has a key, else offline. Its files are in the run."""
+    """Tracker for Weights & Biases: online with an API key, else offline. Its files are in the run's folder."""
 
     def __init__(self, run: Run, config: Mapping[str, Any], resume_id: str | None) -> None:
         _set_default_variables(WANDB_ERROR_REPORTING="false", WANDB_SILENT="true")
@@ -187,7 +187,8 @@ class Wandb(_LibraryRun):
         mode = os.environ.get("WANDB_MODE")
         if mode is None and not _has_key():
             mode = "offline"
-            _log.warning("wandb has no key and writes offline; to upload: `wandb sync %s/offline-run-*`", self._folder)
+            sync = f"wandb sync {self._folder}/offline-run-*"
+            _log.warning(f"there is no API key (`wandb login`): wandb writes to disk; to upload later: `{sync}`")
         self.id = resume_id or f"{int(time.time()):x}{os.urandom(4).hex()}"
         quiet = {"console": "off", "silent": True, "disable_git": True, "save_code": False, "symlink": False}
         self._run = wandb.init(
@@ -210,7 +211,7 @@ class Wandb(_LibraryRun):
 
 
 class MLflow:
-    """Tracker for MLflow: at MLFLOW_TRACKING_URI, else in files of the run."""
+    """Tracker for MLflow: at MLFLOW_TRACKING_URI, else in files in the run's folder."""
 
     def __init__(self, run: Run, config: Mapping[str, Any], resume_id: str | None) -> None:
         _set_default_variables(
@@ -261,7 +262,7 @@ class MLflow:
 
 
 class Trackio(_LibraryRun):
-    """Tracker for trackio: a database in TRACKIO_DIR, else in the run."""
+    """Tracker for trackio: a database in TRACKIO_DIR, else in the run's folder."""
 
     def __init__(self, run: Run, config: Mapping[str, Any], resume_id: str | None) -> None:
         _set_default_variables(
@@ -285,7 +286,7 @@ class Trackio(_LibraryRun):
 
 
 class _StoredTracker(FileModel):
-    """Entry of a tracker in run.json."""
+    """Entry of a tracker in run.json: the run's identifier in the tracker, and the last step that it has."""
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,128}$")]
     step: Annotated[int, Field(ge=0, le=2**53)]
@@ -300,7 +301,7 @@ def _stored_tracker(run: Run, name: str) -> _StoredTracker | None:
 
 
 def _has_key() -> bool:
-    """Return whether the user has a key of wandb: in the environment, or in the netrc file of `wandb login`."""
+    """Return whether the user has an API key of wandb: in the environment, or in the netrc file of `wandb login`."""
     if os.environ.get("WANDB_API_KEY") or os.environ.get("WANDB_IDENTITY_TOKEN_FILE"):
         return True
     host = urlsplit(os.environ.get("WANDB_BASE_URL") or "https://api.wandb.ai").hostname or ""

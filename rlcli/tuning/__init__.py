@@ -1,1 +1,1 @@
-"""Many trainings: several seeds, sweeps over settings, and benchmarks of sizes and threads."""
+"""Commands that run many trainings: several seeds, sweeps (hyperparameter search), benchmarks of speed."""

@@ -1,4 +1,6 @@
-"""Speed of a task on this machine, and the sizes and threads with the shortest training iterations.
+"""Benchmark of `rlcli bench`: speed of a task on this machine, and the sizes and threads that train fastest.
+
+Sizes are the number of environments, the steps of a rollout and the number of minibatches.
 
 Only settings that train equally are compared: they have the same number of samples in an iteration, and the same number
 and size of gradient steps. Then the time of an iteration decides the time to a solution. More steps per second with
@@ -42,7 +44,7 @@ _ENV_BYTES = 256 * 2**10
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Duration of the measurements."""
+    """How long and how often `rlcli bench` measures."""
 
     block_s: float = 0.4
     """Shortest duration of a block of calls [s]."""
@@ -59,7 +61,7 @@ QUICK = Pace(block_s=0.05, blocks=3, rounds=1, longest_s=1.0)
 
 @dataclass(frozen=True, slots=True)
 class Stepped:
-    """Measurement of environments with random actions."""
+    """Speed of a number of environments with random actions, without training."""
 
     num_envs: int
     engine_threads: int
@@ -72,12 +74,12 @@ class Stepped:
     resident: int | None = None
     """Resident memory of the process [bytes]."""
     left_out: str | None = None
-    """Reason for not measuring."""
+    """Reason why this size was not measured; None: it was measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Sizes and threads of a training."""
+    """Sizes and threads of a training that the benchmark compares."""
 
     num_envs: int
     horizon: int | None
@@ -89,7 +91,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """Measurement of training iterations."""
+    """Speed of training iterations with a setting (sizes and threads)."""
 
     setting: Setting
     alike: bool
@@ -117,7 +119,7 @@ class Trained:
 
 @dataclass(slots=True)
 class Findings:
-    """Measurements of a benchmark so far."""
+    """All measurements of a benchmark so far, and the setting that it recommends."""
 
     stepped: list[Stepped] = field(default_factory=list)
     trained: list[Trained] = field(default_factory=list)
@@ -127,13 +129,13 @@ class Findings:
 
     @property
     def unsteady(self) -> bool:
-        """Whether the measurements vary so much that other programs must run on the machine."""
+        """Whether the measurements vary so much that other programs probably load the machine."""
         rows: list[Stepped | Trained] = [*self.stepped, *self.trained]
         spreads = [row.spread for row in rows if row.spread is not None]
         return bool(spreads) and statistics.median(spreads) > UNSTEADY
 
     def record(self) -> dict[str, Any]:
-        """Return the measurements as plain data."""
+        """Return the measurements as JSON data: environment, training, unsteady."""
         rows = []
         for one in self.trained:
             entries = asdict(one)
@@ -143,7 +145,7 @@ class Findings:
 
 @dataclass(slots=True)
 class _Training:
-    """Trainer with the durations of its iterations."""
+    """Training that is measured: its trainer and the durations of its iterations."""
 
     trainer: Trainer
     blocks: list[float] = field(default_factory=list)
@@ -152,11 +154,11 @@ class _Training:
     """Part -> duration [s], for each iteration."""
 
     def iterate(self) -> None:
-        """Run one iteration."""
+        """Run one training iteration and keep its durations."""
         self.seconds.append(self.trainer.iterate().seconds)
 
     def row(self, setting: Setting, *, alike: bool) -> Trained:
-        """Return the measurement."""
+        """Return the speed of the iterations so far; `alike`: see `Trained`."""
         total = sum(sum(parts.values()) for parts in self.seconds)
         names = dict.fromkeys(name for parts in self.seconds for name in parts)
         shares = {name: sum(parts.get(name, 0.0) for parts in self.seconds) / total for name in names}
@@ -168,7 +170,7 @@ class Bench:
     """Benchmark of one task and agent.
 
     Args:
-        resolve: returns the configuration with changed keys: dotted key -> value.
+        resolve: returns the configuration after some changes (dotted key -> value).
         pace: duration of the measurements.
         announce: called before each measurement with its description.
         show: called after each measurement.
@@ -200,7 +202,7 @@ class Bench:
         return self.findings
 
     def changes(self, setting: Setting) -> dict[str, Any]:
-        """Return a setting as keys of the configuration."""
+        """Return what a setting changes in the configuration: dotted key -> value."""
         changed: dict[str, Any] = {
             "scene.num_envs": setting.num_envs,
             "sim.engine_threads": setting.engine_threads,
@@ -280,7 +282,7 @@ class Bench:
         self._compare(best)
 
     def _sizes(self, setting: Setting) -> Iterator[Setting]:
-        """Yield settings with the same samples per iteration from half and from twice the environments."""
+        """Yield settings with half and twice the environments and equal samples per iteration: other rollouts."""
         if setting.horizon is None:
             return
         samples = setting.num_envs * setting.horizon
@@ -313,14 +315,14 @@ class Bench:
 
     @contextlib.contextmanager
     def _open_training(self, setting: Setting) -> Iterator[_Training]:
-        """Context with a training that has started."""
+        """Context with a training in the given setting, ready for `iterate`."""
         trainer, env = make_trainer(self._resolve(self.changes(setting)), 42, "cpu", setting.torch_threads)
         with contextlib.closing(env):
             trainer.start()
             yield _Training(trainer)
 
     def _compare(self, best: Trained) -> None:
-        """Measure the best and the present setting again, in alternation, so that other load affects both alike."""
+        """Measure the fastest and the present setting again in alternation, so that other load affects both alike."""
         present = self.findings.trained[0]
         if best.setting == present.setting:
             self.findings.present = self.findings.recommended = present
@@ -343,14 +345,17 @@ class Bench:
 
 
 def load() -> float | None:
-    """Return the load [processes], the mean over the last minute; None where the system has no such number."""
+    """Return the system's load, the mean number of running processes in the last minute; None if it is unknown."""
     with contextlib.suppress(AttributeError, OSError):
         return os.getloadavg()[0]
     return None
 
 
 def _blocks(call: Callable[[], object], pace: Pace) -> list[float]:
-    """Return the mean seconds of a call in each block; measure more blocks if they differ."""
+    """Call a function repeatedly, in blocks; return the mean duration of a call in each block [s].
+
+    If the blocks differ too much, more blocks are measured.
+    """
     blocks: list[float] = []
     for _ in range(pace.rounds):
         blocks += [_block(call, pace.block_s) for _ in range(pace.blocks)]
@@ -360,7 +365,7 @@ def _blocks(call: Callable[[], object], pace: Pace) -> list[float]:
 
 
 def _block(call: Callable[[], object], min_s: float) -> float:
-    """Repeat a call for at least `min_s`; return the mean duration of a call [s]."""
+    """Call a function repeatedly for at least `min_s` seconds; return the mean duration of a call [s]."""
     begin, calls = time.perf_counter(), 0
     while True:
         call()
@@ -377,12 +382,12 @@ def _spread(blocks: list[float]) -> float:
 
 
 def _powers(most: int) -> list[int]:
-    """Return 1, 2, 4, ... up to a number, and the number itself."""
+    """Return 1, 2, 4, ... up to the number `most`, and `most` itself: the thread counts to measure."""
     return sorted({*(2**n for n in range(int(math.log2(most)) + 1)), most})
 
 
 def _fastest(rows: list[Trained]) -> Trained:
-    """Return the fastest measurement among settings that train equally."""
+    """Return the fastest measurement among settings with equal samples and gradient steps per iteration."""
     measured = [row for row in rows if row.alike and row.seconds is not None]
     return min(measured, key=lambda row: row.seconds or math.inf)
 

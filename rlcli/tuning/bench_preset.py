@@ -1,4 +1,4 @@
-"""The settings that `rlcli bench` recommends, as a `--config` file with the measurements in comments."""
+"""Preset of `rlcli bench`: a file for `--config` with the recommended settings, and the measurements in comments."""
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -15,10 +15,10 @@ def bench_preset(
     """Return YAML with the user's changes, the recommended settings, and comments with the measurements.
 
     Args:
-        resolved: the configuration of the command line.
+        resolved: the task's configuration with the changes of the command line.
         changes: the recommended settings: dotted key -> value.
         findings: the measurements.
-        machine: the machine that was measured.
+        machine: processor, memory and versions of the machine that was measured.
         agent_named: whether the command line names the agent; the preset then makes it the default.
     """
     data = preset_of(resolved, agent_named)
@@ -35,7 +35,7 @@ def bench_preset(
 
 
 def explanation(findings: Findings) -> list[str]:
-    """Return the recommendation and its reason, in sentences."""
+    """Return the recommendation and its reason as sentences, for the terminal and the preset's comments."""
     present, best = findings.present, findings.recommended
     if present is None or best is None:
         return []

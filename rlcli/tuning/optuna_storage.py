@@ -1,4 +1,4 @@
-"""Storage of a sweep's trials in Optuna: a journal in the sweep's folder, or a database for several machines."""
+"""Where Optuna stores the trials of a sweep: a journal file in its folder, or a database for several machines."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
     """Open Optuna's study of a sweep.
 
     Args:
-        folder: the folder of the sweep, which holds the journal.
+        folder: the folder of the sweep, which contains the journal file.
         settings: settings of the sweep: `task`, `name`, `direction` and `pruner` (median or none).
         storage: URL of a database; None uses the journal.
         create: whether to create the study if it does not exist.
@@ -100,11 +100,11 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
 
     file = folder / JOURNAL
     if file.is_symlink():
-        raise CheckpointError(f"{file} is a link; replace it by the file itself")
+        raise CheckpointError(f"{file} is a link, which rlcli does not open; replace it by the file itself")
     if file.exists() and not (file.is_file() and file.stat().st_size <= _MAX_JOURNAL):
         raise CheckpointError(f"{file} is not a regular file of at most {_MAX_JOURNAL:,} bytes; choose another --name")
     if not create and not file.is_file():
-        raise CheckpointError(f"{folder} has no {JOURNAL}, the file of its trials; choose another --name")
+        raise CheckpointError(f"{folder} has no file {JOURNAL} with its trials; choose another --name for a new sweep")
 
     lock: Any = FileLock(folder / f".{JOURNAL}")  # the system releases it when the process is killed
 
@@ -125,12 +125,12 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
             try:
                 for entry in super().read_logs(log_number_from):
                     if not isinstance(entry, dict) or not {"op_code", "worker_id"} <= entry.keys():
-                        raise ValueError("a line is not a log entry of Optuna")
+                        raise ValueError("a line is not an entry of a journal that Optuna has written")
                     yield entry
             except ValueError as error:
                 raise _corrupt(file, error) from None
             except OSError as error:
-                raise CheckpointError(f"{file} cannot be read: {error.strerror or error}") from None
+                raise CheckpointError(f"{file} cannot be read: {error.strerror or error}; check the disk") from None
 
     try:
         return JournalStorage(Backend(str(file), lock_obj=lock))
@@ -144,7 +144,7 @@ def _corrupt(file: Path, error: Exception) -> CheckpointError:
 
 
 def _remove_partial_line(file: Path) -> None:
-    """Remove the incomplete last line of a killed writer; the caller holds the lock."""
+    """Remove the incomplete last line that a killed process has left in a journal; the caller holds the lock."""
     with file.open("r+b") as journal:
         size = begin = journal.seek(0, 2)
         tail = b""
@@ -175,9 +175,10 @@ def _database(url: str) -> optuna.storages.BaseStorage:
         raise DependencyError(f"--storage needs the driver {driver}", hint=f"pip install {driver}") from None
     except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError, ValueError, LookupError) as error:
         message = f"--storage '{without_password(url)}' is not the URL of a database: {_first_line(error)}"
-        raise UsageError(message, hint="as in postgresql+psycopg://user@host/name") from None
+        raise UsageError(message, hint="write a URL such as postgresql+psycopg://user@host/name") from None
     except (sqlalchemy.exc.SQLAlchemyError, OSError) as error:
-        raise MachineError(f"--storage {without_password(url)} cannot be reached: {_first_line(error)}") from None
+        message = f"--storage {without_password(url)} cannot be reached: {_first_line(error)}"
+        raise MachineError(message, hint="start the database, or correct the URL") from None
 
 
 def _is_database_error(error: BaseException) -> bool:

@@ -1,4 +1,4 @@
-"""Search space and objective of a sweep, parsed from the command line."""
+"""Search space (`--param`) and objective (`--objective`) of a sweep, parsed from the command line."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ HINT = "KEY=LOW:HIGH, KEY=log:LOW:HIGH or KEY=A,B,C"
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """Key of the configuration, with a range or choices of values."""
+    """Setting that a sweep varies: a key of the configuration, and the range or the choices of its values."""
 
     key: str
     low: float | int | None = None
@@ -39,22 +39,22 @@ class Parameter:
 
     @property
     def bounds(self) -> tuple[Any, ...]:
-        """Values for the check of the configuration: the ends of the range, or all choices."""
+        """Values to check before the sweep: the two ends of the range, or all choices."""
         return self.choices or (self.low, self.high)
 
     def override(self, value: object) -> str:
-        """Return a value as an override on the command line."""
+        """Return a value of the parameter as an override, `KEY=VALUE`."""
         return f"{self.key}={_to_line(value)}"
 
     def suggest(self, trial: optuna.Trial) -> Any:
-        """Return a value that Optuna suggests."""
+        """Return the value that Optuna suggests for a trial."""
         if self.choices:  # Optuna stores only scalars, so choices are stored as YAML text
             return self.value(trial.suggest_categorical(self.key, [_to_line(choice) for choice in self.choices]))
         suggest = trial.suggest_int if isinstance(self.low, int) else trial.suggest_float
         return suggest(self.key, *self.bounds, log=self.log)
 
     def value(self, stored: Any) -> Any:
-        """Return the value of a trial from what Optuna stores."""
+        """Convert the value that Optuna has stored for a trial (a choice is stored as text)."""
         if not self.choices:
             return stored
         return self.choices[[_to_line(choice) for choice in self.choices].index(stored)]
@@ -62,7 +62,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Objective:
-    """Metric that ranks trials, and the length of a training."""
+    """Metric by which trials are ranked, and the length of each trial's training."""
 
     key: str
     """Entry in the document of `rlcli eval`: success, return, length, reward_terms.NAME or terminations.NAME."""
@@ -72,17 +72,17 @@ class Objective:
     """Environment steps after which training ends."""
 
     def read(self, document: Mapping[str, Any]) -> float:
-        """Return the value in the document of an evaluation; NaN if it was not finite.
+        """Return the metric from the JSON document of `rlcli eval`; NaN if it was not finite.
 
         Raises:
-            UsageError: if the document does not have it.
+            UsageError: if the document does not have the metric.
         """
         first, _, name = self.key.partition(".")
         found = document.get(first)
         entry = found.get(name) if name and isinstance(found, dict) else found
         if not isinstance(entry, dict):
             known = listing(f"{first}.{key}" for key in found) if name and isinstance(found, dict) else ""
-            message = f"--objective {self.key}: not in the results of the evaluation"
+            message = f"--objective {self.key}: the evaluation of this task has no such result"
             raise UsageError(message, hint=f"choose from {known}" if known else "use return, success or length")
         value = entry["rate"] if "rate" in entry else entry["mean"]
         return math.nan if value is None else float(value)
@@ -103,15 +103,15 @@ def read_parameters(texts: Sequence[str]) -> list[Parameter]:
     keys = [parse_address(parameter.key) for parameter in found]
     twice = next((key for key in keys if keys.count(key) > 1), None)
     if twice is not None:
-        raise UsageError(f"--param varies {'.'.join(twice)} twice; leave out one")
+        raise UsageError(f"--param {'.'.join(twice)} is given twice; leave out one")
     return found
 
 
 def read_objective(text: str) -> Objective:
-    """Parse `success@30s`, `return@2e6steps` or `return`.
+    """Parse the option `--objective`, such as `success@30s`, `return@2e6steps` or `return`.
 
     Raises:
-        UsageError: for anything else.
+        UsageError: for a text of another form.
     """
     found = _OBJECTIVE.fullmatch(text)
     number = float(found[2] or 1.0) if found else 0.0
@@ -144,7 +144,7 @@ def _read(text: str) -> Parameter:
         message = f"--param '{text}': the ends of a range must be numbers below 1e300, or whole numbers below 2**53"
         raise UsageError(message, hint=HINT)
     if not low < high:
-        raise UsageError(f"--param '{text}' is empty: {low} is not below {high}", hint=HINT)
+        raise UsageError(f"--param '{text}': LOW ({low}) must be below HIGH ({high})", hint=HINT)
     if log and low <= 0:
         raise UsageError(f"--param '{text}': a logarithmic range must start above 0", hint=HINT)
     if float in (type(low), type(high)):
@@ -163,7 +163,7 @@ def _choices(text: str, key: str, words: str) -> Parameter:
 
 
 def _load(text: str, value: str) -> Any:
-    """Read a value of `--param` as YAML."""
+    """Read a value of the option `--param` (whose text is for messages) as YAML."""
     try:
         return strict_yaml.load_value(value)
     except YamlError as error:

@@ -27,10 +27,10 @@ _Stage = tuple[str, list[Callable[..., Any]], list[tuple[str, Callable[..., Any]
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Time that one part of the step takes.
+    """Time that one part of an environment step takes.
 
-    `section` is a stage of the step, such as `rewards`; `term` is one of its terms, or several that share a function,
-    or None for the whole stage.
+    `section` is a stage of the step, such as `rewards`. `term` is the name of one of its terms, or several names
+    (`a, b`) of terms that share a function; None: the row is for the whole stage.
     """
 
     section: str
@@ -44,8 +44,8 @@ class Cost:
 def profile_step(resolved: Resolved, seconds: float) -> list[Cost]:
     """Run a task with random actions for some seconds, and return the cost of each stage of its step and of its terms.
 
-    Python's profiler measures, which makes short functions look slower than they are: compare terms with each other.
-    Terms of one section that share a function share its row.
+    The times come from Python's profiler, which makes short functions look slower than they are: compare terms only
+    with each other. Terms of one section that share a function have one row.
     """
     env = make_env(resolved, seed=0)
     try:
@@ -64,7 +64,7 @@ def profile_step(resolved: Resolved, seconds: float) -> list[Cost]:
 
 
 def _run(env: VecEnv, actions: torch.Tensor, seconds: float) -> int:
-    """Step for some seconds, and at least `_WARM_UP` times; return the number of steps."""
+    """Step the environment for some seconds, and at least `_WARM_UP` times; return the number of steps."""
     end, steps = time.perf_counter() + seconds, 0
     with torch.inference_mode():
         while steps < _WARM_UP or time.perf_counter() < end:
@@ -91,7 +91,7 @@ def _costs(env: VecEnv, times: dict[CodeType | str, float]) -> list[Cost]:
 
 
 def _stages(env: VecEnv) -> Iterator[_Stage]:
-    """Yield the stages of a step in their order."""
+    """Yield the stages of an environment step in their order: (name, its methods, its terms)."""
     kind: type[Any] = type(env)
     middle: list[_Stage]
     last: list[_Stage]
@@ -138,7 +138,7 @@ def _calls(terms: list[BoundTerm]) -> list[tuple[str, Any]]:
 
 
 def _code(call: Callable[..., Any]) -> CodeType:
-    """Return the code of a function, a bound method, a partial function or an object with `__call__`."""
+    """Return the code object of a callable, by which the profiler identifies it."""
     if isinstance(call, functools.partial):
         return _code(call.func)
     found: CodeType = getattr(call, "__code__", None) or type(call).__call__.__code__

@@ -1,6 +1,7 @@
-"""Sweeps: search for good settings with Optuna.
+"""Sweeps: search for good settings of a task or agent with Optuna.
 
-Any number of processes share the trials; each trial is a run in the sweep's folder.
+A trial is one training with one choice of values, and a run in the sweep's folder. Any number of processes share the
+trials of a sweep.
 """
 
 from __future__ import annotations
@@ -61,13 +62,13 @@ class Trial:
     _lock: FileLock
 
     def release(self) -> None:
-        """Let another process claim the trial."""
+        """Release the trial's lock, so that another process can continue it."""
         self._lock.release()
 
 
 @dataclass(slots=True)
 class Sweep:
-    """Sweep with its folder, its settings and Optuna's study."""
+    """Sweep: its folder, its settings, the varied parameters, and Optuna's study, which stores the trials."""
 
     folder: Path
     settings: dict[str, Any]
@@ -76,15 +77,15 @@ class Sweep:
     _claimed: dict[int, Trial] = field(default_factory=dict)
 
     def trials(self) -> list[FrozenTrial]:
-        """Return Optuna's trials in order, without surplus trials."""
+        """Return the trials in the order of their numbers, without those that were started beyond the wanted number."""
         return [trial for trial in self.study.get_trials(deepcopy=False) if _SURPLUS not in trial.user_attrs]
 
     def ended(self) -> list[FrozenTrial]:
-        """Return the trials that have ended."""
+        """Return the trials that are finished, pruned or failed."""
         return [trial for trial in self.trials() if trial.state.name in _ENDED]
 
     def best(self) -> FrozenTrial | None:
-        """Return the best finished trial, if there is one."""
+        """Return the finished trial with the best objective; None if no trial is finished."""
         done = [trial for trial in self.trials() if trial.state.name == "COMPLETE"]
         if not done:
             return None
@@ -92,19 +93,19 @@ class Sweep:
         return better(done, key=lambda trial: (trial.value, -trial.number if better is max else trial.number))
 
     def values(self, trial: FrozenTrial | optuna.Trial) -> dict[str, Any]:
-        """Return the values of a trial's parameters."""
+        """Return the values of a trial's parameters: key of the configuration -> value."""
         return {p.key: p.value(trial.params[p.key]) for p in self.parameters if p.key in trial.params}
 
     def overrides(self, values: Mapping[str, Any]) -> list[str]:
-        """Return the values of a trial as overrides."""
+        """Return a trial's values, from `values()`, as overrides: `KEY=VALUE` for each parameter."""
         return [p.override(values[p.key]) for p in self.parameters if p.key in values]
 
     def trial_folder(self, number: int) -> Path:
-        """Return the folder of a trial, which is a run."""
+        """Return the folder of the trial with a number; the folder is a run."""
         return self.folder / f"trial-{number:04d}"
 
     def document(self, trial: FrozenTrial) -> dict[str, Any]:
-        """Return a trial as plain data."""
+        """Return a trial as JSON data: number, state, objective, parameters, run, duration."""
         folder = self.trial_folder(trial.number)
         return {
             "trial": trial.number,
@@ -118,9 +119,9 @@ class Sweep:
         }
 
     def claim(self) -> Trial | None:
-        """Return a trial whose process has died, or a new one; None if none is left.
+        """Return a trial to run: an unfinished one whose process has died, or a new one; None if none is left.
 
-        A lock lets one process claim at a time, so that no trial starts twice and none in excess.
+        A lock lets one process claim a trial at a time, so that no trial starts twice, and no more than `--trials`.
         """
         with _locked(self.folder / _SWEEP_LOCK):
             for trial in self.trials():
@@ -148,7 +149,7 @@ class Sweep:
             return self._claim(lock, self._with_own_sampler(new))
 
     def tell(self, trial: Trial, value: float | None = None, *, state: str | None = None, **notes: Any) -> None:
-        """Store the value or the state of an ended trial, and further notes."""
+        """Store the result of an ended trial: its objective or its state, and further entries (`notes`)."""
         for key, note in notes.items():
             trial.trial.set_user_attr(key, note)
         self.study.tell(trial.trial, value, state=_state(state))
@@ -159,7 +160,7 @@ class Sweep:
         """Write the best trial as a `--config` file, with a comment that names the trial.
 
         Args:
-            data: returns the content of the file for the values of a trial.
+            data: returns the content of the file for a trial's values (key -> value).
 
         Raises:
             MachineError: if the file cannot be written.
@@ -174,7 +175,7 @@ class Sweep:
         return self.folder / PRESET
 
     def release(self) -> None:
-        """Let other processes resume the unfinished trials."""
+        """Release the locks of this process's unfinished trials, so that other processes can continue them."""
         for trial in self._claimed.values():
             trial.release()
         self._claimed.clear()
@@ -184,7 +185,7 @@ class Sweep:
         return f"{platform.node()}:{self.folder.resolve()}"
 
     def _is_here(self, trial: FrozenTrial) -> bool:
-        """Return whether a trial was started in this folder on this machine; a journal is always in its folder."""
+        """Return whether a trial was started in this folder on this machine; true if the sweep has no database."""
         return self.settings["storage"] is None or trial.user_attrs.get(_LOCATION) == self._here
 
     def _lock_trial(self, number: int) -> FileLock | None:
@@ -198,7 +199,7 @@ class Sweep:
         return None
 
     def _with_own_sampler(self, trial: FrozenTrial | optuna.Trial) -> optuna.Trial:
-        """Return a trial whose sampler depends only on the trial's number; values that it already has are kept."""
+        """Return a trial whose new values depend only on the seed and the trial's number; existing ones are kept."""
         import optuna
 
         self.study.sampler = _sampler(derive(self.settings["seed"], f"trial {trial.number}"))
@@ -224,8 +225,8 @@ def open_sweep(
     Args:
         folder: the folder of the sweep; created if it does not exist.
         settings: settings of the sweep; equal in all processes, except for `trials`.
-        source: origin of the task; equal in all processes that share the folder.
-        parameters: the parameters of a trial.
+        source: entries for the sweep's file that say where the task comes from; equal in all processes of the folder.
+        parameters: the settings that the sweep varies.
         storage: URL of a database; None uses a journal in the folder.
 
     Raises:
@@ -273,7 +274,7 @@ def find_sweep(words: Sequence[str], runs: Path, storage: str | None) -> Sweep:
         UsageError: for several names, or a name that several sweeps have.
     """
     if len(words) > 1:
-        raise UsageError("more than one sweep given", hint="name one sweep by its folder or its name")
+        raise UsageError("more than one sweep is named", hint="give one folder or name of a sweep")
     known = sorted(file.parent for file in runs.glob(f"*/sweep-*/{STUDY}"))
     if not words:
         found = sorted(known, key=lambda folder: (folder / STUDY).stat().st_mtime)[-1:]
@@ -290,7 +291,7 @@ def find_sweep(words: Sequence[str], runs: Path, storage: str | None) -> Sweep:
 
 
 def draw_sweep(sweep: Sweep) -> Path:
-    """Plot the values of the trials over each parameter in a file in the sweep's folder.
+    """Plot the objective of the trials over each parameter into a file in the sweep's folder; return the file.
 
     Raises:
         UsageError: if no trial is complete yet.
@@ -299,7 +300,7 @@ def draw_sweep(sweep: Sweep) -> Path:
     check_drawing()
     done = [trial for trial in sweep.trials() if trial.state.name == "COMPLETE"]
     if not done:
-        raise UsageError("nothing to plot: wait until a trial is complete")
+        raise UsageError("nothing to plot: no trial of the sweep is complete yet; wait for the first one")
     panels = [("trial", [trial.number for trial in done], False)]
     panels += [(p.key, [sweep.values(trial)[p.key] for trial in done], p.log) for p in sweep.parameters]
     values = [trial.value for trial in done if trial.value is not None]  # a finished trial has a value
@@ -308,17 +309,17 @@ def draw_sweep(sweep: Sweep) -> Path:
 
 
 def _require_same(location: object, known: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-    """Check that the settings of a sweep and of this process are equal, except for `trials`.
+    """Check that the settings of an existing sweep and of this command are equal, except for `--trials`.
 
     Raises:
         UsageError: with the settings that differ.
     """
     differing = [key for key in settings if key != "trials" and known.get(key) != settings[key]]
     if differing:
-        differences = "; ".join(f"{key}: {known.get(key)!r} there, {settings[key]!r} here" for key in differing[:3])
+        changes = (f"{key}: {known.get(key)!r} in the sweep, {settings[key]!r} now" for key in differing[:3])
         where = without_password(str(location))
-        message = f"{where} has other settings ({differences})"
-        raise UsageError(message, hint="choose another --name, or the same settings")
+        message = f"{where} is a sweep with other settings ({'; '.join(changes)})"
+        raise UsageError(message, hint="choose another --name for a new sweep, or give the same settings")
 
 
 def _sampler(seed: int) -> optuna.samplers.BaseSampler:

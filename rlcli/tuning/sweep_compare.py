@@ -1,4 +1,4 @@
-"""Comparison of the best trial of a sweep with the task's own settings: time to a threshold with several seeds."""
+"""`rlcli sweep compare`: time to a threshold with the best trial's settings and with the task's own, several seeds."""
 
 import logging
 import tempfile
@@ -31,10 +31,10 @@ ARMS = {"default": "the task's own settings", "best": "best trial"}
 
 @dataclass(slots=True)
 class Training:
-    """One training of a comparison."""
+    """One training of `sweep compare`: with one seed, and with the task's own or the best trial's settings."""
 
     arm: str
-    """Settings of the training, a name in ARMS."""
+    """Which settings the training has: `default` or `best`, see `ARMS`."""
     seed: int
     folder: Path
     reached: Reached | None = None
@@ -42,11 +42,11 @@ class Training:
 
     @property
     def state(self) -> str:
-        """One of reached, not reached and failed."""
+        """How the training ended: `reached` (the threshold), `not reached` or `failed`."""
         return "failed" if self.error else "reached" if self.reached else "not reached"
 
     def time(self) -> dict[str, float | None]:
-        """Return seconds and steps until the threshold; None if it was not reached."""
+        """Return `seconds` and `steps` until the threshold was reached; None for both if it was not."""
         if self.reached is None:
             return {"seconds": None, "steps": None}
         return {"seconds": self.reached.seconds, "steps": self.reached.step}
@@ -68,15 +68,18 @@ class Comparison:
 
     @property
     def exit_code(self) -> int:
-        """The exit code of the first training that failed."""
+        """The exit code of the first training that failed; 0 if none has failed."""
         return next((one.error.exit_code for one in self.trainings if one.error is not None), 0)
 
     def training(self, seed: int, arm: str) -> Training | None:
-        """Return the training with a seed and settings (a name in ARMS); None if it has not run."""
+        """Return the training with a seed and settings (`default` or `best`); None if it has not run."""
         return next((one for one in self.trainings if (one.seed, one.arm) == (seed, arm)), None)
 
     def medians(self) -> dict[str, dict[str, float | None]]:
-        """Return the medians of seconds and steps, for settings that were trained with all seeds."""
+        """Return the medians over seeds: settings (`default`, `best`) -> {seconds, steps}.
+
+        Settings that were not trained with all seeds yet are left out.
+        """
         medians = {}
         for arm in ARMS:
             times = [one.time() for one in self.trainings if one.arm == arm]
@@ -85,7 +88,10 @@ class Comparison:
         return medians
 
     def ratios(self) -> dict[str, float | None]:
-        """Return the medians of the best trial's settings divided by those of the task's own."""
+        """Return the medians with the best trial's settings divided by those with the task's own: {seconds, steps}.
+
+        Empty until both were trained with all seeds.
+        """
         medians = self.medians()
         if len(medians) < len(ARMS):
             return {}
@@ -96,7 +102,7 @@ class Comparison:
         return ratios
 
     def document(self) -> dict[str, Any]:
-        """Return the comparison as plain data."""
+        """Return the comparison as JSON data."""
         return {
             "sweep": str(self.sweep),
             "task": self.task,
@@ -161,7 +167,7 @@ def compare(
 
 @contextmanager
 def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[TrainingRequest]:
-    """Context with a request that has the settings shared by all trials of a sweep, except for their budget."""
+    """Context with a copy of the request that has the settings shared by a sweep's trials, except their budget."""
     from rlcli.runs.restore import recorded_task
 
     settings = sweep.settings
@@ -184,7 +190,7 @@ def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[Traini
 def _train(
     comparison: Comparison, request: TrainingRequest, arm: str, changes: Sequence[str], stop: StopRequest
 ) -> Training:
-    """Train with the settings `arm` until the threshold is reached, the budget is spent, or a signal arrives."""
+    """Train with the settings `arm` (`default` or `best`) until the threshold, the end of the budget, or a signal."""
     seed, threshold = request.seed, comparison.threshold
     name = "compare-default" if arm == "default" else f"compare-trial-{comparison.trial:04d}"
     training = Training(arm, seed, _run_folder(comparison.sweep, f"{name}-seed-{seed}", request, changes))
@@ -220,7 +226,7 @@ def _train(
 
 
 def _run_folder(sweep: Path, name: str, request: TrainingRequest, changes: Sequence[str]) -> Path:
-    """Return the folder of a training; append a number if a run with other settings has the name."""
+    """Return the folder for a training; a number is appended if a run with other settings has this name already."""
     config = to_yaml(to_data(request.resolve(changes)[0]))
     number = 1
     while True:

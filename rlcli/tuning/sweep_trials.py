@@ -33,7 +33,7 @@ _NOT_CAUSED_BY_TRIAL = (7, 8, 10, STOPPED, INTERRUPTED)
 
 
 def check_parameters(request: TrainingRequest, parameters: Sequence[Parameter], objective: Objective) -> Resolved:
-    """Check, before anything is written, that trials can be trained and evaluated; return a configuration.
+    """Check, before anything is written, that trials can be trained and evaluated; return the first configuration.
 
     Raises:
         ConfigError: for an unknown key, or a bound that is not valid for its key.
@@ -49,12 +49,13 @@ def check_parameters(request: TrainingRequest, parameters: Sequence[Parameter], 
     names = [key for key, term in groups.get(group, {}).items() if term is not None]
     if names and name not in names:
         hint = did_you_mean(name, names) or f"its terms: {listing(names)}"
-        raise UsageError(f"--objective {objective.key}: the task has no such term", hint=hint)
+        kind = "reward" if group == "reward_terms" else "termination"
+        raise UsageError(f"--objective {objective.key}: the task has no {kind} '{name}'", hint=hint)
     return resolved
 
 
 def write_preset(sweep: Sweep, request: TrainingRequest) -> None:
-    """Write the settings of the best trial into the sweep's folder, as a `--config` file."""
+    """Write the settings of the best trial into the sweep's folder, as a file for `rlcli train --config`."""
 
     def preset(values: Mapping[str, Any]) -> dict[str, Any]:
         resolved, _ = replace(request, budget={}).resolve(sweep.overrides(values))
@@ -65,7 +66,7 @@ def write_preset(sweep: Sweep, request: TrainingRequest) -> None:
 
 @dataclass(slots=True)
 class _Stage:
-    """Training or evaluation of a trial in a subprocess."""
+    """Running part of a trial: its training, or later its evaluation, in a subprocess."""
 
     trial: Trial
     process: TrainingProcess
@@ -81,7 +82,7 @@ class _Stage:
     """Iterations that are included in `trained_s`."""
 
     def add_trained_time(self, rows: Sequence[Mapping[str, Any]]) -> float:
-        """Add the rollouts and updates of new rows of metrics; return the total time [s]."""
+        """Add the durations of the new rows of `metrics.jsonl`; return the time of all rollouts and updates [s]."""
         new_rows = [row for row in rows if row["iteration"] > self.counted]
         if new_rows and new_rows[0]["iteration"] > self.counted + 1:  # rows were missed, or the run was resumed
             self.trained_s = max(self.trained_s, overview(self.trial.folder).duration_s or 0.0)
@@ -92,7 +93,7 @@ class _Stage:
 
 
 class TrialRunner:
-    """Runner that claims trials, trains and evaluates them in subprocesses, and stores their results."""
+    """Runner of trials of a sweep: it trains and evaluates them in subprocesses, and stores their results."""
 
     def __init__(
         self, sweep: Sweep, request: TrainingRequest, objective: Objective, jobs: int, stop: StopRequest
@@ -105,7 +106,7 @@ class TrialRunner:
         """Run trials until none is left or a signal arrives.
 
         Raises:
-            RlcliError: if the first trials all fail, or for an error that all trials would have.
+            RlcliError: if the first trials all fail, or for an error that no trial has caused (a full disk).
         """
         try:
             while True:
@@ -149,7 +150,7 @@ class TrialRunner:
         return _Stage(trial, start_command(trial.folder, words), evaluates=True)
 
     def _watch(self, stage: _Stage) -> None:
-        """Stop a training that has reached its time limit or is pruned."""
+        """Stop a training that has reached its time limit, or that is pruned because it learns worse than others."""
         if stage.evaluates or stage.process.stop_requested:
             return
         now, limit_s, metric = time.monotonic(), self._objective.seconds, self._objective.training_metric
@@ -178,13 +179,13 @@ class TrialRunner:
             stage.process.stop()
 
     def _end(self, stage: _Stage, stopping: bool) -> None:
-        """Evaluate a trained trial; store the result of an evaluated, pruned or failed one."""
+        """Handle a process that has ended: evaluate a trained trial; store the result of an evaluated or failed one."""
         trial, process = stage.trial, stage.process
         if stage.evaluates and process.exit_code == 0:
             self._store_value(trial, self._objective.read(process.document))
         elif stage.pruned:
             self._sweep.tell(trial, state="PRUNED")
-            _log.info("trial %s: pruned", trial.number)
+            _log.info("trial %s: stopped by the pruner, because it learns worse than others", trial.number)
         elif stopping:
             return  # the trial stays in the storage, to be resumed
         elif not stage.evaluates and not process.has_failed:

@@ -30,7 +30,7 @@ METRICS = {"return": "Train/mean_reward", "success": "Train/success_rate"}
 
 
 class StudyView(AbstractContextManager[Any], Protocol):
-    """Context that shows the progress of the runs of a study."""
+    """Context that shows the progress of a study's runs (a study: one configuration trained with several seeds)."""
 
     def poll(self) -> None:
         """Update the view if the last update is old enough."""
@@ -38,7 +38,7 @@ class StudyView(AbstractContextManager[Any], Protocol):
 
 @dataclass(slots=True)
 class StudyResult:
-    """State of a study, the runs of one configuration with several seeds, at the end of `train_seeds`."""
+    """Result of a study (one configuration trained with several seeds) at the end of `train_seeds`."""
 
     folder: Path
     task: str
@@ -55,7 +55,7 @@ class StudyResult:
 
 
 def new_study(request: TrainingRequest, resolved: Resolved, device: str, seeds: Sequence[int]) -> Path:
-    """Create the folder of a study, with a waiting run for each seed."""
+    """Create the folder of a study with a run for each seed, whose training has not started; return the folder."""
     record, config = run_record(request, resolved, device), to_yaml(to_data(resolved))
     folder = create_study(request.runs, resolved.source.name, request.name, config, record, seeds)
     _log.info("study %s: seeds %s", folder, ", ".join(map(str, seeds)))
@@ -63,7 +63,7 @@ def new_study(request: TrainingRequest, resolved: Resolved, device: str, seeds: 
 
 
 def resume_options(request: TrainingRequest) -> list[str]:
-    """Return the options of a request that apply to each run of a resumed study."""
+    """Return the options of `rlcli train` (such as --max-steps) that apply to each run of a resumed study."""
     values = {
         "--max-iterations": request.budget.get("agent.max_iterations"),
         "--max-steps": request.budget.get("agent.max_steps"),
@@ -89,8 +89,8 @@ def train_seeds(
         device: device of the trainings; None: the device of the study.
         jobs: number of trainings at a time.
         stop: the request to stop by a signal.
-        make_view: returns the view for a title and the folders of the runs.
-        finished_too: whether finished runs have a new budget and continue.
+        make_view: returns the display of the progress, for a title and the folders of the runs.
+        finished_too: whether finished runs continue too, because they have a new budget.
         options: further options of each `rlcli train --resume`.
     """
     study = read_study(folder)
@@ -107,7 +107,7 @@ def train_seeds(
 
 
 def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
-    """Write the aggregated curves; return them with the last metrics of each seed."""
+    """Write the learning curves over all seeds (CSV, picture); return the result with each seed's last metrics."""
     rows: list[dict[str, Any]] = []
     for run in map(overview, runs):
         row = {"seed": run.seed, "run": str(run.folder), "state": run.state, "step": run.step}
@@ -133,7 +133,7 @@ def _summary(folder: Path, task: str, runs: Sequence[Path]) -> StudyResult:
 
 
 def _csv(lines: dict[str, Line]) -> str:
-    """Return CSV with the steps and, for each metric, the interquartile mean and its interval.
+    """Return CSV with the columns `steps` and NAME, NAME_low, NAME_high (interquartile mean, interval) of each metric.
 
     The steps are those of the first metric; other metrics are interpolated.
     """
@@ -152,7 +152,7 @@ def _csv(lines: dict[str, Line]) -> str:
 
 
 def _picture(folder: Path, curves: list[Curve]) -> Path | None:
-    """Plot the aggregated curves; return None without matplotlib."""
+    """Plot the learning curves over all seeds into the study's folder; return the file, None without matplotlib."""
     try:
         check_drawing()
     except DependencyError:

@@ -1,1 +1,1 @@
-"""Viewers of environments (a native window, the browser), and offscreen videos."""
+"""Viewers of environments (a native window, the browser), and videos rendered without a window."""

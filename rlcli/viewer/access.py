@@ -32,7 +32,7 @@ def response_headers(port: int) -> dict[str, str]:
 
 
 def allowed_hosts(port: int) -> tuple[str, ...]:
-    """Return the `Host` values of a browser on this machine or at the other end of a tunnel."""
+    """Return the `Host` headers that are allowed: those of a browser on this machine or at the end of an SSH tunnel."""
     names = ("localhost", "127.0.0.1")
     return (*(f"{name}:{port}" for name in names), *(names if port == 80 else ()))
 

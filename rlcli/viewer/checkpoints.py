@@ -14,7 +14,7 @@ from rlcli.runs.run import Run
 
 @dataclass(slots=True)
 class RunCheckpoints:
-    """Policies of a run's checkpoints, acting in an environment.
+    """Loader of the policies of a run's checkpoints, for a viewer that can switch between them.
 
     Args:
         run: the run.
@@ -36,7 +36,9 @@ class RunCheckpoints:
             return []
 
     def load(self, step: int) -> Act:
-        """Return the policy of a checkpoint with a reset hidden state.
+        """Return the policy of the checkpoint at a step, as a function from observations to actions.
+
+        The hidden state of a recurrent policy is reset.
 
         Raises:
             CheckpointError: if the checkpoint was removed, is corrupt, or belongs to another task.
@@ -49,6 +51,6 @@ class RunCheckpoints:
             policy = checkpoint.policy()
             require_fit(checkpoint, self.env.layout)
         except OSError as error:  # training removed it while it was read
-            raise CheckpointError(f"{folder} cannot be read: {error.strerror or error}") from None
+            raise CheckpointError(f"{folder} cannot be read: {error.strerror or error}; choose another") from None
         generator = torch.Generator().manual_seed(self.seed)
         return trained_policy(self.env, policy, stochastic=self.stochastic, generator=generator)

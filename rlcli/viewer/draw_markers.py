@@ -1,4 +1,4 @@
-"""Markers as geoms of a MuJoCo scene, for all viewers."""
+"""Drawing of a task's markers (arrows, frames, spheres such as goals) as geoms of a MuJoCo scene, for all viewers."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -20,7 +20,7 @@ _EMISSION = 0.4
 
 
 class _Part(NamedTuple):
-    """Shape between two points (num_envs, 3) [m]. Both points of a sphere are its centre."""
+    """Shape of a marker from one point to another (num_envs, 3) [m]; both points of a sphere are its centre."""
 
     kind: int
     start: Tensor
@@ -37,8 +37,8 @@ def add_markers(
     Args:
         scene: the scene, which may contain other geoms.
         markers: markers of all environments.
-        numbers: indices of the environments to show.
-        offsets: displacement of each of them in the image. (len(numbers), 3) [m]
+        numbers: indices of the environments whose markers are drawn.
+        offsets: displacement of each of these environments in the image from its world position. (len(numbers), 3) [m]
     """
     for marker in markers:
         for part in _parts(marker):

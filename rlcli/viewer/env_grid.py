@@ -1,4 +1,4 @@
-"""Display of further environments beside the selected one, on the grid of `env_spacing`, and of all their markers."""
+"""Grid of several environments in one image: the shown environment first, then the next ones, with their markers."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,22 +19,25 @@ _FIELDS = [name for name in dir(mujoco.MjvGeom) if not name.startswith("_")]
 
 @dataclass(frozen=True, slots=True)
 class EnvGrid:
-    """Environments in an image, and their positions.
+    """Environments that are drawn together in one image, on a grid with the task's `env_spacing`.
+
+    `shown` is the index of the shown environment: the first one of the image. The environments with the next indices
+    follow.
 
     Args:
         env: the environments.
-        count: number of environments in the image, including the selected one (`shown`), which is the first.
+        count: number of environments in the image, with the shown one.
     """
 
     env: VecEnv
     count: int
 
     def others(self, shown: int) -> list[int]:
-        """Return the environments beside the selected one."""
+        """Return the indices of the `count - 1` environments after the shown one; after the last index follows 0."""
         return [(shown + number) % self.env.num_envs for number in range(1, self.count)]
 
     def offsets(self) -> NDArray[np.float64]:
-        """Return the displacement of each environment from its position in its world. (count, 3) [m]
+        """Return the displacement of each environment of the image from its world position. (count, 3) [m]
 
         On terrain they are 0: all environments are on one terrain, at different positions.
         """
@@ -45,7 +48,7 @@ class EnvGrid:
         return offsets
 
     def fit_camera(self, camera: mujoco.MjvCamera, shown: int = 0) -> mujoco.MjvCamera:
-        """Move a camera that looks at the selected environment so that all environments are in the image."""
+        """Move a camera that looks at the shown environment so that all environments of the grid are in the image."""
         positions = self.offsets()
         if self.env.terrain is not None:
             origins = self.env.origins.double().cpu().numpy()
@@ -56,7 +59,7 @@ class EnvGrid:
         return camera
 
     def add(self, scene: mujoco.MjvScene, shown: int, option: mujoco.MjvOption) -> None:
-        """Append the other environments and all markers to a scene with the selected environment and the ground."""
+        """Append the markers and the other environments to a scene that has the shown environment and the ground."""
         add_markers(scene, self.env.markers(), [shown, *self.others(shown)], self.offsets())
         category = _MOVING if self.env.terrain is not None else _MOVING | _FIXED
         for number, offset in zip(self.others(shown), self.offsets()[1:], strict=True):
@@ -73,7 +76,7 @@ class EnvGrid:
                     geom.pos[:] += offset
 
     def geoms(self, scene: mujoco.MjvScene, shown: int, option: mujoco.MjvOption) -> Iterator[mujoco.MjvGeom]:
-        """Yield copies of the geoms that `add` appends to a scene; `scene` is overwritten and limits their number."""
+        """Yield copies of the geoms that `add` appends; `scene` is overwritten, and its size limits their number."""
         scene.ngeom = 0
         self.add(scene, shown, option)
         for source in scene.geoms[: scene.ngeom]:

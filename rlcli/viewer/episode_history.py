@@ -19,7 +19,7 @@ _MAX_POINTS = 150
 
 @dataclass(frozen=True, slots=True)
 class RewardCurves:
-    """Rewards of the shown environment in the last steps, for a plot."""
+    """Rewards of the shown environment over the last seconds, for a plot."""
 
     time_s: tuple[float, ...] = ()
     """Time of each point, at most 0: now [s]."""
@@ -28,7 +28,7 @@ class RewardCurves:
 
 
 class EpisodeHistory:
-    """Rewards of the shown environment in the last seconds; returns and ends of the episodes of all environments."""
+    """What a viewer's panel shows: rewards of the last seconds in one environment, and episodes of all environments."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
@@ -65,20 +65,20 @@ class EpisodeHistory:
             self._last[env_id] = ", ".join(parts)
 
     def last_episode(self, env_id: int) -> str:
-        """Return how the last episode of an environment ended; the empty text before its first end."""
+        """Return the return, length and end of an environment's last episode as text; empty before its first end."""
         return self._last.get(env_id, "")
 
     def clear_curves(self) -> None:
-        """Clear the curves: another environment is shown."""
+        """Clear the reward curves, because another environment is shown."""
         self._rows.clear()
 
     def clear_returns(self) -> None:
-        """Clear returns and curves: every environment starts a new episode."""
+        """Clear returns and reward curves, because every environment starts a new episode."""
         self.returns.zero_()
         self.clear_curves()
 
     def curves(self) -> RewardCurves:
-        """Return the curves of the rewards."""
+        """Return the reward and its terms in the shown environment over the last seconds."""
         names = ["reward", *(() if self._terms is None else [term.name for term in self._terms.terms])]
         step_s = self._every * self._env.step_dt
         times = tuple(step_s * (number - len(self._rows) + 1) for number in range(len(self._rows)))

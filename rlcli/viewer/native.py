@@ -64,13 +64,13 @@ def run(playback: Playback, *, title: str, num_drawn: int, port: int, ready: Rea
 
 
 def press(playback: Playback, code: int) -> None:
-    """Submit the request that belongs to a key."""
+    """Submit the request that belongs to a key, given by its GLFW code; other keys do nothing."""
     if code in _REQUESTS:
         playback.submit(playback.requests()[_REQUESTS[code]])
 
 
 def captions(view: View) -> tuple[str, str]:
-    """Return the text in the corner of the window: names, and values, one in each line."""
+    """Return the text in the corner of the window: the names, and their values, one in each line."""
     rows = {
         "speed": "paused" if view.paused else f"{view.speed:g} x",
         "environment": f"{view.shown} of {view.num_envs}",
@@ -131,7 +131,7 @@ def _draw(window: Any, playback: Playback, env_grid: EnvGrid, model: mujoco.MjMo
 
 
 def _forces(window: Any, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Return forces and torques of the user's mouse on the bodies. (nbody, 6) [N, N m]"""
+    """Return the forces and torques with which the user's mouse pulls at the bodies. (nbody, 6) [N, N m]"""
     with window.lock():
         data.xfrc_applied[:] = 0.0
         if window.perturb.active:

@@ -1,4 +1,4 @@
-"""Offscreen rendering of an environment."""
+"""Rendering of an environment to images without a window, for videos and `render()`."""
 
 import contextlib
 import math
@@ -17,7 +17,7 @@ _PARALLEL = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
 
 
 def free_camera(viewer: ViewerConfig, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> mujoco.MjvCamera:
-    """Return a camera at `eye` that looks at `lookat`, both relative to an environment's origin."""
+    """Return a camera at `viewer.eye` that looks at `viewer.lookat`, both relative to an environment's origin."""
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(mujoco.MjModel.from_xml_string("<mujoco/>"), camera)
     ray = np.subtract(viewer.lookat, viewer.eye)
@@ -34,7 +34,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
     Args:
         model: the environment's model.
         viewer: size of the images [pixels] and camera.
-        env_grid: further environments in the image; None: there are none.
+        env_grid: further environments to draw in the image; None: only one environment.
 
     Raises:
         MachineError: if this machine has no OpenGL backend that works.
@@ -57,7 +57,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         self._rect = mujoco.MjrRect(0, 0, viewer.width, viewer.height)
 
     def image(self, env: VecEnv, number: int = 0) -> NDArray[np.uint8]:
-        """Render an environment with its markers and the other environments of the grid. (height, width, 3)"""
+        """Render environment `number` with its markers and the other environments of the grid. (height, width, 3)"""
         self._compose(*env.world(number), env.origins[number].tolist())
         env_grid = EnvGrid(env, 1) if self._env_grid is None else self._env_grid
         env_grid.add(self._scene, number, self._option)
@@ -69,7 +69,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         return self._pixels()
 
     def _compose(self, model: mujoco.MjModel, data: mujoco.MjData, origin: Sequence[float]) -> None:
-        """Put a state into the scene, and move the camera to the environment's origin."""
+        """Fill the scene from a model and its state, and move the camera to the environment's origin."""
         self._camera.lookat[:] = np.add(self._lookat, origin)
         travelled = np.zeros(3)
         if self._followed is not None:

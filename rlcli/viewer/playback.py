@@ -40,8 +40,8 @@ class Playback:
 
     Args:
         env: the environment; it is reset when the playback is made, unless `initial_obs` is given.
-        act: the policy.
-        checkpoint_source: further policies; None: there are none.
+        act: the policy, a function from observations to actions.
+        checkpoint_source: checkpoints of the run to switch to; None: there are none.
         checkpoint: step of the first policy's checkpoint.
     """
 
@@ -87,11 +87,11 @@ class Playback:
         return self._view
 
     def submit(self, request: Callable[[], None]) -> None:
-        """Queue a call of one of the methods below; it is executed between two steps."""
+        """Queue a call of a method of this object, such as `reset`; it is executed between two steps."""
         self._requests.append(request)
 
     def requests(self) -> dict[str, Callable[[], None]]:
-        """Return the requests of the viewers' keys by name."""
+        """Return the requests that a viewer's keys and buttons submit, by name."""
         view = self._view
         return {
             "pause": partial(self.pause, not view.paused),
@@ -158,22 +158,22 @@ class Playback:
         self._due = 0.0
 
     def show(self, shown: int) -> None:
-        """Show another environment; indices wrap around."""
+        """Show the environment with an index, which wraps around: -1 is the last environment."""
         self.shown = shown % self.env.num_envs
         self.history.clear_curves()
         self._push = None
 
     def hold(self, name: str, value: float | None) -> None:
-        """Hold a command at a value; None: the task samples it again."""
+        """Hold a command of the task (such as `vx`) at a value in all environments; None: the task samples it again."""
         hold_command(self.env, name, value)
 
     def select_command(self, change: int) -> None:
-        """Select the next or previous command for `adjust_command`."""
+        """Select the next (1) or previous (-1) command, which `adjust_command` then changes."""
         if self._commands is not None and (knobs := self._commands.knobs()):
             self._knob = (self._knob + change) % len(knobs)
 
     def adjust_command(self, change: int) -> None:
-        """Raise or lower the selected command by tenths of its range and hold it; outside the range, release it."""
+        """Change the selected command by `change` tenths of its range and hold it; outside the range, release it."""
         if self._commands is None or not (knobs := self._commands.knobs()):
             return
         knob = knobs[self._knob]
@@ -183,7 +183,7 @@ class Playback:
         self.hold(knob.name, round(value, 6) if inside else None)
 
     def refresh_checkpoints(self) -> None:
-        """Read the list of checkpoints; with `follow`, switch to the newest if the list has changed."""
+        """Read the list of the run's checkpoints again; with `follow`, switch to the newest if the list has changed."""
         if self.checkpoint_source is None:
             return
         before, self._checkpoints = self._checkpoints, tuple(self.checkpoint_source.steps())
@@ -202,7 +202,7 @@ class Playback:
             self.switch(self._checkpoints[-1])
 
     def switch(self, step: int) -> None:
-        """Play another checkpoint in the running episodes; if it cannot be loaded, report it and keep the policy."""
+        """Play the checkpoint at a step in the running episodes; if that fails, report it and keep the policy."""
         assert self.checkpoint_source is not None
         try:
             self.act = self.checkpoint_source.load(step)
@@ -246,7 +246,7 @@ class Playback:
         self.steps += 1
 
     def _step_under_force(self, action: Tensor, push: np.ndarray) -> Any:
-        """Make a step with further external forces, then remove them where the step has not overwritten them."""
+        """Make a step with the viewer's forces on bodies, then remove them where the step has not overwritten them."""
         row = self.env.engine.field("xfrc_applied")[self.shown]
         before = row.clone()
         pushed = before + torch.from_numpy(push).to(row)
@@ -287,7 +287,7 @@ class Playback:
 
 
 def run_in_real_time(playback: Playback, is_open: Callable[[], bool], draw: Callable[[], None]) -> None:
-    """Advance and render 60 times a second until the viewer is closed.
+    """Run the playback and draw it 60 times a second until the viewer is closed.
 
     Viewers use this loop and do not call `Playback.advance`.
 
@@ -310,14 +310,14 @@ def run_in_real_time(playback: Playback, is_open: Callable[[], bool], draw: Call
 
 
 def hold_command(env: VecEnv, name: str, value: float | None) -> None:
-    """Hold a command at a value; see `CommandManager.hold`.
+    """Hold a command of the task at a value in all environments; None: the task samples it again.
 
     Raises:
         UsageError: for an unknown name, or a value that is not finite.
     """
     manager = _commands(env)
     if manager is None:
-        raise UsageError(f"no command '{name}'", hint="leave out --command: the task has no commands")
+        raise UsageError(f"no command '{name}': the task has no commands", hint="leave out --command")
     manager.hold(name, value)
 
 

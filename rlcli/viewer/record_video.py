@@ -67,7 +67,7 @@ def record_episode(
 def film_replay(
     recording: Trajectory, env: VecEnv, episodes: Iterable[int], filmed: int, file: Path
 ) -> tuple[Replay, int]:
-    """Replay episodes of a recording and film one of them; return the result and the number of frames."""
+    """Replay episodes of a recording and film episode `filmed`; return the comparison and the number of frames."""
     episode = recording.header.episodes[filmed]
     with open_video(env.engine.model, env.config, file) as (renderer, writer, stride):
 
@@ -81,7 +81,7 @@ def film_replay(
 
 
 def film_case(case: StagedCase, file: Path) -> tuple[int, float, str]:
-    """Film the recorded steps of a failure case; return the frames, frames per second and the OpenGL backend."""
+    """Film the recorded last steps of a failed episode; return frames, frames per second and the OpenGL backend."""
     count = len(case.states)
     with open_video(case.staged.model, case.staged.resolved.task, file) as (renderer, writer, stride):
         for number in range((count - 1) % stride, count, stride):  # this start includes the last state

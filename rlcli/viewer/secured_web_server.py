@@ -47,7 +47,7 @@ _REQUEST_S = 10.0
 
 
 def load() -> SimpleNamespace:
-    """Return the modules of the viewer by the last part of their names.
+    """Import MuJoCo's web viewer; return its modules by the last part of their names.
 
     Raises:
         DependencyError: if the installed MuJoCo has another viewer or none.
@@ -99,7 +99,7 @@ def listen(port: int, socket_class: type[socket.socket] = socket.socket) -> sock
 
 @contextlib.contextmanager
 def secured_server(studio: SimpleNamespace, listener: socket.socket) -> Iterator[None]:
-    """Context in which created viewers listen on `listener`, refuse requests of other pages, and print nothing."""
+    """Context in which a new viewer listens on `listener`, refuses requests of other pages, and prints nothing."""
     server, viewer = studio.web_server, studio.web_viewer
     port = listener.getsockname()[1]
     replacements: list[tuple[Any, str, Any]] = [
@@ -210,7 +210,7 @@ def _is_own_socket(peer: object) -> bool:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Send the viewer's warnings to stderr, and drop its other log records and those of closed browsers."""
+    """Context that sends the viewer's warnings to stderr, and drops other messages, as those of closed browsers."""
     log, loop = logging.getLogger("WebServer"), logging.getLogger("asyncio")
     level, streams = log.level, [(h, h.stream) for h in log.handlers if isinstance(h, logging.StreamHandler)]
     log.setLevel(logging.WARNING)

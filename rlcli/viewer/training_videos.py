@@ -1,4 +1,4 @@
-"""Videos during a training: every few iterations one episode of the current policy, in a separate environment."""
+"""Videos during a training (`--video-every`): one episode of the current policy, in a separate environment."""
 
 import logging
 from collections.abc import Callable
@@ -15,13 +15,13 @@ _log = logging.getLogger(__name__)
 
 
 class VideoAborted(Exception):
-    """Signal that training is being stopped, which aborts the video."""
+    """Exception that ends the recording of a video because training is being stopped."""
 
 
 class TrainingVideos(StepObserver):
-    """Recorder of the deterministic policy, always in the same episode. It does not change the training.
+    """Recorder of videos of the deterministic policy, always in the same episode. It does not change the training.
 
-    Between videos only the idle environment remains: the OpenGL context is freed.
+    The environment is kept between videos; the OpenGL context is freed after each video.
 
     Args:
         make_env: builds a single environment, before the first video.
@@ -58,7 +58,8 @@ class TrainingVideos(StepObserver):
         except Exception as error:  # a full disk, a driver, an encoder, or the task's own code must not stop training
             kind = type(error).__name__
             if kind not in self._warned:
-                _log.warning(f"no video {file.name}: {' '.join(str(error).split()) or kind}; training continues")
+                reason = " ".join(str(error).split()) or kind
+                _log.warning(f"the video {file.name} was not written: {reason}; training continues")
             self._warned.add(kind)
             return None
         return file

@@ -1,4 +1,4 @@
-"""Writer of video files. The import is cheap, so that commands can refuse a wrong file name at once."""
+"""Writer of video files. Importing the module is fast, so that commands can refuse a wrong file name at once."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
             self._temporary.unlink(missing_ok=True)
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Append an image. (height, width, 3)"""
+        """Append an image to the video. (height, width, 3)"""
         self._added += 1
         if (self._added - 1) % self._stride:
             return
@@ -109,7 +109,7 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
 
 
 def gif_stride(period: float) -> int:
-    """Return how many images a GIF advances from one frame to the next, for a period [s] between images."""
+    """Return n such that a GIF gets every n-th image, for a period [s] between images (see `VideoWriter`)."""
     strides = range(1, 64)
     return next(
         (k for k in strides if (n := round(100 * period * k)) >= 2 and abs(n / (100 * period * k) - 1) < 0.02), 1

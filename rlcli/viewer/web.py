@@ -51,7 +51,7 @@ def run(playback: Playback, *, title: str, num_drawn: int = 1, port: int, ready:
 
 
 def ssh_tunnel_command(port: int) -> str | None:
-    """Return the command that forwards a port to the user's machine; None: this is not an SSH session."""
+    """Return the `ssh -L` command that forwards a port to the user's machine; None if this is not an SSH session."""
     connection = os.environ.get("SSH_CONNECTION", "").split()
     if len(connection) != 4:
         return None
@@ -63,7 +63,7 @@ def ssh_tunnel_command(port: int) -> str | None:
 
 
 class _ViewerThread:
-    """Thread of MuJoCo's viewer, and the endpoint that sends states to it."""
+    """Thread that runs MuJoCo's web viewer; `send` gives it the state to show."""
 
     def __init__(self, studio: Any, playback: Playback, title: str, num_drawn: int) -> None:
         from rlcli.viewer.web_panel import WebPanel
@@ -90,7 +90,7 @@ class _ViewerThread:
             self._error = error
 
     def is_open(self) -> bool:
-        """Return whether the viewer still runs; also empties its queues of events, which would grow otherwise."""
+        """Return whether the viewer still runs; also empty its event queues, which would grow otherwise."""
         self._endpoint.get_viewer_events()
         self._endpoint.get_viewer_snapshots()
         return self._thread.is_alive()

@@ -32,7 +32,7 @@ Method = TypeVar("Method", bound=Callable[..., None])
 
 
 def _handler(priority: int) -> Callable[[Method], Method]:
-    """Return the decorator `messages.handler` with type annotations."""
+    """Return MuJoCo's decorator `messages.handler`, typed; it makes a method handle the events of the page."""
     return cast("Callable[[Method], Method]", messages.handler(priority=priority))
 
 
@@ -216,7 +216,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         self._ux.camera_index = ux.TUMBLE_CAMERA_IDX
 
     def _place(self, shown: int) -> np.ndarray:
-        """Return the point with which the camera moves: the environment's origin, or the followed entity. (3,) [m]"""
+        """Return the point that the camera follows: the environment's origin or `viewer.follow`. (3,) [m]"""
         if self._followed is None:
             return np.asarray(self._env_origins[shown])
         body, start = self._followed

@@ -56,7 +56,7 @@ def test_export_writes_into_run_and_prints_path(runs, newest, capfd):
     assert out == f"{file}\n"
     assert files(file.parent) == ["policy.onnx"]
     assert "its newest checkpoint" in err
-    assert "equal to the policy on" in err
+    assert "equals the policy on" in err
 
 
 def test_export_of_task_uses_newest_run(runs, newest, capfd, tmp_path):

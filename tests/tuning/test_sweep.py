@@ -85,7 +85,7 @@ def test_objective_reads_evaluation_document():
     assert Objective("success").read(document) == 0.5
     assert Objective("return").read(document) == 3.0
     assert Objective("reward_terms.alive").read(document) == 2.0
-    with pytest.raises(UsageError, match="not in the results"):
+    with pytest.raises(UsageError, match="has no such result"):
         Objective("length").read(document)
 
 
@@ -143,7 +143,7 @@ def test_same_sweep_is_joined_and_other_settings_are_refused(cli):
     for change in (["--param", "agent.gamma=0.9:0.99"], ["--objective", "success"], ["--seed", "3"], ["--minimize"]):
         other = cli("sweep", "cartpole", *SMALL, *RATE, *change, "--trials", 1, "--max-iterations", 1, "--episodes", 4)
         assert other.code == 2, other.err
-        assert "has other settings" in other.err
+        assert "is a sweep with other settings" in other.err
     again = cli("sweep", "cartpole", *SMALL, *RATE, "--trials", 1, "--max-iterations", 1, "--episodes", 4, "--json")
     assert again.json["trials"] == first.json["trials"]
     shown = cli("sweep", "show", "sweep", "--json")

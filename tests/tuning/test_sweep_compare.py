@@ -154,7 +154,7 @@ def test_stopped_comparison_resumes(cli, start):
         (("--until", "sucess=1"), 2, "--until"),
         (("--seeds", "3..1"), 2, "is empty"),
         (("other",), 5, "no sweep 'other'"),
-        (("sweep", "second"), 2, "more than one sweep given"),
+        (("sweep", "second"), 2, "more than one sweep is named"),
         (("agent.learning_rat=1",), 3, "learning_rate"),
         (("--trials", "3"), 2, "--trials is not an option of sweep compare"),
     ],

@@ -46,7 +46,7 @@ def command(
 
     Options:
         case: Show this case, by its number in the list, from 0. [default: list all]
-        sort: Order of the list: when, return, length or kind.
+        sort: Order of the list: when (oldest first), return, length or kind (why it was recorded).
         steps: Number of last steps of a case to show.
         video: Render the last seconds of the case to FILE.mp4 or FILE.gif. Without FILE: autopsy.mp4.
 
@@ -78,11 +78,11 @@ def command(
         _print_case(found, cases[case], case, steps, video, named)
     else:
         hint = f"give a case from 0 to {len(cases) - 1}" if cases else why_no_cases(found)
-        raise UsageError(f"no case {case} in {found.folder}", hint=hint)
+        raise UsageError(f"no recorded episode {case} in {found.folder}", hint=hint)
 
 
 def _refuse_bundle(folder: str, case: int | None) -> None:
-    """Print that a bundle has no recorded episodes; raise a UsageError if one of them was chosen."""
+    """Print that an exported bundle has no recorded episodes; raise a UsageError if a case was chosen."""
     from rlcli.runs.bundle import open_bundle
 
     open_bundle(Path(folder))
@@ -91,7 +91,7 @@ def _refuse_bundle(folder: str, case: int | None) -> None:
         f" `rlcli eval --checkpoint {folder} --record FILE --record-mode failed`"
     )
     if case is not None:
-        raise UsageError(f"no case {case} in {folder}", hint=why)
+        raise UsageError(f"no recorded episode {case} in {folder}", hint=why)
     _print_no_cases(folder, why)
 
 
@@ -123,7 +123,7 @@ def _row(case: FailureCase) -> list[str]:
 def _print_case(
     run: Run, case: FailureCase, number: int, steps: int, video: Path | None, named: TaskSource | None
 ) -> None:
-    """Print one recorded episode; its contacts and its video need the task's code."""
+    """Print one recorded episode; without the task's code it has no contacts and no video."""
     from rlcli.replay.failure_cases import stage_case
 
     staged, error = None, None
@@ -217,7 +217,10 @@ def _print_contacts(contacts: Sequence[Contact]) -> None:
 
 
 def sparkline(values: Sequence[float], width: int = _WIDTH) -> str:
-    """Return values as at most `width` bars of eight heights (means of neighbours), `?` for one that is not finite."""
+    """Return values as a line of at most `width` bars of eight heights; `?` for a value that is not finite.
+
+    If there are more values, each bar is the mean of neighbours.
+    """
     if len(values) > width:
         edges = [round(i * len(values) / width) for i in range(width + 1)]
         values = [sum(values[a:b]) / (b - a) for a, b in itertools.pairwise(edges)]

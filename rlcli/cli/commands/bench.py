@@ -44,8 +44,8 @@ def command(
     Options:
         save_preset: Write the recommended settings to FILE.yaml, or to NAME.yaml here, for train --config.
         overwrite: Allow --save-preset to replace a file.
-        quick: Measure shortly and once, for a first impression.
-        profile: Instead show where the time of an environment step goes: by stage, term and reset.
+        quick: Measure only briefly, for a first impression.
+        profile: Measure no sizes; show where the time of an environment step goes, by stage and term.
 
     Examples:
         rlcli bench cartpole --save-preset fast.yaml
@@ -86,9 +86,9 @@ def command(
 
 
 def _profile(resolved: Resolved, preset: Path | None, seconds: float) -> None:
-    """Print where the time of an environment step goes."""
+    """Print the table of `--profile`: where the time of an environment step goes."""
     if preset is not None:
-        raise UsageError("--profile measures no sizes for a preset", hint="leave out --profile or --save-preset")
+        raise UsageError("--profile recommends no settings to save", hint="leave out --profile or --save-preset")
     import torch
 
     from rlcli.tuning.step_profile import profile_step
@@ -243,7 +243,7 @@ class _View(LiveView):
         self._rows: list[list[str]] = []
 
     def announce(self, current: str) -> None:
-        """Show which setting is measured next."""
+        """Show the description of what is measured next."""
         self._current = current
         self._draw()
 

@@ -23,11 +23,12 @@ def command(
     num_envs: FewEnvs = 8,
     seed: Seed = 0,
 ) -> None:
-    """Check that a task keeps the contract of rlcli: shapes, seeds, resets, rewards, devices.
+    """Check that a task keeps rlcli's rules (its contract) for shapes, seeds, resets, rewards and devices.
 
     Options:
         only: Run only this check; repeatable.
-        record: Write the columns of observations and actions to a file in the task, for the check `layout`.
+        record: Write the columns of observations and actions to a file in the task's folder. The check `layout`
+            compares them later.
 
     Examples:
         rlcli check cartpole
@@ -44,7 +45,8 @@ def command(
 
     torch.set_num_threads(1)
     if record:
-        console.info(f"recorded {record_layout(task, agent=agent, overrides=overrides or (), config=config)}")
+        file = record_layout(task, agent=agent, overrides=overrides or (), config=config)
+        console.info(f"recorded the columns in {file}")
     checks: list[tuple[str, list[Finding] | None]] = []
     notes: dict[str, str] = {}
     findings = check_task(

@@ -33,7 +33,7 @@ def command(
     agent: Agent = None,
     runs_dir: RunsDir = None,
 ) -> None:
-    """Show the differences of two runs or configurations. Each key belongs to physics, MDP, agent or cosmetic.
+    """Show the differences of two runs or configurations. Each is marked as physics, MDP, agent or cosmetic.
 
     Options:
         words: Each side is a run (RUN, RUN@step:N, RUN@best, a checkpoint folder, latest), or a task (a name, a
@@ -66,13 +66,13 @@ def command(
             both = (one or _find(left[0], runs)[0], other or _find(right[0], runs)[0])
             equal = _compare_configurations(*both, left, right)
     except RecursionError:
-        raise CheckpointError(f"{left[0]} or {right[0]} is corrupt: nested too deeply; train again") from None
+        raise CheckpointError(f"the files of {left[0]} or {right[0]} are damaged; train again") from None
     if not equal:
         raise typer.Exit(9)
 
 
 def _sides(words: list[str]) -> tuple[Side, Side]:
-    """Split the command line into two sides, each with its overrides."""
+    """Split the command line into the two sides to compare: (run or task, overrides) each."""
     sides: list[Side] = []
     for word in words:
         if "=" not in word or Path(word).exists():
@@ -134,7 +134,8 @@ def _compare_runs(left: str, right: str, runs: Path, only: list[str] | None) -> 
     one, step = _find(left, runs)
     other, twin = _find(right, runs)
     if step is not None and twin is not None and step != twin:
-        raise UsageError(f"{left} is at step {step}, {right} at step {twin}", hint="compare equal steps: RUN@step:N")
+        message = f"{left} is at step {step}, but {right} is at step {twin}"
+        raise UsageError(message, hint="compare checkpoints of the same step: RUN@step:N")
     until = step if step is not None else twin
     if until is not None:
         for run in (one, other):
@@ -144,13 +145,13 @@ def _compare_runs(left: str, right: str, runs: Path, only: list[str] | None) -> 
 
 
 def _find(reference: str, runs: Path) -> tuple[Run, int | None]:
-    """Return a run, and the step of its checkpoint if the reference names one."""
+    """Return the run that a reference names, and the step of its checkpoint if it names one (`RUN@step:N`)."""
     from rlcli.runs.run_ref import find_checkpoint, find_run, is_checkpoint_ref
 
     if is_checkpoint_ref(reference):
         run, folder, _ = find_checkpoint(reference, runs)
         if not folder.resolve().name.isdecimal():
-            raise CheckpointError(f"{folder} is not the checkpoint of a run; give RUN or RUN@step:N")
+            raise CheckpointError(f"{folder} is not in the checkpoints of a run; give RUN or RUN@step:N")
         return run, int(folder.resolve().name)
     try:
         run, why = find_run(reference, runs)

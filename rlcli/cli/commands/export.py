@@ -63,7 +63,8 @@ def command(
         return
     reference = _open_reference(chosen, saved, file, task) if verify else None
     done = export(saved, file, format, None if reference is None else reference.deployment)
-    console.info(f"equal to the policy on {done.observations} observations: difference <= {done.max_difference:.1e}")
+    limit = f"difference <= {done.max_difference:.1e}"
+    console.info(f"the exported file equals the policy on {done.observations} observations: {limit}")
     verdict = None if reference is None else _verify(reference, saved, done.file, format, episodes)
     entries = {"observations": done.observations, "max_difference": done.max_difference, "metadata": done.metadata}
     verified = None if verdict is None else verdict.record()
@@ -94,20 +95,20 @@ def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | N
 
 
 def _verify(reference: ReferenceEnv, saved: Checkpoint, file: Path, format_: str, episodes: int) -> ClosedLoopResult:
-    """Run the file in plain MuJoCo, and print the comparison with the evaluation."""
+    """Run the exported file in plain MuJoCo, and print the comparison with the run's evaluation."""
     from rlcli.deploy.closed_loop import verify
 
     verdict = verify(reference, saved, file, format_, episodes)
-    for source, terms in (("the metadata", verdict.by_metadata), ("the task's own code", verdict.by_task)):
+    for source, terms in (("formulas of the metadata", verdict.by_metadata), ("the task's code", verdict.by_task)):
         if terms:
-            console.info(f"computed by {source}: {', '.join(terms)}")
+            console.info(f"terms that are computed by {source}: {', '.join(terms)}")
     rows = [
         [name, f"{found:.2e}", f"{allowed:g}", "holds" if held else "FAILS"]
         for name, found, allowed, held in verdict.rows()
     ]
     console.table(["", "FOUND", "ALLOWED", ""], rows)
     if verdict.differing:
-        console.info(f"metadata and task differ in {listing(verdict.differing[:_MAX_KEYS])}")
+        console.info(f"the exported file and the task differ in {listing(verdict.differing[:_MAX_KEYS])}")
     console.info(
         f"{verdict.episodes} episodes, mean return {verdict.plain_return:.6g} in plain MuJoCo,"
         f" {verdict.evaluation_return:.6g} in the run's evaluation"
@@ -127,7 +128,7 @@ def _report(checkpoint: Path, format_: str, file: Path, size: int, **entries: An
 
 
 def _export_bundle(saved: Checkpoint, run: Run | None, output: Path) -> None:
-    """Write a bundle for rlcli, with the saved evaluation of the checkpoint if the run has one."""
+    """Write a bundle: a folder with the policy for rlcli on another machine, and the checkpoint's saved evaluation."""
     from rlcli.runs.bundle import check_bundle_target, write_bundle
     from rlcli.runs.eval_store import read_evaluation
 
@@ -141,9 +142,9 @@ def _export_bundle(saved: Checkpoint, run: Run | None, output: Path) -> None:
 
 
 def _find(reference: str | None, runs_dir: Path, task: str | None) -> Choice:
-    """Return a checkpoint and the reason for choosing it; a checkpoint folder may be outside a run.
+    """Return the checkpoint that --checkpoint or the task names, and why; its folder may be outside of a run.
 
-    The task is only imported if it has no run: a trained policy is exported without the task's code.
+    The task's code is only imported if the task has no run: a trained policy is exported without it.
     """
     from rlcli.evaluation.session import named_task_or_run
     from rlcli.runs.bundle import is_bundle

@@ -106,7 +106,7 @@ def _resolve(task: str, agent: str | None, activation: str | None, action_bound:
     if activation is not None:
         require_known(activation, ("elu", "relu", "tanh", "silu"), "activation", "activations")
     if action_bound is not None and not 0.0 < action_bound < float("inf"):
-        raise UsageError(f"--action-bound {action_bound} cannot bound actions", hint="give a number above 0")
+        raise UsageError(f"--action-bound must be a finite number above 0, found {action_bound}")
     resolved = resolve(find_task(task), agent=agent, device="cpu")
     resolved.require_agent()
     return resolved
@@ -115,7 +115,7 @@ def _resolve(task: str, agent: str | None, activation: str | None, action_bound:
 def _create_run(
     form: str, file: Path, policy: ImportedPolicy, resolved: Resolved, runs_dir: Path | None, name: str | None
 ) -> None:
-    """Write an imported policy as a run."""
+    """Write an imported policy as a new run, and print what was imported."""
     from rlcli.runs.run_ref import default_runs_dir
     from rlcli.training.import_policy import create_imported_run
 
@@ -134,7 +134,7 @@ def _create_run(
 
 
 def _importer(form: str, convert: Callable[..., Imported]) -> Callable[..., None]:
-    """Return a command with the parameters and the docstring of an importer."""
+    """Return the command `rlcli import NAME` of a format's plugin, with the options and help of its import function."""
 
     @functools.wraps(convert)
     def command(**values: Any) -> None:
@@ -163,7 +163,10 @@ def _report(form: str, imported: Imported) -> None:
 
 
 def _add_formats() -> None:
-    """Add a command for each installed format with an importer, and hidden commands that name missing plugins."""
+    """Add the commands `rlcli import NAME`: policies, and task formats of installed plugins.
+
+    For a known format without its plugin, a hidden command prints how to install the plugin.
+    """
     add_command(app, "sb3", sb3)
     add_command(app, "rsl-rl", rsl_rl)
     added = set()
@@ -182,7 +185,7 @@ def _add_formats() -> None:
 
 
 def _missing(name: str) -> Callable[[], None]:
-    """Return a command that raises the error of a format whose plugin is missing or broken."""
+    """Return the command of a task format whose plugin is missing or broken; it raises the error that says so."""
 
     def command() -> None:
         missing = missing_formats()

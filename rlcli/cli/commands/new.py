@@ -20,8 +20,8 @@ def command(
 
     Options:
         name: Name of the task in lowercase letters, digits and hyphens, such as my-arm.
-        robot: MJCF of a robot. A floating base on feet tracks velocities, a fixed base with all joints driven reaches
-            goals, and any other robot balances. All numbers are in the YAML.
+        robot: MJCF of a robot, for which the task is written: velocity tracking for a floating base on feet, reaching
+            goals for a fixed base with all joints driven, balancing for any other robot.
         flavour: yaml (lists of terms), or direct (one class with the hooks of the direct workflow).
         output: Folder to write. [default: a new folder named after the task]
 

@@ -67,7 +67,7 @@ def command(
     from rlcli.evaluation.session import PolicyRequest, open_session
 
     to_file = video is not None or record is not None
-    require_viewer(viewer, port, drawn=to_file)
+    require_viewer(viewer, port, to_file=to_file)
     held = read_commands(commands or [])
     options.video_file(video, _FALLBACK_VIDEO)
     viewers = choose_viewers(viewer, port, headless=headless or to_file)
@@ -100,7 +100,7 @@ def _check_record(record: Path | None, mode: str, video: Path | None, commands: 
     if record is not None and video is not None:
         raise UsageError("--record and --video cannot be combined", hint="`rlcli replay FILE --video` renders FILE")
     if record is not None and commands:
-        raise UsageError("`rlcli replay` cannot repeat episodes with --command", hint="leave out --record or --command")
+        raise UsageError("--record cannot be combined with --command", hint="leave out --record or --command")
     check_record(record, mode)
 
 
@@ -117,7 +117,7 @@ def _prepare(session: Session, drawn: int, commands: dict[str, float]) -> None:
 
 
 def _default_video(session: Session) -> Path:
-    """Return `videos/STEP.mp4` in the run; for a policy without a run, a file in the current folder."""
+    """Return the file of `--video` without FILE: `videos/STEP.mp4` in the run, else a file in the current folder."""
     run, checkpoint = session.policy.run, session.policy.checkpoint
     if run is None or checkpoint is None:
         return Path(_FALLBACK_VIDEO)

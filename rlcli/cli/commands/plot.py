@@ -85,7 +85,7 @@ def _choose_panels(curves: list[Curve], names: list[str] | None, x: str) -> list
 
 
 def _draw(file: Path, curves: list[Curve], panels: list[Panel], x: str) -> None:
-    """Write the figure, and print the seeds of each curve."""
+    """Write the picture of the learning curves, and print the seeds of each curve."""
     from rlcli.reporting.curves import AXES
     from rlcli.reporting.panel_plots import picture
     from rlcli.runs.atomic_io import write_atomic
@@ -133,7 +133,7 @@ def _note(curves: list[Curve]) -> str:
 
 
 def _record(curve: Curve, axis: str) -> dict[str, Any]:
-    """Return a curve as JSON: its runs and the last value of each metric."""
+    """Return a curve as JSON data: its runs, and the last value of each metric over an axis."""
     ends = {}
     for name in curve.names():
         line = curve.line(name, axis)

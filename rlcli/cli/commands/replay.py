@@ -1,4 +1,4 @@
-"""`rlcli replay`: simulate a trajectory file again and compare it bit by bit."""
+"""`rlcli replay`: simulate a recording, crash dump or failure case again and compare it bit by bit."""
 
 from __future__ import annotations
 
@@ -61,20 +61,20 @@ def command(
 
 
 def _print_episodes(trajectory: Trajectory, result: Replay, episodes: int, video: Path | None, frames: int) -> None:
-    """Print the replay of a recording."""
+    """Print how the replay of a recording (`--record`) ended."""
     difference, values = result.difference, None
     text = f"episodes: {episodes}, steps: {result.steps}; equal bit by bit"
     if difference is not None:
         text = (
             f"episode {difference.episode} differs first at step {difference.step} in {_values(difference, 'recorded')}"
         )
-        console.info("since the recording, the task, MuJoCo or the machine has changed: undo the change")
+        console.info("since the recording, the task, MuJoCo or the machine has changed: undo the change to repeat it")
         values = {name: getattr(difference, name) for name in ("episode", "step", "field", "recorded", "replayed")}
     _print_result(trajectory, text, values, episodes=episodes, steps=result.steps, video=video, frames=frames)
 
 
 def _print_calls(trajectory: Trajectory, result: Replay) -> None:
-    """Print the replay of a crash dump or failure case."""
+    """Print how the replay of a crash dump or failure case ended, for each environment in it."""
     from rlcli.runs.atomic_io import finite_json
 
     header = trajectory.header
@@ -124,7 +124,12 @@ def _print_result(trajectory: Trajectory, text: str, difference: dict[str, Any] 
 
 
 def _values(difference: Difference, word: str) -> str:
-    """Return the field that differs with the first values of both sides; `word` names the side of the file."""
+    """Return the field that differs, with its values in the file and in the replay.
+
+    Args:
+        difference: the difference.
+        word: what the values in the file are called: recorded or dumped.
+    """
     sides = []
     for values in (difference.recorded, difference.replayed):
         text = ", ".join(repr(value) for value in values[:6])

@@ -72,7 +72,7 @@ def command(
 
 
 def _add_media(page: Page, run: Run, checkpoint: Path | None, *, no_eval: bool, no_video: bool) -> tuple[str, str]:
-    """Add the evaluation and the video to the page; return the origin of each (see `PageMedia`), empty if missing."""
+    """Add evaluation and video to the page; return for each `stored`, `made`, `older` or an empty text (missing)."""
     from rlcli.reporting.page_media import PageMedia
 
     if checkpoint is None:
@@ -85,7 +85,7 @@ def _add_media(page: Page, run: Run, checkpoint: Path | None, *, no_eval: bool, 
 
 
 def _find(reference: str, runs_dir: Path) -> tuple[Run, Path | None]:
-    """Return the run and the checkpoint for the page; None if the run has no checkpoint yet."""
+    """Return the run that a reference names, and its checkpoint; None if the run has no checkpoint yet."""
     from rlcli.runs.run_ref import find_checkpoint, find_run, is_checkpoint_ref
 
     one_checkpoint = is_checkpoint_ref(reference)

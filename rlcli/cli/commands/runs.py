@@ -87,7 +87,7 @@ def _row(run: Overview, runs_dir: Path) -> list[str]:
 
 
 def _tags(run: Overview) -> str:
-    """Return remarks about a device other than the CPU, several processes, or initial weights."""
+    """Return what is special about a run: a device other than the CPU, several processes, weights of another run."""
     tags = []
     if (device := str(run.tags.get("device", "cpu"))) != "cpu":
         tags.append(device)
@@ -107,7 +107,7 @@ def _one_line(text: str) -> str:
 
 
 def age(seconds: float) -> str:
-    """Return a time in its largest unit, as `3 d` or `5 min`."""
+    """Return a duration [s] as text in its largest unit, such as `3 d` or `5 min`."""
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
         if seconds >= length:
             return f"{seconds / length:.0f} {unit}"
@@ -121,4 +121,4 @@ def size(count: int) -> str:
         if value < 1000 or unit == "GB":
             return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
         value /= 1000
-    raise AssertionError("GB takes all sizes")
+    raise AssertionError("bug in rlcli: no unit is large enough")

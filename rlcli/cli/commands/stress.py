@@ -49,8 +49,8 @@ def command(
             push [m/s or rad/s].
         points: Number of values in a range.
         episodes: Number of episodes in each variant.
-        worst: Number of further points at which to search for a worse variant.
-        against: Baseline that is evaluated too: lqr, zero or random.
+        worst: Number of further variants, between the values of the ranges, in which to search for a worse one.
+        against: Other policy to compare with: lqr, zero or random.
         fail_under: Exit with code 9 if the mean is below X in any variant, such as success=0.9; repeatable.
         output: Write the heat map to FILE.png or FILE.svg.
 
@@ -108,14 +108,14 @@ def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
 
 
 def _resolve_run(request: PolicyRequest) -> PolicyRequest:
-    """Return the request; if the first argument names a run, move it from the task to the checkpoint."""
+    """Return the request for a policy; a run as the first argument (`RUN|TASK`) becomes its checkpoint."""
     from rlcli.evaluation.session import is_run_name
 
     task = request.task
     if task is None or not is_run_name(task, request.runs_dir):
         return request
     if request.checkpoint is not None:
-        raise UsageError(f"{task} is a run, but --checkpoint names another", hint="leave out RUN or --checkpoint")
+        raise UsageError(f"{task} is a run, and --checkpoint names one too", hint="leave out one of them")
     return replace(request, task=None, checkpoint=task)
 
 

@@ -104,7 +104,7 @@ def command(
 
 
 def _show(request: TrainingRequest, storage: str | None, plot: bool) -> None:
-    """Print the trials of a sweep, and plot them with --plot."""
+    """Run `sweep show`: print the trials of a sweep, and plot them with --plot."""
     from rlcli.cli.ui.several_trainings import print_sweep
     from rlcli.tuning.sweep import draw_sweep, find_sweep
 
@@ -117,7 +117,7 @@ def _show(request: TrainingRequest, storage: str | None, plot: bool) -> None:
 def _compare(
     request: TrainingRequest, seeds: str, until: str | None, episodes: int, storage: str | None, stop: StopRequest
 ) -> None:
-    """Compare the best trial's settings with the task's own."""
+    """Run `sweep compare`: train with the best trial's settings and with the task's own."""
     from rlcli.cli.ui.several_trainings import print_comparison
     from rlcli.runs.study import read_seeds
     from rlcli.tuning.sweep import find_sweep
@@ -186,10 +186,10 @@ def _check_options(ctx: typer.Context, task: str | None) -> None:
     given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
     if task in _OPTIONS:
         wrong = next((name for name in given if name not in _OPTIONS[task]), None)
-        form, hint = f"sweep {task}", "it belongs to a new sweep, or to another form of the command"
+        form, hint = f"sweep {task}", "leave it out; it is an option of a new sweep or of another subcommand"
     else:
         wrong = next((name for name in given if name in _NOT_OF_A_SWEEP), None)
-        form, hint = "a new sweep", f"it belongs to rlcli {_NOT_OF_A_SWEEP.get(wrong or '')}"
+        form, hint = "a new sweep", f"leave it out; it is an option of rlcli {_NOT_OF_A_SWEEP.get(wrong or '')}"
     if wrong is not None:
         raise UsageError(f"--{wrong.replace('_', '-')} is not an option of {form}", hint=hint)
     require_known(ctx.params["pruner"], ("median", "none"), "--pruner", "pruners")

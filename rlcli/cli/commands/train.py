@@ -1,4 +1,4 @@
-"""`rlcli train`: options -> configuration -> run folder -> environment and trainer -> training loop."""
+"""`rlcli train`: train a policy, or several with other seeds; start a new run or resume one."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def _study(request: TrainingRequest, seeds: str | None, jobs: int | None, seed: 
 
 
 def _source(task: str | None, request: TrainingRequest, seed: int | None, seeds: str | None) -> TaskSource | None:
-    """Return the task; None for a resumed run without one.
+    """Return the task to train; None if a run is resumed and no task is named.
 
     Raises:
         UsageError: without a task, or if --resume is combined with changes of the configuration.

@@ -1,4 +1,4 @@
-"""`rlcli watch`: the live table of a training of another process, read from the files of its run."""
+"""`rlcli watch`: follow a training that runs in another terminal, from the files of its run."""
 
 from __future__ import annotations
 

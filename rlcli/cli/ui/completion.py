@@ -12,7 +12,7 @@ _MAX_RUNS = 50
 
 
 def words(*choices: str) -> Callable[[str], list[str]]:
-    """Return a completion function for a few words."""
+    """Return a completion function that offers a few words."""
 
     def offer(incomplete: str) -> list[str]:
         return [choice for choice in choices if choice.startswith(incomplete)]
@@ -56,7 +56,7 @@ def runs_and_tasks(ctx: typer.Context, incomplete: str) -> list[Offer]:
 
 
 def agents(ctx: typer.Context, incomplete: str) -> list[Offer]:
-    """Return the agents of the task that is named on the command line."""
+    """Return the names of the agents of the task that is on the command line."""
     words = [ctx.params[key] for key in ("task", "subject", "target") if ctx.params.get(key)]
     words += ctx.args  # arguments after an incomplete --agent are not parsed into ctx.params
     try:
@@ -77,7 +77,7 @@ def _runs_dir(ctx: typer.Context) -> Path:
 
 
 def _runs(ctx: typer.Context) -> Iterator[Offer]:
-    """Yield the names of the newest runs, by the time at which their folders last changed."""
+    """Yield the names of the newest runs with a description; new are those whose folders changed last."""
     from rlcli.runs.run import RECORD
 
     runs_dir = _runs_dir(ctx)

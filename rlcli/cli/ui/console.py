@@ -85,7 +85,7 @@ class Console:
             _write(sys.stderr, message_line(text))
 
     def detail(self, text: str) -> None:
-        """Print a message if -v is set."""
+        """Print a detailed message, only if -v is set."""
         if self.verbose and not self.quiet and not self.muted:
             _write(sys.stderr, message_line(text))
 
@@ -127,7 +127,13 @@ class Console:
             _write(sys.stdout, "  ".join(cells).rstrip())
 
     def heat_map(self, title: str, corner: str, heat_map: HeatMap) -> None:
-        """Print a heat map on stdout, on a terminal in colours: red is low, green is high."""
+        """Print a heat map on stdout, on a terminal in colours: red is low, green is high.
+
+        Args:
+            title: the metric and the policy.
+            corner: text above the names of the rows: the two varied parameters.
+            heat_map: the values.
+        """
         cells = zip(heat_map.rows.values, heat_map.cells, strict=True)
         rows = [[name, *(f"{number:.2f}" for number in numbers)] for name, numbers in cells]
         if self.json or not supports_styles(sys.stdout):
@@ -142,7 +148,7 @@ class Console:
 
 
 def _shade(share: float) -> str:
-    """Return a style with black text: on red for 0, yellow for 0.5, green for 1."""
+    """Return rich's style of a heat map's cell: black on red for a share of 0, on yellow for 0.5, on green for 1."""
     red, green = min(1.0, 2.0 - 2.0 * share), min(1.0, 2.0 * share)
     return f"#000000 on #{round(225 * red):02x}{round(200 * green):02x}40"
 
@@ -154,7 +160,7 @@ class _ConsoleHandler(logging.Handler):
     """Logging handler that prints warnings always, INFO unless -q is set, and DEBUG with -v."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print one record on stderr."""
+        """Print one log record on stderr."""
         if record.levelno >= logging.WARNING:
             console.warn(record.getMessage())
         elif record.levelno >= logging.INFO:
@@ -188,7 +194,7 @@ def discard(stream: Any) -> None:
 
 
 def _write(stream: Any, *lines: str) -> None:
-    """Print some lines.
+    """Print lines on a stream, with control characters escaped.
 
     Raises:
         MachineError: if stdout cannot be written, for example to a full disk.

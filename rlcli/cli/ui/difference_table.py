@@ -85,7 +85,7 @@ def _rows(section: Section) -> list[list[str]]:
 
 
 def _sides(difference: Difference) -> list[str]:
-    """Return the value of each side, and the file and line that set it."""
+    """Return the values on the left and on the right side, each with the file and line that set it."""
     sides = ((difference.left, difference.left_from), (difference.right, difference.right_from))
     return [f"{cell(value)} ({origin})" if origin else cell(value) for value, origin in sides]
 

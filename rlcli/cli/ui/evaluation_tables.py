@@ -19,7 +19,7 @@ INTERVAL = "95 % INTERVAL"
 
 
 def show_summary(summary: Mapping[str, Any]) -> None:
-    """Print the summary of an evaluation."""
+    """Print the metrics of an evaluation, each with its interval."""
     entries = [("success rate", summary["success"])] if "success" in summary else []
     for name, condition in summary.get("conditions", {}).items():
         entries.append((f"success: {name} held", condition["held"]))
@@ -77,12 +77,12 @@ def show_stress(result: StressResult, against: str | None) -> None:
 
 
 def interval(entry: Mapping[str, Any]) -> str:
-    """Return the interval of a mean or a rate as text."""
+    """Return the 95 % interval of a mean or a rate in an evaluation as text."""
     return "unknown" if entry["low"] is None else f"{entry['low']:.4f} .. {entry['high']:.4f}"
 
 
 def _cells(entry: Mapping[str, Any]) -> list[str]:
-    """Return a mean or a rate, and its interval."""
+    """Return the cells of a table for a mean or a rate: the value, and its 95 % interval."""
     value = mean_or_rate(entry)
     return ["not finite" if value is None else f"{value:.4f}", interval(entry)]
 

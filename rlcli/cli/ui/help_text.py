@@ -40,7 +40,7 @@ def read_docstring(function: Callable[..., Any]) -> tuple[str, dict[str, str], s
 
 
 class _PanelHelp:
-    """Mix-in for typer's commands and groups: prints the help in panels."""
+    """Mix-in for typer's commands and groups that prints the help in panels (titled groups of options)."""
 
     def collect_usage_pieces(self: Any, ctx: Any) -> list[str]:
         """Return the usage line after the name of the command."""
@@ -76,11 +76,11 @@ class _PanelHelp:
 
 
 class HelpCommand(_PanelHelp, TyperCommand):
-    """Command with help in panels."""
+    """Command of typer whose help is in panels."""
 
 
 class HelpGroup(_PanelHelp, TyperGroup):
-    """Group of commands with help in panels."""
+    """Group of typer's commands whose help is in panels."""
 
 
 def _panel(parameter: Any) -> str:

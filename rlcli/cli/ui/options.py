@@ -24,7 +24,7 @@ CHOOSE = "auto"
 
 
 def choice(metavar: str, *names: str, help: str | None = None) -> Any:
-    """Return the declaration of an option whose values a shell completes."""
+    """Return the typer declaration of an option with a few values, which the shell completes."""
     return typer.Option(autocompletion=words(*names), metavar=metavar, help=help)
 
 
@@ -141,7 +141,8 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
         for option, (other, what) in _NEEDED.items():
             is_alone = {option, other} <= values.keys() and values[other] in (None, False)
             if is_alone and values[option] != signature.parameters[option].default:
-                raise UsageError(f"--{option.replace('_', '-')} needs {what}", hint="add it, or leave out the option")
+                flag = f"--{option.replace('_', '-')}"
+                raise UsageError(f"{flag} needs {what}", hint=f"add {what}, or leave out {flag}")
         if "overrides" in values and (model := values.pop("model")):
             from rlcli.config.given_models import MODELS, read_models
 
@@ -178,7 +179,7 @@ def _read(value: object) -> object:
 
 
 def _with_strict_number(parameter: inspect.Parameter) -> inspect.Parameter:
-    """Return a parameter of a command; a number has the same form as in a task file."""
+    """Return a command's parameter; if it is a number, its text must have the form of a number in a task file."""
     kind, *infos = get_args(parameter.annotation) or (None,)
     kind = next((number for number in (int, float) if kind in (number, number | None)), None)
     if kind is None or not infos:
@@ -191,7 +192,10 @@ def _with_strict_number(parameter: inspect.Parameter) -> inspect.Parameter:
 
 
 def budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
-    """Return the budget of the command line, which replaces the agent's whole budget; empty: the agent's own."""
+    """Return the changes for --max-iterations and --max-steps (key -> value); empty without both.
+
+    One of them replaces the agent's whole budget.
+    """
     if max_iterations is None and max_steps is None:
         return {}
     return {"agent.max_iterations": max_iterations, "agent.max_steps": max_steps}

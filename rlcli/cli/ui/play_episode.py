@@ -28,7 +28,7 @@ _MAX_REASONS = 6
 def check_choice(
     env: int | None, episode: int | None, num_envs: int | None, record_mode: str, commands: Mapping[str, float]
 ) -> None:
-    """Check, before anything is built, that the options name one episode.
+    """Check, before anything is built, that --env and --episode name one episode and fit the other options.
 
     Raises:
         UsageError: if they do not.
@@ -42,7 +42,7 @@ def check_choice(
             hint=f"give --num-envs {env + 1}, or leave it out",
         )
     if record_mode != "all":
-        raise UsageError("--env and --episode choose one episode: leave out --record-mode")
+        raise UsageError("--env and --episode choose one episode, --record-mode chooses among several: leave it out")
     if commands:
         raise UsageError("--command would change the episode", hint="leave out --command, or --env and --episode")
 
@@ -64,7 +64,7 @@ def play_episode(
         episode: index of the episode in this environment, from 0.
         video: file for the video of the episode.
         record: file to record the episode to.
-        watch: opens a viewer at the start of the episode; returns whether there was one.
+        watch: opens a viewer at the start of the episode; returns whether one could be opened.
     """
     from rlcli.replay.episode_recorder import EpisodeRecorder
     from rlcli.replay.rerun_episode import run_episode, start_episode
@@ -114,7 +114,7 @@ def _print_origin(session: Session, start: EpisodeStart, env_id: int, episode: i
 
 
 def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) -> dict[str, Any]:
-    """Return the identity of the episode as JSON; call this after the episode has run."""
+    """Return which episode was repeated, as JSON data; call this after the episode has run."""
     shared = start.shared_draws()
     if shared:
         console.warn(
@@ -131,7 +131,7 @@ def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) ->
 
 @dataclass(slots=True)
 class Filming:
-    """Policy that also renders the states of its environment to a video."""
+    """Policy that also renders each state of its environment into a video before it acts."""
 
     session: Session
     env_id: int
@@ -174,7 +174,7 @@ def film(session: Session, file: Path, env_id: int = 0, drawn: int = 1) -> Itera
 
 
 def _outcome(last: StepResult, env_id: int) -> dict[str, Any]:
-    """Return the result of the episode as JSON."""
+    """Return the result of the repeated episode (length, return, end) as JSON data."""
     assert last.episodes is not None
     ended = last.episodes.ended()
     row = ended.ids.tolist().index(env_id)

@@ -54,14 +54,14 @@ class LiveView:
                 self._live.__exit__(*error)
 
     def update(self, lines: Sequence[str], *, refresh: bool = False) -> None:
-        """Replace the lines of the live block."""
+        """Replace the lines of the live block; `refresh` draws it at once."""
         from rich.text import Text
 
         self._live.update(Text("\n".join(lines)), refresh=refresh)
 
 
 class WorkView:
-    """View of the work in `rlcli.progress`: one line on a terminal, else a new line every ten seconds."""
+    """View of a command's progress (`rlcli.progress`): one line on a terminal, else a new line every ten seconds."""
 
     def __init__(self, running: list[Work]) -> None:
         self._running = running
@@ -103,7 +103,7 @@ class WorkView:
 
 
 def work_line(running: Sequence[Work]) -> str:
-    """Return one line about nested work, the outermost first: names with counts, the done share, the time left."""
+    """Return one line about the running work, the outermost first: names with counts, percentage, time left."""
     works = list(running)
     counts = [f"{work.what} {work.done:,}/{work.total:,}" if work.total else work.what for work in works]
     counted = [work for work in works if work.total]
@@ -191,7 +191,7 @@ def _left(progress: Progress) -> str:
 
 
 def clock(seconds: float) -> str:
-    """Return a time as hours, minutes and seconds; `?` for a negative or endless one."""
+    """Return a duration [s] as `h:mm:ss`; `?` if it is negative or endless."""
     if not 0.0 <= seconds < _MAX_S:
         return "?"
     minutes, left = divmod(int(seconds), 60)

@@ -14,7 +14,7 @@ _MIN_BROKEN = 24
 
 
 def flow(parts: Sequence[str], width: int, indent: int = 0) -> list[str]:
-    """Return lines with parts side by side; a part is only broken if it is wider than a line."""
+    """Arrange parts of text side by side, in lines of at most `width` characters; only a too long part is longer."""
     lines: list[str] = []
     line = ""
     for part in parts:
@@ -27,12 +27,12 @@ def flow(parts: Sequence[str], width: int, indent: int = 0) -> list[str]:
 
 
 def cell(value: Any, form: str = "", unit: str = "") -> str:
-    """Format a value as a cell; `-` for None."""
+    """Format a value as a cell of a table, with a format such as `.3f` and a unit; `-` for None."""
     return "-" if value is None else f"{value:{form}}{unit}"
 
 
 def draw_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> None:
-    """Print a table on the terminal at stdout."""
+    """Print a table on the terminal at stdout; a table that is too wide becomes a block of lines for each row."""
     from rich.table import Table
     from rich.text import Text
 

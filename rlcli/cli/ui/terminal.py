@@ -34,7 +34,7 @@ def colors() -> str:
 
 
 def screen(stream: TextIO) -> Console:
-    """Return a console of rich on a stream, with or without colours."""
+    """Return rich's console for a stream, with colours if the stream supports them and the user wants them."""
     from rich.console import Console
 
     chosen, width = colors(), None if stream.isatty() or os.environ.get("COLUMNS") else _ANY_WIDTH

@@ -25,27 +25,32 @@ Choice = tuple[str, str]
 """A viewer, and the reason for choosing it."""
 
 
-def require_viewer(viewer: str | None, port: int | None, *, drawn: bool) -> None:
-    """Check that the options of the viewer do not contradict other options.
+def require_viewer(viewer: str | None, port: int | None, *, to_file: bool) -> None:
+    """Check that --viewer and --port do not contradict other options.
+
+    Args:
+        viewer: the value of --viewer.
+        port: the value of --port.
+        to_file: whether --video or --record writes a file, so that no viewer opens.
 
     Raises:
         UsageError: with both options.
     """
     if viewer is not None:
         require_known(viewer, CHOICES, "viewer", "viewers")
-    if drawn and viewer in VIEWERS:
+    if to_file and viewer in VIEWERS:
         raise UsageError(
             f"--viewer {viewer} opens a viewer, but --video and --record only write files", hint="leave out --viewer"
         )
-    if port is not None and (drawn or viewer not in (None, "auto", "web")):
+    if port is not None and (to_file or viewer not in (None, "auto", "web")):
         raise UsageError("--port is an option of the web viewer", hint="add --viewer web")
 
 
 def read_commands(texts: Sequence[str]) -> dict[str, float]:
-    """Parse `vx=0.5,wz=0` into names and values.
+    """Parse the values of --command, such as `vx=0.5,wz=0`: name of a command -> value.
 
     Raises:
-        UsageError: for anything else.
+        UsageError: for a text of another form.
     """
     values = {}
     for part in ",".join(texts).split(",") if texts else ():
@@ -120,14 +125,14 @@ def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn
         except (MachineError, DependencyError) as error:
             if position + 1 == len(viewers):
                 raise
-            console.info(f"viewer: not {name}: {error.message}{f'; {error.hint}' if error.hint else ''}")
+            console.info(f"viewer: {name} does not work: {error.message}{f'; {error.hint}' if error.hint else ''}")
             continue
         return True
-    raise AssertionError("the list of viewers is never empty")
+    raise AssertionError("bug in rlcli: there is no viewer to try")
 
 
 def _open(session: Session, name: str, reason: str, port: int | None, drawn: int) -> None:
-    """Show the policy until the viewer is closed, then print the JSON document."""
+    """Show the policy in the viewer `name` until it is closed, then print the JSON document."""
     module, _, function = VIEWERS[name].partition(":")
     run: Viewer = getattr(importlib.import_module(module), function)
     playback, address = _playback(session), None

@@ -71,30 +71,44 @@ class _Limits:
 
 
 Number = Annotated[float, _FractionString(), _Limits(-1e38, 1e38)]
+"""Finite number; like all numbers below that need not be whole, it may be written as a fraction: `1/120`."""
 Positive = Annotated[float, Field(gt=0), _FractionString(), _Limits(1e-38, 1e38)]
+"""Number above 0."""
 NotNegative = Annotated[float, Field(ge=0), _FractionString(), _Limits(0.0, 1e38)]
+"""Number of at least 0."""
 Seconds = Annotated[float, Field(gt=0), _FractionString(), _Limits(0.0, 1e9)]
 """Time that is divided by the control period: with `sim.dt` of at least 1e-9 the number of steps fits 64 bits."""
 Count = Annotated[int, Field(ge=1), _Limits(1, 2**31 - 1)]
+"""Whole number of at least 1."""
 Width = Annotated[int, Field(ge=1, le=2**24)]
 """Number of columns of a layer of a network."""
 Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=100)]
 """Widths of the layers of a network."""
 Threads = Annotated[int, Field(ge=1, le=4096)]
+"""Number of threads, 1 to 4096."""
 Share = Annotated[float, Field(ge=0, le=1), _FractionString()]
+"""Number from 0 to 1."""
 Vec3 = tuple[Number, Number, Number]
+"""Three numbers: x, y, z."""
 Quaternion = Annotated[
     tuple[Number, Number, Number, Number],
     _nonzero("a quaternion must not be zero; no rotation is [1, 0, 0, 0]"),
 ]
+"""Rotation (w, x, y, z), not zero."""
 Direction = Annotated[Vec3, _nonzero("a direction must not be zero; straight down is [0, 0, -1]")]
+"""Vector x, y, z that is not zero."""
 Range = Annotated[tuple[Number, Number], AfterValidator(_check_order)]
+"""Two numbers [low, high]; low is not above high."""
 _SecondsOrZero = Annotated[float, Field(ge=0), _FractionString(), _Limits(0.0, 1e9)]
 SecondsRange = Annotated[tuple[_SecondsOrZero, _SecondsOrZero], AfterValidator(_check_order)]
+"""Two times of at least 0, [low, high]."""
 ShareRange = Annotated[tuple[Share, Share], AfterValidator(_check_order)]
+"""Two numbers from 0 to 1, [low, high]."""
 _Steps = Annotated[int, Field(ge=0, le=1000)]
 StepRange = Annotated[tuple[Annotated[int, Field(ge=0)], _Steps], AfterValidator(_check_order)]
+"""Two whole numbers [low, high], from 0 to 1000."""
 Names = str | Annotated[list[str], Field(min_length=1)]
+"""A name or regular expression, or a list of these."""
 
 
 class StrictModel(BaseModel):

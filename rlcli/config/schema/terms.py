@@ -105,6 +105,7 @@ class UniformNoiseConfig(_NoiseConfig):
     """Uniform noise."""
 
     kind: Literal["uniform"]
+    """Kind of noise: always uniform."""
     low: Columns = -1.0
     """Lower end of the samples, in the unit of the term (for `operation: scale` a factor)."""
     high: Columns = 1.0
@@ -115,6 +116,7 @@ class GaussianNoiseConfig(_NoiseConfig):
     """Gaussian noise."""
 
     kind: Literal["gaussian"]
+    """Kind of noise: always gaussian."""
     mean: Columns = 0.0
     """Mean of the samples, in the unit of the term (for `operation: scale` a factor)."""
     std: Columns = 1.0
@@ -125,17 +127,20 @@ class ConstantNoiseConfig(_NoiseConfig):
     """A constant value, the same in every step."""
 
     kind: Literal["constant"]
+    """Kind of noise: always constant."""
     value: Columns = 0.0
     """The value, in the unit of the term (for `operation: scale` a factor)."""
 
 
 NoiseConfig = Annotated[UniformNoiseConfig | GaussianNoiseConfig | ConstantNoiseConfig, Field(discriminator="kind")]
+"""Noise of an observation: uniform, gaussian or constant, as `kind` says."""
 
 
 class ScaleModifierConfig(StrictModel):
     """Multiply: value x factor."""
 
     kind: Literal["scale"]
+    """Kind of modifier: always scale."""
     factor: Columns
     """Factor."""
 
@@ -144,6 +149,7 @@ class BiasModifierConfig(StrictModel):
     """Add: value + offset."""
 
     kind: Literal["bias"]
+    """Kind of modifier: always bias."""
     offset: Columns
     """Offset, in the unit of the term."""
 
@@ -152,6 +158,7 @@ class ClipModifierConfig(StrictModel):
     """Limit the value to a range."""
 
     kind: Literal["clip"]
+    """Kind of modifier: always clip."""
     bounds: Range
     """[low, high] limits, in the unit of the term."""
 
@@ -160,6 +167,7 @@ class DigitalFilterModifierConfig(StrictModel):
     """Digital filter: y[i] = sum_j b[j] x[i-j] - sum_j a[j] y[i-1-j], with zeros before an episode's first step."""
 
     kind: Literal["digital_filter"]
+    """Kind of modifier: always digital_filter."""
     a: list[Number] = []
     """Coefficients of past outputs, the newest output first; empty for a filter without feedback."""
     b: Annotated[list[Number], Field(min_length=1)]
@@ -170,6 +178,7 @@ class IntegratorModifierConfig(StrictModel):
     """Integral of the value over the episode, by the trapezoidal rule."""
 
     kind: Literal["integrator"]
+    """Kind of modifier: always integrator."""
 
 
 ModifierConfig = Annotated[
@@ -180,6 +189,7 @@ ModifierConfig = Annotated[
     | IntegratorModifierConfig,
     Field(discriminator="kind"),
 ]
+"""Modifier of an observation, such as a filter; `kind` says which."""
 
 
 class DelayConfig(StrictModel):

@@ -131,6 +131,7 @@ SubTerrainConfig = Annotated[
     | GridPatchConfig,
     Field(discriminator="kind"),
 ]
+"""Kind of ground on a patch of a generated terrain; `kind` says which."""
 
 
 class TerrainGeneratorConfig(StrictModel):
@@ -186,3 +187,4 @@ class TerrainHeightsConfig(StrictModel):
 
 
 TerrainConfig = Annotated[TerrainGeneratorConfig | TerrainHeightsConfig, Field(discriminator="kind")]
+"""Terrain: generated, or heights from a file, as `kind` says."""

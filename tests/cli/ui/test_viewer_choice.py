@@ -178,7 +178,7 @@ def test_macos_without_mjpython_names_command(cli, monkeypatch):
     assert "mjpython -m rlcli play" in done.err
     auto = cli(*ZERO)
     assert auto.code == 0
-    assert "viewer: not native: " in auto.err
+    assert "viewer: native does not work: " in auto.err
     assert "mjpython" in auto.err
     assert "viewer: none (no window" in auto.err
     assert "episodes" in auto.out
