@@ -92,7 +92,7 @@ def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
     content = distribution.metadata  # each access parses the metadata again
     name, version = content["Name"], content["Version"]
     if not name or not version:
-        raise ValueError("its METADATA has no Name or no Version; reinstall the package")
+        raise ValueError("the METADATA of the package has no Name or no Version; reinstall the package")
     return name, version
 
 

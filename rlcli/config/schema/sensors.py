@@ -10,7 +10,7 @@ _MAX_RAYS = 1_000_000
 
 
 class TouchedConfig(StrictModel):
-    """The other side of the contacts that a contact sensor measures."""
+    """The bodies whose contacts with the sensor's bodies a contact sensor measures."""
 
     entity: str
     """Name of an entity."""
