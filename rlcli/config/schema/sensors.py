@@ -10,7 +10,7 @@ _MAX_RAYS = 1_000_000
 
 
 class TouchedConfig(StrictModel):
-    """The bodies whose contacts with the sensor's bodies a contact sensor measures."""
+    """The bodies of an entity with which a contact sensor measures contacts (its key `against`)."""
 
     entity: str
     """Name of an entity."""
