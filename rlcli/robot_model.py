@@ -67,7 +67,10 @@ class Robot:
         self.inertia = self._inertia()
 
     def kind(self) -> str:
-        """Return the kind of task that fits the robot: velocity, reach or balance."""
+        """Return the kind of task that fits the robot.
+
+        It is velocity (walk as commanded), reach (move the last body to a goal) or balance (keep the default pose).
+        """
         if self.free and len(self.driven) >= max(4, len(self.passive) + 1) and self.feet():
             return "velocity"
         if self.free or self.passive or len(self.driven) < 2:

@@ -137,7 +137,7 @@ def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
         value = value.__rlcli_agent__(notes)
     plain = _PlainData({}, "agent").plain(value, ())
     if not isinstance(plain, dict):
-        raise TypeError(f"the agent is of type {type(value).__name__}; write a mapping of settings")
+        raise TypeError(f"the agent is of type {type(value).__name__}; write a mapping")
     return plain
 
 
@@ -367,7 +367,7 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
             task.notes.append(Note("", f"agents.{name}", "ignored", str(agent)))
         elif data is None:
             what = str(agent) if isinstance(agent, str | FilePath) else type(agent).__name__
-            task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}: write a mapping"))
+            task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}; write a mapping"))
         else:
             found[name] = data
     ranked = [name for name in order if name in found]

@@ -375,7 +375,7 @@ def _literal(node: ast.expr) -> Any:
 
 
 def _field_default(node: ast.expr | None) -> Any:
-    """Return the default of a `Params` field in the form that `create_model` takes."""
+    """Return the default of a field of `Params` in the form that pydantic's `create_model` takes."""
     if node is None:
         return ...
     if isinstance(node, ast.Call) and last_name(node.func) == "Field":

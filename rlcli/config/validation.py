@@ -111,7 +111,7 @@ class TaskCheck:
             self.problem(path, f"expected a mapping, found {messages.format_value(value)}")
         return isinstance(value, dict)
 
-    # --- layers ---
+    # --- merging of the sources ---
 
     def read_task(self, document: Document) -> None:
         """Merge the content of the task's file, which may be in another framework's format."""

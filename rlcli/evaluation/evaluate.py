@@ -78,7 +78,7 @@ class Evaluation:
         return result
 
     def part(self, first: int, stop: int) -> Self:
-        """Return the episodes of the environments `first` to `stop` - 1, which are numbered from 0."""
+        """Return the episodes of the environments `first` to `stop` - 1; in the result, `first` is environment 0."""
         rows = [row for row, env in enumerate(self.envs) if first <= env < stop]
         return self._rows(rows, first)
 

@@ -201,8 +201,10 @@ def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
     """
     require_known(kind, POLICIES, "policy", "policies")
     if kind == "trained":
-        message = "--against trained: only a policy without training can be the reference"
-        raise UsageError(message, hint="use --against lqr, zero or random")
+        raise UsageError(
+            "--against trained: only a policy without training can be the reference",
+            hint="use --against lqr, zero or random",
+        )
     return replace(policy, kind=kind, stochastic=False, as_trained=False)
 
 

@@ -15,7 +15,7 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
 
     The folder has a `task.yaml`, and optionally `terms.py` and `task.py` (with a class `Task`). Or it has a task in an
     installed format of another framework. Else the configuration is in Python: `TASK` in `task.py`, or the task that
-    the package registers with Gymnasium. `file` is another name for `task.yaml`.
+    the package registers with Gymnasium. `file` is the name of the YAML file, if it is not `task.yaml`.
 
     Raises:
         TaskError: if the folder has no task, or several tasks.

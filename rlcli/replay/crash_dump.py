@@ -46,7 +46,7 @@ class CrashDumper(StepObserver):
         env.observers.add(self)
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
-        """Write the dump of the first divergence, log it, and stop observing."""
+        """Write the crash dump of the first divergence, log a warning, and stop observing divergences."""
         if not found:
             return
         env = self._env
@@ -90,9 +90,14 @@ class CallTrace:
 
 
 def trace_calls(env: Environment, divergence: Divergence, pending: bool = False) -> CallTrace:
-    """Copy the last engine calls of the environment of a divergence, before its state is restored or reset.
+    """Copy the last engine calls (calls that simulate physics steps) of an environment that has diverged.
 
-    `pending`: whether the engine has not made the call that diverges yet.
+    It must be called before the environment's state is restored or reset.
+
+    Args:
+        env: all environments.
+        divergence: the divergence, with the index of its environment.
+        pending: whether the engine has not made the call that diverges yet.
     """
     engine, number = env.engine.replayable, divergence.env
     assert engine is not None

@@ -142,7 +142,7 @@ class FailureRecorder(StepObserver):
         """Stop recording."""
         stop_observing_divergences(self._env, self)
 
-    # --- between iterations ---
+    # --- called after iterations and at checkpoints ---
 
     def commit(self, iteration: int, step: int) -> None:
         """Add the recorded episodes of a finished iteration to those that the next checkpoint writes.
@@ -205,7 +205,7 @@ class FailureRecorder(StepObserver):
     def _header(self) -> Header:
         return Header.of(self._env)
 
-    # --- in a step ---
+    # --- called in every step ---
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
         """Copy the last engine calls of environments that diverged, for the first divergence of each cause."""
@@ -329,7 +329,7 @@ class FailureRecorder(StepObserver):
             del self._files[oldest]
             self._unwritten.pop(oldest, None)
 
-    # --- at the beginning ---
+    # --- start of the recording ---
 
     def _steps_that_fit(self, seconds: float, memory: int) -> int:
         """Return the number of environment steps in the ring buffers: as many as fit `seconds` and `memory` [bytes]."""

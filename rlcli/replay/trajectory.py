@@ -354,7 +354,7 @@ def read_trajectory(file: Path) -> Trajectory:
                 raise ValueError(f"the file is larger than {_MAX_BYTES >> 20} MiB")
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 (not a mapping)
         if isinstance(data.get("episodes"), list) and len(data["episodes"]) > len(tensors):
-            raise ValueError(f"the header has {len(data['episodes'])} episodes, but the file {len(tensors)} tensors")
+            raise ValueError(f"the file is damaged: {len(data['episodes'])} episodes, but only {len(tensors)} tensors")
         if data.pop("sha256", None) != content_digest(tensors, data):
             raise CheckpointError(f"{file} is corrupt: its hash does not match; record it again")
         header = check_json(Header, data, file)

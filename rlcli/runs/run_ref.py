@@ -143,17 +143,23 @@ def find_checkpoint(
     if which == "best":
         best = run.record.get("best")
         if best not in have:
-            message = f"{run.folder} has no best checkpoint: it was not evaluated"
-            raise CheckpointError(message, hint="leave out @best to use the newest checkpoint")
+            raise CheckpointError(
+                f"{run.folder} has no best checkpoint: it was not evaluated",
+                hint="leave out @best to use the newest checkpoint",
+            )
         return run, run.checkpoints / f"{best:012d}", "its best evaluation"
     kind, _, number = which.partition(":")
     if kind == "step" and re.fullmatch("[0-9]{1,30}", number):
         if int(number) not in have:
-            message = f"{run.folder} has no checkpoint at step {number}"
-            raise CheckpointError(message, hint=f"it has checkpoints at these steps: {listing(map(str, have))}")
+            raise CheckpointError(
+                f"{run.folder} has no checkpoint at step {number}",
+                hint=f"it has checkpoints at these steps: {listing(map(str, have))}",
+            )
         return run, run.checkpoints / f"{int(number):012d}", "as named"
-    message = f"'{reference}' does not name a checkpoint"
-    raise CheckpointError(message, hint="write RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest")
+    raise CheckpointError(
+        f"'{reference}' does not name a checkpoint",
+        hint="write RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest",
+    )
 
 
 def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Path, str]:

@@ -64,7 +64,7 @@ def _record_use(key: str) -> None:
 
 
 def _file(key: str) -> Path:
-    """Return the file whose existence means that the user has named the task with this text, from `_key`."""
+    """Return the file that exists if the user has named the task before; `key`, from `_key`, identifies its code."""
     import platformdirs
 
     folder = os.environ.get("RLCLI_STATE_DIR") or platformdirs.user_state_dir("rlcli")

@@ -108,7 +108,7 @@ class ActuatorModel(TensorState):
         super().load_state_dict(state)
 
     def _delayed_targets(self, history: Tensor) -> Tensor:
-        """Return the targets that act now, after the delay of each environment. (num_envs, 3, k)
+        """Return the position, velocity and effort targets that act now, after the delay. (num_envs, 3, k)
 
         They are those of `delay` physics steps ago, or the first ones of the episode. `history` has the past targets.
         """

@@ -41,9 +41,9 @@ class SceneProblem(NameProblem):
 
 
 def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> list[int]:
-    """Return the positions of the names that the patterns match in full.
+    """Return the indices of the names that match one of the patterns completely.
 
-    Positions are in the order of the patterns; the matches of one regular expression are in the order of `names`.
+    They are in the order of the patterns; the matches of one regular expression are in the order of `names`.
 
     Args:
         patterns: names or regular expressions.
