@@ -207,15 +207,18 @@ class Checkpoint:
         values = self.json("state.json")
         _check_state(values, self.step, self.folder / "state.json")
         if values["policy"] != self.json("policy.json"):
-            message = f"{self.folder} is corrupt: state.json and policy.json have different policies"
-            raise CheckpointError(f"{message}; use an older checkpoint: RUN@step:N")
+            raise CheckpointError(
+                f"{self.folder} is corrupt: state.json and policy.json have different policies"
+                "; use an older checkpoint: RUN@step:N"
+            )
         self.policy()
         parts = [name.removesuffix(".safetensors") for name in self.manifest["files"] if name.endswith(".safetensors")]
         tensors = {part: self.tensors(part) for part in parts}
         obs = tensors["trainer"].get("observations")
         if obs is not None and (obs.dim() != 2 or obs.shape[1] != values["policy"]["observation_size"]):
-            message = f"{self.folder}: 'observations' has wrong shape {tuple(obs.shape)}"
-            raise CheckpointError(f"{message}; use an older checkpoint: RUN@step:N")
+            raise CheckpointError(
+                f"{self.folder}: 'observations' has wrong shape {tuple(obs.shape)}; use an older checkpoint: RUN@step:N"
+            )
         file = self.folder / "trainer.safetensors"  # `self.policy()` has checked the tensors of the policy
         for name, value in tensors["trainer"].items():
             if value.is_floating_point() and not bool(value.isfinite().all()):
@@ -253,12 +256,15 @@ class Checkpoint:
         first, stop, shards = log.first, log.stop, log.shards
         starts = [shard.start for shard in shards] + [stop]
         if [shard.stop for shard in shards] != starts[1:] or starts[0] > first:
-            message = f"{self.folder}/manifest.json is corrupt: '{name}' lacks rows"
-            raise CheckpointError(f"{message}; use an older checkpoint: RUN@step:N")
+            raise CheckpointError(
+                f"{self.folder}/manifest.json is corrupt: '{name}' lacks rows; use an older checkpoint: RUN@step:N"
+            )
         size, limit = sum(shard.size for shard in shards), available_memory() // 3
         if size > limit:
-            message = f"{self.folder}: '{name}' needs {size:,} bytes of memory, at most {limit:,} are used"
-            raise CheckpointError(f"{message}; end other programs")
+            raise CheckpointError(
+                f"{self.folder}: '{name}' needs {size:,} bytes of memory, at most {limit:,} are used"
+                "; end other programs"
+            )
 
         def read(start: int, end: int) -> dict[str, Tensor]:
             parts = []
@@ -268,8 +274,10 @@ class Checkpoint:
                     rows = slice(max(start, shard.start) - shard.start, min(end, shard.stop) - shard.start)
                     parts.append({column: values[rows] for column, values in columns.items()})
             if any(set(part) != set(parts[0]) for part in parts):
-                message = f"{self.folder} is corrupt: the parts of '{name}' have different columns"
-                raise CheckpointError(f"{message}; use an older checkpoint: RUN@step:N")
+                raise CheckpointError(
+                    f"{self.folder} is corrupt: the parts of '{name}' have different columns"
+                    "; use an older checkpoint: RUN@step:N"
+                )
             return {column: torch.cat([part[column] for part in parts]) for column in parts[0]} if parts else {}
 
         return Rows(first, stop, read)
@@ -280,8 +288,9 @@ class Checkpoint:
         columns = _tensors(data, file)
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
-                message = f"{file} is corrupt: rows of '{column}' are missing"
-                raise CheckpointError(f"{message}; use an older checkpoint: RUN@step:N")
+                raise CheckpointError(
+                    f"{file} is corrupt: rows of '{column}' are missing; use an older checkpoint: RUN@step:N"
+                )
         return columns
 
     def _data(self, name: str, limit: int) -> bytes:

@@ -139,7 +139,8 @@ def new_folder(runs_dir: Path, task: str, name: str | None) -> Path:
     """
     require_name(name)
     if len(os.fsencode(task)) > 255:
-        raise UsageError(f"the task's name has {len(os.fsencode(task))} bytes, but a folder's name at most 255")
+        message = f"the task's name has {len(os.fsencode(task))} bytes, but a folder's name at most 255"
+        raise UsageError(message, hint="give the task a shorter name")
     parent = runs_dir / task
     stem = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S") + (f"-{name}" if name else "")
     with disk_errors(parent):

@@ -117,8 +117,9 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
     archive = _archive(data, where)
     described = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
     if len(described) != 1 or archive.getinfo(described[0]).file_size > _PICKLE_LIMIT:
-        message = f"{where} is not a torch file: its data.pkl is missing or too large"
-        raise CheckpointError(f"{message}; save it again with torch.save")
+        raise CheckpointError(
+            f"{where} is not a torch file: its data.pkl is missing or too large; save it again with torch.save"
+        )
     _require_tensors_only(_content(archive, described[0], where), where)
     try:
         with warnings.catch_warnings(action="ignore"):

@@ -126,7 +126,7 @@ class CameraSensorConfig(StrictModel):
     @model_validator(mode="after")
     def _relations(self) -> Self:
         if self.entity is None and (self.camera or self.body):
-            raise ValueError("camera and body belong to an entity: set entity")
+            raise ValueError("the keys camera and body need the key entity: set it, or remove them")
         placed = sorted({"body", "eye", "lookat", "fov"} & self.model_fields_set)
         if self.camera is not None and placed:
             keys = ", ".join(placed)
