@@ -69,8 +69,9 @@ class Evaluation:
         return result
 
     def _condition(self, name: str, bounds: dict[str, Any]) -> dict[str, Any]:
-        """Return the statistics of a condition of success: `held`, the share of episodes in which it held at the end,
-        `value`, its mean value, and its bounds.
+        """Return the statistics of a condition of success.
+
+        `held` is the share of episodes in which it held at the end, `value` its mean value; its bounds are added.
         """
         result = {"held": proportion(sum(self.held[name]), len(self.held[name])), **bounds}
         if name in self.condition_values:
