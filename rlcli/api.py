@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 def make(
     task: str, *, num_envs: int | None = None, seed: int = 42, device: str = "cpu", overrides: Sequence[str] = ()
 ) -> VecEnv:
-    """Return the vectorized environment of a task.
+    """Return the vectorized environment of a task, as `VecEnv`.
 
     Args:
         task: name of an installed task, or the path of a task folder.
@@ -217,7 +217,7 @@ def _find(checkpoint: Path | str | None, task: str | None, runs_dir: Path | str 
 
 
 class _ProgressCallback:
-    """View of a training that calls a function with the progress after each iteration."""
+    """Progress view of a training that calls the function of the user after each iteration."""
 
     def __init__(self, function: Callable[[Progress], None] | None) -> None:
         self._function = function

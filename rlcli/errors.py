@@ -1,4 +1,7 @@
-"""Errors that the user can fix, each with its exit code. Any other exception is a bug and keeps its traceback."""
+"""Errors that the user can fix. The command line ends with the exit code of the class.
+
+Any other exception is a bug and keeps its traceback.
+"""
 
 import difflib
 import itertools
@@ -32,7 +35,7 @@ class RlcliError(Exception):
 
 
 class UsageError(RlcliError):
-    """Invalid command line."""
+    """Error for an invalid command line or an invalid argument of a function. Exit code 2."""
 
     exit_code = 2
     kind = "usage"
@@ -65,7 +68,7 @@ class Problem:
 
 
 class ConfigError(RlcliError):
-    """Invalid configuration. `problems` lists every mistake that was found, not only the first."""
+    """Error for an invalid configuration. `problems` lists every mistake that was found. Exit code 3."""
 
     exit_code = 3
     kind = "config"
@@ -76,64 +79,64 @@ class ConfigError(RlcliError):
 
 
 class ShapeError(ConfigError):
-    """Value of a term with a shape or type that its manager does not accept."""
+    """Error for a term (a reward, an observation, ...) whose result has a wrong shape or type. Exit code 3."""
 
 
 class TaskError(RlcliError):
-    """Missing or broken task or plugin."""
+    """Error for a missing or broken task or plugin. Exit code 4."""
 
     exit_code = 4
     kind = "task"
 
 
 class MissingModelError(TaskError):
-    """Missing robot model that the user must provide."""
+    """Error for a missing robot model that the user must provide. Exit code 4."""
 
 
 class CheckpointError(RlcliError):
-    """Checkpoint or run that is missing, corrupt or does not fit the task."""
+    """Error for a checkpoint or run that is missing, corrupt or does not fit the task. Exit code 5."""
 
     exit_code = 5
     kind = "checkpoint"
 
 
 class DivergedError(RlcliError):
-    """NaN or infinite values of the simulation or the learner."""
+    """Error for NaN or infinite values in the simulation or in the policy update. Exit code 6."""
 
     exit_code = 6
     kind = "diverged"
 
 
 class DependencyError(RlcliError):
-    """Missing optional dependency; the hint is the pip command that installs it."""
+    """Error for a missing optional dependency; the hint is the pip command that installs it. Exit code 7."""
 
     exit_code = 7
     kind = "dependency"
 
 
 class DeviceError(RlcliError):
-    """Requested device that is not available."""
+    """Error for a requested device that is not available. Exit code 8."""
 
     exit_code = 8
     kind = "device"
 
 
 class VerdictError(RlcliError):
-    """Negative result of a command that ran to its end: a check failed, or a limit was not reached."""
+    """Negative result of a command that ran to its end: a check failed, or a limit was missed. Exit code 9."""
 
     exit_code = 9
     kind = "verdict"
 
 
 class MachineError(RlcliError):
-    """Operation that the machine refused: disk, port, OpenGL, storage."""
+    """Error for an operation that the machine refused, such as writing to a full disk. Exit code 10."""
 
     exit_code = 10
     kind = "machine"
 
 
 class Stopped(RlcliError):
-    """Stop of a run on request (Ctrl-C, a signal, a time limit); the run can be resumed."""
+    """Stop of a run on request; the run can be resumed. Exit code 130 for Ctrl-C, 75 for other requests."""
 
     kind = "stopped"
 
@@ -173,7 +176,7 @@ def require_known(name: str, names: Sequence[str], what: str, plural: str) -> No
     Args:
         name: the name that the user typed.
         names: the valid names.
-        what: the kind of name, as in `no {what} '{name}'`.
+        what: what has the name, for the message, such as `policy`.
         plural: the plural of `what`, for the hint.
 
     Raises:
@@ -184,7 +187,7 @@ def require_known(name: str, names: Sequence[str], what: str, plural: str) -> No
 
 
 def listing(names: Iterable[str], limit: int = 20) -> str:
-    """Return the names for a message, separated by commas and cut after `limit` names."""
+    """Return names as text for a message, separated by commas and cut after `limit` names."""
     names = list(names)
     shown = ", ".join(names[:limit])
     return f"{shown}, ... ({len(names)} in all)" if len(names) > limit else shown or "(none)"

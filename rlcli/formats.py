@@ -1,4 +1,4 @@
-"""Interface of plugins that read the task files of other frameworks: their specification and their results."""
+"""Interface for plugins that read the task files of other frameworks: what a plugin declares, and what it returns."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ task's own class; default: the key has its default value; to do: the user must t
 
 @dataclass(frozen=True, slots=True)
 class FormatSpec:
-    """A format of task files. An entry point of the group `rlcli.formats` names an object of this class.
+    """A format of other frameworks' task files. An entry point of the group `rlcli.formats` names such an object.
 
     The module that defines the object must be cheap to import. The format's name is the name of the entry point. Each
     reference below has the form `module:name` and is imported when it is used first; an empty string means that the
@@ -41,15 +41,17 @@ class FormatSpec:
         importer: the function of the command `rlcli import NAME`, which returns an `Imported`. Its parameters have
             Typer's annotations.
         hint: `(error: BaseException) -> str | None`. Return what to do about an error of a task's code.
-        agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration.
+        agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration
+            in the folder.
         models: dotted key in a task's data that `--model NAME=FILE` sets, with `{name}` in the place of NAME; empty: a
             configuration in this format receives the models as an argument, `__rlcli_task__(root, models)`.
         agent_file: `(file: Path, library: str, notes: list[Note]) -> dict | None`. Return the settings of an agent
-            that a registration names by a file; None if the format does not read the library's files.
-        agent_order: libraries of agents, best first; the first one that a registration names is the default agent.
-        aliases: module name -> module, or -> `module:function`. Imports of the first name, and of names below it, in
-            files of a task resolve to the second. `function(name, file)` returns the module of a full name for the
-            importing file, or None.
+            that a registration with Gymnasium names by a file; None if the format does not read the library's files.
+        agent_order: libraries of agents, best first; the first one for which a registration with Gymnasium has an agent
+            is the default agent.
+        aliases: name of a module of the framework -> name of the module that replaces it in imports of task files, or
+            -> `module:function`. Modules below it are replaced, too. `function(name, file)` returns the module for
+            a full name that `file` imports, or None.
         api: the `API_VERSION` that the format was written for.
     """
 
@@ -88,7 +90,7 @@ class Translation:
 
 @dataclass(slots=True)
 class Imported:
-    """Result of an importer: the files that it wrote, and one note for each key of the source."""
+    """Result of `rlcli import`: the files that it wrote, and a note for each key of the other framework's file."""
 
     folder: Path
     """Folder of the new task."""
@@ -102,7 +104,7 @@ class Imported:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """How one key of the source was translated."""
+    """How one key of another framework's file was translated: its status, and a text that explains it."""
 
     where: str
     """File and line of the key; empty if unknown."""
@@ -121,7 +123,7 @@ class Note:
 
 
 def summary(notes: Iterable[Note]) -> list[str]:
-    """Return one line for each of the statuses mapped, approximated and ignored, with the keys that have it."""
+    """Return the lines `mapped: KEYS`, `approximated: KEYS` and `ignored: KEYS` for the notes of a translation."""
     lines, notes = [], list(notes)
     for status in ("mapped", "approximated", "ignored"):
         parents: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""Resources of the machine that this process may use: cores, memory, devices."""
+"""Resources of the machine that this process may use (cores, memory, devices), and settings of its libraries."""
 
 import contextlib
 import errno
@@ -39,7 +39,7 @@ def available_cores(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> int:
 
 
 def launcher_number(name: str, default: int, least: int = 0) -> int:
-    """Return the number in an environment variable that a launcher such as torchrun sets.
+    """Return the number in an environment variable that a launcher such as torchrun sets; `default` if it is not set.
 
     Raises:
         UsageError: if it is no whole number, or below `least`.
@@ -71,7 +71,13 @@ def memory_limit(groups: Path = _GROUPS, own: Path = _OWN_GROUP) -> int | None:
 
 
 def _control_groups(controller: str, groups: Path, own: Path) -> Iterator[Path]:
-    """Yield the folders of this process's control groups, from its own group up to the root group."""
+    """Yield the folders of this process's control groups (Linux), from its own group up to the root group.
+
+    Args:
+        controller: cpu or memory.
+        groups: folder of all groups.
+        own: file that names the process's own group.
+    """
     try:
         lines = [line.split(":", 2) for line in own.read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError):
@@ -86,7 +92,7 @@ def _control_groups(controller: str, groups: Path, own: Path) -> Iterator[Path]:
 
 
 def python_command(*arguments: str) -> list[str]:
-    """Return the command that runs this Python with arguments, without imports from the current folder."""
+    """Return the command that starts this Python with arguments, so that it imports nothing from the current folder."""
     return [sys.executable, "-P", *arguments]
 
 
@@ -116,9 +122,9 @@ def read_plain(file: Path, most: int, *, pipe: bool = False) -> bytes:
             os.set_blocking(descriptor, True)
         data: bytes | None = opened.read(most + 1)
         if data is None:  # files such as /proc/kmsg
-            raise OSError(errno.EAGAIN, "it has no content yet", str(file))
+            raise OSError(errno.EAGAIN, "the system gives no content of this file now", str(file))
     if len(data) > most:
-        raise OSError(errno.EFBIG, f"larger than {most} bytes", str(file))
+        raise OSError(errno.EFBIG, f"the file is larger than {most} bytes, the most that rlcli reads", str(file))
     return data
 
 
@@ -139,7 +145,7 @@ def available_memory(report: Path = Path("/proc/meminfo")) -> int:
 
 
 def memory_error(error: BaseException | None) -> MachineError | None:
-    """Return the error to show if an exception, or one in its chain of causes, means too little memory; else None."""
+    """Return the error to show if an exception, or one of its causes, means that memory was too small; else None."""
     limit = address_space()
     limited = f" (the process is limited to {limit >> 20} MiB)" if limit else ""
     while error is not None:
@@ -164,7 +170,9 @@ def address_space() -> int | None:
 
 
 def require_address_space(least: int = 1 << 30) -> None:
-    """Check that a limit such as `ulimit -v` leaves room for large libraries, which would end the process otherwise.
+    """Check that a limit such as `ulimit -v` leaves enough memory to load large libraries.
+
+    Otherwise the libraries would end the process without a message.
 
     Args:
         least: the limit that the libraries need [bytes]. The default is for torch and MuJoCo.
@@ -178,7 +186,7 @@ def require_address_space(least: int = 1 << 30) -> None:
 
 
 def require_memory(size: int, what: str) -> None:
-    """Check that memory is free: a system that overcommits would kill the process later.
+    """Check that enough memory is free. Without this check, the system may kill the process later.
 
     Args:
         size: the memory [bytes].
@@ -208,7 +216,7 @@ class AddressSpaceCheck:
 
 
 class MatplotlibFinder:
-    """Import hook that imports matplotlib in its own folder.
+    """Import hook that imports matplotlib with its own folder as the current folder.
 
     matplotlib reads a file `matplotlibrc` of the current folder, which may be a pipe or belong to someone else.
     """
@@ -271,7 +279,7 @@ def delay_garbage_collection() -> None:
 
 
 def restore_garbage_collection() -> None:
-    """Undo `delay_garbage_collection`, if it was called. Call it when the large libraries have been imported.
+    """Undo `delay_garbage_collection`, if it was called, after the large libraries have been imported.
 
     The objects that exist now are excluded from all later collections, also from the one at the end of the process.
     """
@@ -281,7 +289,7 @@ def restore_garbage_collection() -> None:
 
 
 def _quota(group: Path) -> float | None:
-    """Return the CPU quota that one control group sets, in cores; None if it sets none."""
+    """Return the CPU quota, in cores, that the control group of a folder sets; None if it sets none."""
     try:
         if (group / "cpu.max").is_file():
             limit, period = (group / "cpu.max").read_text(encoding="utf-8").split()
@@ -293,7 +301,7 @@ def _quota(group: Path) -> float | None:
 
 
 def require_device(device: str) -> None:
-    """Check that torch can use a device on this machine.
+    """Check that torch can use a device, such as `cuda:0`, on this machine.
 
     Raises:
         DeviceError: for any device except cpu and an existing CUDA device.
@@ -313,10 +321,12 @@ def require_device(device: str) -> None:
 
 
 def choose_device(wanted: str) -> str:
-    """Return the torch device for auto, cpu, cuda or cuda:N. auto means the GPU if torch and MuJoCo Warp can use it.
+    """Return the torch device for the value of `--device`: auto, cpu, cuda or cuda:N.
+
+    auto means the GPU if torch and MuJoCo Warp can use it.
 
     Raises:
-        UsageError: for any other name.
+        UsageError: for any other value.
         DeviceError: if the device does not exist.
         DependencyError: for a GPU if rlcli[gpu] is not installed.
     """
@@ -335,13 +345,13 @@ def choose_device(wanted: str) -> str:
 
 
 def has_gpu_driver() -> bool:
-    """Return whether an NVIDIA driver is installed (/dev/dxg is the one of WSL), without importing torch."""
+    """Return whether an NVIDIA driver is installed, also that of WSL, without importing torch."""
     files = ("/proc/driver/nvidia", "/dev/nvidiactl", "/dev/dxg")
     return shutil.which("nvidia-smi") is not None or any(Path(file).exists() for file in files)
 
 
 def processor(info: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
-    """Return the processor's model, its vector instruction sets and a hash of all its flags.
+    """Return the processor's `model`, its vector instruction sets (`kernels`) and a hash of all its `flags`.
 
     Math libraries choose their kernels by these, so results may differ in the last bits between two processors.
     """
@@ -360,7 +370,7 @@ def processor(info: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
 
 
 def has_onednn() -> bool:
-    """Return whether torch was built with oneDNN."""
+    """Return whether torch can use oneDNN, a library with fast CPU kernels."""
     import torch
 
     return bool(torch.backends.mkldnn.is_available())  # type: ignore[no-untyped-call]  # torch has no type here
@@ -368,7 +378,7 @@ def has_onednn() -> bool:
 
 @contextlib.contextmanager
 def native_stderr_discarded() -> Iterator[None]:
-    """Discard what C code in libraries writes to file descriptor 2, such as messages of a library's initialisation."""
+    """Discard what C code writes to stderr (file descriptor 2) in the `with` block, such as messages at its start."""
     with contextlib.ExitStack() as stack:
         try:
             kept = os.dup(2)

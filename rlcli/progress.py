@@ -33,7 +33,7 @@ class Work:
         self.done += count
 
     def fraction(self) -> float:
-        """Return the share of the work that is done; 0 if it is unknown."""
+        """Return the share of the work that is done, from 0 to 1; 0 if it is unknown."""
         return min(1.0, max(self.share, self.done / self.total if self.total else 0.0))
 
 
@@ -44,7 +44,9 @@ view: Callable[[list[Work]], AbstractContextManager[object]] | None = None
 
 @contextlib.contextmanager
 def track(what: str, total: int | None = None, *, has_own_view: bool = False) -> Iterator[Work]:
-    """Report work while the context is open; work inside other work is shown together with it.
+    """Report a piece of work, which is done in the `with` block, so that its progress can be shown.
+
+    Work inside of other work is shown together with it.
 
     Args:
         what: what is counted, such as `episodes`.
@@ -62,7 +64,10 @@ def track(what: str, total: int | None = None, *, has_own_view: bool = False) ->
 
 
 def tracked(items: Iterable[T], what: str, total: int) -> Iterator[T]:
-    """Yield the items, and report each as done when the next one is needed."""
+    """Yield the items one by one, and report the progress: an item is done when the next one is requested.
+
+    `what` is what is counted, `total` the number of items.
+    """
     with track(what, total) as work:
         for item in items:
             yield item

@@ -1,4 +1,4 @@
-"""Pytest fixture `rlcli_check` for authors of tasks. It comes with rlcli and is imported only when a test uses it.
+"""Pytest fixture `rlcli_check`, with which authors of tasks test them. Pytest finds it when rlcli is installed.
 
 ```python
 def test_the_contract(rlcli_check):
@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def rlcli_check() -> Callable[..., list[Finding]]:
-    """Return a function that runs `rlcli check` on a task: it fails the test with all errors and returns the warnings.
+    """Return a function that runs the checks of `rlcli check` on a task.
+
+    It fails the test if there are errors, and returns the warnings.
 
     Its arguments are those of `rlcli.testing.check_task`: the name or folder of a task, `agent`, `overrides`, `only`.
     """

@@ -26,12 +26,12 @@ _BLOCK = 1 << 14
 
 @functools.lru_cache(maxsize=4096)
 def stream(name: str) -> np.uint64:
-    """Return the stream of a term: the first 64 bits of the BLAKE2b hash of its name."""
+    """Return the number of a random stream, such as that of a term: 64 bits of the BLAKE2b hash of its name."""
     return np.uint64(int.from_bytes(hashlib.blake2b(name.encode(), digest_size=8).digest(), "little"))
 
 
 def mix(x: Keys) -> Keys:
-    """Apply SplitMix64's finaliser in place: a bijection in which every output bit depends on every input bit.
+    """Mix the bits of 64-bit words in place with SplitMix64's finaliser: every output bit depends on all input bits.
 
     Overflow of the products is intended: the arithmetic is modulo 2**64.
     """
@@ -44,19 +44,22 @@ def mix(x: Keys) -> Keys:
 
 
 def row_keys(seed: int, env_ids: NDArray[np.int64], counters: NDArray[np.int64]) -> Keys:
-    """Return one key for each row, from the seed, the environment and a counter (episode or step number). (n,)"""
+    """Return the key of each row, from the seed, its environment and its counter (episode or step number). (n,)
+
+    All random numbers of a row are computed from its key.
+    """
     keys = mix(env_ids.astype(np.uint64) * _GOLDEN + start(seed))
     keys += counters.astype(np.uint64) * _GOLDEN
     return mix(keys)
 
 
 def bits(keys: Keys, stream: np.uint64, index: int, count: int) -> Keys:
-    """Return `count` 64-bit words for each row: those with index `index`, `index + 1`, ... of a stream. (n, count)"""
+    """Return `count` random 64-bit words for each key: number `index` and the following ones of a stream. (n, count)"""
     return mix(keys[:, None] + _offsets(int(stream), index, count))
 
 
 def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
-    """Return uniform random numbers in [0, 1), multiples of 2**-24. (n, count)"""
+    """Return uniform random numbers in [0, 1), multiples of 2**-24; the arguments are as in `bits`. (n, count)"""
     unit = np.empty((len(keys), count), np.float32)
     rows = max(1, _BLOCK // max(1, count))
     for first in range(0, len(keys), rows):
@@ -68,7 +71,10 @@ def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np
 
 
 def normal(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
-    """Return standard normal random numbers, each from two uniform ones by the Box-Muller transform. (n, count)"""
+    """Return standard normal random numbers, each from two uniform ones (Box-Muller). (n, count)
+
+    The arguments are as in `bits`.
+    """
     u = uniform(keys, stream, index, 2 * count)
     # log1p(-u) with u in [0, 1) is finite; log(u) would be -inf at u = 0
     radius = np.sqrt(-2.0 * np.log1p(-u[:, :count].astype(np.float64)))
@@ -77,18 +83,21 @@ def normal(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.
 
 
 def integers(keys: Keys, stream: np.uint64, index: int, count: int, high: int) -> NDArray[np.int64]:
-    """Return uniform random integers in [0, high). (n, count)"""
+    """Return uniform random integers from 0 to `high` - 1; the other arguments are as in `bits`. (n, count)"""
     return (uniform(keys, stream, index, count).astype(np.float64) * high).astype(np.int64)
 
 
 def derive(seed: int, name: str) -> int:
-    """Return a 31-bit seed for another library; seeds of different names are independent."""
+    """Return a 31-bit seed for another random generator, from a seed and the generator's purpose (`name`).
+
+    Seeds with different names are independent.
+    """
     return int(mix(_word(seed) ^ stream(name))[0] >> np.uint64(33))
 
 
 @functools.lru_cache
 def start(seed: int) -> Keys:
-    """Return the word from which every key of a seed is computed. (1,)"""
+    """Return the 64-bit word of a seed from which `row_keys` computes all keys. (1,)"""
     return mix(_word(seed) + _GOLDEN)
 
 

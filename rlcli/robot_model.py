@@ -1,4 +1,4 @@
-"""Robot of an MJCF, for `rlcli new --robot`: joints, efforts, default pose, height above the ground, asset files."""
+"""What `rlcli new --robot FILE.xml` must know of a robot: joints, efforts, default pose, height, asset files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ROOT = 1
 
 
 class Robot:
-    """Compiled robot of an MJCF: its joints, their actuators, its default pose, and its height above the ground."""
+    """Robot of an MJCF, compiled: its joints, their actuators, its default pose, and its height above the ground."""
 
     def __init__(self, spec: mujoco.MjSpec, file: Path) -> None:
         self.spec, self.file = spec, file
@@ -67,7 +67,10 @@ class Robot:
         self.inertia = self._inertia()
 
     def kind(self) -> str:
-        """Return the kind of task that fits the robot: velocity, reach or balance."""
+        """Return the kind of task that fits the robot.
+
+        It is velocity (walk as commanded), reach (move the last body to a goal) or balance (keep the default pose).
+        """
         if self.free and len(self.driven) >= max(4, len(self.passive) + 1) and self.feet():
             return "velocity"
         if self.free or self.passive or len(self.driven) < 2:
@@ -75,15 +78,15 @@ class Robot:
         return "reach" if np.ptp(self.workspace(), axis=1).max() > 0.01 else "balance"
 
     def name(self, joint: int) -> str:
-        """Return the name of a joint."""
+        """Return the name of the joint with this id."""
         return str(self.model.joint(joint).name)
 
     def body(self, number: int) -> str:
-        """Return the name of a body."""
+        """Return the name of the body with this id."""
         return str(self.model.body(number).name)
 
     def effort(self, joint: int) -> float:
-        """Return the largest effort of a joint's actuator, else an estimate from the weight that it carries.
+        """Return the largest effort of a joint [N or N m]: its actuator's limit, or an estimate from carried weight.
 
         A joint of a floating base is assumed to carry half of the robot's weight, at half of its height.
         """
@@ -102,7 +105,10 @@ class Robot:
         return max(0.05, weight * (2.0 if model.jnt_type[joint] == SCALAR[1] else lever))
 
     def settings(self) -> dict[str, dict[str, float]]:
-        """Return gains for joints without a position actuator in the file, from their largest effort and inertia."""
+        """Return joint name -> kp, kv and effort_limit, for joints without a position actuator in the file.
+
+        They are estimated from the largest effort and the inertia of each joint.
+        """
         settings = {}
         for joint in self.driven:
             if joint in self.actuator and self.model.actuator_biasprm[self.actuator[joint], 1] < 0.0:
@@ -114,7 +120,7 @@ class Robot:
         return settings
 
     def scene(self) -> dict[str, Any]:
-        """Return the scene of the task as data of its YAML."""
+        """Return the key `scene` of the task for this robot, as data for its YAML."""
         robot: dict[str, Any] = {"model": "model.xml"}
         if self.free:
             robot["pos"] = [0.0, 0.0, round(self.height + 0.005, 4)]
@@ -127,11 +133,11 @@ class Robot:
         return {"num_envs": envs, "env_spacing": 2.5, "entities": {"robot": robot}}
 
     def feet(self) -> list[str]:
-        """Return the bodies that touch the ground in the default pose (with the robot 1 cm lower), without the root."""
+        """Return the names of the bodies, without the root, that touch the ground in the default pose within 1 cm."""
         return [self.body(b) for b in self._touching(-0.01) if self.model.body_weldid[b] != _ROOT]
 
     def trunk(self) -> list[str]:
-        """Return the root and the bodies fixed to it, those with a geom."""
+        """Return the names of the root and of the bodies that are fixed to it, if they have a geom."""
         return [self.body(b) for b in dict.fromkeys(self.model.geom_bodyid) if self.model.body_weldid[b] == _ROOT]
 
     def _stand(self) -> float:
@@ -144,9 +150,9 @@ class Robot:
         return high
 
     def _touching(self, height: float, *, absolute: bool = False) -> list[int]:
-        """Return the bodies with a colliding geom below z = 0 after the root is raised by a height [m].
+        """Return the ids of the bodies with a colliding geom below z = 0 if the root is moved.
 
-        If `absolute` is true, the root is placed at this height instead.
+        The root is raised by `height` [m] from its place in the default pose; with `absolute`, it is at this height.
         """
         model, data = self.model, mujoco.MjData(self.model)
         data.qpos[:] = self.data.qpos
@@ -165,9 +171,10 @@ class Robot:
         return {j: float(matrix[self.model.jnt_dofadr[j], self.model.jnt_dofadr[j]]) for j in self.joints}
 
     def workspace(self) -> list[list[float]]:
-        """Return a box of positions of the last body near the default pose, 20 % to 80 % of 300 random ones [m]. (3, 2)
+        """Return a box of positions that the last body can reach: [low, high] along x, y and z [m].
 
-        Positions are in the frame of the fixed root, as the goals of commands.
+        300 random poses near the default one are tried; the box goes from 20 % to 80 % of the positions along each
+        axis. Positions are in the frame of the fixed root, as the goals of commands.
         """
         generator, model, data = np.random.default_rng(0), self.model, mujoco.MjData(self.model)
         body, turn = self.last_body(), np.zeros(9)
@@ -185,7 +192,7 @@ class Robot:
         return [[round(float(x), 3) for x in ends] for ends in np.percentile(places, [20, 80], axis=0).T]
 
     def last_body(self) -> int:
-        """Return the body at the end of the longest chain of driven joints."""
+        """Return the id of the body at the end of the longest chain of driven joints, such as a gripper."""
 
         def length(body: int) -> int:
             count = 0
@@ -198,7 +205,10 @@ class Robot:
 
 
 def _home(spec: mujoco.MjSpec) -> np.ndarray | None:
-    """Return `qpos` of the keyframe home or stand, else of the first one, else of the numeric `init_qpos`."""
+    """Return the robot's default pose as `qpos`: of the keyframe home or stand, else of the first keyframe.
+
+    Without a keyframe it is the numeric `init_qpos`; None if there is none.
+    """
     keys = sorted(spec.keys, key=lambda key: key.name not in ("home", "stand", "standing"))
     start = next((numeric for numeric in spec.numerics if numeric.name == "init_qpos"), None)  # a habit of Gymnasium
     if keys:
@@ -207,7 +217,7 @@ def _home(spec: mujoco.MjSpec) -> np.ndarray | None:
 
 
 def _clean(spec: mujoco.MjSpec) -> None:
-    """Remove what the scene has itself (ground, lights, keyframes), and name every element."""
+    """Remove ground, lights and keyframes from a model, because the task's scene has its own; name every element."""
     for key in list(spec.keys):
         spec.delete(key)
     world = spec.worldbody
@@ -225,7 +235,10 @@ def _clean(spec: mujoco.MjSpec) -> None:
 
 
 def _put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
-    """Make the body with most driven joints the first one, the root of an entity; centre and level it if it is free."""
+    """Move the body with most driven joints to the first place of an MJCF: the first body is the root of an entity.
+
+    If it is free, it is placed at the origin, and made level.
+    """
     joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     driven = model.actuator_trnid[joint_actuator, 0] if model.nu else np.flatnonzero(np.isin(model.jnt_type, SCALAR))
     world, bodies = tree.find("worldbody"), tree.findall("worldbody/body")
@@ -246,7 +259,7 @@ def _put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
 
 
 def _insert_level_root(body: ElementTree.Element) -> None:
-    """Move the free joint of a body to a new parent that is level, because terms read the tilt of the root.
+    """Give a free body a new parent with the free joint, whose z axis points up: terms read the tilt of the root.
 
     The element of the body becomes the new parent, and a copy of the body its child.
     """
@@ -260,7 +273,7 @@ def _insert_level_root(body: ElementTree.Element) -> None:
 
 
 def _collect_assets(tree: ElementTree.Element, spec: mujoco.MjSpec, file: Path) -> dict[str, Path]:
-    """Refer to all files of an MJCF in the folder `assets`, and return these files by their new place."""
+    """Change the paths of all files that an MJCF loads to the folder `assets`; return new path -> present file."""
     found: dict[str, Path] = {}
     home = Path(spec.modelfiledir or file.parent)
     for element in tree.iter():
@@ -287,7 +300,7 @@ def _collect_assets(tree: ElementTree.Element, spec: mujoco.MjSpec, file: Path) 
 
 
 def _compile_copy(xml: str, assets: Mapping[str, Path]) -> mujoco.MjModel:
-    """Compile an MJCF with its files in memory, without any other file.
+    """Compile an MJCF text with the files `assets` (path in the MJCF -> file), which are given to MuJoCo in memory.
 
     Raises:
         ValueError: if MuJoCo cannot compile it, for example because it needs a further file.
@@ -313,5 +326,5 @@ def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
 
 
 def short(value: float) -> float:
-    """Return a number rounded to three significant digits."""
+    """Return a number, rounded to three significant digits."""
     return float(f"{value:.3g}")

@@ -36,7 +36,13 @@ _DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{n}" for port in ("com", "lpt"
 def create(
     name: str, flavour: str, folder: Path | None = None, robot: RobotTask | None = None
 ) -> tuple[Path, list[str]]:
-    """Write the package of a new task, completely or not at all. With `robot`, its model and YAML are used.
+    """Write the package of a new task, completely or not at all.
+
+    Args:
+        name: name of the task.
+        flavour: which template; not used with `robot`.
+        folder: folder of the package; None: a folder with the task's name.
+        robot: model and YAML of a task for a robot of the user (`rlcli new --robot`).
 
     Returns:
         The folder of the package, and its files relative to that folder.
@@ -99,7 +105,7 @@ def check_name(name: str) -> None:
 
 
 def render(name: str, flavour: str, summary: str = "") -> dict[str, str]:
-    """Return the files of a new task: path within its folder -> text."""
+    """Return the files of a new task's package, from the templates: path within the package's folder -> text."""
     import jinja2
 
     package = name.replace("-", "_")
@@ -121,7 +127,14 @@ _SCHEMA = "task.schema.json"
 
 
 def _write(folder: Path, files: dict[str, str], package: str, assets: Mapping[str, Path]) -> None:
-    """Write all files to a temporary folder beside the target folder, then move them when they are complete."""
+    """Write all files to a temporary folder beside the target folder, and move them when they are complete.
+
+    Args:
+        folder: the target folder.
+        files: path within the folder -> text.
+        package: name of the Python package, for which the JSON Schema of its task is written, too.
+        assets: path within the folder -> file to copy, such as a mesh.
+    """
     from rlcli.config.dump import json_schema
     from rlcli.config.load import extensions
 
@@ -164,14 +177,14 @@ def _check_folder(folder: Path) -> None:
 
 
 def _suggest_name(name: str) -> str | None:
-    """Return a hint with a valid name that is similar to an invalid one."""
+    """Return the hint for an invalid task name: a valid name that is similar to it."""
     words = re.sub(r"([a-z0-9])([A-Z])", r"\1-\2", name)
     near = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-").lstrip("0123456789-")
     return f"did you mean '{near}'?" if near and near != name and name.isascii() else "use my-arm, for example"
 
 
 def _installed(name: str) -> str | None:
-    """Return the installed distribution of this name with its version; None if there is none."""
+    """Return name and version of the installed distribution of this name; None if there is none."""
     try:
         return f"{name} {metadata.version(name)}"
     except metadata.PackageNotFoundError:

@@ -29,7 +29,7 @@ _current: Mapping[str, Any] = {}
 
 @contextmanager
 def use_settings(settings: Mapping[str, Any]) -> Iterator[None]:
-    """Make `setting` read from these settings inside the `with` block."""
+    """Use these settings (key -> value) for `setting` inside the `with` block."""
     global _current
     before, _current = _current, settings
     try:

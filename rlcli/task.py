@@ -38,12 +38,12 @@ class TaskSpec:
 
     def __post_init__(self) -> None:
         if isinstance(self.terms, str):
-            raise TypeError(f"terms must be a tuple of modules; write ({self.terms!r},)")
+            raise TypeError(f"terms of a TaskSpec must be a tuple of modules; write ({self.terms!r},)")
         if not isinstance(self.api, int) or self.api < 1:
-            raise TypeError(f"api must be a whole number of 1 or more, found {self.api!r}")
+            raise TypeError(f"api of a TaskSpec must be a whole number of 1 or more, found {self.api!r}")
         for name in ("package", "summary", "config", "policies"):
             if not isinstance(getattr(self, name), str):
-                raise TypeError(f"{name} must be a string, found {getattr(self, name)!r}")
+                raise TypeError(f"{name} of a TaskSpec must be a string, found {getattr(self, name)!r}")
 
 
 # Aliases for the parameters of terms. A YAML file gives a name or regular expressions; the term receives the object or

@@ -1,4 +1,4 @@
-"""Interface of trainer plugins: `TrainerSpec`."""
+"""Interface for plugins that bring a trainer (a learning algorithm): `TrainerSpec`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,1 +1,1 @@
-"""Configuration: the strict YAML reader, the schema of a task, and the layers of a resolved configuration."""
+"""Configuration of a task: strict YAML reader, schema, and how files and command line are merged and checked."""

@@ -60,7 +60,10 @@ _Dumper.add_representer(list, _sequence)
 
 
 def to_data(resolved: Resolved) -> dict[str, Any]:
-    """Return the whole configuration as plain data: patches applied, with all defaults, with the chosen agent only."""
+    """Return the whole configuration as plain data, as YAML or JSON can hold it.
+
+    It has all defaults, the changes that the chosen agent and `play:` make, and of the agents only the chosen one.
+    """
     data = resolved.task.model_dump(mode="json", exclude={"agents"})
     data |= data.pop("foreign")
     data["play"] = resolved.layers.data.get("play", {})
@@ -78,10 +81,10 @@ def to_yaml(data: dict[str, Any]) -> str:
 
 
 def select(data: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:
-    """Return the parts of a configuration at some dotted keys; all of it without keys.
+    """Return a configuration with these dotted keys only, such as `sim.dt`; without keys the whole configuration.
 
     Raises:
-        UsageError: for a key that it does not have.
+        UsageError: for a key that the configuration does not have.
     """
     found: dict[str, Any] = {} if keys else data
     for key in keys:
@@ -100,9 +103,13 @@ def select(data: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:
 
 
 def to_yaml_with_origins(resolved: Resolved, data: dict[str, Any] | None = None) -> str:
-    """Return a part of the configuration as YAML with the origin of every value as a comment, and a list of the files.
+    """Return a configuration as YAML. A comment names the origin of each value: the file and line that set it.
 
-    A comment has only the name of a file, with a parent folder where two files have the same name.
+    The comments have short names of files; the first lines of the YAML list the full paths.
+
+    Args:
+        resolved: the configuration.
+        data: the part of it to write, from `select`; None: all of it.
     """
     lines: list[str] = []
     _annotate(to_data(resolved) if data is None else data, (), resolved, lines)
@@ -117,7 +124,12 @@ def to_yaml_with_origins(resolved: Resolved, data: dict[str, Any] | None = None)
 
 
 def origins(resolved: Resolved, data: dict[str, Any] | None = None) -> dict[str, str]:
-    """Return the origin of every value of a part of the configuration, by dotted key."""
+    """Return dotted key -> origin (the file and line, override or flag that set the value; `default` if none did).
+
+    Args:
+        resolved: the configuration.
+        data: the part of it to look at, from `select`; None: all of it.
+    """
     return {
         messages.dotted(path): _origin(resolved, path)
         for path, _ in leaves(to_data(resolved) if data is None else data)
@@ -125,12 +137,12 @@ def origins(resolved: Resolved, data: dict[str, Any] | None = None) -> dict[str,
 
 
 def explicit_values(resolved: Resolved) -> dict[str, str]:
-    """Return the origin of every value set on the command line or in a `--config` file, by dotted key."""
+    """Return dotted key -> origin of the values that the command line or a `--config` file sets."""
     return {messages.dotted(path): _location(origin) for path, origin in _explicit_origins(resolved)}
 
 
 def preset_of(resolved: Resolved, names_agent: bool) -> dict[str, Any]:
-    """Return the values set on the command line or in a `--config` file, in the form of such a file.
+    """Return the values that the command line or a `--config` file sets, in the form of a `--config` file.
 
     Args:
         resolved: the configuration.
@@ -198,7 +210,7 @@ def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -
 
 
 def _annotate(value: Any, path: Path, resolved: Resolved, lines: list[str]) -> None:
-    """Append the YAML lines of a mapping, each value with its origin."""
+    """Append the YAML of the mapping at a path to `lines`, with the origin of each value as a comment."""
     indent = "  " * len(path)
     for key, item in value.items():
         below = (*path, key)
@@ -217,7 +229,7 @@ def _inline(value: object) -> str:
 
 
 def _origin(resolved: Resolved, path: Path) -> str:
-    """Return the origin of a value as text; for a list also the origins of overridden items."""
+    """Return the origin of the value at a path as text; for a list also the origins of items that overrides changed."""
     known = resolved.layers.origins
     if path not in known:
         return "default"
@@ -237,7 +249,10 @@ def _explicit_origins(resolved: Resolved) -> list[tuple[Path, Origin]]:
 
 
 def _until_list(data: object, path: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
-    """Return the path up to the first list, and the value there, because a file can only replace a whole list."""
+    """Cut a path at the first list on it, and return it with the value there.
+
+    An override can change one item of a list, but a `--config` file can only replace the whole list.
+    """
     for depth, step in enumerate(path):
         if not isinstance(data, dict):
             return path[:depth], data

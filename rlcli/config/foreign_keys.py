@@ -1,4 +1,7 @@
-"""Move top-level keys of a task file that belong to another framework's format into its key `foreign`."""
+"""Keys of a task file that only the environment class of another framework's format reads.
+
+Such a key is at the top level of the file; in a `TaskConfig` it is inside of the key `foreign`.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,7 +11,7 @@ from rlcli.registry.formats import format_keys
 
 
 def foreign_keys(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys that a task file in rlcli's own format does not have, with their values."""
+    """Return the top-level keys of a task file that rlcli's own format does not have, with their values."""
     return {key: value for key, value in data.items() if key not in TaskConfig.model_fields}
 
 

@@ -1,4 +1,4 @@
-"""Models of robots that a user gives for task files of other frameworks: `--model NAME=FILE`, or a YAML file."""
+"""The option `--model`: the user's MJCF files for tasks of other frameworks, whose files name no MJCF."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path as FilePath
@@ -15,10 +15,11 @@ MODELS = "models"
 
 
 def read_models(words: Iterable[str]) -> dict[str, Any]:
-    """Return the model of each robot or object: of `NAME=FILE`, or of a YAML file `{NAME: FILE}`.
+    """Return the name of each robot or object -> its MJCF file, from the values of `--model`.
 
-    FILE is an MJCF, relative to the YAML file if it is in one, or `TASK:FILE`, a model of an installed task. In a YAML
-    file it may be `{model: FILE, gains: {GROUP: {stiffness: S, damping: D}}}`, with gains that replace a network.
+    A value is `NAME=FILE` or a YAML file with `{NAME: FILE}`. FILE is an MJCF, relative to the YAML file if it is in
+    one, or `TASK:FILE`, a model of an installed task. In a YAML file it may be `{model: FILE, gains: {GROUP:
+    {stiffness: S, damping: D}}}`, with PD gains for actuators that the task describes by a neural network.
 
     Raises:
         ConfigError: if a YAML file cannot be read, or is not such a mapping.
@@ -44,7 +45,7 @@ def read_models(words: Iterable[str]) -> dict[str, Any]:
 
 
 def recorded_models(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the models and gains in the record of a run, in the form of `read_models`."""
+    """Return the models and gains in the configuration that a run has stored, in the form of `read_models`."""
     entities = (task.get("scene") or {}).get("entities") or {}
     return {
         name: {"model": entity["model"], "gains": entity.get("actuators") or {}}
@@ -54,14 +55,19 @@ def recorded_models(task: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def model_path(path: Path, form: Format | None, problems: list[Problem]) -> Path:
-    """Return the path in a task's data that `--model NAME=FILE` sets; `path` is its override, `models.NAME`.
+    """Return the path of the key that `--model NAME=FILE` sets in a task's data; an empty path if it sets no key.
 
-    The path is empty for a format whose configurations receive the models when they are read, and for a task in rlcli's
-    own format, for which a problem is added.
+    It sets none in a format whose configurations receive the models while they are read. `--model` is a mistake for a
+    task in rlcli's own format, which names its models itself.
+
+    Args:
+        path: `("models", NAME)`.
+        form: the format of the task; None: rlcli's own format.
+        problems: the list to which the mistake is added.
     """
     name = ".".join(map(str, path[1:]))
     if form is None:
         hint = f"set scene.entities.{name}.model"
-        problems.append(Problem(f"--model {name}", "", "this task names its models itself", hint))
+        problems.append(Problem(f"--model {name}", "", "this task names its model files itself", hint))
     keys = form.spec.models.split(".") if form is not None and form.spec.models else ()
     return tuple(name if key == "{name}" else key for key in keys)

@@ -1,4 +1,7 @@
-"""Layers of raw configuration, merged in order. Every value keeps its origin: the file and line it was written in."""
+"""Merging of the sources of a configuration (task, agent, --config file, command line) before it is validated.
+
+Each source is one layer; later layers win. Every value keeps its origin: the file and line that it was written in.
+"""
 
 import copy
 import re
@@ -19,10 +22,11 @@ _OVERRIDE = re.compile(rf"\s*((?:{_KEY.pattern})(?:\.(?:{_KEY.pattern}))*)\s*=(.
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Origin of a value.
+    """Origin of a value of a configuration: which source set it, and where.
 
-    `layer` is task, agent, play, config, override, flag or settings. `where` is `file:line:column`, the text of an
-    override, or a flag.
+    `layer` is the kind of source: task (the task's file), agent (`task:` of an agent), play (`play:` of the task),
+    config (the `--config` file), override, flag or settings (the user's settings file). `where` is `file:line:column`,
+    the text of an override, or a flag.
     """
 
     layer: str
@@ -31,7 +35,7 @@ class Origin:
 
 @dataclass(slots=True)
 class Layers:
-    """Configuration merged from several layers: the data, and the origin of the value at every path."""
+    """Configuration merged from several sources: the data, and the origin of the value at every path (its keys)."""
 
     data: dict[str, Any] = field(default_factory=dict)
     origins: dict[Path, Origin] = field(default_factory=dict)
@@ -39,7 +43,7 @@ class Layers:
     def merge(self, patch: Mapping[str, Any], origin: Callable[[Path], Origin], at: Path = ()) -> None:
         """Merge a patch into the data at path `at`: mappings key by key, all other values are replaced.
 
-        `origin` returns the origin of the value at a path of the patch.
+        `origin(path)` returns the origin of the value at that path of the patch.
         """
         self.origins.setdefault((), origin(()))
         self._merge(patch, origin, at, ())
@@ -98,12 +102,19 @@ class Layers:
         return None
 
     def place(self, path: Path) -> str:
-        """Return the location of the value at a path, for a message."""
+        """Return where the value at a path was written, for a message: `file:line:column`, an override or a flag."""
         origin = self.origin(path)
         return origin.where if origin else "configuration"
 
     def _descend(self, target: object, step: str | int, taken: Path, origin: Origin) -> tuple[Any, Path]:
-        """Return the member `step` of a value and its path; create a mapping if there is no member."""
+        """Return the member `step` of a mapping or list, and its path; a mapping without it gets an empty mapping.
+
+        Args:
+            target: the mapping or list.
+            step: key or index of the member.
+            taken: path of `target`.
+            origin: origin of a member that is created.
+        """
         if isinstance(target, list):
             index = _index(target, step, taken)
             return target[index], (*taken, index)
@@ -153,7 +164,14 @@ def read(file: FilePath, name: str | None = None, *, pipe: bool = False) -> Docu
 
 
 def document_origins(document: Document, name: str, layer: str, at: Path = ()) -> Callable[[Path], Origin]:
-    """Return a function that maps a path below `at` in a document to its origin."""
+    """Return the function from the path of a value, relative to `at`, to the value's origin.
+
+    Args:
+        document: the parsed file.
+        name: name of the file.
+        layer: kind of source, as in `Origin`.
+        at: path in the document at which the values are.
+    """
 
     def origin(path: Path) -> Origin:
         full = at + path
@@ -204,7 +222,7 @@ def parse_override(text: str) -> tuple[Path, Any]:
 
 
 def override_place(text: str) -> str:
-    """Return the location of an override, for a message."""
+    """Return the text that names an override as the location of a mistake in a message."""
     return f"override '{shorten(text, 150)}'"
 
 
@@ -214,7 +232,7 @@ def parse_address(text: str) -> tuple[str, ...]:
 
 
 def without(data: Any, paths: Iterable[Path]) -> Any:
-    """Return a copy of the data with null at these paths, for values that are validated separately."""
+    """Return a copy of nested mappings with None at these paths; the values there are validated separately."""
     inner: dict[Any, list[Path]] = {}
     for path in paths:
         if path == ():

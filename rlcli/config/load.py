@@ -29,7 +29,7 @@ __all__ = ["Resolved", "agent_names", "check_all", "extensions", "resolve", "ter
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """A validated configuration with the origin of each value."""
+    """A validated configuration: the task, the chosen agent, and the origin of each value (in `layers`)."""
 
     source: TaskSource
     """Where the task comes from."""
@@ -50,7 +50,7 @@ class Resolved:
     """The other framework's format in which the task is written; None: rlcli's own."""
 
     def place(self, path: Path) -> str:
-        """Return the location of the value at a path, for a message."""
+        """Return where the value at a path was written, for a message: `file:line:column`, an override or a flag."""
         return self.layers.place(path)
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> Problem:
@@ -175,7 +175,9 @@ def check_all(source: TaskSource, *, config_file: FilePath | None = None, overri
 
 
 def extensions(source: TaskSource) -> tuple[Vocabulary, type[BaseModel] | None]:
-    """Return what a task adds to the schema: its own terms, and the model of a direct task's parameters (or None).
+    """Return the terms that a task may name, its own ones included, and the model of a direct task's parameters.
+
+    The model is None for a manager-based task, and for a direct task without parameters.
 
     Raises:
         ConfigError: if the source code of the task cannot be read.

@@ -1,4 +1,4 @@
-"""Messages for the validation errors of pydantic: the key, the value found, what is allowed, the most similar key."""
+"""Conversion of pydantic's validation errors to messages: the key, the value found, what is allowed, a similar key."""
 
 import functools
 import json
@@ -43,7 +43,7 @@ def problems(
     prefix: Path = (),
     locations: KeyLocations | None = None,
 ) -> Iterator[Problem]:
-    """Yield the errors of a validation as problems.
+    """Yield pydantic's errors as `Problem`s: with the location in the file, and in words for users.
 
     Args:
         error: the error that pydantic raised.
@@ -80,7 +80,10 @@ def format_value(value: object) -> str:
 
 
 def key_locations(models: Mapping[str, type[BaseModel]]) -> dict[str, list[str]]:
-    """Return the dotted paths of every key of some models. `models` maps a dotted prefix to a model ('': the task)."""
+    """Return each key of some models -> the dotted paths at which the key is allowed.
+
+    `models` maps the dotted path of a model in the configuration to the model; the path of the task's model is ''.
+    """
     found: dict[str, list[str]] = {}
     for prefix, model in models.items():
         for key, location in _keys(model, prefix):
@@ -91,7 +94,7 @@ def key_locations(models: Mapping[str, type[BaseModel]]) -> dict[str, list[str]]
 def _message(
     path: Path, items: list[Any], model: type[BaseModel], data: object, locations: KeyLocations
 ) -> tuple[str, str | None, Path]:
-    """Return the message, the hint and the path for pydantic's errors at one path."""
+    """Return the message, the hint and the path to report for `items`, pydantic's errors at one path of the data."""
     kind, found = items[0]["type"], items[0]["input"]
     if kind == "extra_forbidden":
         return f"unknown key '{path[-1]}'", _suggest_key(str(path[-1]), _fields(model, path[:-1]), locations), path
@@ -121,12 +124,12 @@ def _message(
 
 
 def expected_and_found(items: Sequence[Any]) -> str:
-    """Return the message for pydantic's errors of one value."""
+    """Return `expected ..., found ...` for `items`, pydantic's errors of one value."""
     wanted = " or ".join(dict.fromkeys(map(_expected, items)))
     return f"expected {wanted}, found {format_value(items[0]['input'])}"
 
 
-_OTHER_PLACES = {
+_KEYS_OF_OTHER_FRAMEWORKS = {
     "env": ("scene", "remove 'env.': the keys of a task are at the top level, for example scene.num_envs"),
     "params": ("func", "write the parameters of a term beside its 'func'"),
     "device": ("dt", "the device is an option: --device cpu"),
@@ -135,9 +138,15 @@ _OTHER_PLACES = {
 
 
 def _suggest_key(key: str, fields: Iterable[str], locations: KeyLocations) -> str:
-    """Return the hint for an unknown key in a mapping with these fields."""
+    """Return the hint for an unknown key of a mapping: a similar key, where the key belongs, or the allowed keys.
+
+    Args:
+        key: the unknown key.
+        fields: the keys that the mapping may have.
+        locations: where each key belongs in the whole schema.
+    """
     fields = list(fields)
-    beside, instead = _OTHER_PLACES.get(key, ("", ""))
+    beside, instead = _KEYS_OF_OTHER_FRAMEWORKS.get(key, ("", ""))
     if beside in fields:
         return instead
     similar = did_you_mean(key, fields)
@@ -154,7 +163,7 @@ def _inside(location: str) -> str:
 
 
 def _expected(item: Any) -> str:
-    """Return what pydantic expected, in words."""
+    """Return what was expected by one of pydantic's errors, in words: `a number > 0`, `true or false`."""
     kind, context = item["type"], item.get("ctx", {})
     if kind in _BOUNDS:
         sign, key = _BOUNDS[kind]
@@ -180,7 +189,7 @@ def _choices(item: Any) -> list[str]:
 
 
 def _unquoted(text: str, items: Iterable[Any]) -> str | None:
-    """Return the hint for a number or truth value that was written in quotes by mistake."""
+    """Return the hint to remove the quotes if `text` is a number or truth value in quotes; None for other text."""
     try:
         value = strict_yaml.load_value(text)
     except strict_yaml.YamlError:
@@ -193,7 +202,7 @@ def _unquoted(text: str, items: Iterable[Any]) -> str | None:
 
 
 def _data_path(item: Any, data: Any) -> Path:
-    """Return the path of an error in the data. Pydantic's location also has the tags of unions, which are removed."""
+    """Return the path in the data of one of pydantic's errors: its location without the tags of unions."""
     path: list[str | int] = []
     location = item["loc"]
     for position, step in enumerate(location):
@@ -225,7 +234,7 @@ def _length(model: type[BaseModel], path: Path) -> int | None:
 
 
 def _arms_at(model: type[BaseModel], path: Path) -> list[Any]:
-    """Return the types that the value at a path of a model may have."""
+    """Return the types that a model allows for the value at a path."""
     arms: list[Any] = [model]
     for step in path:
         arms = [below for arm in arms for child in _children(arm, step) for below in _arms(child)]
@@ -243,7 +252,7 @@ def _children(arm: Any, step: str | int) -> Iterator[Any]:
 
 
 def _arms(annotation: object) -> Iterator[Any]:
-    """Yield the alternatives of an annotation, without `Annotated` and unions."""
+    """Yield the plain types that an annotation allows: the members of unions, without `Annotated` and None."""
     if get_origin(annotation) in (Union, types.UnionType):
         for arm in get_args(annotation):
             yield from _arms(arm)
@@ -254,7 +263,10 @@ def _arms(annotation: object) -> Iterator[Any]:
 
 
 def _keys(model: type[BaseModel], prefix: str) -> Iterator[tuple[str, str]]:
-    """Yield every key of a model and its dotted path, nested models included."""
+    """Yield (key, dotted path of the key) for every key of a model and of the models inside it.
+
+    `prefix` is the dotted path of the model.
+    """
     for name, field in model.model_fields.items():
         location = f"{prefix}.{name}".lstrip(".")
         yield name, location

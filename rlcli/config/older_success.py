@@ -48,7 +48,7 @@ _OWN_KEYS = {
 
 
 def upgraded(document: Document, file: Path) -> Document:
-    """Return the content of a file; in the configuration of a run, `success` gets its present form."""
+    """Return a parsed file; if it is the `config.yaml` of a run, convert its `success` to the present form."""
     success = document.data.get("success")
     if file.name == "config.yaml" and isinstance(success, dict) and isinstance(success.get("func"), str):
         document.data["success"] = _named_conditions(success)
@@ -56,7 +56,7 @@ def upgraded(document: Document, file: Path) -> Document:
 
 
 def _named_conditions(success: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the named conditions that equal one condition of the earlier form, `{func: ..., hold_s: ...}`."""
+    """Return the named conditions, `{NAME: {func: ...}}`, that equal `success` in its earlier form, `{func: ...}`."""
     bounds = _CONDITIONS.get(str(success["func"]), {})
     if not bounds:
         return {"success": dict(success)}  # a function of the task, which returns a truth value

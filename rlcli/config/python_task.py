@@ -33,11 +33,14 @@ _AGENTS = "agents/*.py"
 
 @dataclass(slots=True)
 class PythonTask:
-    """A task as plain data, with the functions that its terms name and the notes of the translation."""
+    """A task that was written in Python, as plain data."""
 
     data: dict[str, Any]
+    """The task as a YAML file would contain it; functions of terms are replaced by their names."""
     terms: dict[str, Signature] = field(default_factory=dict)
+    """Name in `data` -> signature of a function that is not a term of `rlcli.mdp`."""
     notes: list[Note] = field(default_factory=list)
+    """How each setting was translated, for a configuration of another framework."""
     format: Format | None = None
     """The other framework's format to whose classes the configuration belongs; None: rlcli's own."""
     place: str = ""
@@ -45,11 +48,11 @@ class PythonTask:
 
 
 def source_of(value: object, root: FilePath | None = None, name: str = "task") -> TaskSource:
-    """Return the source of a task that exists in memory only.
+    """Return the `TaskSource` of a configuration that exists in memory only.
 
     Args:
-        value: the configuration.
-        root: the folder of its models; None: the current folder.
+        value: the configuration: a `TaskConfig`, a mapping, or a function that returns one.
+        root: the folder to which the paths of its models are relative; None: the current folder.
         name: the name of the task.
     """
     root = (root or FilePath.cwd()).resolve()
@@ -57,10 +60,14 @@ def source_of(value: object, root: FilePath | None = None, name: str = "task") -
 
 
 def load(source: TaskSource, models: Mapping[str, Any] | None = None) -> PythonTask:
-    """Return the configuration of a task in Python. `models`: robot or object -> its model, from --model.
+    """Import the configuration of a task in Python and convert it to plain data.
+
+    Args:
+        source: the task.
+        models: name of a robot or object -> its MJCF file, from `--model`.
 
     Raises:
-        TaskError: if the code of the task raises an error, or the object does not exist.
+        TaskError: if the code of the task raises an error, or the configuration's object does not exist.
         ConfigError: if the object is not a configuration.
     """
     if source.value is not None:
@@ -91,7 +98,13 @@ def load(source: TaskSource, models: Mapping[str, Any] | None = None) -> PythonT
 
 
 def to_task(value: Any, label: str, root: FilePath, models: Mapping[str, Any] | None = None) -> PythonTask:
-    """Return a configuration object as plain data.
+    """Convert a configuration object to plain data.
+
+    Args:
+        value: the object, or a function that returns it.
+        label: name of the configuration in messages.
+        root: the folder of the task.
+        models: name of a robot or object -> its MJCF file, from `--model`.
 
     Raises:
         ConfigError: if the object is not a configuration.
@@ -113,21 +126,23 @@ def to_task(value: Any, label: str, root: FilePath, models: Mapping[str, Any] | 
 
 
 def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
-    """Return an agent's settings as plain data.
+    """Return the settings of an agent as plain data.
 
-    `value` is a mapping, the model of a trainer's settings, or an object with `__rlcli_agent__(notes)`.
+    Args:
+        value: a mapping, the settings of a trainer (an `AgentConfig`), or an object with `__rlcli_agent__(notes)`.
+        notes: the list to which notes about the translation are added.
     """
     value = value() if isinstance(value, type) else value
     if hasattr(value, "__rlcli_agent__"):
         value = value.__rlcli_agent__(notes)
     plain = _PlainData({}, "agent").plain(value, ())
     if not isinstance(plain, dict):
-        raise TypeError(f"the agent is of type {type(value).__name__}; write a mapping of settings")
+        raise TypeError(f"the agent is of type {type(value).__name__}; write a mapping")
     return plain
 
 
 def _place_of(value: object) -> str:
-    """Return `file:line` of the class of a configuration in another framework's form; empty for others."""
+    """Return `file:line` of the class of a configuration of another framework; empty for rlcli's own configurations."""
     kind = value if isinstance(value, type) else type(value)
     if not hasattr(kind, "__rlcli_task__") or is_framework(kind.__module__):
         return ""
@@ -140,7 +155,10 @@ def _place_of(value: object) -> str:
 
 
 class _PlainData:
-    """Converter of a configuration to plain data. Only values that were set are written; defaults are left out."""
+    """Converter of a configuration object to plain data. Defaults are left out: only values that were set are written.
+
+    `label` names the configuration in messages. Functions that are not terms of `rlcli.mdp` are added to `terms`.
+    """
 
     def __init__(self, terms: dict[str, Signature], label: str) -> None:
         self.terms = terms
@@ -175,7 +193,7 @@ class _PlainData:
         return None
 
     def _term(self, term: object, path: tuple[str | int, ...]) -> str:
-        """Return the name of a function in the task's vocabulary; add the function if it is new."""
+        """Return the name in YAML of a function or class that is a term; add it to `terms` if it is not built in."""
         section = str(path[0])
         wanted = getattr(term, "__name__", type(term).__name__)
         wanted = snake_case(wanted) if isinstance(term, type) else wanted
@@ -203,7 +221,7 @@ def _target(term: Any) -> Any:
 
 
 def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
-    """Import the configuration of a source, and its further agents."""
+    """Import the configuration of a task in Python; return it and the agents that are not in it, by name."""
     assert source.python is not None
     agents = {name: load_object(reference) for name, reference in source.agents}
     if source.distribution is not None:
@@ -231,7 +249,10 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
 
 
 def _agents_in_modules(modules: Iterable[Any]) -> dict[str, Any]:
-    """Return the agents that are defined in some modules, by name; a single agent has the name of its library."""
+    """Return the settings of agents in another framework's form that some modules define, by name.
+
+    The name is that of the variable or class; a single agent has the name of its library.
+    """
     found = {
         name: item
         for module in modules
@@ -247,7 +268,7 @@ def _agents_in_modules(modules: Iterable[Any]) -> dict[str, Any]:
 
 
 def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
-    """Return the configuration and the agents that a package registers with Gymnasium.
+    """Return the configuration that a package registers with Gymnasium, and its agents by name.
 
     They are the arguments `env_cfg_entry_point` and `AGENT_cfg_entry_point` of the registration.
     """
@@ -271,7 +292,12 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
 
 
 def _with_environment(value: Any, kwargs: Mapping[str, Any]) -> Any:
-    """Return a configuration; if its format needs the environment class of the registration, pass the class to it."""
+    """Return a configuration object; pass it the registered environment class if it has `__rlcli_environment__`.
+
+    Args:
+        value: the configuration, or its class.
+        kwargs: the arguments of its registration with Gymnasium.
+    """
     value = value() if isinstance(value, type) else value
     if hasattr(value, "__rlcli_environment__"):
         value.__rlcli_environment__(kwargs[ENVIRONMENT])
@@ -288,7 +314,10 @@ def _registered_agents(kwargs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _agent_object(entry: object) -> Any:
-    """Import an agent; return the error if a library that it imports is not installed: another agent may be used."""
+    """Import the settings of an agent.
+
+    If a library that they import is not installed, return the error instead of raising it: another agent may be used.
+    """
     try:
         return _object(entry)
     except ModuleNotFoundError as error:
@@ -296,7 +325,7 @@ def _agent_object(entry: object) -> Any:
 
 
 def _is_entry(entry: object, module: str, attribute: str) -> bool:
-    """Return whether a registration's entry, `module:name` or an object, is the object `attribute` of a module."""
+    """Return whether `entry`, a reference `module:name` or an object, means the object `attribute` of a module."""
     if isinstance(entry, str):
         return entry == f"{module}:{attribute}"
     return getattr(entry, "__module__", "") == module and getattr(entry, "__qualname__", "") == attribute
@@ -307,7 +336,10 @@ def _module_of(entry: object) -> str:
 
 
 def _object(entry: object) -> Any:
-    """Import the object of a reference `module:name`; return the path of a file, and other objects unchanged."""
+    """Return what an argument of a registration means.
+
+    `module:name` is imported; `module:file.yaml` becomes the file's path; an argument that is no text is returned.
+    """
     if not isinstance(entry, str):
         return entry
     if not entry.endswith((".yaml", ".yml", ".json")):
@@ -317,9 +349,9 @@ def _object(entry: object) -> Any:
 
 
 def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
-    """Add agents to a task. The default is the first one in the order of the task's format, or the only one.
+    """Add agents, by name, to a task. The default is the first one in `agent_order` of the format, or the only one.
 
-    An agent among several that rlcli cannot read is left out, with a note.
+    Of several agents, those that rlcli cannot read are left out, each with a note.
     """
     order = task.format.spec.agent_order if task.format is not None else ()
     found: dict[str, Any] = {}
@@ -335,7 +367,7 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
             task.notes.append(Note("", f"agents.{name}", "ignored", str(agent)))
         elif data is None:
             what = str(agent) if isinstance(agent, str | FilePath) else type(agent).__name__
-            task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}: write a mapping"))
+            task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}; write a mapping"))
         else:
             found[name] = data
     ranked = [name for name in order if name in found]
@@ -348,7 +380,13 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
 
 
 def _read_agent(task: PythonTask, name: str, agent: object) -> dict[str, Any] | None:
-    """Return the settings of an agent; None if rlcli cannot read it."""
+    """Return the settings of an agent as plain data; None if they have a form that rlcli cannot read.
+
+    Args:
+        task: the task, which gets the notes about the translation.
+        name: name of the agent.
+        agent: a file, a mapping, or an object with settings.
+    """
     if isinstance(agent, FilePath):
         read = task.format.spec.agent_file if task.format is not None else ""
         return task.format.load(read)(agent, name, task.notes) if task.format is not None and read else None

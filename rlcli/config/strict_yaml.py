@@ -90,12 +90,12 @@ def _decode(text: str | bytes) -> str:
 
 
 def _after(before: str) -> Mark:
-    """Return the position (line, column) after a text."""
+    """Return the position (line, column) of the character that follows the text `before`."""
     return before.count("\n") + 1, len(before) - before.rfind("\n")
 
 
 def _parse(text: str) -> tuple[Any, dict[Path, Mark]]:
-    """Return the value of a text and its positions. Both are copies that the caller may change."""
+    """Return the parsed value of a YAML text, and path -> position (line, column). The caller may change both."""
     value, marks = _parse_cached(text)
     return _copy(value), dict(marks)
 
@@ -148,7 +148,7 @@ def _checked_events(text: str) -> Iterator[events.Event]:
 
 
 def _read(text: str) -> tuple[Any, dict[Path, Mark]]:
-    """Return the value of a text, and the position of every key and item."""
+    """Return the parsed value of a YAML text, and path -> position (line, column) of every key and list item."""
     reader = _Reader(_checked_events(text))
     root = [reader.value(event, ()) for event in reader.stream if isinstance(event, events.NodeEvent)]
     return root[0] if root else None, reader.marks
@@ -156,13 +156,13 @@ def _read(text: str) -> tuple[Any, dict[Path, Mark]]:
 
 @dataclass(slots=True)
 class _Reader:
-    """Reader of values from PyYAML's events."""
+    """Builder of Python values from PyYAML's events; `marks` collects the position of every key and list item."""
 
     stream: Iterator[events.Event]
     marks: dict[Path, Mark] = field(default_factory=dict)
 
     def value(self, event: events.Event, path: Path) -> Any:
-        """Return the value that starts with an event."""
+        """Return the value that starts with an event; `path` is where the value is in the file."""
         self.marks.setdefault(path, _position(event))  # `_mapping` has stored the position of the key
         if isinstance(event, events.ScalarEvent):
             return _scalar(event, key=False)
@@ -189,7 +189,10 @@ class _Reader:
         return found
 
     def _until(self, end: type[events.Event]) -> Iterator[events.Event]:
-        """Yield the events up to the end of a container; the caller reads the events inside of each value."""
+        """Yield the first event of each key or item of a mapping or list, up to its end event.
+
+        The caller must read the further events of each value before it takes the next one.
+        """
         return itertools.takewhile(lambda event: not isinstance(event, end), self.stream)
 
 

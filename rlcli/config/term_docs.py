@@ -116,7 +116,7 @@ def type_text(schema: Mapping[str, Any]) -> str:
 
 
 def yaml_text(value: Any) -> str:
-    """Return a value as one line of YAML; text that needs no quotes has none."""
+    """Return a value as one line of YAML, with quotes only where text needs them."""
     with contextlib.suppress(YamlError):
         if isinstance(value, str) and re.fullmatch(r"\w[\w.-]*", value) and load(f"key: {value}").data["key"] == value:
             return value

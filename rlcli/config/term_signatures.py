@@ -54,12 +54,15 @@ _MDP = Path(__file__).resolve().parent.parent / "mdp"
 
 
 class SignatureError(ValueError):
-    """Signature of a term that YAML cannot express."""
+    """Error for a function that cannot be a term, because a YAML file could not set its parameters."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A keyword-only parameter of a term. `alias` is the alias of `rlcli.task` in its annotation."""
+    """A keyword-only parameter of a term, which is a key of the term in YAML.
+
+    `alias` is the name from `rlcli.task` in its annotation, such as `Joints`; None if it has none.
+    """
 
     name: str
     type: Any
@@ -70,16 +73,20 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """Signature of a term in its source file."""
+    """Name, parameters and location of a term, as read from its source file."""
 
     name: str
+    """Name in YAML."""
     attribute: str
+    """Name of the function or class in the file."""
     is_class: bool
     file: Path
     line: int
     summary: str
+    """First line of the docstring."""
     parameters: tuple[Parameter, ...]
     error: str | None = None
+    """Why the function cannot be a term; None: it can."""
     target: Any = None
     """The function or class itself, if it comes from a configuration in Python; None: `attribute` of the file."""
     description: str = ""
@@ -93,7 +100,10 @@ class Signature:
 
 @dataclass(slots=True)
 class Vocabulary:
-    """The terms that the YAML of a task may name: its own terms first, then those of `rlcli.mdp` for the section."""
+    """The terms that the YAML of a task may name: those of the task (`own`) first, then those of `rlcli.mdp`.
+
+    A section is a key of the task that has terms, such as `rewards`. A task's own term fits every section.
+    """
 
     own: dict[str, Signature] = field(default_factory=dict)
 
@@ -147,7 +157,7 @@ def read_terms(file: Path) -> dict[str, Signature]:
 
 
 def signature_of(term: Any, name: str) -> Signature:
-    """Return the signature of a term that is a function or class in memory.
+    """Return the signature of a function or class in memory as a term with this name.
 
     Raises:
         SignatureError: if the object does not have the form of a term, or its source cannot be read.
@@ -172,7 +182,9 @@ def signature_of(term: Any, name: str) -> Signature:
 
 
 def read_params(file: Path, class_name: str) -> type[schema.StrictModel] | None:
-    """Return the `Params` model of a direct task's class (own or inherited), rebuilt from its source; None without one.
+    """Return a model like the class `Params` of a direct task, rebuilt from the source code; None without `Params`.
+
+    `Params` is inside of the task's class or of one of its base classes.
 
     Raises:
         SyntaxError: if a file is not Python.
@@ -193,7 +205,7 @@ def read_params(file: Path, class_name: str) -> type[schema.StrictModel] | None:
 
 
 def params_model(signature: Signature, section: str) -> type[schema.TermConfig]:
-    """Return the model of a term's YAML entry. Its keys are the keys of the section and the function's parameters.
+    """Return the pydantic model of a term's YAML entry: the keys of its section, and the parameters of its function.
 
     Raises:
         SignatureError: if the function cannot be a term of this section.
@@ -266,14 +278,21 @@ def _model(name: str, base: type[schema.StrictModel], fields: dict[str, Any]) ->
 
 @functools.cache
 def _closed(section: str) -> type[schema.TermConfig]:
-    """Return the model of a section's terms that refuses unknown keys."""
+    """Return the model of the keys that all terms of a section share, as a class that refuses unknown keys."""
     base = SECTIONS[section]
     config = ConfigDict(extra="forbid", protected_namespaces=())  # a parameter may start with `model_`
     return type(base.__name__, (base,), {"model_config": config, "__module__": __name__})
 
 
 def _signature(node: ast.FunctionDef | ast.ClassDef, call: ast.FunctionDef, name: str, file: Path) -> Signature:
-    """Return the signature of a term. `node` is the function or class; `call` is the function or its `__init__`."""
+    """Return the signature of a term.
+
+    Args:
+        node: the function or class.
+        call: the function, or the `__init__` of the class.
+        name: name of the term in YAML.
+        file: file of the term.
+    """
     parameters: list[Parameter] = []
     error = _positional_error(call, isinstance(node, ast.ClassDef))
     for argument, default in zip(call.args.kwonlyargs, call.args.kw_defaults, strict=True):
@@ -329,7 +348,7 @@ def _parameter(argument: ast.arg, default: ast.expr | None) -> Parameter:
 
 
 def _alias(node: ast.expr) -> str | None:
-    """Return the alias of `rlcli.task` in an annotation, also in `Joints | None` or in quotes; None if it has none."""
+    """Return the name from `rlcli.task` in an annotation, such as `Joints` in `Joints | None`; None if it has none."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return _alias(_quoted(node.value))
     if isinstance(node, ast.BinOp):
@@ -356,7 +375,7 @@ def _literal(node: ast.expr) -> Any:
 
 
 def _field_default(node: ast.expr | None) -> Any:
-    """Return the default of a `Params` field in the form that `create_model` takes."""
+    """Return the default of a field of `Params` in the form that pydantic's `create_model` takes."""
     if node is None:
         return ...
     if isinstance(node, ast.Call) and last_name(node.func) == "Field":
@@ -371,7 +390,7 @@ def _takes_env(arguments: ast.arguments, position: int) -> bool:
 
 
 def term_entries(data: dict[str, Any]) -> list[tuple[str, KeyPath, dict[str, Any]]]:
-    """Return every term of a raw configuration as (section, path, entry)."""
+    """Return every term of a configuration that is not validated yet, as (section, path of the term, its mapping)."""
     found: list[tuple[str, KeyPath, dict[str, Any]]] = []
     for section in SECTIONS:
         content = data.get(section)

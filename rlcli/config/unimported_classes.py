@@ -1,4 +1,4 @@
-"""Classes in source files, and their base classes in the same package or in `rlcli.mdp`, without importing anything."""
+"""Search for classes and their base classes in source files, by their syntax trees, without importing the files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SourceClass:
     node: ast.ClassDef
 
     def nested(self, name: str) -> SourceClass | None:
-        """Return the class of this name in the body of the class; None if there is none."""
+        """Return the class of this name that is defined inside of this class; None if there is none."""
         node = next((n for n in self.node.body if isinstance(n, ast.ClassDef) and n.name == name), None)
         return None if node is None else SourceClass(self.file, node)
 
@@ -59,12 +59,15 @@ class ClassSearch:
         return [] if first is None else list(self.walk(first))
 
     def nested(self, file: Path, outer: str, name: str) -> SourceClass | None:
-        """Return the class `name` in the body of the class `outer` or of one of its bases."""
+        """Return the class `name` inside of the class `outer` or of one of its base classes; None if there is none."""
         found = (owner.nested(name) for owner in self.lineage(file, outer))
         return next((inner for inner in found if inner is not None), None)
 
     def nested_lineage(self, file: Path, outer: str, name: str) -> list[SourceClass]:
-        """Return a class in the body of another class (or of its bases), and the base classes of the inner class."""
+        """Return the class `name` inside of the class `outer` (or of its base classes), and then its own base classes.
+
+        The list is empty if there is no such class.
+        """
         found = self.nested(file, outer, name)
         return [] if found is None else list(self.walk(found))
 
@@ -123,7 +126,7 @@ class ClassSearch:
 
 
 def _module_files(file: Path, node: ast.ImportFrom) -> Iterator[Path]:
-    """Yield the possible files of the module that a file imports from."""
+    """Yield the files that the module in `node`, a `from MODULE import ...` of a file, may have; they may not exist."""
     parts = (node.module or "").split(".")
     # an absolute import may start at any folder above the file, because the root of the package is unknown
     roots: Sequence[Path] = file.parents[node.level - 1 : node.level] if node.level else file.parents
@@ -202,7 +205,7 @@ def _dataclass_decorator(node: ast.ClassDef) -> ast.expr | None:
 
 
 def _default(value: ast.expr | None) -> ast.expr | None:
-    """Return the default of a dataclass field, also of `field(default_factory=lambda: ...)`; None without one."""
+    """Return the default in the value of a dataclass field, also of `field(default_factory=...)`; None without one."""
     options = _options(value)
     factory = options.get("default_factory")
     if factory is not None:

@@ -45,7 +45,7 @@ def agent_names(layers: Layers) -> list[str]:
 
 
 class _AnyAgent(AgentConfig):
-    """An agent whose trainer is unknown or not installed: only the keys that all agents share are checked."""
+    """Agent whose trainer is unknown or not installed: only the settings that all agents share are checked."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -62,7 +62,7 @@ Change = tuple[Path, Any, Origin]
 
 @dataclass(slots=True)
 class TaskCheck:
-    """Check of one configuration, step by step: the layers merged so far, and every problem found so far."""
+    """Check of one configuration, step by step: the sources merged so far, and every problem found so far."""
 
     source: TaskSource
     layers: Layers = field(default_factory=Layers)
@@ -79,7 +79,7 @@ class TaskCheck:
     """File and line of a configuration's class in another framework's form; empty for others."""
 
     def document(self, changes: Iterable[Change] = ()) -> Document:
-        """Return the content of the task's file; a configuration in Python also gets the models among the changes."""
+        """Return the content of the task's file. A configuration in Python gets the models that `changes` name."""
         file = self.source.config  # YAML: a task, or the record of a run
         recorded = upgraded(read(file, self.source.label), file) if file.suffix != ".py" else None
         if recorded is not None and self.source.python is None and self.source.value is None:
@@ -102,7 +102,7 @@ class TaskCheck:
             raise ConfigError([Problem(self.source.label, "", text), *self.problems[:MAX_PROBLEMS]])
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
-        """Add a problem of the value at a path."""
+        """Add a problem with the value at a path."""
         self.add(Problem(self.layers.place(path), messages.dotted(path), message, hint))
 
     def _is_mapping(self, value: object, path: Path) -> bool:
@@ -111,7 +111,7 @@ class TaskCheck:
             self.problem(path, f"expected a mapping, found {messages.format_value(value)}")
         return isinstance(value, dict)
 
-    # --- layers ---
+    # --- merging of the sources ---
 
     def read_task(self, document: Document) -> None:
         """Merge the content of the task's file, which may be in another framework's format."""
@@ -205,7 +205,7 @@ class TaskCheck:
             self.layers.merge(patch, origin, ("agents", name))
 
     def _no_agent(self, where: str) -> None:
-        """Add the problem that a change of `agent` has no agent to apply to."""
+        """Add the problem that the change `agent.x` at location `where` applies to no agent, because none is chosen."""
         names = agent_names(self.layers)
         if not names:
             self.add(Problem(where, "agent", "this task has no agents; add agents: to its YAML"))
@@ -214,13 +214,13 @@ class TaskCheck:
             self.add(Problem(where, "agent", "the task has several agents and no default", hint))
 
     def patch(self, layer: str, at: Path) -> None:
-        """Merge the patch at path `at` over the task."""
+        """Merge the mapping at path `at` over the task: `play`, or `task` of the chosen agent."""
         patch = self.layers.get(at)
         if patch is None or not self._is_mapping(patch, at):
             return
         for key in PATCHES:
             if key in patch:
-                self.problem((*at, key), f"'{key}' cannot be changed by a patch; remove it here")
+                self.problem((*at, key), f"'{key}' belongs at the top level; remove it here")
         task = {key: value for key, value in patch.items() if key not in PATCHES}
         self.layers.merge(task, lambda path: Origin(layer, self.layers.place(at + path)))
 
@@ -241,7 +241,7 @@ class TaskCheck:
                 similar = did_you_mean(str(path[-1]), _mapping(self.layers.get(path[:-1])))
                 if similar:
                     key = messages.dotted(path)
-                    self.add(Problem(origin.where, key, "there is nothing to remove", similar))
+                    self.add(Problem(origin.where, key, "there is no such term to remove", similar))
                     continue
             try:
                 self.layers.set(path, value, origin)
@@ -330,7 +330,7 @@ class TaskCheck:
             return None
 
     def read_terms(self) -> None:
-        """Read the signatures of the task's own terms."""
+        """Read the signatures of the task's own terms into `vocabulary`."""
         try:
             self.vocabulary = Vocabulary.of(self.source.term_files)
             self.vocabulary.own.update(self.functions)
@@ -358,7 +358,7 @@ class TaskCheck:
         return base.model_construct(**dict(checked)) if checked is not None else None
 
     def _siblings(self, path: Path) -> list[str]:
-        """Return the names of the terms beside the one at a path."""
+        """Return the names of all terms in the section (or group of observations) of the term at a path."""
         terms = _mapping(self.layers.get(path[:-1]))
         return [name for name, term in terms.items() if isinstance(term, dict) and "func" in term]
 
@@ -406,7 +406,7 @@ class TaskCheck:
             self.problem(("observations",), "the observations need a group 'policy' with at least one term: add one")
 
     def _require_direct(self, data: Mapping[str, Any]) -> None:
-        """Check the block of another framework's format, and that a direct task has no terms."""
+        """Check that a direct task has no terms but those of `success`, and the settings of another format's class."""
         if self.format is not None and self.format.spec.check:
             key, check = self.format.spec.key, self.format.load(self.format.spec.check)
             for path, message, hint in check(data.get(key, {})):
@@ -418,7 +418,7 @@ class TaskCheck:
 
 
 def _filled(task: TaskConfig, terms: Mapping[Path, TermConfig | None], params: dict[str, Any] | None) -> TaskConfig:
-    """Return the task with its validated terms and parameters. Terms that are null in the data are removed."""
+    """Return the task with its terms (path -> validated term) and parameters. Terms that are None are removed."""
     update: dict[str, Any] = {} if params is None else {"params": params}
     for section in SECTIONS:
         if section == "observations":
@@ -438,7 +438,7 @@ def _kept_terms(terms: Mapping[Path, TermConfig | None], at: Path, names: Iterab
 
 @functools.lru_cache(maxsize=16)
 def _key_locations(prefix: str, agent: type[BaseModel]) -> messages.KeyLocations:
-    """Return where each key of a task and of its agent belongs. `prefix` is the path of the agent."""
+    """Return each key of a task and of an agent -> the dotted paths at which it is allowed. `prefix`: the agent's."""
     return messages.key_locations({"": TaskConfig, prefix: agent})
 
 

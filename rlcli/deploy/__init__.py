@@ -1,1 +1,1 @@
-"""Exported policies: their files, their metadata, and the check in plain MuJoCo."""
+"""Export of trained policies to files that run without rlcli, with metadata, and a check of them in plain MuJoCo."""

@@ -1,4 +1,4 @@
-"""Closed-loop check of an exported policy: the file controls plain MuJoCo and is compared with the environment.
+"""Check of an exported policy (`export --verify`): it controls plain MuJoCo and is compared with the environment.
 
 The generated program `run_policy.py` computes observations and controls from an MjData, and `mj_step` advances it. No
 code of the environment takes part in that loop. The environment is the reference: it resets, samples commands and
@@ -59,15 +59,16 @@ _BAD_METADATA = (KeyError, IndexError, TypeError, ValueError)
 
 @dataclass(slots=True)
 class ReferenceEnv:
-    """The run's environment, built as for an evaluation, and its description for code without rlcli."""
+    """The environment of a run, built as for an evaluation, with which an exported policy is compared."""
 
     env: VecEnv
     deployment: dict[str, Any]
+    """Its description for code without rlcli."""
 
 
 @dataclass(slots=True)
 class ClosedLoopResult:
-    """Result of the closed-loop check: the exported policy against the environment.
+    """Result of the check of an exported policy in plain MuJoCo against the environment.
 
     A difference between two values is divided by max(1, |value|).
     """
@@ -85,9 +86,9 @@ class ClosedLoopResult:
     plain_return: float
     """Mean return in plain MuJoCo."""
     scale: float
-    """Mean |return| of the evaluation."""
+    """Mean |return| of the evaluation, by which differences of returns are divided."""
     by_metadata: list[str]
-    """Terms that plain code computed from the metadata."""
+    """Terms that the generated program computed from formulas in the metadata."""
     by_task: list[str]
     """Terms without a formula. The task's own code computed them from the states of plain MuJoCo."""
     synchronized_return: float | None = None
@@ -101,7 +102,7 @@ class ClosedLoopResult:
         return self._relative(self.plain_return)
 
     def rows(self) -> list[tuple[str, float, float, bool]]:
-        """Return the checks as (name, value found, largest value allowed, whether the check passed)."""
+        """Return one row for each check: (name, value found, largest value allowed, whether the check passed)."""
         synchronized = self.synchronized_return
         returns = self.return_difference if synchronized is None else self._relative(synchronized)
         suffix = "" if synchronized is None else " (re-synchronised)"
@@ -147,7 +148,7 @@ def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | N
     """Build the environment that a policy was trained for, without observation noise, bias and delays.
 
     Args:
-        choice: the policy.
+        choice: the policy, as chosen on the command line.
         checkpoint: its checkpoint.
         named: the task on the command line, if there is one.
     """
@@ -189,7 +190,7 @@ def verify(
     code = generate_program(file, model, format_)
     program = file.parent / PROGRAM
     if not write_program(file.parent, code):
-        _log.warning(f"{program} was changed and is not replaced; delete it to get a new one")
+        _log.warning(f"{program} differs from the generated program and is not replaced; delete it to get a new one")
     _log.info(f"{file.name} controls plain MuJoCo with {model.name} for {episodes} episodes")
     differing = deployment_differences(checkpoint, env.layout.record(), reference.deployment, _may_randomize(env))
     space: dict[str, Any] = {"__name__": "run_policy"}
@@ -233,7 +234,7 @@ def verify(
 
 
 def _may_randomize(env: VecEnv) -> bool:
-    """Return whether the task may randomise gains or the initial state: an event does more than reset."""
+    """Return whether the task may randomise gains or the initial state: it has an event that is no plain reset."""
     events = [event for event in env.config.events.values() if event is not None]
     return isinstance(env, DirectEnv) or not all(event.func.startswith("reset_") for event in events)
 
@@ -272,7 +273,10 @@ class _PlainMujocoRunner:
         self._decimation = controller.metadata["decimation"]
 
     def act(self, obs: Tensor) -> Tensor:
-        """Return the file's actions for the plain simulations; `obs` are the environment's observations."""
+        """Return the actions of the exported policy in the plain simulations.
+
+        It replaces the policy in the evaluation. `obs` are the environment's observations, which are compared.
+        """
         is_first = (self._env.episode_length_buf == 0).tolist()
         for i, controller in enumerate(self._controllers):
             self._copy_state(i, is_first[i])
@@ -294,7 +298,7 @@ class _PlainMujocoRunner:
         return torch.where(agree[:, None], expected, actions)
 
     def physics(self) -> None:
-        """Call `mj_step` `decimation` times in every plain simulation; replaces the physics of the engine."""
+        """Simulate one environment step in every plain simulation: it replaces the physics of the engine."""
         ctrl = self._engine.field("ctrl").numpy()
         allowed = np.clip(ctrl, *self._bounds)  # the program clips its controls; MuJoCo clips those of the engine later
         pairs = (torch.from_numpy(values[:, self._closed]) for values in (self._ctrl, allowed))
@@ -326,7 +330,10 @@ class _PlainMujocoRunner:
             self._engine.copy_data(i, self._datas[i])
 
     def _synchronize_states(self) -> None:
-        """Copy the engine's state to plain MuJoCo if both agree within rounding; else copy in the other direction."""
+        """Give plain MuJoCo and the engine the same state after a step of both.
+
+        If the two agree within rounding, it is the engine's state; otherwise it is that of plain MuJoCo.
+        """
         disagreeing = []
         for i, data in enumerate(self._datas):
             fields = (self._engine.field(name)[i] for name in ("qpos", "qvel"))
@@ -341,12 +348,12 @@ class _PlainMujocoRunner:
         self.disagreeing_steps += len(disagreeing)
 
     def terms(self, *, closed: bool) -> list[str]:
-        """Return the terms that plain code computes from the metadata, or those that it cannot compute."""
+        """Return the terms that the generated program computes itself (`closed`), or those that it cannot compute."""
         kinds = {"observation": self._plan["observations"], "control": self._plan["controls"]}
         return [f"{kind} {t['name']}" for kind, terms in kinds.items() for t in terms if t["closed"] is closed]
 
     def _copy_state(self, i: int, is_first: bool) -> None:
-        """Copy the engine's state into the plain simulation if a reset or an event has changed it."""
+        """Copy the state of environment `i` to its plain simulation if a reset or an event has changed it."""
         row, last, data = self._engine.state_row(i), self._rows[i], self._datas[i]
         if not is_first and last is not None and np.array_equal(row, last):
             return
@@ -368,7 +375,7 @@ class _PlainMujocoRunner:
         mujoco.mj_setState(self._models[i], self._datas[i], row, int(mujoco.mjtState.mjSTATE_INTEGRATION))
 
     def _inputs(self, i: int, obs: Tensor) -> dict[str, np.ndarray]:
-        """Return the inputs that plain code cannot compute: commands, and observations without a formula."""
+        """Return the inputs of the program for environment `i`: commands, and observations without a formula."""
         commands = getattr(self._env, "command_manager", None)
         inputs = {
             f"command/{term.name}": term.instance.command[i].numpy()
@@ -401,7 +408,10 @@ def _metadata_error(error: Exception) -> CheckpointError:
 
 
 def _control_bounds(controller: Any, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return the smallest and largest effective controls: MuJoCo's ranges and the limits of `command`. (nu,) each"""
+    """Return the smallest and the largest value that each control can have, (nu,) each.
+
+    They follow from MuJoCo's control ranges and from the limits of the policy's output `command`.
+    """
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = (np.where(limited, end, far) for end, far in zip(model.actuator_ctrlrange.T, _FREE, strict=True))
     columns = [pair for term in controller.metadata["actions"] for pair in term["limits"] or [_FREE] * term["size"]]
@@ -415,7 +425,7 @@ def _control_bounds(controller: Any, model: mujoco.MjModel) -> tuple[np.ndarray,
 
 
 def _reads_only_command(formula: Any) -> bool:
-    """Return whether the only input of a formula is the command."""
+    """Return whether a formula of the metadata depends on nothing but the policy's output `command`."""
     if isinstance(formula, list):
         return True
     if "op" in formula:

@@ -1,4 +1,7 @@
-"""Description of an environment for code without rlcli; it is stored in checkpoints and in exported files."""
+"""Description of an environment for programs without rlcli: joints, actuators, formulas of observations and controls.
+
+It is stored in checkpoints and in exported files.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -22,7 +25,7 @@ _INPUT = "observation/"
 
 
 def describe(env: VecEnv) -> dict[str, Any]:
-    """Return joints, actuators, start state, and the formulas of observations and controls, as plain JSON.
+    """Describe an environment as plain JSON: its joints, actuators, start state, and formulas (`DeploymentRecord`).
 
     Raises:
         ConfigError: if the terms of a direct task's `in_terms` do not fit the task.
@@ -46,7 +49,7 @@ def describe(env: VecEnv) -> dict[str, Any]:
 
 
 def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the observation terms by group and the action terms of a manager-based environment."""
+    """Describe the terms of a manager-based environment: (group -> observation terms, action terms)."""
     groups = {}
     for group in env.config.observations:
         begin, terms = 0, []
@@ -61,7 +64,10 @@ def _describe_managed(env: ManagedEnv) -> tuple[dict[str, Any], list[dict[str, A
 
 
 def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the observation groups and the actions of a direct task, with formulas for the terms of `in_terms`."""
+    """Describe the observations and actions of a direct task: (group -> observations, actions).
+
+    A direct task has formulas only if its method `in_terms` writes it as terms of `rlcli.mdp`.
+    """
     task, in_terms = env.task, env.task.in_terms()
     groups = {
         group: [_observation(name, f"{type(task).__name__}.{hook}", {}, 0, width)]
@@ -97,7 +103,14 @@ def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any
 
 
 def _bind(env: DirectEnv, section: str, number: int, entry: Mapping[str, Any]) -> BoundTerm:
-    """Check an entry of a direct task's `in_terms`, and return its term for this environment."""
+    """Check one entry of a direct task's `in_terms`, and return it as a term of this environment.
+
+    Args:
+        env: the environment.
+        section: observations or actions.
+        number: index of the entry.
+        entry: name of the term and its parameters.
+    """
     path = (section, f"{entry['func']}_{number}")
     signature = env.resolved.vocabulary.find(section, entry["func"])
     if signature is None:
@@ -125,7 +138,7 @@ def _observation(
 
 
 def _controls(env: VecEnv, terms: Iterable[BoundTerm]) -> list[dict[str, Any]]:
-    """Return the description of each action term. The terms take consecutive columns of the action."""
+    """Describe action terms, which take consecutive columns of the action."""
     controls, begin = [], 0
     for term in terms:
         controls.append(_control(env, term, (begin, begin + term.instance.size)))
@@ -152,7 +165,16 @@ def _control(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> dict[str
 
 
 def _processed_formula(env: VecEnv, term: BoundTerm, width: int, bound: float | None = None) -> Formula | None:
-    """Return a term's formula with its modifiers, clip and scale, but without noise, bias, delay and history."""
+    """Return the formula of an observation term with its modifiers, clip and scale; None if it has no formula.
+
+    Noise, bias, delay and history are not part of it.
+
+    Args:
+        env: the environment.
+        term: the term.
+        width: number of its columns.
+        bound: limit of the absolute value; None: no limit.
+    """
     value, config = observation_formula(env, term), term.config
     assert isinstance(config, ObservationConfig)
     # a curriculum may change a tunable number, so it cannot be a constant of the formula
@@ -185,7 +207,7 @@ def _row(values: float | Sequence[float] | torch.Tensor, width: int) -> Formula:
 
 
 def _joints(env: VecEnv) -> list[dict[str, Any]]:
-    """Return all hinge and slide joints of all entities with the stiffness and damping of their actuators."""
+    """Describe all hinge and slide joints of all entities, with the stiffness and damping of their actuators."""
     model, rows = env.engine.model, []
     for name, entity in env.entities.items():
         gains: dict[int, tuple[float, float]] = {}

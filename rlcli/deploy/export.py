@@ -40,7 +40,7 @@ _EPISODE = 32
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """Written file, its metadata and the largest difference from the policy."""
+    """Result of an export: the written file, its metadata, and how much its outputs differ from the policy's."""
 
     file: Path
     metadata: dict[str, Any]
@@ -51,7 +51,7 @@ class Exported:
 
 
 def check_target(format_: str, output: Path | None) -> None:
-    """Check that the format exists, and that the output file has its suffix and can be written.
+    """Check the options `--format` and `--output` of an export: the format exists, and the file has its suffix.
 
     Raises:
         UsageError: for an unknown format, or a file with another suffix.
@@ -73,7 +73,7 @@ def check_target(format_: str, output: Path | None) -> None:
 
 
 def refusal(spec: PolicySpec) -> str | None:
-    """Return the reason why a policy cannot be exported; None if it can be exported."""
+    """Return why a policy cannot be exported, as text after `its policy has`; None if it can be exported."""
     if len(set(spec.memory)) > 1:
         return f"recurrent layers of different sizes ({', '.join(map(str, spec.memory))})"
     return None
@@ -88,7 +88,8 @@ def export(
         checkpoint: the checkpoint.
         file: the file to write.
         format_: one of `FORMATS`.
-        deployment: the result of `rlcli.deploy.env_description.describe`, for a checkpoint without one.
+        deployment: the description of the environment (`rlcli.deploy.env_description.describe`), which is used if the
+            checkpoint has none.
 
     Raises:
         UsageError: for an unknown format, a wrong suffix, or a policy that cannot be exported.
@@ -136,9 +137,16 @@ def _observations(checkpoint: Checkpoint, size: int) -> Tensor:
 
 
 def _require_equal(run: PolicyFunction, graph: DeployedPolicy, observations: Tensor, file: Path) -> float:
-    """Check that file and policy agree, with batches of 1, 7 and all observations; return the largest difference.
+    """Check that an exported file and the policy give the same outputs; return the largest difference.
 
-    For a recurrent policy the rows are the steps of an episode; each side has its own hidden state.
+    They are compared with batches of 1, 7 and all observations. For a recurrent policy the batches are successive steps
+    of episodes, and each side has its own hidden state.
+
+    Args:
+        run: the function of the file.
+        graph: the policy.
+        observations: the test inputs.
+        file: the file, for the message.
     """
     worst = 0.0
     for batch in (1, 7, len(observations)):
@@ -164,7 +172,10 @@ def _require_equal(run: PolicyFunction, graph: DeployedPolicy, observations: Ten
 
 @contextlib.contextmanager
 def _temporary_file(file: Path) -> Iterator[Path]:
-    """Yield a temporary file that becomes `file` at the end. After an error remove it and new folders."""
+    """Yield a temporary file, which becomes `file` at the end of the `with` block.
+
+    After an error, the temporary file and the folders that were created for it are removed.
+    """
     temporary = file.with_name(f".{file.stem}.tmp-{os.getpid()}{file.suffix}")
     made: list[Path] = []
     try:

@@ -1,4 +1,4 @@
-"""Formats of exported policies: a writer for each, and a reader that checks the file."""
+"""File formats of exported policies (ONNX, torch, numpy): a writer for each, and a reader to check its file."""
 
 import contextlib
 import importlib
@@ -30,13 +30,13 @@ PolicyFunction = Callable[[dict[str, Tensor]], dict[str, Tensor]]
 
 
 def write(format_: str, graph: DeployedPolicy, metadata: str, extra_properties: dict[str, str]) -> bytes:
-    """Return the content of a file.
+    """Return the content of a file with an exported policy.
 
     Args:
         format_: one of `FORMATS`.
-        graph: the module to export.
-        metadata: JSON.
-        extra_properties: further metadata properties of an ONNX file.
+        graph: the policy.
+        metadata: the metadata as JSON text.
+        extra_properties: further metadata properties; only ONNX files have them.
     """
     if format_ == "onnx":
         return _onnx_bytes(graph, {KEY: metadata, **extra_properties})
@@ -44,7 +44,7 @@ def write(format_: str, graph: DeployedPolicy, metadata: str, extra_properties: 
 
 
 def read(format_: str, file: Path) -> tuple[PolicyFunction, str]:
-    """Return the function in a file and its metadata as JSON.
+    """Read a file with an exported policy; return the policy as a function, and the metadata as JSON text.
 
     A Python file is executed, so call this only with a file that this process has written.
     """
@@ -52,10 +52,10 @@ def read(format_: str, file: Path) -> tuple[PolicyFunction, str]:
 
 
 def require_packages(format_: str) -> None:
-    """Check that the packages that write and check a format are installed.
+    """Check that the packages that write and check a file format are installed.
 
     Raises:
-        DependencyError: if one of them is not.
+        DependencyError: if one of them is not installed.
     """
     if format_ != "onnx":
         return
@@ -124,7 +124,7 @@ def _read_onnx(file: Path) -> tuple[PolicyFunction, str]:
 
 
 def require_self_contained(data: bytes, file: Path) -> None:
-    """Refuse an ONNX file that stores tensors in other files, whose paths may lead anywhere on the disk.
+    """Check that an ONNX file does not store tensors in other files, whose paths may lead anywhere on the disk.
 
     Args:
         data: the content of the file.
@@ -146,7 +146,7 @@ def require_self_contained(data: bytes, file: Path) -> None:
 
 
 def _external_tensors(part: Any) -> Iterator[Any]:
-    """Yield the tensors below a part of an ONNX model whose values are in another file."""
+    """Yield the tensors in an ONNX model, or in a part of it, whose values are stored in another file."""
     from google.protobuf.message import Message
 
     if part.DESCRIPTOR.name == "TensorProto":

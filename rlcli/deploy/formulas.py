@@ -1,7 +1,7 @@
-"""Formulas of observation and action terms.
+"""Formulas of observation and action terms, from which a program without rlcli computes them.
 
-A formula is plain data (JSON); a program without rlcli evaluates it with the values of MjData. A formula is one of
-these. Every value is a row of float32.
+A formula is plain data (JSON); such a program evaluates it with the values of MjData. A formula is one of these. Every
+value is a row of float32.
 
 - A list of numbers.
 - `{"field": NAME, "at": [...]}`: elements of a flattened field of MjData.
@@ -31,11 +31,11 @@ Formula = Any
 
 
 class NoFormula(Exception):
-    """Raised for a term that depends on something that MjData does not contain."""
+    """Error for a term without a formula, because it depends on something that MjData does not contain."""
 
 
 def observation_formula(env: VecEnv, term: BoundTerm) -> Formula | None:
-    """Return the formula of an observation term's function; None if it has none."""
+    """Return the formula of an observation term, without its modifiers, clip and scale; None if it has none."""
     function = getattr(term.call, "func", None)
     make = _OBSERVATIONS.get(getattr(function, "__name__", "")) if _is_defined_in(observations, function) else None
     if make is None:
@@ -47,7 +47,9 @@ def observation_formula(env: VecEnv, term: BoundTerm) -> Formula | None:
 
 
 def control_formula(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> tuple[list[int], Formula] | None:
-    """Return the controls that an action term writes, by index, and the formula of their values; None if it has none.
+    """Return the indices in `MjData.ctrl` that an action term writes, and the formula of their values.
+
+    Return None if the term has no formula.
 
     Args:
         env: the environment.
@@ -65,27 +67,27 @@ def control_formula(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> t
 
 
 def field(name: str, at: Any) -> Formula:
-    """Return the formula of elements of a field of MjData."""
+    """Return the formula for the elements `at` of the flattened field `name` of MjData."""
     return {"field": name, "at": [int(i) for i in at]}
 
 
 def given(name: str, at: Any = None) -> Formula:
-    """Return the formula of an input, or of some elements of it."""
+    """Return the formula for the input `name`, such as `action`, or for its elements `at`."""
     return {"given": name} if at is None else {"given": name, "at": [int(i) for i in at]}
 
 
 def op(name: str, *of: Formula) -> Formula:
-    """Return the formula of an operation on formulas."""
+    """Return the formula for the operation `name`, such as `add`, applied to the formulas `of`."""
     return {"op": name, "of": list(of)}
 
 
 def numbers(values: Tensor) -> Formula:
-    """Return a constant formula."""
+    """Return the formula for constant values."""
     return [float(value) for value in values.detach().cpu().float().flatten().tolist()]
 
 
 def _is_defined_in(module: Any, function: Any) -> bool:
-    """Return whether a function or class is the library's own: a task may define another one with the same name."""
+    """Return whether a function or class belongs to a module of rlcli: a task may have another one of the same name."""
     return bool(getattr(function, "__module__", None) == module.__name__)
 
 
@@ -93,32 +95,36 @@ def _is_defined_in(module: Any, function: Any) -> bool:
 
 
 def _shared(values: Tensor) -> Formula:
-    """Return a constant formula of a quantity (num_envs, k) that is equal in all environments."""
+    """Return the constant formula for a quantity (num_envs, k).
+
+    Raises:
+        NoFormula: if it differs between environments.
+    """
     if not bool((values == values[:1]).all()):
         raise NoFormula
     return numbers(values[0])
 
 
 def _joint_field(entity: Entity, name: str, joints: Columns) -> Formula:
-    """Return the joints' elements of qpos, or of a field with one element for each degree of freedom."""
+    """Return the formula for the elements of some joints in `name`: qpos, or a field with one element for each dof."""
     return field(name, (entity.qpos_columns if name == "qpos" else entity.dof_columns)[joints].tolist())
 
 
 def _selected(ids: np.ndarray, columns: Columns) -> list[int]:
-    """Return the ids of the selected bodies, sites or sensors."""
+    """Return the ids in the model of the bodies, sites or sensors that `columns`, an index into `ids`, selects."""
     return torch.from_numpy(ids)[columns if isinstance(columns, slice) else columns.cpu()].tolist()
 
 
 def _row_of(name: str, number: int, width: int, begin: int = 0, count: int | None = None) -> Formula:
-    """Return a row of a field of shape (n, width), or `count` of its elements from `begin` on."""
+    """Return the formula for row `number` of a field (n, width), or for `count` of its elements from `begin` on."""
     start = number * width + begin
     return field(name, range(start, start + (width if count is None else count)))
 
 
 def _root(entity: Entity, name: str, start: int, stop: int, default: int) -> Formula:
-    """Return elements `start` to `stop` of the root's part of qpos or qvel.
+    """Return the formula for the elements `start` to `stop` - 1 of the root's part of `name`, qpos or qvel.
 
-    A fixed root has constants instead: those of the default root state from index `default` on.
+    A fixed root has constants instead: the values of its default state from index `default` on.
     """
     address = entity.root_qpos if name == "qpos" else entity.root_dof
     if address is None:
@@ -149,20 +155,24 @@ def _root_ang_vel_b(entity: Entity) -> Formula:
 
 
 def _down(entity: Entity) -> Formula:
-    """Return the unit vector of gravity in world frame."""
+    """Return the formula for the unit vector of gravity in the world frame."""
     if entity.engine.expanded("opt.gravity") is not None:  # gravity differs between environments
         raise NoFormula
     return _shared(entity.data.down_w)
 
 
 def _require_no_terrain(env: VecEnv) -> None:
-    """Refuse terrain: positions are relative to the environment's origin, the world's origin only without terrain."""
+    """Check that an environment has no terrain: then its origin, from which positions count, is that of the world.
+
+    Raises:
+        NoFormula: if it has terrain.
+    """
     if env.terrain is not None:
         raise NoFormula
 
 
 def _velocity_at(entity: Entity, body: int, point: Formula) -> Formula:
-    """Return the velocity of a point of a body in world frame.
+    """Return the formula for the velocity of a point of a body in the world frame.
 
     MjData's `cvel` is [angular, linear] velocity at the centre of mass of the body's kinematic tree.
     """
@@ -218,7 +228,7 @@ def _yaw(entity: Entity) -> Formula:
 
 
 def _heading_and_path(env: VecEnv, entity: Entity, target: Iterable[float]) -> tuple[Formula, Formula]:
-    """Return the root's forward axis and the vector from the root to a point, both horizontal (x, y)."""
+    """Return the formulas of the root's forward axis and of the vector from the root to `target`, both (x, y)."""
     _require_no_terrain(env)
     point = [float(value) for value in target][:2]
     path = op("sub", point, op("take", _root_pos(entity), [0.0, 1.0]))

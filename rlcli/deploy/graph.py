@@ -47,7 +47,10 @@ class DeployedPolicy(nn.Module):
         return ["action", "command"] if self.policy.memory is None else ["action", "command", "h_out", "c_out"]
 
     def initial_state(self, rows: int) -> dict[str, Tensor]:
-        """Return the hidden state at the start of an episode, as inputs; empty for a policy without one."""
+        """Return the inputs `h_in` and `c_in` at the start of an episode; empty for a policy without memory.
+
+        `rows` is the number of rows of the observations.
+        """
         cells = self.policy.spec.memory
         return {name: torch.zeros(len(cells), rows, cells[0]) for name in self.inputs[1:]}
 
@@ -63,7 +66,7 @@ class DeployedPolicy(nn.Module):
         return {**self.with_command(action), "h_out": torch.stack(after[::2]), "c_out": torch.stack(after[1::2])}
 
     def with_command(self, action: Tensor) -> dict[str, Tensor]:
-        """Return an action and its command: scaled, shifted and clipped as the action terms do it. (n, action_size)"""
+        """Return the outputs `action` and `command`: the action scaled, shifted and clipped as by the action terms."""
         command = action * self.scale + self.offset if self.scaled else action.clone()
         for bounds in (self.clip, self.limits):
             if bounds is not None:

@@ -15,7 +15,14 @@ SCHEMA = 2
 def metadata_of(
     checkpoint: Checkpoint, graph: DeployedPolicy, layout: LayoutRecord, deployment: DeploymentRecord | None
 ) -> dict[str, Any]:
-    """Return the metadata of a checkpoint's policy."""
+    """Return the metadata of an exported policy, as plain JSON.
+
+    Args:
+        checkpoint: the checkpoint of the policy.
+        graph: the exported policy.
+        layout: columns of observations and actions.
+        deployment: description of the environment; None: the checkpoint has none.
+    """
     manifest, spec = checkpoint.manifest, graph.policy.spec
     task, run = manifest.get("task") or {}, checkpoint.folder.resolve().parent.parent
     normalized = graph.policy.normalizer is not None
@@ -131,7 +138,7 @@ def _entry(value: object) -> str:
 
 
 def _with_columns(terms: Sequence[ObservationColumns | ActionColumns]) -> list[dict[str, Any]]:
-    """Return the entries of terms, each with its first column and the column after its last."""
+    """Return the layout of terms as plain JSON, each with `columns`: its first column and the one after its last."""
     entries, begin = [], 0
     for term in terms:
         entries.append({**term.model_dump(mode="json"), "columns": [begin, begin + term.size]})

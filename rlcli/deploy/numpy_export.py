@@ -18,7 +18,10 @@ _TEMPLATE = Path(__file__).parent / "deployed" / "policy.py"
 
 
 def numpy_bytes(graph: DeployedPolicy, metadata: str) -> bytes:
-    """Return the content of the exported Python file: readable code, then the weights as an npz file in base64."""
+    """Return the content of the exported Python file: readable code, then the weights as an npz file in base64.
+
+    `metadata` is JSON text.
+    """
     weights = io.BytesIO()
     np.savez(weights, **_weights(graph))  # type: ignore[arg-type]
     text = _TEMPLATE.read_text(encoding="utf-8")
@@ -32,7 +35,10 @@ def numpy_bytes(graph: DeployedPolicy, metadata: str) -> bytes:
 
 
 def read_numpy(file: Path) -> tuple[Any, str]:
-    """Execute a file that this process has written; return its function, and its metadata as JSON."""
+    """Execute an exported Python file; return its function, and its metadata as JSON text.
+
+    Call it only with a file that this process has written.
+    """
     space: dict[str, Any] = {"__name__": "policy"}
     exec(compile(file.read_text(encoding="utf-8"), str(file), "exec"), space)
 
@@ -44,7 +50,7 @@ def read_numpy(file: Path) -> tuple[Any, str]:
 
 
 def literal(value: object) -> str:
-    """Return plain data as Python source in ASCII."""
+    """Return plain data as Python source code in ASCII."""
     return pprint.pformat(value, width=110, sort_dicts=False).encode("ascii", "backslashreplace").decode()
 
 

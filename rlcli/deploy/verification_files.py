@@ -45,7 +45,10 @@ _TOLERANCE = {"rtol": 1e-4, "atol": 1e-5}
 
 
 def generate_program(policy: Path, model: Path, format_: str) -> str:
-    """Return the program that runs a policy file on a model file; all three are in one folder."""
+    """Return the source code of the program that runs a policy file on a model file.
+
+    The program will be in the same folder as the two files.
+    """
     text = _TEMPLATE.read_text(encoding="utf-8")
     for parts in (_PACKAGES, _IMPORTS, _OPEN):
         text = text.replace(parts["onnx"], parts[format_])
@@ -54,14 +57,14 @@ def generate_program(policy: Path, model: Path, format_: str) -> str:
 
 
 def check_overwrites(policy: Path) -> None:
-    """Check that --verify would overwrite neither the policy nor a model that the user has written.
+    """Check that --verify, which writes beside the file `policy`, does not overwrite it or a model of the user.
 
     Raises:
         UsageError: if the policy has the program's name, or the folder has a model that export did not write.
     """
     if policy.name == PROGRAM:
         message = f"--verify writes its program to {PROGRAM}, so the policy needs another name"
-        raise UsageError(message, hint="give --output FILE")
+        raise UsageError(message, hint="give the policy another name with --output FILE")
     for name in (MODEL, BINARY_MODEL):
         require_regular(policy.with_name(name))
     model = policy.with_name(MODEL)
@@ -74,11 +77,11 @@ def check_overwrites(policy: Path) -> None:
         is_exported = False
     if not is_exported:
         message = f"--verify would overwrite {model}, which is not a file of `rlcli export`"
-        raise UsageError(message, hint="give an --output in an empty folder")
+        raise UsageError(message, hint="give an --output in another folder")
 
 
 def write_program(folder: Path, text: str) -> bool:
-    """Write the program if there is no file of its name; return whether the file now has this text.
+    """Write the program `run_policy.py` if there is no file of this name; return whether the file now has this text.
 
     An existing file is never replaced: the user may have edited it.
 
@@ -109,7 +112,7 @@ def write_model(spec: mujoco.MjSpec, model: mujoco.MjModel, folder: Path) -> Pat
 
 
 def open_model(file: Path) -> mujoco.MjModel:
-    """Return the model in a file of `write_model`."""
+    """Load the model from a file that `write_model` has written."""
     read = mujoco.MjModel.from_xml_path if file.suffix == ".xml" else mujoco.MjModel.from_binary_path
     return read(str(file))
 
@@ -146,7 +149,7 @@ def _full_xml_precision() -> Iterator[None]:
 
 
 def _models_close(read: mujoco.MjModel, model: mujoco.MjModel) -> bool:
-    """Return whether two models are equal within the precision of XML."""
+    """Return whether a model, read back from XML, equals the original within the precision of XML."""
     for one, other in ((read, model), (read.opt, model.opt)):
         for name in dir(model if other is model else model.opt):
             value = getattr(other, name, None) if not name.startswith("_") else None

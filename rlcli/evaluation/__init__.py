@@ -1,1 +1,1 @@
-"""Evaluation of policies: sessions, limits, comparisons, stress tests and a known regulator."""
+"""Evaluation of policies: episodes and their statistics, limits, comparisons, stress tests, and a regulator (LQR)."""

@@ -33,7 +33,7 @@ _MISSING = "not set"
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Evaluations of several policies in the same episodes."""
+    """Result of a comparison: the evaluations of several policies in the same episodes."""
 
     names: list[str]
     policies: list[PolicyInTask]
@@ -68,15 +68,15 @@ class Comparison:
 
 
 def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyInTask]:
-    """Find the policy of each name; policies without a checkpoint act in the first run's task.
+    """Find the policies to compare; zero, random and lqr, which need no run, act in the task of the first run.
 
     Args:
-        names: references of runs and checkpoints, or zero, random, lqr.
-        request: the other settings.
+        names: a run or checkpoint, or zero, random, lqr, for each policy.
+        request: the further settings, the same for all policies.
 
     Raises:
-        UsageError: for fewer than two policies, or if no name is a run.
-        ConfigError: if the tasks differ.
+        UsageError: for fewer than two policies, or if none of them is of a run.
+        ConfigError: if the tasks of the policies differ.
     """
     from rlcli.runs.policy_ref import SHIPPED
 
@@ -85,7 +85,7 @@ def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyIn
     if len(names) < 2:
         raise UsageError(f"--compare needs at least two policies, found: {listing(names)}", hint=usage)
     if len(without_run) == len(names):
-        raise UsageError("--compare needs at least one run, whose task is used", hint=usage)
+        raise UsageError("--compare needs at least one run, because its task is used for all", hint=usage)
     found: dict[str, PolicyInTask] = {}
     # `shipped` comes last: it is searched in the task of the runs
     for name in sorted(dict.fromkeys(names), key=SHIPPED.__eq__):
@@ -103,8 +103,8 @@ def compare(names: Sequence[str], policies: Sequence[PolicyInTask], episodes: in
     """Evaluate the policies in the same episodes, and compare each with the first.
 
     Args:
-        names: names of the policies.
-        policies: the policies, from `find_policies`.
+        names: the names of the policies that were given to `find_policies`.
+        policies: the policies, from `find_policies`, in the same order.
         episodes: number of episodes of each policy.
     """
     from rlcli.evaluation.session import one_each
@@ -145,7 +145,7 @@ def _require_same_task(name: str, first: PolicyInTask, other_name: str, other: P
 
 
 def _settings(resolved: Resolved) -> dict[str, Any]:
-    """Return the task's values by dotted key, without those that do not affect episodes."""
+    """Return dotted key -> value of a task's configuration, without keys that do not affect episodes."""
     from rlcli.config.dump import to_data
 
     values = leaves(to_data(resolved))
@@ -157,7 +157,10 @@ def _settings(resolved: Resolved) -> dict[str, Any]:
 
 
 def _compare_pair(left: Evaluation, right: Evaluation) -> dict[str, Any]:
-    """Return paired differences and probabilities of improvement; entry i of both evaluations is the same episode."""
+    """Return metric -> paired difference of two evaluations, and probability that the left one is better.
+
+    Entry i of both evaluations must be the same episode.
+    """
     from rlcli.rl.confidence import difference, improvement
 
     found = {}

@@ -26,7 +26,7 @@ _COLUMNS = (
 
 @dataclass(slots=True)
 class Evaluation:
-    """Finished episodes. Each list has one entry for each episode, in the order in which they ended."""
+    """Result of an evaluation: each list has one entry for each finished episode, in the order in which they ended."""
 
     conditions: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Condition of success -> its bounds, as `at_least` and `at_most`."""
@@ -49,7 +49,10 @@ class Evaluation:
     commands, as `command/metric`."""
 
     def summary(self) -> dict[str, Any]:
-        """Return means and rates as plain JSON, with 95 % intervals: Student's t for means, Wilson's for rates."""
+        """Return the statistics of all episodes, as `rlcli eval --json` prints them.
+
+        Means and rates have 95 % intervals: Student's t for means, Wilson's for rates.
+        """
         result: dict[str, Any] = {
             "episodes": len(self.returns),
             "return": mean(self.returns),
@@ -66,19 +69,25 @@ class Evaluation:
         return result
 
     def _condition(self, name: str, bounds: dict[str, Any]) -> dict[str, Any]:
-        """Return the share of episodes in which a condition of success held, its mean value and its bounds."""
+        """Return the statistics of a condition of success.
+
+        `held` is the share of episodes in which it held at the end, `value` its mean value; its bounds are added.
+        """
         result = {"held": proportion(sum(self.held[name]), len(self.held[name])), **bounds}
         if name in self.condition_values:
             result["value"] = _mean_of_finite(self.condition_values[name])
         return result
 
     def part(self, first: int, stop: int) -> Self:
-        """Return the episodes of the environments `first` to `stop` - 1, which are numbered from 0."""
+        """Return the episodes of the environments `first` to `stop` - 1; in the result, `first` is environment 0."""
         rows = [row for row, env in enumerate(self.envs) if first <= env < stop]
         return self._rows(rows, first)
 
     def in_environment_order(self) -> Self:
-        """Return the episodes ordered by environment: equal positions in two evaluations have equal random streams."""
+        """Return the episodes ordered by environment.
+
+        At equal positions, two evaluations of the same seed then have episodes with the same random numbers.
+        """
         return self._rows(sorted(range(len(self.envs)), key=lambda row: self.envs[row]), 0)  # a stable sort
 
     def _rows(self, rows: list[int], first: int) -> Self:
@@ -100,16 +109,16 @@ def evaluate(
     on_step: Callable[[StepResult], None] = lambda _: None,
     groups: int = 1,
 ) -> Evaluation:
-    """Run exactly `episodes` episodes; the share of each environment is fixed beforehand.
+    """Run exactly `episodes` episodes with a policy, and return them; each environment runs a fixed number of them.
 
     Counting the first episodes that finish in any environment would favour short episodes.
 
     Args:
         env: the environments.
-        act: the policy's action function.
+        act: the policy, a function from observations to actions.
         episodes: number of episodes of each group.
         on_step: called with the result of every step.
-        groups: number of groups: equal, consecutive parts of the environments.
+        groups: number of groups of environments (equal, consecutive parts), each evaluated by itself.
 
     Raises:
         ConfigError: if an episode does not end because the task has no time-out.
@@ -144,14 +153,14 @@ def evaluate(
 
 
 def _mean_of_finite(values: list[float]) -> dict[str, float | None]:
-    """Return the mean with its interval; all entries are None if a value is not finite."""
+    """Return mean, std, and low and high of the 95 % interval; all are None if one of the values is not finite."""
     if all(map(math.isfinite, values)):
         return mean(values)
     return {"mean": None, "std": None, "low": None, "high": None}
 
 
 class _EpisodeMeans(StepObserver):
-    """Observer that sums a task's metrics in each environment, for their means over finished episodes."""
+    """Observer that computes the mean of each of a task's metrics over every finished episode."""
 
     def __init__(self, env: Environment) -> None:
         self._env = env
@@ -167,7 +176,10 @@ class _EpisodeMeans(StepObserver):
             steps += 1.0
 
     def finish(self, ids: Tensor) -> dict[str, list[float]]:
-        """Return the means over the episodes that have just ended in these environments, and reset their sums."""
+        """Return metric -> its mean over the episode that has just ended in each of the environments `ids`.
+
+        Their sums are reset.
+        """
         ids, found = ids.cpu(), {}
         for name, sums in self._sums.items():
             steps = self._steps[name]
@@ -177,7 +189,14 @@ class _EpisodeMeans(StepObserver):
 
 
 def _add_episodes(result: Evaluation, ended: Episodes, quota: Tensor, means: _EpisodeMeans) -> None:
-    """Add the ended episodes of environments that need more episodes, and reduce the numbers in `quota`. (num_envs,)"""
+    """Add the episodes that have just ended to a result, unless their environments have run enough of them.
+
+    Args:
+        result: the evaluation.
+        ended: the episodes.
+        quota: number of episodes that each environment must still run; reduced here. (num_envs,)
+        means: means of the task's metrics.
+    """
     values = {name: column.tolist() for name, column in ended.metrics.items()} | means.finish(ended.ids)
     for row, env in enumerate(ended.ids.tolist()):
         if quota[env] <= 0:

@@ -22,9 +22,10 @@ _WORD = re.compile(r"[A-Za-z_][\w./-]*")
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """Smallest or largest accepted value of one metric of an evaluation."""
+    """Limit of a metric of an evaluation, from `--fail-under KEY=X` (a minimum) or `--fail-over KEY=X`."""
 
     key: str
+    """success, return or length, or the name of a metric; with `.low` or `.high` an end of its 95 % interval."""
     value: float
     is_minimum: bool = True
 
@@ -35,14 +36,16 @@ class Limit:
 
     @property
     def end(self) -> str:
-        """End of the confidence interval that the option accepts after KEY: `low` for a minimum, else `high`."""
+        """End of the 95 % interval that the option can limit, as KEY.low or KEY.high: low for a minimum, else high."""
         return "low" if self.is_minimum else "high"
 
     def value_in(self, summary: Mapping[str, Any]) -> float | None:
-        """Return the value of the limit's key in an evaluation; None if episodes are too few or values not finite.
+        """Return the value of the limited metric in the summary of an evaluation.
+
+        It is None if there are too few episodes, or if a value is not finite.
 
         Raises:
-            UsageError: if the evaluation has no such term or value.
+            UsageError: if the evaluation has no such metric.
         """
         head, _, rest = self.key.partition(".")
         if head in _KEYS:
@@ -58,7 +61,7 @@ class Limit:
         return value
 
     def failure(self, summary: Mapping[str, Any]) -> str | None:
-        """Return why an evaluation fails this limit; None if it holds."""
+        """Return the sentence that says why an evaluation fails this limit; None if it does not fail."""
         value = self.value_in(summary)
         if value is None:
             return f"{self.key} needs two or more episodes with finite values; the limit is {self.value:g}"
@@ -72,21 +75,21 @@ class Limit:
         option = f"{self.flag} {self.key}={self.value:g}"
         if group != "values":
             hint = did_you_mean(name, entries) or f"allowed: {listing(entries)}"
-            return UsageError(f"{option}: there is no {group}.{name}", hint=hint)
+            return UsageError(f"{option}: the evaluation has no '{name}' in {group}", hint=hint)
         if same := _ending_in(entries, name):
-            return UsageError(f"{option}: '{name}' is ambiguous", hint=f"write one of {listing(same)}")
+            return UsageError(f"{option}: several metrics end in '{name}'", hint=f"write one of {listing(same)}")
         names = [*_KEYS, *entries]
         hint = did_you_mean(name, names) or f"allowed: {listing(names)}"
-        return UsageError(f"{option}: the task logs no value '{name}'", hint=hint)
+        return UsageError(f"{option}: the evaluation has no metric '{name}'", hint=hint)
 
 
 def read_limits(fail_under: Sequence[str] | None, fail_over: Sequence[str] | None = None) -> list[Limit]:
-    """Parse the `KEY=X` of `--fail-under` and `--fail-over`.
+    """Return the limits of an evaluation from the values `KEY=X` of the options `--fail-under` and `--fail-over`.
 
     If an option is repeated with the same key, its last value counts.
 
     Raises:
-        UsageError: for any other text.
+        UsageError: if a value is not of the form KEY=X.
     """
     limits = {}
     for texts, is_minimum in ((fail_under or (), True), (fail_over or (), False)):
@@ -97,31 +100,31 @@ def read_limits(fail_under: Sequence[str] | None, fail_over: Sequence[str] | Non
 
 
 def require_success(resolved: Resolved, keys: Iterable[str], instead: str = "--fail-under return=X") -> None:
-    """Check that the task defines success if a key needs it.
+    """Check that the task defines success if one of some metrics is the success rate.
 
     Args:
         resolved: the task.
-        keys: keys of an evaluation, such as `success` or `return`.
+        keys: the metrics, such as `success` or `return`.
         instead: options without `success`, for the hint.
 
     Raises:
-        UsageError: if a key is `success` and the task does not define success.
+        UsageError: if a metric is `success` and the task does not define success.
     """
     if any(key.partition(".")[0] == "success" for key in keys) and not resolved.task.success:
         raise UsageError("the task defines no success", hint=f"add `success:` to its YAML, or write {instead}")
 
 
 def failures(summary: Mapping[str, Any], limits: Iterable[Limit]) -> list[str]:
-    """Return a sentence for each limit that an evaluation fails.
+    """Return a sentence for each limit that the summary of an evaluation fails.
 
     Raises:
-        UsageError: if the evaluation has no such term or value.
+        UsageError: if the evaluation has no metric that a limit names.
     """
     return [failure for limit in limits if (failure := limit.failure(summary)) is not None]
 
 
 def mean_or_rate(entry: Mapping[str, Any]) -> Any:
-    """Return the rate or the mean of an entry of an evaluation."""
+    """Return the value of one metric from its entry in the summary of an evaluation: its rate or its mean."""
     return entry["rate"] if "rate" in entry else entry["mean"]
 
 
@@ -131,15 +134,15 @@ def _parse(text: str, is_minimum: bool) -> Limit:
     if not math.isfinite(limit.value) or not _is_key(limit):
         end = "lower" if is_minimum else "upper"
         raise UsageError(
-            f"{limit.flag} '{text}' is not success=X, return=X, length=X or NAME=X",
-            hint="NAME: a value of the task, reward_terms.NAME or terminations.NAME;"
-            f" KEY.{limit.end}=X is the {end} end of the 95 % interval",
+            f"{limit.flag} '{text}' is not METRIC=X with a number X",
+            hint="METRIC is success, return, length, or a metric that `rlcli eval` prints, such as reward_terms.alive"
+            f" or terminations.time_out; METRIC.{limit.end}=X limits the {end} end of its 95 % interval",
         )
     return limit
 
 
 def _is_key(limit: Limit) -> bool:
-    """Return whether a key is well-formed; only an evaluation shows whether the task has a value of that name."""
+    """Return whether the key of a limit is well-formed; only an evaluation shows whether there is such a metric."""
     head, _, rest = limit.key.partition(".")
     if head in _KEYS:
         return rest in ("", limit.end)
@@ -149,7 +152,10 @@ def _is_key(limit: Limit) -> bool:
 
 
 def _find_name(entries: Mapping[str, Any], name: str) -> str | None:
-    """Return the entry of this name; `metric` stands for `command/metric` if it is unique."""
+    """Return the full name of a metric; `metric` stands for `command/metric` if only one command has this metric.
+
+    Return None if there is no such metric, or several ones.
+    """
     if name in entries:
         return name
     same = _ending_in(entries, name)

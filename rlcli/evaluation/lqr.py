@@ -36,7 +36,7 @@ _MAX_COST = 1e12
 
 @dataclass(frozen=True, slots=True)
 class Regulator:
-    """Feedback law: action = -gain (observation - rest), clamped to the bound."""
+    """LQR as a policy: action = -gain (observation - rest), clamped to the bound."""
 
     gain: Matrix
     """(actions, observations)"""
@@ -48,7 +48,7 @@ class Regulator:
     """Absolute values of the closed loop's poles, per control step, the largest first; stable below 1."""
 
     def acting(self, env: VecEnv) -> Callable[[Tensor], Tensor]:
-        """Return the action function of the regulator in an environment."""
+        """Return the regulator as a function from observations to actions, on the device of an environment."""
         gain = torch.from_numpy(self.gain).to(env.device)
         rest = torch.from_numpy(self.rest).to(env.device)
 
@@ -60,14 +60,14 @@ class Regulator:
 
 
 def regulator(resolved: Resolved, bound: float | None) -> Regulator:
-    """Compute the regulator of a task, with unit weights on positions, velocities, and actions divided by the bound.
+    """Compute the LQR of a task. The weights of positions, velocities, and actions divided by the bound are 1.
 
     Args:
         resolved: the task.
         bound: largest absolute action; None: no bound.
 
     Raises:
-        UsageError: if the task has no regulator, with the reason.
+        UsageError: if the task has no LQR, with the reason.
     """
     if not resolved.task.success:
         raise _no_regulator(resolved, "the task defines no success, so its target state is unknown")
@@ -99,7 +99,9 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
 
 
 def riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix) -> Matrix | None:
-    """Return the gain k of u = -k x that minimises the sum of x'qx + u'ru for x+ = a x + b u; None if none exists.
+    """Return the gain k of the feedback u = -k x that minimises the sum of x'qx + u'ru, or None if none exists.
+
+    x is the state, u the input, and the next state is a x + b u.
 
     The discrete algebraic Riccati equation is iterated from q on; iteration n gives the cost of a horizon of n steps.
     """
@@ -117,10 +119,12 @@ def riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix) -> Matrix | None:
 
 
 def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Return deviations from the default state: inputs, next states and observations; and the observation at rest.
+    """Make one step from many states near the default state, and return what the linear model is fitted to.
 
-    The first three are half the differences of pairs on both sides of the default state, so that quadratic and other
-    even terms cancel.
+    Returns:
+        Deviations from the default state, a row for each pair of samples: (state and action, next state, observation);
+        and the observation at the default state. The two samples of a pair are on opposite sides of the default state;
+        half their difference is returned, in which quadratic and other even terms cancel.
 
     Raises:
         UsageError: if the default state is not an equilibrium in which the task succeeds.
@@ -155,7 +159,10 @@ def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matr
 
 
 def _fit(inputs: Matrix, targets: Matrix) -> tuple[Matrix, Matrix]:
-    """Return the least-squares matrix from rows of inputs to rows of targets, and the relative residual by column."""
+    """Return the matrix that maps rows of inputs to rows of targets best, by least squares.
+
+    The second result is the relative error of each column of the targets.
+    """
     found, *_ = np.linalg.lstsq(inputs, targets, rcond=_SINGULAR)
     residual = np.sqrt(np.square(targets - inputs @ found).mean(axis=0))
     return found, residual / np.maximum(np.sqrt(np.square(targets).mean(axis=0)), 1e-9)

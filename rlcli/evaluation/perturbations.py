@@ -29,11 +29,11 @@ _NO_BIAS, _AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjB
 
 
 class Perturbations(StepObserver):
-    """Observer that applies all perturbations to an environment.
+    """Observer that applies all perturbations of a stress test to an environment.
 
     Args:
         env: the environment; from now on its steps are perturbed.
-        sweeps: the parameters.
+        sweeps: the perturbed parameters, such as the mass of a body.
         values: value of each parameter in every environment; NaN: not changed. (num_envs, sweeps) float64
 
     Raises:
@@ -60,7 +60,7 @@ class Perturbations(StepObserver):
         env.observers.add(self)
 
     def around(self, act: Act) -> Act:
-        """Return the action function with perturbed observations and actions."""
+        """Return a policy function that perturbs the observations before, and the actions after, the policy `act`."""
         if not self._inputs and not self._outputs:
             return act
 
@@ -90,7 +90,7 @@ class Perturbations(StepObserver):
             self._physical.append(ModelPerturbation(env, sweep, values))
 
     def before_step(self) -> None:
-        """Change the model's fields where necessary, and push bodies."""
+        """Push bodies, and change the model again where an event of the task has undone the perturbation."""
         self._apply_to_model()
         for push in self._pushes:
             push()
@@ -112,14 +112,14 @@ class Perturbations(StepObserver):
 
 
 class _Signal:
-    """Base of noise and delay: a perturbation of some columns of the observations or of the actions."""
+    """Base class of noise and delay: a perturbation of some columns of the observations or of the actions."""
 
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor, columns: Tensor, of_action: bool) -> None:
         self.env, self.values, self.columns, self.of_action = env, values, columns, of_action
         self.stream = random.stream(f"stress.{sweep.name}")
 
     def __call__(self, signal: Tensor, is_first: Tensor) -> Tensor:
-        """Perturb a signal (num_envs, k); `is_first` (num_envs,) marks the first step of an episode."""
+        """Return the perturbed observations or actions. `is_first` (num_envs,) marks the first step of an episode."""
         raise NotImplementedError
 
 
@@ -136,7 +136,10 @@ class _Noise(_Signal):
 
 
 class _Delay(_Signal):
-    """Delay by some steps. At the start of an episode its first observation is repeated, and the action is 0."""
+    """Delay of observations or actions by some steps.
+
+    At the start of an episode, the delayed observation is the first one of the episode, and the delayed action is 0.
+    """
 
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor, columns: Tensor, of_action: bool) -> None:
         super().__init__(env, sweep, values, columns, of_action)
@@ -156,7 +159,10 @@ class _Delay(_Signal):
 
 
 class _Push:
-    """Push once in an episode, at a random step of its first half: a jump of a velocity in a random direction."""
+    """Push of a robot or joint once in an episode, at a random step of its first half.
+
+    It adds a velocity in a random direction.
+    """
 
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor) -> None:
         self._env, self._values = env, values
@@ -182,7 +188,7 @@ class _Push:
         self._root, self._joint = floating.get(name), joints.get(name)
 
     def __call__(self) -> None:
-        """Push the environments that have reached their random step."""
+        """Push in the environments in which the episode has reached its random step."""
         env = self._env
         # columns: the step of the push, and its direction
         uniform = random.uniform(_keys(env, env.episode_index), self._stream, 0, 2)
@@ -213,13 +219,16 @@ _STEPS = 1 << 32
 
 
 def _keys(env: VecEnv, counters: Tensor) -> random.Keys:
-    """Return the keys of random numbers by random stream and counter. (num_envs,)"""
+    """Return the key of each environment's random numbers, from its random stream and a counter. (num_envs,)"""
     ids = np.arange(env.num_envs) % (env.engine.shared_streams or env.num_envs)
     return random.row_keys(env.seed, ids, counters.cpu().numpy())
 
 
 def _columns(terms: Sequence[TermLayout], pattern: str | None, what: str) -> Tensor:
-    """Return the columns of the terms, or of the elements `term.element`, that match a pattern. (k,)"""
+    """Return the columns whose term, or `term.element`, matches a pattern; all columns without a pattern. (k,)
+
+    `what` is observation or action, for messages.
+    """
     total = sum(term.size for term in terms)
     if pattern is None:
         return torch.arange(total)
@@ -239,7 +248,7 @@ def _columns(terms: Sequence[TermLayout], pattern: str | None, what: str) -> Ten
 
 
 class ModelPerturbation:
-    """One parameter of the model, for one or more elements.
+    """Perturbation of one parameter of the model, such as the mass, for one or more bodies, joints and so on.
 
     Args:
         env: the environment.
@@ -280,10 +289,10 @@ class ModelPerturbation:
         self._affected = ~values.isnan() & ((values != 1.0) | sweep.absolute)
 
     def apply(self) -> Tensor | None:
-        """Change the values that the task has written since `note_values`.
+        """Perturb the values that the task has written since the last call of `note_values`.
 
         Returns:
-            The changed environments, (num_envs,) bool; None if there are none.
+            Whether each environment was changed, (num_envs,) bool; None if none was.
         """
         written = [part.written() & self._affected[:, None] for part in self._parts]
         rows = torch.stack([mask.any(dim=1) for mask in written]).any(dim=0)
@@ -299,7 +308,7 @@ class ModelPerturbation:
             part.held = part.now()
 
     def _targets(self, now: Tensor) -> list[Tensor]:
-        """Return the values that each part must have. (num_envs, values) each"""
+        """Return the perturbed values of each part, from the first part's present values. (num_envs, values) each"""
         value = self._values[:, None]
         if not self._sweep.absolute:
             return [part.now() * value for part in self._parts]
@@ -314,7 +323,7 @@ class ModelPerturbation:
 
 
 class _Part:
-    """Some values of a model field in every environment, which one perturbation changes."""
+    """The values of one model field that a perturbation changes, in every environment."""
 
     def __init__(self, env: VecEnv, field: str, rows: list[int], axes: list[int] | None) -> None:
         self.field = field
@@ -328,21 +337,23 @@ class _Part:
         self._columns = torch.tensor([row * width + axis for row in rows for axis in axes], device=env.device)
 
     def now(self) -> Tensor:
-        """Return a copy of the values. (num_envs, elements x axes)"""
+        """Return a copy of the present values. (num_envs, elements x axes)"""
         return self._live[:, self._columns]
 
     def written(self) -> Tensor:
-        """Return which values the task has written since the last change. (num_envs, elements x axes) bool"""
+        """Return which values the task has written since they were perturbed. (num_envs, elements x axes) bool"""
         now = self.now()
         return torch.ones_like(now, dtype=torch.bool) if self.held is None else now != self.held
 
     def write(self, mask: Tensor, values: Tensor) -> None:
-        """Set the values where a mask holds. (num_envs, elements x axes) each"""
+        """Set the values where the mask is true. (num_envs, elements x axes) each"""
         self._live[:, self._columns] = torch.where(mask, values.to(self._live.dtype), self.now())
 
 
 def _rows(env: VecEnv, field: str, pattern: str | None) -> tuple[list[int], list[str]]:
-    """Return rows of a model field, and the names of the elements that they belong to.
+    """Return the rows of a model field whose elements (bodies, joints, ...) match a pattern, and the elements' names.
+
+    Without a pattern, all elements match.
 
     Raises:
         NameProblem: if the model has no such element.
@@ -350,7 +361,7 @@ def _rows(env: VecEnv, field: str, pattern: str | None) -> tuple[list[int], list
     model, kind = env.engine.model, FIELDS[field]
     if not kind:
         if pattern is not None:
-            raise NameProblem("the parameter belongs to the whole world", f"leave out '{pattern}'")
+            raise NameProblem("the parameter belongs to the whole world, not to an element", f"leave out '{pattern}'")
         return [0], ["the world"]
     entities = [f"{name}/" for name in env.entities]
     ids: list[int] = []
@@ -373,7 +384,10 @@ def _rows(env: VecEnv, field: str, pattern: str | None) -> tuple[list[int], list
 
 
 def _elements(model: mujoco.MjModel, field: str, number: int) -> list[int]:
-    """Return the rows of an element in a field; a joint has one for each degree of freedom or coordinate."""
+    """Return the rows of a model field that belong to the element with index `number`.
+
+    A joint has one row for each degree of freedom (fields `dof_...`) or coordinate (`qpos0`).
+    """
     if field.startswith("dof_"):
         return [dof for dof in range(model.nv) if model.dof_jntid[dof] == number]
     if field in ("qpos0", "qpos_spring"):
@@ -383,10 +397,10 @@ def _elements(model: mujoco.MjModel, field: str, number: int) -> list[int]:
 
 
 def _axes(env: VecEnv, field: str, sweep: Sweep) -> list[int] | None:
-    """Return the columns of an element's row that are changed; None: all.
+    """Return which values in a row of a model field a sweep changes, by index; None: all.
 
     Raises:
-        NameProblem: if a row has several values, and all would be set to the same value.
+        NameProblem: if a row has several values, and all of them would be set to the same value.
     """
     if field == "geom_friction":
         return [0]  # sliding friction; the other two are torsional and rolling friction
@@ -399,7 +413,10 @@ def _axes(env: VecEnv, field: str, sweep: Sweep) -> list[int] | None:
 
 
 def _require_affine(model: mujoco.MjModel, rows: list[int], names: list[str]) -> None:
-    """Check that scaling the gain and bias parameters of actuators scales their force."""
+    """Check that the force of actuators is scaled if their gain and bias parameters are scaled.
+
+    `rows` are the actuators in the model, `names` their names.
+    """
     kinds = [(int(model.actuator_gaintype[row]), int(model.actuator_biastype[row])) for row in rows]
     unsupported = [
         name

@@ -1,4 +1,4 @@
-"""Sessions of play, eval, stress and report: find a policy and its task, check them, and build the environment."""
+"""Preparation of play, eval, stress and report: find a policy and its task, check them, and build the environment."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MAX_ENVS = 8192
 
 @dataclass(frozen=True, slots=True)
 class PolicyRequest:
-    """References to a policy and a task from a command line."""
+    """Choice of a policy and a task on a command line, before they are found and checked."""
 
     task: str | None
     overrides: Sequence[str] = ()
@@ -68,14 +68,14 @@ class PolicyInTask:
     """Whether the policy is a checkpoint of a run and the task is configured as in that run."""
 
     def record(self) -> dict[str, Any]:
-        """Return the references of the policy as JSON."""
+        """Return the checkpoint of the policy, why it was chosen, and the kind of policy, as JSON."""
         checkpoint = str(self.checkpoint) if self.checkpoint else None
         return {"checkpoint": checkpoint, "chosen": self.reason, "policy": self.kind}
 
 
 @dataclass(slots=True)
 class Session:
-    """An environment and a policy that acts in it."""
+    """An environment and a policy that acts in it, ready to run."""
 
     env: VecEnv
     act: Act
@@ -85,11 +85,13 @@ class Session:
 
 
 def find_policy(request: PolicyRequest, check: Callable[[Resolved], None] = lambda resolved: None) -> PolicyInTask:
-    """Find the policy and its task, and check the task; torch and MuJoCo are not imported for a policy without files.
+    """Find the policy and its task, and check the task.
+
+    torch and MuJoCo are not imported for a policy without a checkpoint, such as `random`.
 
     Args:
         request: the policy and the task.
-        check: called with the configuration; it may raise an error.
+        check: a further check, called with the task's configuration; it may raise an error.
 
     Raises:
         UsageError: if neither a task nor a checkpoint is named, or there is no such policy.
@@ -126,7 +128,10 @@ def find_policy(request: PolicyRequest, check: Callable[[Resolved], None] = lamb
 
 
 def split_overrides(task: str | None, overrides: Sequence[str]) -> tuple[str | None, list[str]]:
-    """Return the task and the overrides of a command line; a word with `=` in place of the task is an override."""
+    """Return the task and the overrides of a command line.
+
+    If the word in place of the task has a `=`, it is an override, and there is no task.
+    """
     if task is not None and "=" in task:
         return None, [task, *overrides]
     return task, list(overrides)
@@ -136,7 +141,7 @@ def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
     """Find a task by its name.
 
     Raises:
-        TaskError: if there is no such task; the message or the hint says whether the name is that of a run.
+        TaskError: if there is no such task. If a run has this name, the message says so.
     """
     from rlcli.runs.trusted_tasks import named_task
 
@@ -153,11 +158,13 @@ def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
 
 
 def open_session(request: PolicyRequest, check: Callable[[Resolved], None] = lambda resolved: None) -> Session:
-    """Find and check a policy and its task, then build the environment; if it diverges, its state is dumped to a file.
+    """Find and check a policy and its task, then build the environment.
+
+    If the simulation diverges later, a crash dump is written.
 
     Args:
         request: the policy and the task.
-        check: called with the configuration; it may raise an error.
+        check: a further check, called with the task's configuration; it may raise an error.
     """
     policy = find_policy(request, check)
     if request.episodes is not None:
@@ -187,15 +194,17 @@ def one_each(resolved: Resolved, episodes: int) -> Resolved:
 
 
 def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
-    """Return a policy without a checkpoint (zero, random or lqr) in the task of another policy.
+    """Return a policy without a checkpoint in the task of another policy. `kind` is zero, random or lqr.
 
     Raises:
         UsageError: if there is no such policy.
     """
     require_known(kind, POLICIES, "policy", "policies")
     if kind == "trained":
-        message = "--against trained: only a policy without training can be the reference"
-        raise UsageError(message, hint="use lqr, zero or random")
+        raise UsageError(
+            "--against trained: only a policy without training can be the reference",
+            hint="use --against lqr, zero or random",
+        )
     return replace(policy, kind=kind, stochastic=False, as_trained=False)
 
 
@@ -211,7 +220,10 @@ def is_run_name(word: str, runs_dir: Path | None) -> bool:
 
 
 def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
-    """Return a function that opens the policy in an environment; the policy's files are read only once."""
+    """Read a policy, and return a function from an environment to the policy's action function in it.
+
+    The function can be called for several environments; the files of the policy are read only once.
+    """
     import torch
 
     from rlcli.random import derive
@@ -243,10 +255,10 @@ def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
 
 
 def check_record(record: Path | None, mode: str) -> None:
-    """Check the options of a recording, before anything is built.
+    """Check the options `--record FILE` and `--record-mode MODE`, before anything is built.
 
     Raises:
-        UsageError: for an unknown mode, or something else than a regular file.
+        UsageError: for an unknown mode, or if the path is a folder, pipe or device.
         MachineError: if the folder of the file does not exist.
     """
     modes = ("all", "succeeded", "failed", "separate")
@@ -260,7 +272,12 @@ def check_record(record: Path | None, mode: str) -> None:
 
 
 def recording_files(file: Path, mode: str) -> dict[str, Path]:
-    """Return which episodes (all, succeeded or failed) a mode of `--record-mode` writes, and the file of each."""
+    """Return which episodes are recorded (all, succeeded or failed) -> the file to which they are written.
+
+    Args:
+        file: the FILE of `--record`.
+        mode: the mode of `--record-mode`; `separate` writes succeeded and failed episodes to two files.
+    """
     if mode != "separate":
         return {mode: file}
     return {word: file.with_name(f"{file.stem}-{word}{file.suffix}") for word in ("succeeded", "failed")}
@@ -269,7 +286,14 @@ def recording_files(file: Path, mode: str) -> dict[str, Path]:
 def run_episodes(
     session: Session, episodes: int, record: Path | None = None, mode: str = "all"
 ) -> tuple[dict[str, Any], list[str]]:
-    """Evaluate, and record if a file is given; return the summary and the written files."""
+    """Evaluate the policy of a session; return the summary and the files of recorded episodes.
+
+    Args:
+        session: the environment and the policy.
+        episodes: number of episodes.
+        record: file to which episodes are recorded; None: no recording.
+        mode: which episodes are recorded, as in `recording_files`.
+    """
     from rlcli.evaluation.evaluate import evaluate
 
     if record is None:
@@ -291,7 +315,7 @@ def evaluation_record(session: Session, summary: dict[str, Any]) -> dict[str, An
 
 
 def save_evaluation(session: Session, record: dict[str, Any]) -> None:
-    """Write the evaluation of a checkpoint into its run, for `report` and `runs`.
+    """Write the evaluation of a checkpoint (`record`, its JSON) into its run, where `report` and `runs` read it.
 
     It is written only for a deterministic policy in the task as it was trained. If the run cannot be written, a warning
     is logged.

@@ -36,7 +36,7 @@ Summary = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class StressResult:
-    """Summaries of the evaluations of a stress test."""
+    """Result of a stress test: the summary of the evaluation of every variant of the task."""
 
     sweeps: Sequence[Sweep]
     nominal: Summary
@@ -56,16 +56,16 @@ class StressResult:
 
     @property
     def variants(self) -> dict[Point, Summary]:
-        """Summaries of the grid and of the search."""
+        """Values of the parameters -> summary, for every variant of the grid and of the search."""
         return {**self.grid, **self.searched}
 
     @property
     def worst(self) -> Point:
-        """Point of the worst variant."""
+        """Values of the parameters in the variant with the lowest success rate, or else the lowest return."""
         return min(self.variants, key=lambda point: score(self.variants[point]))
 
     def failures(self, limits: Sequence[Limit]) -> list[str]:
-        """Return a sentence for each minimum that fails in the variant with the lowest value of its metric."""
+        """Return a sentence for each minimum that a variant of the task fails; it names the worst variant."""
         found = []
         for limit in limits:
             values = {point: limit.value_in(summary) for point, summary in self.variants.items()}
@@ -76,7 +76,7 @@ class StressResult:
         return found
 
     def record(self, against: str | None) -> dict[str, Any]:
-        """Return the result as JSON; `against` is the name of the reference policy."""
+        """Return the result as JSON; `against` is the name of the reference policy, None without one."""
         worst = self.worst
         reference = {point: summary for point, summary in self.reference.items() if point is not None}
         return {
@@ -110,13 +110,15 @@ def stress(
     worst: int = 0,
     reference: PolicyInTask | None = None,
 ) -> StressResult:
-    """Evaluate a policy in its unchanged task, in every variant of the grid, and in further ones near the worst.
+    """Evaluate a policy in its unchanged task and in many variants of it.
+
+    The variants are all combinations of the sweeps' values (the grid), and further ones near the worst of these.
 
     Args:
         policy: the policy.
-        sweeps: the parameters that are varied.
+        sweeps: the parameters that are varied, with their values.
         episodes: number of episodes in each variant.
-        worst: number of further points in a search for a worse case.
+        worst: number of further variants in the search for a worse one.
         reference: a policy that is evaluated in the same variants.
 
     Raises:
@@ -184,7 +186,10 @@ def run_points(
 
 
 def search(sweeps: Sequence[Sweep], center: Point, count: int, seed: int) -> list[Point]:
-    """Return `count` random points of the box that the sweeps span: half of them near a point, the others uniform."""
+    """Return `count` random points between the lowest and the highest values of the sweeps.
+
+    Half of them are near the point `center`, the others are uniformly distributed.
+    """
     generator = np.random.default_rng(derive(seed, "stress"))
     middle = np.array([sweep.share(value) for sweep, value in zip(sweeps, center, strict=True)])
     near = middle + _NEAR * generator.standard_normal(((count + 1) // 2, len(sweeps)))
@@ -193,5 +198,5 @@ def search(sweeps: Sequence[Sweep], center: Point, count: int, seed: int) -> lis
 
 
 def score(summary: Summary) -> tuple[float, float]:
-    """Return the key that orders variants: success rate, then mean return."""
+    """Return the sort key of a variant, (success rate, mean return), from its summary; the worst comes first."""
     return summary["success"]["rate"] if "success" in summary else 0.0, summary["return"]["mean"]

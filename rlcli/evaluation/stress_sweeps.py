@@ -32,17 +32,17 @@ SIGNALS = {
 """Parameter -> its unit."""
 _INTEGER = ("action_delay", "observation_delay")
 _MAX_POINTS = 1000
-_MAX_VARIANTS = 10_000
 """Largest number of values of a sweep, and of steps of a delay."""
+_MAX_VARIANTS = 10_000
 _FORM = re.compile(r"(?P<name>\w+)(?:\.(?P<element>[^=]+))?=(?P<absolute>abs:)?(?P<values>[^=]+)")
 
 Point = tuple[float, ...]
-"""One value for each sweep."""
+"""A variant of the task: one value for each sweep."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """One parameter and the values that it takes."""
+    """A parameter of a stress test, such as `body_mass.pole`, and the values that it takes."""
 
     parameter: str
     element: str | None
@@ -53,7 +53,7 @@ class Sweep:
 
     @property
     def name(self) -> str:
-        """Parameter and element, as on the command line."""
+        """Parameter and element as on the command line, such as `body_mass.pole`."""
         return self.parameter if self.element is None else f"{self.parameter}.{self.element}"
 
     @property
@@ -68,7 +68,7 @@ class Sweep:
 
     @property
     def spacing(self) -> Literal["linear", "geometric"]:
-        """Spacing of values in a range: factors have equal ratios, other values equal differences."""
+        """How values are spaced in a range: factors geometrically (equal ratios), other values linearly."""
         return "geometric" if self.neutral == 1.0 and min(self.values) > 0.0 else "linear"
 
     def between(self, share: float) -> float:
@@ -80,7 +80,7 @@ class Sweep:
         return float(f"{value:.12g}")  # so that the middle of 0.8:1.25 is exactly 1
 
     def share(self, value: float) -> float:
-        """Return the share at which `between` gives a value."""
+        """Return the share (0 to 1) of the way from the lowest to the highest value at which a value lies."""
         low, high = min(self.values), max(self.values)
         if high == low:
             return 0.0
@@ -90,10 +90,12 @@ class Sweep:
 
 
 def read_sweeps(texts: Sequence[str], points: int) -> list[Sweep]:
-    """Parse `NAME[.ELEMENT]=[abs:]LOW:HIGH[:POINTS]` or `...=A,B,C`; no parameter may appear twice.
+    """Return the sweeps of a command line, from texts `NAME[.ELEMENT]=[abs:]LOW:HIGH[:POINTS]` or `...=A,B,C`.
+
+    `points` is the number of values of a range that has no POINTS.
 
     Raises:
-        UsageError: for text of another form, values that are not possible, or too many combinations.
+        UsageError: for text of another form, impossible values, a repeated parameter, or too many combinations.
     """
     sweeps: list[Sweep] = []
     for text in texts:
@@ -104,24 +106,24 @@ def read_sweeps(texts: Sequence[str], points: int) -> list[Sweep]:
     count = math.prod(len(sweep.values) for sweep in sweeps)  # before `grid` builds all combinations
     if count > _MAX_VARIANTS:
         raise UsageError(
-            f"{count:,} variants, but at most {_MAX_VARIANTS:,} are allowed",
+            f"--sweep: {count:,} variants of the task, but at most {_MAX_VARIANTS:,} are allowed",
             hint="give fewer sweeps, or a smaller --points",
         )
     return sweeps
 
 
 def grid(sweeps: Sequence[Sweep]) -> list[Point]:
-    """Return every combination of the sweeps' values; the last sweep changes fastest."""
+    """Return every combination of the sweeps' values; the values of the last sweep change fastest."""
     return list(itertools.product(*(sweep.values for sweep in sweeps)))
 
 
 def format_value(value: float) -> str:
-    """Return a value of a sweep in few digits."""
+    """Return a value of a sweep as text with four digits."""
     return f"{value:.4g}"
 
 
 def by_name(sweeps: Sequence[Sweep], point: Point) -> dict[str, float]:
-    """Return the value of each sweep at a point, by the sweep's name."""
+    """Return name of each sweep -> its value at a point."""
     return {sweep.name: value for sweep, value in zip(sweeps, point, strict=True)}
 
 
@@ -131,7 +133,7 @@ def describe_point(sweeps: Sequence[Sweep], point: Point) -> str:
 
 
 def unknown_parameter(name: str, fields: Sequence[str]) -> UsageError:
-    """Return the error for an unknown parameter; `fields` are the names of model fields."""
+    """Return the error for an unknown parameter. `fields` are the model fields that are parameters, too."""
     own = [*PHYSICAL, *SIGNALS]
     near = did_you_mean(name, [*own, *fields])
     message = f"--sweep: there is no parameter '{name}'"
@@ -171,7 +173,7 @@ def _values(text: str, written: str, name: str, points: int, absolute: bool) -> 
     low, high = (_number(text, part) for part in ends[:2])
     if len(ends) == 3:
         if not re.fullmatch("[0-9]{1,6}", ends[2].strip()):
-            raise UsageError(f"--sweep {text}: '{ends[2]}' is not a whole number of points")
+            raise UsageError(f"--sweep {text}: '{ends[2]}' is not a number of points; write a whole number")
         points = int(ends[2])
     if not low < high:
         raise UsageError(f"--sweep {text}: {low:g} is not below {high:g}", hint="give LOW:HIGH, or a single value")

@@ -1,4 +1,7 @@
-"""Registry of tasks, trainers and formats by name. Names come from package metadata; plugins are imported when used."""
+"""Registry of the installed tasks, trainers and formats (of other frameworks' task files), by name.
+
+The names come from the metadata of installed packages; a plugin is imported only when it is used.
+"""
 
 from rlcli.registry.entries import (
     FORMATS,

@@ -1,4 +1,4 @@
-"""Entry points of installed distributions, read without importing any of them.
+"""Search for plugins: the entry points of installed distributions, read without importing any of them.
 
 Distributions are read one by one, so that a broken one does not hide the others.
 """
@@ -34,7 +34,7 @@ _entry_points: Any = vars(metadata.Distribution)["entry_points"].fget
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """An entry point: the facts that are available without importing anything."""
+    """An entry point of an installed distribution, with which a plugin offers a task, a trainer or a format."""
 
     name: str
     """Name of the task, trainer or format."""
@@ -47,7 +47,7 @@ class Entry:
 
     @property
     def qualified(self) -> str:
-        """`distribution:name`, which is unique even if two distributions offer the same name."""
+        """The text `distribution:name`; two distributions may have entry points of the same name."""
         return f"{self.distribution}:{self.name}"
 
     @property
@@ -66,9 +66,14 @@ class Broken:
 
 
 def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], list[Broken]]:
-    """Return every entry of a group, sorted by name and distribution, and the distributions that could not be read.
+    """Return every entry point of a group, and the distributions whose metadata could not be read.
 
-    Entries that RLCLI_PLUGINS or the user's settings exclude are returned only if `hidden` is true.
+    Args:
+        group: the entry-point group, one of `GROUPS`.
+        hidden: whether to return also the plugins that RLCLI_PLUGINS or the user's settings exclude.
+
+    Returns:
+        The entry points, sorted by name and distribution, and the unreadable distributions.
     """
     entries: dict[tuple[str, str], Entry] = {}
     broken: dict[str, Broken] = {}
@@ -100,12 +105,12 @@ def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
     content = distribution.metadata  # each access parses the metadata again
     name, version = content["Name"], content["Version"]
     if not name or not version:
-        raise ValueError("its METADATA has no Name or no Version; reinstall the package")
+        raise ValueError("the METADATA of the package has no Name or no Version; reinstall the package")
     return name, version
 
 
 def find_entry(group: str, name: str, *, what: str) -> Entry:
-    """Return the entry of a group with this name or `distribution:name`.
+    """Return the entry point of a group by its name or by `distribution:name`.
 
     Args:
         group: the entry-point group.
@@ -138,7 +143,7 @@ def find_entry(group: str, name: str, *, what: str) -> Entry:
 
 
 def unreadable_distributions() -> list[Broken]:
-    """Return every installed distribution whose metadata is malformed, also those that are no plugins of rlcli."""
+    """Return every installed distribution whose metadata is malformed, whether or not it has plugins of rlcli."""
     found: dict[str, Broken] = {}
     for distribution in metadata.distributions():
         folder = Path(str(getattr(distribution, "_path", "?")))
@@ -152,7 +157,10 @@ def unreadable_distributions() -> list[Broken]:
 
 
 def unknown_wanted() -> str:
-    """Return the names in RLCLI_PLUGINS or the user's settings that are not installed plugins, listed for a message."""
+    """Return the names in RLCLI_PLUGINS or the user's settings that no installed plugin has, as a list for a message.
+
+    The text is empty if there are no such names.
+    """
     wanted = _enabled_distributions()
     if not wanted:
         return ""
@@ -163,7 +171,7 @@ def unknown_wanted() -> str:
 
 
 def plugins_chosen_by() -> str:
-    """Return the source of the list of plugins, for messages: the environment variable or the user's settings."""
+    """Return what chose the plugins to use, for messages: RLCLI_PLUGINS, or the key in the user's settings file."""
     return "RLCLI_PLUGINS" if os.environ.get("RLCLI_PLUGINS", "").strip() else f"plugins in {settings_file()}"
 
 

@@ -15,7 +15,7 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
 
     The folder has a `task.yaml`, and optionally `terms.py` and `task.py` (with a class `Task`). Or it has a task in an
     installed format of another framework. Else the configuration is in Python: `TASK` in `task.py`, or the task that
-    the package registers with Gymnasium.
+    the package registers with Gymnasium. `file` is the name of the YAML file, if it is not `task.yaml`.
 
     Raises:
         TaskError: if the folder has no task, or several tasks.
@@ -94,7 +94,7 @@ def python_task(reference: str, name: str | None = None) -> TaskSource:
 
 
 def python_place(reference: str) -> tuple[Path, str]:
-    """Return the file or folder of a Python configuration (links resolved) and the attribute in it ('' if none)."""
+    """Split a reference such as `FILE.py:NAME` into the real path of the file or folder, and NAME ('' if none)."""
     path, _, attribute = reference.rpartition(":")
     if not path or Path(reference).exists():
         return Path(reference).resolve(), ""

@@ -1,4 +1,7 @@
-"""Installed formats (entry-point group `rlcli.formats`), and known formats whose plugin is not installed."""
+"""Formats: plugins (entry-point group `rlcli.formats`) that read the task files of other frameworks.
+
+The module finds the installed formats. It also knows formats whose plugin is not installed, to say what to install.
+"""
 
 import functools
 import json
@@ -26,7 +29,7 @@ _MOST_FILES = 100
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """An installed format of task files: its entry point and its specification."""
+    """An installed plugin that reads task files of another framework: its entry point and its `FormatSpec`."""
 
     entry: Entry
     spec: FormatSpec
@@ -37,7 +40,7 @@ class Format:
         return self.entry.name
 
     def load(self, reference: str) -> Any:
-        """Import a part of the format by a reference of its spec.
+        """Import a function or class of the format; `reference` is a value of its `FormatSpec`, `module:name`.
 
         Raises:
             TaskError: if the plugin is broken.
@@ -47,7 +50,7 @@ class Format:
 
 @dataclass(frozen=True, slots=True)
 class KnownFormat:
-    """A format that some plugin offers, as `known_plugins.json` describes it."""
+    """A format of other frameworks' task files that some plugin reads, installed or not, from `known_plugins.json`."""
 
     install: str
     """The arguments of `pip install`."""
@@ -79,7 +82,7 @@ class KnownFormat:
         return all(map(occurs, self.all_of)) and not any(map(occurs, self.none_of))
 
     def missing(self, what: str = "") -> DependencyError:
-        """Return the error that the plugin is not installed. `what` names the file or import that needs the plugin."""
+        """Return the error for a missing plugin. `what` names the file or the import that needs it, for the message."""
         message = f"the plugin that reads {self.summary} is not installed"
         return DependencyError(f"{what}: {message}" if what else message, hint=pip_install(self.install))
 
@@ -118,13 +121,16 @@ def find_in_formats(path: Path) -> TaskSource | None:
 
 
 def format_of_key(keys: Mapping[str, Any]) -> Format | None:
-    """Return the installed format whose key has a non-empty value here; None if there is none."""
+    """Return the installed format whose `FormatSpec.key` has a non-empty value in `keys`; None if there is none.
+
+    `keys` are the top-level keys of a task file.
+    """
     used = {key for key, value in keys.items() if value}
     return next((form for form in installed_formats() if form.spec.key in used), None) if used else None
 
 
 def format_of_module(module: str) -> Format | None:
-    """Return the installed format that a module belongs to; None if it belongs to none."""
+    """Return the installed format whose plugin contains a module, named by its dotted name; None if none does."""
     top = module.partition(".")[0]
     return next((_load(entry) for entry in catalog(FORMATS)[0] if entry.package == top), None)
 
@@ -140,12 +146,12 @@ def _framework_packages() -> frozenset[str]:
 
 
 def known_trainers() -> dict[str, str]:
-    """Return the trainers that plugins offer, each with the arguments of `pip install`."""
+    """Return the name of each trainer in `known_plugins.json` -> the arguments of `pip install` for its plugin."""
     return dict(_known_plugins()["trainers"])
 
 
 def known_formats() -> dict[str, KnownFormat]:
-    """Return the formats that plugins offer, by name."""
+    """Return the formats in `known_plugins.json`, by name, whether or not their plugin is installed."""
     return {name: KnownFormat(**values) for name, values in _known_plugins()["formats"].items()}
 
 
@@ -177,10 +183,10 @@ def require_format(path: Path) -> None:
 
 
 def require_module(error: BaseException) -> None:
-    """Check that a failed import does not need the plugin of a known format that is not installed.
+    """Check that `error` is not the failed import of a module that belongs to a format without its plugin.
 
     Raises:
-        DependencyError: if it needs one, with the `pip install` command.
+        DependencyError: if it is, with the `pip install` command.
     """
     name = error.name if isinstance(error, ModuleNotFoundError) else None
     for form in missing_formats().values() if name else ():
@@ -190,7 +196,7 @@ def require_module(error: BaseException) -> None:
 
 @functools.cache
 def aliasing_formats() -> tuple[Format, ...]:
-    """Return the installed formats that work and have aliases for imports of task files."""
+    """Return the installed formats that work and replace imports of task files (`FormatSpec.aliases`)."""
     return tuple(form for form in usable_formats() if form.spec.aliases)
 
 

@@ -28,7 +28,12 @@ _Spec = TypeVar("_Spec", TaskSpec, TrainerSpec, FormatSpec)
 
 
 def load_spec(entry: Entry, kind: type[_Spec], what: str) -> _Spec:
-    """Import the specification of a plugin. `what` is task, trainer or format, for messages.
+    """Import the object of a plugin's entry point, its `TaskSpec`, `TrainerSpec` or `FormatSpec`.
+
+    Args:
+        entry: the entry point.
+        kind: the class of the object.
+        what: task, trainer or format, for messages.
 
     Raises:
         TaskError: if the plugin is broken, or needs a newer plugin interface.
@@ -43,7 +48,7 @@ def load_spec(entry: Entry, kind: type[_Spec], what: str) -> _Spec:
 
 
 def load_entry(entry: Entry, kind: type) -> Any:
-    """Import the object that an entry point names, and check its type.
+    """Import the object that an entry point names, and check that it is of type `kind`.
 
     Raises:
         TaskError: for any error of the plugin, with the name of its distribution.
@@ -85,7 +90,7 @@ def _named_if_slow(entry: Entry) -> Iterator[None]:
 
 
 def import_object(reference: str) -> Any:
-    """Return the object of `package.module:Name`. Output of the import goes to stderr."""
+    """Import and return the object of a reference `package.module:Name`. What the import prints goes to stderr."""
     name, _, attributes = reference.rpartition(":")
     with contain_side_effects():
         module = importlib.import_module(name)
@@ -94,7 +99,7 @@ def import_object(reference: str) -> Any:
 
 @contextlib.contextmanager
 def contain_side_effects() -> Iterator[None]:
-    """Send output of the `with` block to stderr (also output of C code) and restore the current folder at its end."""
+    """Send what the `with` block prints to stderr, also from C code, and undo its changes of the current folder."""
     folder = _current_folder()
     with contextlib.redirect_stdout(sys.stderr), _descriptor_to_stderr():
         try:
@@ -113,7 +118,7 @@ def error_location(error: BaseException) -> str:
 
 
 def _newer_rlcli(entry: Entry) -> str | None:
-    """Return the hint for a plugin whose metadata requires a newer rlcli; None if it does not."""
+    """Return the hint to upgrade rlcli, for a plugin whose metadata requires a newer one; None for other plugins."""
     import rlcli
 
     requirements: list[str] = []
@@ -127,7 +132,7 @@ def _newer_rlcli(entry: Entry) -> str | None:
 
 
 def release_numbers(version: str) -> list[int]:
-    """Return the numbers of a version without its local part: `2.13.0+cpu` -> [2, 13, 0]."""
+    """Return the numbers of a version, to compare versions: `2.13.0+cpu` -> [2, 13, 0]."""
     return [int(number) for number in re.findall(r"[0-9]+", version.partition("+")[0])]
 
 

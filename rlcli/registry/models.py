@@ -1,4 +1,4 @@
-"""Lookup of a robot model: in the task's folder, another task's folder, a package, or a folder of the user."""
+"""Lookup of a robot's model file (MJCF) in the task's folder, another task's folder, a package, or a user's folder."""
 
 import os
 from pathlib import Path
@@ -12,7 +12,7 @@ MODELS = "RLCLI_MODELS"
 
 
 def model_file(root: Path, model: str) -> Path:
-    """Return the file of a model for a task in `root`.
+    """Return the path of the model file that a task in the folder `root` names by the text `model`.
 
     `FILE` is in the task's own folder; `TASK:FILE` in the folder of an installed task; `package:PACKAGE/FILE` in an
     installed package, which is not imported; `models:FILE` in a folder of the environment variable RLCLI_MODELS;
@@ -27,7 +27,7 @@ def model_file(root: Path, model: str) -> Path:
 
 
 def chosen_model(root: Path, model: str) -> str:
-    """Return the first existing model of alternatives separated by ` | `. A single model is returned unchecked.
+    """Return the first of the alternatives in `model`, separated by ` | `, that exists; a single one is not checked.
 
     Raises:
         MissingModelError: if none of the alternatives exists.
@@ -48,7 +48,7 @@ def chosen_model(root: Path, model: str) -> str:
 
 
 def _install_hint(model: str) -> str:
-    """Return what the user can do to make a model available."""
+    """Return what the user can do so that the model of this name is found, as the hint of an error."""
     kind, _, file = model.partition(":")
     if kind == "models":
         return f"set {MODELS} to a folder that holds {file}"

@@ -1,8 +1,9 @@
-"""Import statements in task files. A module of another framework is replaced by one of an installed format.
+"""Imports in task files of another framework: its modules are replaced by the ones that a format's plugin brings.
 
-The files of a task are executed with their own `__import__`. No other module uses it, and `sys.modules` never has an
-entry for another framework: an installed original is neither imported for a task nor hidden from others. Functions of
-a task that import something later use the same `__import__`.
+For example, `import isaaclab.envs` in a task file imports a module of the plugin. The files of a task are executed with
+their own `__import__`, also when their functions import something later. No other code uses it, and `sys.modules` never
+has an entry for another framework: the framework itself, if it is installed, is not imported for a task, and other code
+can still import it.
 """
 
 import builtins
@@ -38,7 +39,13 @@ class TaskFileLoader(SourceFileLoader):
 
 
 def register_package(module: str, folder: Path, own_name: str) -> None:
-    """Register a folder of task files: its files import each other as `own_name`, and Python knows them as `module`."""
+    """Register a folder of task files, so that its modules are executed as task files.
+
+    Args:
+        module: name of the folder's package in `sys.modules`.
+        folder: the folder.
+        own_name: name of the package in the import statements of its files.
+    """
     _trees[module] = own_name
     if folder not in _roots:
         _roots.append(folder)
@@ -48,7 +55,7 @@ def register_package(module: str, folder: Path, own_name: str) -> None:
 
 @contextlib.contextmanager
 def files_below(folder: Path) -> Iterator[None]:
-    """Execute modules that are found in a folder as files of a task, inside the `with` block."""
+    """Treat the modules in a folder as files of a task while the `with` block imports them."""
     added = folder not in _roots
     register_package("", folder, "")
     try:
@@ -59,19 +66,22 @@ def files_below(folder: Path) -> Iterator[None]:
 
 
 def is_alias(name: str) -> bool:
-    """Return whether an installed format has modules below a top-level name."""
+    """Return whether an installed format replaces modules of the package with this top-level name."""
     return bool(_formats_for(name, ""))
 
 
 def import_by_name(name: str) -> Any:
-    """Import a module by the name that a task file would write. Folders of imported task files come first."""
+    """Import a module by the name that a task file writes in its import statement.
+
+    The folders of task files that are imported already are searched first.
+    """
     tree = next((module for module, own in _trees.items() if own == name.partition(".")[0] != module), "")
     module, _ = _resolve(name, {"__name__": tree})
     return importlib.import_module(name) if module is None else module
 
 
 class _TaskFinder(MetaPathFinder):
-    """Import finder for the registered folders."""
+    """Import finder (an entry of `sys.meta_path`) for the registered folders of task files."""
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, target: Any = None) -> ModuleSpec | None:
         """Return the spec of a file in a registered folder; None for any other module."""
@@ -114,7 +124,7 @@ def _import(
 
 
 def _with_members(module: ModuleType, members: Mapping[str, Any]) -> ModuleType:
-    """Return a module, or a copy of it that has modules of a format as members."""
+    """Return a copy of a module that has these members, too; the module itself if there are no members."""
     if not members:
         return module
     copy = ModuleType(module.__name__)
@@ -123,7 +133,15 @@ def _with_members(module: ModuleType, members: Mapping[str, Any]) -> ModuleType:
 
 
 def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return the module of a name and that of its first part; None if Python's own import finds them."""
+    """Find the module that an import statement in a task file means.
+
+    Args:
+        name: name of the module, `a.b.c`.
+        scope: globals of the task file.
+
+    Returns:
+        The module, and the module of the first part, `a`; (None, None) if Python's own import has to find them.
+    """
     first, _, rest = name.partition(".")
     own = str(scope.get("__name__", "")).partition(".")[0]
     in_tree = _trees.get(own) == first and own != first
@@ -140,7 +158,10 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def _import_folder_above(name: str, file: Path) -> None:
-    """Import a folder above a file as a package, for imports from the repository's root: `source.robot.mdp`."""
+    """Import the folder `name` above a task file as a package, if there is one.
+
+    Such files import modules by their path in the repository, for example `source.robot.mdp`.
+    """
     folder = next((parent for parent in file.parents if parent.name == name), None)
     spec = PathFinder.find_spec(name)
     if folder is None or (spec is not None and str(folder) not in (spec.submodule_search_locations or ())):
@@ -154,13 +175,19 @@ def _import_folder_above(name: str, file: Path) -> None:
 
 
 def _above_alias(form: Format, name: str, file: str) -> Any:
-    """Return the package of which an alias is a part, with the alias as a member: `rlcli` of `rlcli.FORMAT.module`."""
+    """Return the package `a` of a module `a.b.c`, with the format's module for `a.b` as its member.
+
+    Args:
+        form: the format that replaces the module.
+        name: full name of the module, `a.b.c`.
+        file: the importing file.
+    """
     first, second, *_ = name.split(".")
     return _with_members(sys.modules[first], {second: _alias_module(form, f"{first}.{second}", file)})
 
 
 def _alias_module(form: Format, name: str, file: str, below_top: bool = False) -> Any:
-    """Return the module that a format has for a name; None if it has none.
+    """Return the module with which a format replaces the module of a name; None if it does not replace it.
 
     Args:
         form: the format.
@@ -179,9 +206,9 @@ def _alias_module(form: Format, name: str, file: str, below_top: bool = False) -
 
 @functools.cache
 def _formats_for(first: str, file: str) -> tuple[Format, ...]:
-    """Return the formats with an alias below a name; first the one whose other aliases the importing file mentions.
+    """Return the formats that replace modules of the package `first`, the one that fits the importing file best first.
 
-    If the file mentions none, the other files of its task decide.
+    It is the one whose other modules the file mentions most often; if it mentions none, all files of its task count.
     """
     forms = [
         form for form in aliasing_formats() if any(alias.partition(".")[0] == first for alias in form.spec.aliases)

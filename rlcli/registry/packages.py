@@ -12,7 +12,7 @@ from rlcli.task import TaskSpec
 
 
 def installed_task(entry: Entry) -> TaskSource:
-    """Return the task of an entry point. Only the module of its `TaskSpec` is imported.
+    """Return the task of an installed package by its entry point. Only the module of its `TaskSpec` is imported.
 
     Raises:
         TaskError: if the task is broken, or needs a newer rlcli.
@@ -21,7 +21,7 @@ def installed_task(entry: Entry) -> TaskSource:
 
 
 def packaged_task(entry: Entry, spec: TaskSpec) -> TaskSource:
-    """Return the task of an installed package with its files.
+    """Return the task of an installed package: the files and modules that its `TaskSpec` names.
 
     Raises:
         TaskError: if a file or module of the task does not exist.
@@ -69,7 +69,7 @@ def package_folder(entry: Entry) -> Path | None:
 
 
 def package_folders(package: str) -> list[Path]:
-    """Return the folders of a top-level package (several for a namespace package), without importing it."""
+    """Return the folders of a top-level package, without importing it: one, or several of a namespace package."""
     try:
         found = importlib.util.find_spec(package) if package.isidentifier() else None
     except (ImportError, ValueError):
@@ -78,9 +78,9 @@ def package_folders(package: str) -> list[Path]:
 
 
 def is_offered(module: str, source: TaskSource) -> bool:
-    """Return whether a configuration may name a module: one of the task's own package or of an installed plugin.
+    """Return whether a configuration may name a module: it is in the task's own package or in an installed plugin.
 
-    Nothing is imported, because the configuration may come from an untrusted file.
+    The module is not imported, because the configuration may come from an untrusted file.
     """
     top = module.partition(".")[0]
     if top in {entry.package for group in GROUPS for entry in catalog(group)[0]}:
@@ -103,7 +103,10 @@ def _module_file(module: str, entry: Entry) -> Path:
 
 
 def _find(module: str, entry: Entry) -> ModuleSpec | None:
-    """Return the spec of a module; None if there is none. Its parent packages are imported."""
+    """Return the spec of a module; None if there is no such module. Its parent packages are imported.
+
+    `entry` is the entry point of the task, for the message of an error.
+    """
     try:
         with contain_side_effects():
             return importlib.util.find_spec(module)

@@ -39,7 +39,7 @@ _BUILDER = "rlcli.envs.describe_plugins"
 
 @dataclass(frozen=True, slots=True)
 class Details:
-    """Details of a task; None or an empty string means unknown."""
+    """Details of a task, as `list-tasks` shows them; None or an empty string means unknown."""
 
     summary: str = ""
     workflow: str | None = None
@@ -100,15 +100,15 @@ def probe(
     stop: threading.Event | None = None,
     without: Iterable[str] = (),
 ) -> dict[str, Details]:
-    """Load every entry in another process, cache the details of tasks, and return the details by qualified name.
+    """Load plugins in other processes to find out whether they work; return their details by `Entry.qualified`.
 
-    A broken entry has `Details.broken` with the reason. The entries of one distribution share a process. If an entry
-    ends the process or exceeds the time limit, only this entry is broken; the others continue in a new process. Several
-    distributions are loaded at the same time.
+    Details of tasks are also cached. For a broken entry point, `Details.broken` is the reason. The entry points of one
+    distribution share a process. If one of them ends the process or exceeds the time limit, only this one is broken;
+    the others continue in a new process. Several distributions are loaded at the same time.
 
     Args:
-        entries: the entries to load.
-        timeout_s: time limit for one entry [s].
+        entries: the entry points to load.
+        timeout_s: time limit for one entry point [s].
         group: the entry-point group.
         stop: ends the probe early when it is set.
         without: environment variables that are removed for the processes.
@@ -152,7 +152,7 @@ def _update_cache(details: dict[str, Any]) -> None:
 def _probe_distribution(
     entries: list[Entry], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str], work: Work
 ) -> dict[str, Details]:
-    """Load the entries of one distribution, in as many processes as needed."""
+    """Load the entry points of one distribution, after a crash in a new process; the arguments are as in `probe`."""
     found: dict[str, Details] = {}
     late = f"did not load within {timeout_s:g} s"
     while remaining := [entry.qualified for entry in entries if entry.qualified not in found]:
@@ -169,16 +169,16 @@ def _probe_distribution(
 
 @functools.cache
 def _cores() -> threading.Semaphore:
-    """Return the cores of the machine; a process that loads entries holds one until it seems to hang."""
+    """Return a semaphore with one unit for each core; a process that loads plugins holds one until it seems to hang."""
     return threading.Semaphore(available_cores())
 
 
 def _probe_names(
     names: list[str], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str]
 ) -> dict[str, Details]:
-    """Load entries in one process, in this order, and return the details of those that it reached: at least the first.
+    """Load entry points, in this order, in one process; return the details by name, as far as the process came.
 
-    The entry at which the process crashed or exceeded the time limit is among them, as broken.
+    The entry point at which the process crashed or exceeded the time limit is the last one, marked as broken.
     """
     with (
         tempfile.TemporaryDirectory(prefix="rlcli-probe-", ignore_cleanup_errors=True) as folder,
@@ -228,9 +228,18 @@ def _wait(
     stop: threading.Event,
     core: contextlib.ExitStack,
 ) -> int | None:
-    """Wait for a process that appends rows to a file, and return its exit code; free its core if it seems to hang.
+    """Wait for the end of a process that loads plugins, and return its exit code.
 
-    Return None if a row, or the end after the last row, takes longer than `timeout_s`, or if `stop` is set.
+    Return None if a plugin, or the end after the last one, takes longer than `timeout_s`, or if `stop` is set. If the
+    process seems to hang, another one may use its core.
+
+    Args:
+        process: the process.
+        file: the file to which it appends a row for each plugin that it has loaded.
+        wanted: number of plugins to load.
+        timeout_s: time limit for one plugin [s].
+        stop: ends the wait when it is set.
+        core: holds the core that the process uses.
     """
     rows, deadline = 0, time.monotonic() + timeout_s
     while process.poll() is None:
@@ -255,7 +264,7 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def _rows(file: Path) -> list[Details]:
-    """Return the rows of a file up to the first line that is not a valid row."""
+    """Return the details in a file with one JSON row for each loaded plugin, up to the first line that is not valid."""
     rows = []
     with contextlib.suppress(OSError, ValueError):
         for line in file.read_bytes().split(b"\n")[:-1]:  # the process may still be writing the last line
@@ -279,7 +288,7 @@ def _key(entry: Entry) -> str:
 
 
 def _last_change(entry: Entry) -> int:
-    """Return the time at which the distribution was installed, or a file of its package was edited last [ns]."""
+    """Return the time [ns] of the last change: the installation of the distribution, or an edit of its package."""
     files = [file for suffix in _SUFFIXES for file in (package_folder(entry) or Path("/none")).rglob(f"*{suffix}")]
     with contextlib.suppress(metadata.PackageNotFoundError):
         files.append(Path(str(getattr(metadata.distribution(entry.distribution), "_path", ""))) / "RECORD")

@@ -1,4 +1,4 @@
-"""Import of task files by module name or path."""
+"""Import of the Python files of tasks, by module name or by path."""
 
 import contextlib
 import hashlib
@@ -28,7 +28,7 @@ _imported: dict[tuple[Path, str], None] = {}
 
 
 def load_object(reference: str) -> Any:
-    """Import the object of `package.module:Name` or `/path/file.py:Name`."""
+    """Import and return the object of a reference `package.module:Name` or `/path/file.py:Name`."""
     module_name, _, attribute = reference.rpartition(":")
     return operator.attrgetter(attribute)(load_module(module_name))
 
@@ -77,9 +77,12 @@ def import_file(file: Path) -> Any:
 
 
 def import_from(package: Path, inner: str, *, run_start: bool = True) -> Any:
-    """Import a module of a package folder, for example `robots.arm`; an empty text is the package itself.
+    """Import a module of a package by the package's folder.
 
-    With `run_start` false, the package's `__init__.py` is not executed.
+    Args:
+        package: folder of the package.
+        inner: name of the module in the package, for example `robots.arm`; empty: the package itself.
+        run_start: whether the package's `__init__.py` is executed.
     """
     with contain_side_effects(), _registrations_kept():
         name = _package(package, run_start)
@@ -87,19 +90,22 @@ def import_from(package: Path, inner: str, *, run_start: bool = True) -> Any:
 
 
 def imported_files() -> list[tuple[Path, str]]:
-    """Return the task files that this process has imported, for `import_again` in another process."""
+    """Return the task files that this process has imported, each with the name of the function that imported it.
+
+    `import_again` imports them in another process.
+    """
     return list(_imported)
 
 
 def import_again(files: Sequence[tuple[Path, str]]) -> None:
-    """Import the files that another process has imported, under the same module names."""
+    """Import the files that another process has imported (its `imported_files`), under the same module names."""
     for file, how in files:
         load_module(str(file)) if how == load_module.__name__ else import_file(file)
 
 
 @contextlib.contextmanager
 def _sibling_modules(folder: Path) -> Iterator[None]:
-    """Let a file of a task folder import the files beside it.
+    """Let a file of a task folder, imported in the `with` block, import the files beside it.
 
     Afterwards the imported files are removed from `sys.modules`, because another task may have files of the same names.
     """
@@ -118,7 +124,10 @@ def _sibling_modules(folder: Path) -> Iterator[None]:
 
 
 def _package(folder: Path, run_start: bool = True) -> str:
-    """Import a folder as a package and return its module name: the folder's name, or a unique one if that is taken."""
+    """Import a folder as a package and return the package's name: that of the folder, or a unique one if it is taken.
+
+    With `run_start` false, the folder's `__init__.py` is not executed.
+    """
     digest = hashlib.blake2b(str(folder).encode(), digest_size=8).hexdigest()
     name = f"rlcli_folder_{digest}"
     if folder.name.isidentifier() and not is_alias(folder.name):
@@ -154,7 +163,10 @@ def _package(folder: Path, run_start: bool = True) -> str:
 
 @contextlib.contextmanager
 def _siblings_importable(folder: Path) -> Iterator[None]:
-    """Let files of a folder import the files beside them by name, if no installed module has the name."""
+    """Let the files of a folder, imported in the `with` block, import each other by name.
+
+    An installed module of the same name is preferred.
+    """
     sys.path.append(str(folder))
     try:
         with files_below(folder):
@@ -165,7 +177,7 @@ def _siblings_importable(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _registrations_kept() -> Iterator[None]:
-    """Copy what task files register with Gymnasium to `registrations`."""
+    """Copy the tasks that the `with` block registers with Gymnasium to `registrations`."""
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""Location of a task: the files and modules from which it is read, checked and built."""
+"""Where a task comes from: the files and modules from which it is read, checked and built."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class TaskSource:
-    """Location of a task: its name, its files, and the references that import its code."""
+    """Where a task comes from: its name, its files, and the references by which its code is imported."""
 
     name: str
     """Name of the task, as on the command line."""

@@ -1,1 +1,1 @@
-"""Recorded episodes, failure cases and crash dumps: one file format and one replayer."""
+"""Recordings of evaluations, of failures in a training and of diverged simulations, and replays of them."""

@@ -1,6 +1,7 @@
-"""Crash dumps: trajectory files with the engine calls that led to a divergence.
+"""Crash dumps: files with the last physics steps before a simulation diverged, which `rlcli replay` simulates again.
 
-An engine call simulates one or more physics steps from a state (`rlcli.sim.divergence_report.Call`).
+The steps are stored as engine calls: each one simulates one or more physics steps from a state
+(`rlcli.sim.divergence_report.Call`).
 """
 
 import itertools
@@ -30,12 +31,12 @@ CALLS = 64
 
 
 class CrashDumper(StepObserver):
-    """Observer that logs and dumps the first divergence of an environment.
+    """Observer that writes a crash dump when an environment diverges for the first time, and logs a warning.
 
     Args:
         env: the environment; its engine is set to keep the last calls.
         folder: folder of the dump; created with the dump.
-        parents: as for `write_trajectory`.
+        parents: whether missing folders above it are created, too.
     """
 
     def __init__(self, env: Environment, folder: Path, *, parents: bool = False) -> None:
@@ -45,7 +46,7 @@ class CrashDumper(StepObserver):
         env.observers.add(self)
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
-        """Write the dump of the first divergence, log it, and stop observing."""
+        """Write the crash dump of the first divergence, log a warning, and stop observing divergences."""
         if not found:
             return
         env = self._env
@@ -65,7 +66,7 @@ class CrashDumper(StepObserver):
 
 
 def stop_observing_divergences(env: Environment, observer: StepObserver) -> None:
-    """Remove an observer of divergences; without another one, the engine keeps only its last call."""
+    """Remove an observer of divergences. If it is the last one, the engine need not keep its calls any more."""
     env.observers.remove(observer)
     if not env.observers.on_divergence and env.engine.replayable is not None:
         env.engine.replayable.record_calls(1)
@@ -73,7 +74,7 @@ def stop_observing_divergences(env: Environment, observer: StepObserver) -> None
 
 @dataclass(slots=True)
 class CallTrace:
-    """Copies of an environment's last engine calls; another thread simulates them again later."""
+    """Copies of the last engine calls of one environment, from which another thread can simulate them again."""
 
     divergence: Divergence
     """The divergence; for an episode that did not diverge, its cause is the reason why the episode is kept."""
@@ -89,7 +90,15 @@ class CallTrace:
 
 
 def trace_calls(env: Environment, divergence: Divergence, pending: bool = False) -> CallTrace:
-    """Return the last engine calls of an environment, before it is restored or reset."""
+    """Copy the last engine calls (calls that simulate physics steps) of an environment that has diverged.
+
+    It must be called before the environment's state is restored or reset.
+
+    Args:
+        env: all environments.
+        divergence: the divergence, with the index of its environment.
+        pending: whether the engine has not made the call that diverges yet.
+    """
     engine, number = env.engine.replayable, divergence.env
     assert engine is not None
     calls, final = engine.recorded_calls(number), engine.state_row(number)
@@ -103,10 +112,10 @@ def trace_calls(env: Environment, divergence: Divergence, pending: bool = False)
 def describe_traces(
     traces: Sequence[CallTrace], model: mujoco.MjModel, resolved: Resolved, follows_constants: bool, *, diverged: bool
 ) -> tuple[list[World], dict[str, Tensor]]:
-    """Simulate traces again, and return their records and tensors for a trajectory file.
+    """Simulate engine calls again to describe them; return the descriptions and tensors for a trajectory file.
 
     Args:
-        traces: one for each environment.
+        traces: the calls of each environment.
         model: the model of all environments.
         resolved: the configuration.
         follows_constants: whether MuJoCo's constants are derived again from an environment's model fields.
@@ -137,14 +146,14 @@ def describe_traces(
 
 
 def write_dump(env: Environment, found: list[Divergence], pending: bool, folder: Path, parents: bool) -> Path:
-    """Write the last engine calls of environments that diverged.
+    """Write a crash dump with the last engine calls of the environments that diverged; return its file.
 
     Args:
         env: the environment, before the diverged states are restored.
         found: the divergences.
         pending: whether the engine has not made the call that diverges yet.
         folder: folder of the file; created if it does not exist.
-        parents: as for `write_trajectory`.
+        parents: whether missing folders above it are created, too.
 
     Raises:
         MachineError: if the disk reports an error.

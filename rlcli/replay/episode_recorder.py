@@ -1,4 +1,4 @@
-"""Recorder of whole episodes of an evaluation; a replay can simulate them again."""
+"""Recorder of whole episodes of an evaluation (`rlcli eval --record`), which `rlcli replay` can simulate again."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,8 +18,8 @@ class EpisodeRecorder(StepObserver):
 
     Args:
         env: the environment.
-        episodes: number of episodes; each environment contributes a fixed number, as in an evaluation.
-        env_id: the environment that contributes all episodes; None: all environments contribute.
+        episodes: number of episodes, divided evenly between the environments, as in an evaluation.
+        env_id: the environment from which all episodes are taken; None: from all environments.
     """
 
     def __init__(self, env: VecEnv, episodes: int, *, env_id: int | None = None) -> None:
@@ -70,7 +70,7 @@ class EpisodeRecorder(StepObserver):
                 self.episodes.append(Episode.of(self._env, ended, row, begin=self._begin[env]))
 
     def save(self, files: Mapping[str, Path]) -> list[Path]:
-        """Write episodes: all, succeeded or failed -> the file of these episodes.
+        """Write the recorded episodes. `files` maps `all`, `succeeded` or `failed` to the file of these episodes.
 
         Returns:
             The files that were written.

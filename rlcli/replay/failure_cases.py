@@ -1,4 +1,7 @@
-"""Failure cases of a training, as `rlcli autopsy` reads them; no code of a run is executed."""
+"""Failure cases: recordings of failed and unusual episodes of a training, as `rlcli autopsy` reads and shows them.
+
+No code of a run is executed.
+"""
 
 import logging
 import re
@@ -28,55 +31,58 @@ _MAX_FILES = 10_000
 
 @dataclass(frozen=True, slots=True)
 class FailureCase:
-    """The last steps of one episode of a training."""
+    """Recording of the last steps of a failed or unusual episode of a training."""
 
     trajectory: Trajectory
 
     @property
     def episode(self) -> Episode:
-        """The episode."""
+        """Length, return and end of the episode."""
         return self.trajectory.header.episodes[0]
 
     @property
     def failure(self) -> Failure:
-        """Why the episode was kept."""
+        """Why the episode was recorded, and in which iteration."""
         failure = self.trajectory.header.failure
         assert failure is not None
         return failure
 
     @property
     def world(self) -> World:
-        """Engine calls of the kept steps."""
+        """The recorded engine calls, which simulate the physics steps of the recorded steps."""
         return self.trajectory.header.worlds[0]
 
     @property
     def ended_by(self) -> str:
-        """The terminations, or the cause of a divergence with its joint, actuator or element."""
+        """What ended the episode: the names of the terminations, or the cause of the divergence."""
         return self.world.ended_by if self.failure.kind == "diverged" else ", ".join(self.episode.causes)
 
     @property
     def seconds(self) -> float:
-        """Duration of the kept steps [s]."""
+        """Duration of the recorded steps [s]."""
         return self.episode.kept * self.trajectory.header.step_dt
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """Time in the episode at the end of each kept step [s]. (steps,)"""
+        """Time since the start of the episode at the end of each recorded step [s]. (steps,)"""
         e = self.episode
         return np.arange(e.length - e.kept + 1, e.length + 1, dtype=np.float64) * self.trajectory.header.step_dt
 
     def values(self, name: str) -> NDArray[np.float32]:
-        """Return the observations, actions or reward_terms (steps, columns), or the rewards (steps,)."""
+        """Return the recorded observations, actions or reward_terms (steps, columns), or the rewards (steps,).
+
+        `name` is one of these four names.
+        """
         array: NDArray[np.float32] = self.trajectory.tensors[f"episode.0.{name}"].numpy()
         return array
 
     def columns(self, name: str) -> dict[str, NDArray[np.float32]]:
-        """Return each column of the observations, actions or reward_terms by its name. (steps,)"""
+        """Return column name -> recorded values (steps,). `name` is observations, actions or reward_terms."""
         names = getattr(self.trajectory.header.columns, name)
         return dict(zip(names, self.values(name).T, strict=True))
 
     def record(self) -> dict[str, Any]:
-        """Return the metadata as plain JSON."""
+        """Return the metadata of the recording, everything but the values of the steps, as plain JSON."""
         episode, failure = self.episode, self.failure
         facts = {
             "file": str(self.trajectory.file),
@@ -98,7 +104,7 @@ class FailureCase:
         return finite
 
     def series(self) -> dict[str, Any]:
-        """Return the values of every kept step as plain JSON."""
+        """Return the values of every recorded step as plain JSON: time, reward, reward_terms, observations, actions."""
         values = {
             "time": self.times.tolist(),
             "reward": self.values("rewards").tolist(),
@@ -138,7 +144,7 @@ def list_failure_cases(run: Run) -> list[FailureCase]:
 
 
 def why_no_cases(run: Run) -> str:
-    """Return why a run has no failure cases."""
+    """Return the text that says why a run has no failure cases."""
     device = str(run.record.get("device", "cpu"))
     if device.startswith("cuda"):
         return (
@@ -150,7 +156,7 @@ def why_no_cases(run: Run) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """Two geoms in contact."""
+    """Two geoms in contact, with the contact force."""
 
     geoms: tuple[str, str]
     distance: float
@@ -163,14 +169,14 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class StagedCase:
-    """A failure case in a simulation of the installed task."""
+    """A failure case with a simulation of its task, as installed now, to compute contacts and draw images."""
 
     staged: Staged
     states: list[NDArray[np.float64]]
     """The finite states at the beginning of each kept step, and after the last one."""
 
     def forward(self, number: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return MuJoCo's model and data of one of the states, with derived fields."""
+        """Return MuJoCo's model, and its data at the recorded state `number`, with all derived fields computed."""
         engine = self.staged.worlds[0].world.engine
         engine.set_state_row(0, self.states[number])
         return engine.world(0)
@@ -190,7 +196,9 @@ class StagedCase:
 
 
 def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase:
-    """Build the task of a case, for contacts and images.
+    """Build the task of a failure case, to compute contacts and draw images.
+
+    `named` is the task on the command line: if the recorded task is not installed, its code is used.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `rlcli.replay.resimulate.stage`.
@@ -213,7 +221,7 @@ def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase
 
 
 def _geom_name(model: mujoco.MjModel, index: int) -> str:
-    """Return a geom's name, or its index and its body's name."""
+    """Return the name of a geom; if it has none, its index and the name of its body."""
     name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, index)
     if name:
         return str(name)

@@ -60,10 +60,10 @@ _Key = tuple[FailureKind, *tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True)
 class KeptEpisode:
-    """The last steps of an episode, in memory."""
+    """The last steps of a failed or unusual episode, in memory, before they are written to a file."""
 
     value: float
-    """Rank of the episode: the one with the lowest value of its kind is kept."""
+    """Rank of the episode: of each kind, the episode with the lowest value is kept."""
     kind: FailureKind
     episode: Episode
     trace: CallTrace
@@ -73,17 +73,20 @@ class KeptEpisode:
 
 @dataclass(frozen=True, slots=True)
 class FailureBatch:
-    """Changes of the folder of failure cases that are made with a checkpoint."""
+    """Files of failure cases that are written and removed together with a checkpoint."""
 
     step: int
+    """Environment steps of the checkpoint."""
     write: dict[str, tuple[KeptEpisode, Failure]]
     """File name -> content."""
     remove: list[str]
+    """Names of files to remove."""
     returns: list[float]
+    """Returns of recent episodes, which a resumed training needs to tell unusual returns."""
 
 
 class _RecentReturns(BaseModel):
-    """File of the recent returns at a checkpoint."""
+    """Content of the file with the returns of recent episodes at a checkpoint (environment step `step`)."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
     step: int
@@ -91,7 +94,7 @@ class _RecentReturns(BaseModel):
 
 
 class FailureRecorder(StepObserver):
-    """Observer that records the last steps of episodes of a training on a CPU.
+    """Observer that records the last steps of failed and unusual episodes of a training on a CPU.
 
     Args:
         env: the environment; its engine is set to keep the last seconds.
@@ -139,10 +142,13 @@ class FailureRecorder(StepObserver):
         """Stop recording."""
         stop_observing_divergences(self._env, self)
 
-    # --- between iterations ---
+    # --- called after iterations and at checkpoints ---
 
     def commit(self, iteration: int, step: int) -> None:
-        """Add the episodes of a finished iteration; `step` is the number of environment steps so far."""
+        """Add the recorded episodes of a finished iteration to those that the next checkpoint writes.
+
+        `step` is the number of environment steps so far.
+        """
         if self._failed:
             _log.warning("failed episodes are not recorded any more: %s", self._failed)
             self._failed = ""
@@ -159,14 +165,17 @@ class FailureRecorder(StepObserver):
         self._update_quartiles()
 
     def take(self, step: int) -> FailureBatch:
-        """Return the changes that are written with the checkpoint of a step."""
+        """Return the files to write and to remove with the checkpoint at an environment step."""
         names = set(self._files)
         batch = FailureBatch(step, self._unwritten, sorted(self._written - names), self._recent.tolist())
         self._unwritten, self._written = {}, names
         return batch
 
     def write(self, batch: FailureBatch) -> None:
-        """Write the files, in the thread of the checkpoints; a disk error ends the recording, but not the training."""
+        """Write the files of a batch; a disk error ends the recording, but not the training.
+
+        It runs in the thread that writes the checkpoint.
+        """
         try:
             for name, (kept, failure) in batch.write.items():
                 worlds, tensors = describe_traces(
@@ -187,7 +196,7 @@ class FailureRecorder(StepObserver):
             self._failed = str(error)
 
     def drop(self, batch: FailureBatch) -> None:
-        """Remove the files that newer ones replace."""
+        """Remove the files that a batch lists, after its checkpoint is complete."""
         for name in batch.remove:
             with contextlib.suppress(OSError):
                 (self._folder / name).unlink(missing_ok=True)
@@ -196,16 +205,16 @@ class FailureRecorder(StepObserver):
     def _header(self) -> Header:
         return Header.of(self._env)
 
-    # --- in a step ---
+    # --- called in every step ---
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
-        """Copy the last engine calls of the first divergence of each cause."""
+        """Copy the last engine calls of environments that diverged, for the first divergence of each cause."""
         for divergence in found:
             if ("diverged", divergence.cause) not in self._pending:
                 self._diverging[divergence.env] = trace_calls(self._env, divergence, pending)
 
     def on_step(self, record: StepRecord) -> None:
-        """Write the step into the ring buffers, and select from the episodes that end."""
+        """Write the step into the ring buffers, and keep the failed and unusual ones of the episodes that end."""
         slot = self._step % self._slots
         for name, value in (
             ("observations", record.obs["policy"]),
@@ -220,7 +229,10 @@ class FailureRecorder(StepObserver):
         self._diverging.clear()
 
     def _choose(self, ended: Episodes) -> None:
-        """Record the episodes that are the first, or have the lowest value, of their kind in this iteration."""
+        """Keep those of the ended episodes that diverged, have an unusual return, or were terminated.
+
+        Of each kind, one episode of an iteration is kept: the first that diverged, else the one with the lowest value.
+        """
         returns, rest = ended.returns.detach().numpy().copy(), ~ended.truncated.numpy()
         self._returns.append(returns)
         if DIVERGED in ended.causes:
@@ -250,7 +262,14 @@ class FailureRecorder(StepObserver):
             self._keep_lowest(("terminated", *names), returns, rest & (code == causes), ended)
 
     def _keep_lowest(self, key: _Key, value: NDArray[np.float32], mask: NDArray[np.bool_], ended: Episodes) -> None:
-        """Record the episode with the lowest value where a mask holds, if it is lower than the recorded one's."""
+        """Keep the episode with the lowest value, unless one with a lower value is kept already under the key.
+
+        Args:
+            key: kind of the episode, and the causes of its end.
+            value: value of each ended episode.
+            mask: whether an ended episode is of this kind.
+            ended: the ended episodes.
+        """
         if not mask.any():
             return
         row = int(np.where(mask, value, np.inf).argmin())
@@ -261,7 +280,15 @@ class FailureRecorder(StepObserver):
             self._keep_episode(key, float(value[row]), ended, row, trace)
 
     def _keep_episode(self, key: _Key, value: float, ended: Episodes, row: int, trace: CallTrace) -> None:
-        """Copy the last steps of an episode, as many as the ring buffers and the trace hold."""
+        """Copy the last steps of an ended episode, as many as are in the ring buffers and in the trace.
+
+        Args:
+            key: kind of the episode, and the causes of its end.
+            value: its rank, as in `KeptEpisode`.
+            ended: the ended episodes.
+            row: the row of the episode in `ended`.
+            trace: its last engine calls.
+        """
         per_step, env = self._env.calls_per_step, trace.divergence.env
         whole = (len(trace.calls) - trace.last) // per_step
         steps = min(int(ended.lengths[row]), self._slots, self._step, whole + 1)
@@ -276,7 +303,7 @@ class FailureRecorder(StepObserver):
         self._pending[key] = KeptEpisode(value, key[0], episode, trace, tensors, self._engine.own_constants)
 
     def _fences(self) -> tuple[float, float]:
-        """Return the bounds beyond which a return is unusual."""
+        """Return the bounds of usual returns, from the quartiles of recent returns: (lowest, highest)."""
         if self._quartiles is None:
             return -np.inf, np.inf
         first, third = self._quartiles
@@ -284,7 +311,7 @@ class FailureRecorder(StepObserver):
         return first - FAR * spread, third + FAR * spread
 
     def _update_quartiles(self) -> None:
-        """Add the iteration's returns to the recent ones, and compute their quartiles."""
+        """Add the returns of the finished iteration to those of recent episodes, and compute the quartiles."""
         if self._returns:
             self._recent = np.concatenate([self._recent, *self._returns])[-RECENT:]
             self._returns.clear()
@@ -293,7 +320,7 @@ class FailureRecorder(StepObserver):
             self._quartiles = (first, third)
 
     def _evict(self) -> None:
-        """While there are too many files, drop the oldest of the most frequent kind."""
+        """While there are more files than `keep` of the settings, drop the oldest one of the most frequent kind."""
         self._files = dict(sorted(self._files.items()))  # a resumed run reads the folder in this order
         while len(self._files) > self._keep:
             counts = Counter(self._files.values())
@@ -302,10 +329,10 @@ class FailureRecorder(StepObserver):
             del self._files[oldest]
             self._unwritten.pop(oldest, None)
 
-    # --- at the beginning ---
+    # --- start of the recording ---
 
     def _steps_that_fit(self, seconds: float, memory: int) -> int:
-        """Return the number of environment steps that the ring buffers can hold."""
+        """Return the number of environment steps in the ring buffers: as many as fit `seconds` and `memory` [bytes]."""
         env, engine = self._env, self._engine
         columns = env.layout.size() + env.layout.action_size + 1 + len(env.reward_names)
         bytes_per_step = env.num_envs * (8 * engine.history.width * env.calls_per_step + 4 * columns)
@@ -313,7 +340,10 @@ class FailureRecorder(StepObserver):
         return max(1, min(round(seconds / env.step_dt), most, memory // bytes_per_step))
 
     def _read_folder(self, step: int | None) -> None:
-        """Read the files of earlier checkpoints, and remove those of later ones; a file that cannot be read is kept."""
+        """Read the failure cases that the folder has already, and remove those that are newer than the checkpoint.
+
+        `step` is the step of the checkpoint from which training resumes. A file that cannot be read is kept.
+        """
         if not self._folder.is_dir():
             return
         for file in sorted(self._folder.iterdir()):
@@ -340,5 +370,8 @@ class FailureRecorder(StepObserver):
 def open_failure_recorder(
     env: Environment, config: AutopsyConfig | None, folder: Path, step: int | None
 ) -> FailureRecorder | None:
-    """Return a recorder; None if none is configured, or on a GPU, whose steps cannot be replayed."""
+    """Return a recorder of failed and unusual episodes; None without a configuration, and on a GPU.
+
+    Steps on a GPU cannot be replayed. The arguments are those of `FailureRecorder`.
+    """
     return None if config is None or env.engine.replayable is None else FailureRecorder(env, config, folder, step)

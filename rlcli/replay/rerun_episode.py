@@ -1,9 +1,9 @@
 """Run one episode of an evaluation again from its seed: the episode K of environment E of `rlcli eval`.
 
 A random number depends on the seed, the term, the environment and the index of its episode. If nothing else connects
-the episodes of a task, episode K starts at once. Other tasks have commands and intervals that follow the clock of all
-episodes, noise, curricula, or terms with a state. Then the episodes before K are run first, in all environments as in
-the evaluation, and the reasons are reported.
+the episodes of a task, episode K starts at once. In other tasks an episode also depends on the earlier ones, because of
+noise, curricula, terms with a state, or timers that a reset does not restart. Then the episodes before K are run first,
+in all environments as in the evaluation, and the reasons are reported.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from rlcli.rl.rng import load_rng_state, rng_state
 
 @dataclass(frozen=True, slots=True)
 class EpisodeStart:
-    """An environment at the beginning of an episode."""
+    """Result of `start_episode`: the first observations of the episode, and how the environment got there."""
 
     obs: Tensor
     """Observations of the policy. (num_envs, d)"""
@@ -33,7 +33,10 @@ class EpisodeStart:
     """States of the generators that all environments share, before any step."""
 
     def shared_draws(self) -> bool:
-        """Return whether the task has used global random generators; then `num_envs` changes the episode."""
+        """Return whether the task has drawn random numbers from global generators since the start.
+
+        Then the episode also depends on the number of environments.
+        """
         return _has_drawn(self.generators)
 
 
@@ -41,8 +44,8 @@ def start_episode(env: VecEnv, act: Act, env_id: int, episode: int, *, drawn_act
     """Bring an environment to the beginning of one of its episodes.
 
     Args:
-        env: new environments.
-        act: the policy.
+        env: the environments, newly created.
+        act: the policy, a function from observations to actions.
         env_id: the environment of the episode.
         episode: its index, from 0.
         drawn_actions: whether the policy is stochastic.
@@ -66,10 +69,10 @@ def start_episode(env: VecEnv, act: Act, env_id: int, episode: int, *, drawn_act
 
 
 def run_episode(env: VecEnv, act: Act, obs: Tensor, env_id: int) -> StepResult:
-    """Step until the running episode of an environment ends, and return the last step.
+    """Run the policy until the present episode of environment `env_id` ends, and return the last step.
 
     Raises:
-        ConfigError: if it does not end because the task has no time-out.
+        ConfigError: if the episode does not end, because the task has no time-out.
     """
     with torch.no_grad():
         while True:
@@ -81,10 +84,10 @@ def run_episode(env: VecEnv, act: Act, obs: Tensor, env_id: int) -> StepResult:
 
 
 def require_end(env: Environment, length: int) -> None:
-    """Check that a running episode of `length` steps is not much longer than the task's episodes.
+    """Check that an episode, which has had `length` steps so far, is not much longer than episode_length_s.
 
     Raises:
-        ConfigError: if it is, because the task has no time-out.
+        ConfigError: if it is much longer, because the task has no time-out.
     """
     if length > PATIENCE * env.max_episode_length:
         message = f"an episode has lasted {length} steps, {PATIENCE} times episode_length_s, and has not ended"
@@ -93,6 +96,6 @@ def require_end(env: Environment, length: int) -> None:
 
 
 def _has_drawn(before: dict[str, Tensor]) -> bool:
-    """Return whether random numbers were drawn from the shared generators since their states `before`."""
+    """Return whether random numbers were drawn from the global generators since they had the states `before`."""
     after = rng_state()
     return any(not torch.equal(before[name].nan_to_num(-1.0), after[name].nan_to_num(-1.0)) for name in before)

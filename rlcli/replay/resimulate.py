@@ -32,7 +32,7 @@ _PHYSICS_FIELDS = ("time", "qpos", "qvel", "act", "qacc_warmstart")
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """The first value that differs between a replay and its file."""
+    """The first value in which a replay differs from the recorded file: where it is, and both values."""
 
     env: int
     episode: int | None
@@ -46,7 +46,7 @@ class Difference:
 
 @dataclass(slots=True)
 class Replay:
-    """The result of a replay."""
+    """Result of a replay: what was simulated again, and the first difference from the file (None: all is equal)."""
 
     steps: int
     """Environment steps, or engine calls, that were simulated again."""
@@ -63,7 +63,12 @@ class Replay:
 
 
 def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool = False) -> list[int]:
-    """Return the indices of the episodes to replay, one or all; none for a file of engine calls.
+    """Return the indices of the episodes to replay; the list is empty for a crash dump or a failure file.
+
+    Args:
+        trajectory: the file.
+        episode: index of the only episode to replay; None: all.
+        filmed: whether a video of the replay is wanted, which crash dumps and failure files do not allow.
 
     Raises:
         UsageError: if the file does not hold the episode.
@@ -72,7 +77,7 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
     if trajectory.header.kind != "recording":
         if episode is not None or filmed:
             message = "a dump has no complete episodes: --episode and --video need a recording"
-            raise UsageError(message, hint="`rlcli autopsy RUN N --video FILE.mp4` renders a case of a run")
+            raise UsageError(message, hint="to film a failure case: `rlcli autopsy RUN N --video FILE.mp4`")
         return []
     if episode is not None and episode >= count:
         raise UsageError(f"no episode {episode} in {trajectory.file}", hint=f"it has {count} episodes, from 0")
@@ -82,7 +87,7 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
 
 
 class StateReader(StepObserver):
-    """Observer that copies the state after physics, before any reset."""
+    """Observer that copies the state of all environments in each step, after physics and before any reset."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
@@ -94,18 +99,18 @@ class StateReader(StepObserver):
 
 
 def read_state(env: VecEnv) -> dict[str, Tensor]:
-    """Return copies of the state's fields in STATE_FIELDS. (num_envs, n) each"""
+    """Return copies of the fields of the state that a recording holds: field name -> values (num_envs, n)."""
     return {name: env.engine.field(name).detach().cpu().clone() for name in STATE_FIELDS}
 
 
 def replay_episodes(
     recording: Trajectory, env: VecEnv, episodes: Iterable[int], before_step: Callable[[int], None] = lambda step: None
 ) -> Replay:
-    """Apply the actions of a recording again; compare every state and reward of some episodes.
+    """Apply the recorded actions again; compare every state and reward of some episodes with the recorded ones.
 
     Args:
         recording: the recording.
-        env: an environment of its configuration.
+        env: an environment with the recorded configuration.
         episodes: numbers of the episodes to compare.
         before_step: called with the index of each step.
 
@@ -144,7 +149,7 @@ def replay_episodes(
 
 
 def _same_bits(left: NDArray[np.generic], right: NDArray[np.generic]) -> bool:
-    """Return whether all bits are equal: NaN equals itself, 0 differs from -0."""
+    """Return whether two arrays are equal bit by bit: NaN equals itself, 0 differs from -0."""
     return left.shape == right.shape and left.tobytes() == right.tobytes()
 
 
@@ -187,14 +192,20 @@ class ReplayWorld:
         return self.engine.state_row(0)
 
     def differing_field(self, recorded: NDArray[np.float64], now: NDArray[np.float64], *, final: bool) -> str | None:
-        """Return the first field whose bits differ. Before the final state only fields of physics are compared."""
+        """Return the name of the first field in which two states differ, bit by bit; None if all are equal.
+
+        Args:
+            recorded: the recorded state.
+            now: the state of the replay.
+            final: whether to compare all fields; false: only those that physics alone writes between engine calls.
+        """
         for name, columns in self.layout.fields():
             if (final or name in _PHYSICS_FIELDS) and not _same_bits(recorded[columns], now[columns]):
                 return name
         return None
 
     def find_divergence(self, calls: list[Call], first: int) -> DivergencePoint | None:
-        """Return the first physics step that diverges, starting at the call `first`."""
+        """Simulate engine calls again, from index `first` on; return the first physics step that diverges, or None."""
         for number, call in enumerate(calls[first:], start=first):
             self.engine.set_state_row(0, call.state)
             for substep in range(call.nstep):
@@ -211,7 +222,10 @@ class ReplayWorld:
         return None
 
     def _diverged_value(self, found: Divergence, before: NDArray[np.float64]) -> tuple[str, str]:
-        """Return the element that shows a divergence, and its value."""
+        """Return the array element, joint or actuator whose value shows a divergence, and this value, as texts.
+
+        `before` is the state before the physics step that diverged.
+        """
         warned = WARNING_FIELDS.get(found.cause)
         if warned is None:
             name = found.cause.removesuffix(" not finite")
@@ -233,7 +247,7 @@ class ReplayWorld:
 
 @dataclass(frozen=True, slots=True)
 class StagedWorld:
-    """The engine calls of one environment, with a world to simulate them in."""
+    """The recorded engine calls of one environment, with a simulation in which they can be run again."""
 
     header: World
     world: ReplayWorld
@@ -253,7 +267,9 @@ class Staged:
 
 
 def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
-    """Build the task of a failure or crash file, and a world for each of its environments.
+    """Build the task of a failure or crash file, and a simulation for each of the recorded environments.
+
+    `named` is the task on the command line: if the recorded task is not installed, its code is used.
 
     Raises:
         TaskError: if the task is not installed any more.
@@ -282,7 +298,10 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
 
 
 def replay_calls(trajectory: Trajectory, named: TaskSource | None = None) -> Replay:
-    """Simulate every engine call of a failure or crash file again, and compare the states that physics determines.
+    """Simulate every engine call of a failure or crash file again, and compare the states with the recorded ones.
+
+    A state that an event changed between two calls is not compared. `named` is the task on the command line: if the
+    recorded task is not installed, its code is used.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `stage`.

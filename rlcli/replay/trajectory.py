@@ -93,7 +93,15 @@ class Episode(_Strict):
 
     @staticmethod
     def of(env: Environment, ended: Episodes, row: int, begin: int = 0, kept: int | None = None) -> Episode:
-        """Return an episode that ends in the current step, before the reset; `row` is its row in `ended`."""
+        """Return an episode that ends in the current step, before the environment is reset.
+
+        Args:
+            env: the environments.
+            ended: the episodes that end in this step.
+            row: the row of the episode in `ended`.
+            begin: number of steps in the recording before the episode.
+            kept: number of its steps in the file; None: all.
+        """
         number, length = int(ended.ids[row]), int(ended.lengths[row])
         return Episode(
             env=number,
@@ -109,7 +117,7 @@ class Episode(_Strict):
 
     @property
     def succeeded(self) -> bool:
-        """Whether it is a success; without a success condition, whether it ended by a time-out alone."""
+        """Whether the episode is a success. In a task without success condition: whether it ended by a time-out."""
         return self.truncated if self.success is None else self.success
 
 
@@ -156,12 +164,12 @@ class World(_Strict):
 
     @property
     def ended_by(self) -> str:
-        """The cause and its detail."""
+        """The cause of the divergence, and the joint, actuator or element that diverged, as one text."""
         return f"{self.cause}{f' ({self.detail})' if self.detail else ''}"
 
 
 class Failure(_Strict):
-    """Why a training kept an episode."""
+    """Why and when a training recorded the end of an episode."""
 
     kind: FailureKind
     iteration: Count
@@ -196,7 +204,7 @@ class Header(_Strict):
 
     @staticmethod
     def of(env: Environment) -> Header:
-        """Return the header of a recording without episodes."""
+        """Return the header of a recording that has no episodes yet, with the task and configuration of `env`."""
         columns = Columns(
             observations=_column_names(env.layout.observations["policy"]),
             actions=_column_names(env.layout.actions),
@@ -225,9 +233,9 @@ class Header(_Strict):
     def _check_task(cls, task: dict[str, str | None]) -> dict[str, str | None]:
         names = [value for value in task.values() if value is not None]
         if not task.get("name") or not all(name.isprintable() for name in names):
-            raise ValueError("task: a name without unprintable characters is missing")
+            raise ValueError("task: the name is missing, or a text has unprintable characters; the file is damaged")
         if not (task.get("folder") or task.get("distribution")):
-            raise ValueError("task: folder or distribution is missing")
+            raise ValueError("task: folder or distribution is missing; the file is damaged")
         return task
 
     @model_validator(mode="after")
@@ -235,37 +243,37 @@ class Header(_Strict):
         """Check that the parts fit each other and the kind of the file."""
         for world in self.worlds:
             if len(world.follows) != len(world.nstep) - 1 or world.first >= len(world.nstep):
-                raise ValueError(f"the engine calls of environment {world.env} are malformed")
+                raise ValueError(f"the file is damaged: the engine calls of environment {world.env} do not match")
         if sum(count for world in self.worlds for count in world.nstep) > MAX_SUBSTEPS:
-            raise ValueError(f"the file has more than {MAX_SUBSTEPS} physics steps")
+            raise ValueError(f"the file is damaged: it has more than {MAX_SUBSTEPS} physics steps")
         for number, e in enumerate(self.episodes):
             if e.env >= self.num_envs or e.kept > e.length or (self.kind == "recording" and e.kept != e.length):
-                raise ValueError(f"episode {number} is malformed")
+                raise ValueError(f"the file is damaged: numbers of episode {number} do not fit together")
         if self.kind == "failure":
             if len(self.worlds) != 1 or len(self.episodes) != 1 or self.failure is None:
-                raise ValueError("a failure case must hold the end of exactly one episode")
+                raise ValueError("the file is damaged: a failure case must have the end of exactly one episode")
             first, steps_before = self.worlds[0].first, self.episodes[0].kept - 1
             if first < steps_before or first % max(1, steps_before):
-                raise ValueError("the number of recorded engine calls does not fit the number of steps")
+                raise ValueError("the file is damaged: the number of engine calls does not fit the number of steps")
         elif self.failure is not None or bool(self.worlds) != (self.kind == "crash"):
-            raise ValueError(f"the content is not that of a {self.kind}")
+            raise ValueError(f"the file is damaged: it is of kind '{self.kind}', but has the content of another kind")
         return self
 
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """Content of a trajectory file, after all checks."""
+    """Content of a trajectory file (a recording, failure or crash file), after all checks."""
 
     file: Path
     header: Header
     tensors: dict[str, Tensor]
 
     def part(self, prefix: str) -> dict[str, Tensor]:
-        """Return the tensors whose names begin with a prefix, without it."""
+        """Return the tensors whose names begin with a prefix, by their names without the prefix."""
         return {n.removeprefix(prefix): tensor for n, tensor in self.tensors.items() if n.startswith(prefix)}
 
     def of_episodes(self) -> dict[int, dict[str, Tensor]]:
-        """Return the tensors of each episode by its number, by names without the prefix `episode.K.`."""
+        """Return episode number -> the tensors of the episode, by their names without the prefix `episode.K.`."""
         found: dict[int, dict[str, Tensor]] = {number: {} for number in range(len(self.header.episodes))}
         for name, tensor in self.part("episode.").items():
             number, _, rest = name.partition(".")
@@ -301,16 +309,16 @@ class Trajectory:
         """Return the error for a file whose states do not fit the installed task."""
         message = f"{self.file} does not fit the installed task: {' '.join(str(error).split())}"
         words = ", ".join(f"{key} {value}" for key, value in self.header.task.items() if value is not None)
-        return CheckpointError(message, hint=f"install the version that made it: {words}")
+        return CheckpointError(message, hint=f"install the version of the task that made the file: {words}")
 
 
 def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor], *, parents: bool = True) -> None:
-    """Write a file; its folder is created if it does not exist.
+    """Write a trajectory file; its folder is created if it does not exist.
 
     Args:
         file: the file to write.
-        header: description of the recording.
-        tensors: the recording, by name.
+        header: the JSON document of the file.
+        tensors: name -> tensor, with the names that the module's docstring lists.
         parents: whether the folders above are created, too. In a run they are not: a run that was moved away during
             its training must not be created again.
 
@@ -328,7 +336,7 @@ def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor], 
 
 
 def read_trajectory(file: Path) -> Trajectory:
-    """Read and check a file.
+    """Read and check a trajectory file.
 
     Raises:
         CheckpointError: if it is missing, corrupt or of another format.
@@ -339,28 +347,28 @@ def read_trajectory(file: Path) -> Trajectory:
         with safe_open(file, "pt") as opened:
             data = json.loads((opened.metadata() or {}).get("rlcli", "{}"))
             if not isinstance(data, dict) or "format" not in data:
-                raise ValueError("the file has no header of rlcli")
+                raise ValueError("the file was not written by rlcli: it has no header of rlcli")
             if data["format"] != FORMAT:
                 raise CheckpointError(f"{file} has format {data['format']}; this rlcli reads {FORMAT}: record it again")
             if data.get("kind") != "recording" and file.stat().st_size > _MAX_BYTES:
                 raise ValueError(f"the file is larger than {_MAX_BYTES >> 20} MiB")
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 (not a mapping)
         if isinstance(data.get("episodes"), list) and len(data["episodes"]) > len(tensors):
-            raise ValueError(f"the header has {len(data['episodes'])} episodes, but the file {len(tensors)} tensors")
+            raise ValueError(f"the file is damaged: {len(data['episodes'])} episodes, but only {len(tensors)} tensors")
         if data.pop("sha256", None) != content_digest(tensors, data):
             raise CheckpointError(f"{file} is corrupt: its hash does not match; record it again")
         header = check_json(Header, data, file)
         _check_tensors(header, tensors)
     except FileNotFoundError:
         message = f"there is no recording or dump {file}"
-        raise CheckpointError(message, hint="rlcli eval TASK --record FILE makes a recording") from None
+        raise CheckpointError(message, hint="check the path; rlcli eval TASK --record FILE makes a recording") from None
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{file} is no valid recording or dump: {' '.join(str(error).split())}") from None
     return Trajectory(file, header, tensors)
 
 
 def content_digest(tensors: Mapping[str, Tensor], document: Mapping[str, Any]) -> str:
-    """Return the sha256 of tensors and a JSON document."""
+    """Return the SHA-256 of a trajectory file's tensors and JSON document."""
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode())
     for name in sorted(tensors):
         value = tensors[name].contiguous()
@@ -396,13 +404,13 @@ def _check_tensors(header: Header, tensors: Mapping[str, Tensor]) -> None:
             or len(shape) != tensor.dim()
             or any(size not in (None, found) for size, found in zip(shape, tensor.shape, strict=True))
         ):
-            raise ValueError(f"the tensor {name} is missing or does not have the shape in the header")
+            raise ValueError(f"the file is damaged: tensor {name} is missing, or has not the shape in the header")
         expected = torch.float64 if name.startswith("world.") else torch.float32
         if tensor.dtype != expected and not name.endswith(STATE_FIELDS):  # states have the engine's precision
-            raise ValueError(f"the tensor {name} holds {tensor.dtype} instead of {expected}")
+            raise ValueError(f"the file is damaged: tensor {name} has type {tensor.dtype}, expected {expected}")
     for number, e in enumerate(header.episodes):
         if header.kind == "recording" and e.begin + e.length > len(tensors["actions"]):
-            raise ValueError(f"episode {number} is longer than the recording")
+            raise ValueError(f"the file is damaged: episode {number} is longer than the recording")
 
 
 def _column_names(terms: tuple[TermLayout, ...]) -> list[str]:

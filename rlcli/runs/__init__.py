@@ -1,1 +1,1 @@
-"""The folder of a run: checkpoints, records, references and comparisons."""
+"""The folder of a run (one training): its checkpoints, configuration and metrics, and comparisons of runs."""

@@ -17,11 +17,13 @@ from rlcli.errors import MachineError, UsageError
 
 
 def write_atomic(file: Path, content: bytes | str) -> Path:
-    """Write a temporary file in the same folder, sync it to the disk, rename it, and return the file.
+    """Write a file so that a crash leaves either the old or the new content; return the file.
+
+    The content goes to a temporary file in the same folder, which is synced to the disk and then renamed.
 
     Raises:
         MachineError: if the disk reports an error; the old file is unchanged.
-        UsageError: if there is something else than a regular file.
+        UsageError: if the path is a folder, a pipe, a socket or a device.
     """
     require_regular(file)
     data = content.encode() if isinstance(content, str) else content
@@ -38,7 +40,7 @@ def write_atomic(file: Path, content: bytes | str) -> Path:
 
 
 def require_regular(file: Path) -> None:
-    """Check, before any work is done, that writing a file replaces a regular file or nothing.
+    """Check that a path can be written as a file: nothing is there yet, or a regular file.
 
     Raises:
         UsageError: for a folder, a pipe, a socket or a device.
@@ -64,7 +66,10 @@ def write_synced(file: Path, data: bytes) -> None:
 
 
 def remove_leftovers(folder: Path, name: str) -> None:
-    """Remove the temporary files and folders `.NAME.tmp-PID...` of processes that have ended: they were killed."""
+    """Remove the temporary files and folders `.NAME.tmp-PID...` in a folder that killed processes have left.
+
+    `name` is the NAME, that of the file or folder to which they would have been renamed.
+    """
     for leftover in folder.glob(f".{glob.escape(name)}.tmp-*") if os.name == "posix" else ():
         process = re.match(r"\d+", leftover.name.rpartition(".tmp-")[2])
         with contextlib.suppress(OSError):
@@ -94,7 +99,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def to_json(value: object) -> str:
-    """Return indented JSON with a final newline.
+    """Return a value as indented JSON text with a final newline.
 
     Raises:
         ValueError: if a number is not finite.
@@ -103,7 +108,7 @@ def to_json(value: object) -> str:
 
 
 def finite_json(value: Any) -> Any:
-    """Return a copy in which numbers that are not finite are text, because JSON has only finite numbers."""
+    """Return a copy of JSON data in which NaN and infinity are the texts `nan` and `inf`, which JSON can hold."""
     if isinstance(value, dict):
         return {key: finite_json(inner) for key, inner in value.items()}
     if isinstance(value, list):

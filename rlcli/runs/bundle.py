@@ -27,14 +27,14 @@ BUNDLE = 1
 
 
 class _BundleRecord(FileModel):
-    """The entries of a manifest that only the manifest of a bundle has."""
+    """The entries of manifest.json that a bundle has and a checkpoint of a run does not have."""
 
     task: TaskRecord
     agent: Annotated[PrintableText, Field(max_length=200)] | None = None
 
 
 def is_bundle(folder: Path) -> bool:
-    """Return whether a folder's manifest names a bundle; `open_bundle` checks whether the bundle is valid.
+    """Return whether a folder is a bundle, by its manifest.json; `open_bundle` checks whether the bundle is valid.
 
     Raises:
         CheckpointError: if the manifest cannot be read.
@@ -46,7 +46,9 @@ def is_bundle(folder: Path) -> bool:
 
 
 def open_bundle(folder: Path) -> Checkpoint:
-    """Open a bundle and check its manifest, in which `task` is the record of its task and `agent` the agent's name.
+    """Open a bundle and check its manifest.
+
+    In the manifest, `task` is the record of the policy's task (`TaskSource.record`), and `agent` the agent's name.
 
     Raises:
         CheckpointError: if the folder is not a bundle, or a bundle of another version.
@@ -55,7 +57,7 @@ def open_bundle(folder: Path) -> Checkpoint:
     version = bundle.manifest.get("bundle")
     if type(version) is not int or version != BUNDLE:
         message = f"{folder} has bundle version {str(version)[:40]}; this rlcli reads {BUNDLE}"
-        raise CheckpointError(message, hint="use the rlcli version that its manifest.json names")
+        raise CheckpointError(message, hint="install the rlcli version that manifest.json in the bundle names")
     check_json(_BundleRecord, bundle.manifest, folder / "manifest.json")
     return bundle
 
@@ -71,7 +73,7 @@ def check_bundle_target(output: Path) -> None:
     if output.is_symlink() or (output.exists() and not output.is_dir()):
         raise UsageError(f"--output {output} is not a folder", hint="give the name of a new folder")
     if output.is_dir() and any(output.iterdir()) and not is_bundle(output):
-        raise UsageError(f"--output {output} exists and is not a bundle", hint="name a new folder")
+        raise UsageError(f"--output {output} exists and is not a bundle", hint="name a new folder or an older bundle")
 
 
 def write_bundle(
@@ -118,7 +120,13 @@ def write_bundle(
 
 
 def _write_folder(output: Path, contents: Mapping[str, bytes], checkpoint: Checkpoint) -> None:
-    """Write a temporary folder beside the target, check that it can be read, and rename it."""
+    """Write the files of a bundle to a temporary folder, check that they hold the policy, and rename the folder.
+
+    Args:
+        output: the folder of the bundle.
+        contents: file name -> content.
+        checkpoint: the checkpoint with the policy.
+    """
     temporary_name = f".{output.name}.tmp-{os.getpid()}-{secrets.token_hex(4)}"
     fresh, old = output.parent / temporary_name, output.parent / f"{temporary_name}-old"
     try:
@@ -152,13 +160,13 @@ def _require_same_policy(checkpoint: Checkpoint, fresh: Path, output: Path) -> N
 
 
 def _portable_task(record: object) -> dict[str, Any]:
-    """Return a task's record without paths of this machine."""
+    """Return the record of a task (`TaskSource.record`) without paths of this machine."""
     record = record if isinstance(record, Mapping) else {}
     return {key: record.get(key) for key in ("name", "distribution", "version")}
 
 
 def _training_record(run: Run) -> dict[str, Any]:
-    """Return the hardware and the duration of a run's training."""
+    """Return the hardware and the duration of a run's training, as a bundle's manifest records them."""
     record = run.record
     seconds = record.get("trained_s")
     return {
@@ -172,6 +180,6 @@ def _training_record(run: Run) -> dict[str, Any]:
 
 
 def _evaluation_summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the numbers of an evaluation without file paths."""
+    """Return the results of an evaluation without file paths, as a bundle's manifest records them."""
     wanted = ("episodes", "seed", "num_envs", "success", "return", "length", "values", "terminations", "diverged")
     return {key: evaluation[key] for key in wanted if evaluation.get(key) is not None}

@@ -1,4 +1,8 @@
-"""Layout and deployment records of a checkpoint's manifest, checked as content of an untrusted file."""
+"""Schema of two entries of a checkpoint's manifest.json, which may be untrusted: `layout` and `deployment`.
+
+The layout lists the columns of observations and actions that a policy was trained with. The deployment record describes
+the environment, with formulas for observations and controls, for programs that run the policy without rlcli.
+"""
 
 import math
 import re
@@ -32,32 +36,35 @@ _INPUT_NAME = re.compile(r"last_action|steps|action|command|(command|observation
 
 
 def check_formula(value: Any) -> None:
-    """Check that a JSON value is a formula: a list of constants, a field of MjData, an input, or an operation.
+    """Check that a JSON value is a formula for observations or controls.
+
+    A formula is a list of constants, `{field, at}` (elements of a field of MjData), `{given}` (an input, such as the
+    action), or `{op, of}` (an operation on formulas).
 
     Raises:
-        ValueError: if it is anything else.
+        ValueError: if the value is anything else.
     """
     if isinstance(value, list):
         if not all(type(item) in (int, float) for item in value):
-            raise ValueError("a constant must be a list of numbers")
+            raise ValueError("the constant of a formula must be a list of numbers")
         return
     if not isinstance(value, dict):
-        raise ValueError(f"not a formula: {str(value)[:60]}")
+        raise ValueError(f"{str(value)[:60]} is not a formula, which is a list of numbers or a mapping")
     keys, at, name = set(value), value.get("at", []), value.get("given")
     if not isinstance(at, list) or not all(type(i) is int and 0 <= i < 2**31 for i in at):
-        raise ValueError("`at` must be a list of indices from 0")
+        raise ValueError("`at` of a formula must be a list of indices, which are not negative")
     if keys == {"field", "at"} and value["field"] in FIELDS:
         return
     if keys in ({"given"}, {"given", "at"}) and isinstance(name, str) and _INPUT_NAME.fullmatch(name):
         return
     own = {"b", "a", "key"} if value.get("op") == "filter" else set()
     if keys != {"op", "of"} | own or not isinstance(value["op"], str) or value["op"] not in OPS:
-        raise ValueError(f"not a formula: {str(value)[:60]}")
+        raise ValueError(f"{str(value)[:60]} is not a formula that this rlcli knows")
     count, of = OPS[value["op"]], value["of"]
     if not isinstance(of, list) or (count is not None and len(of) != count) or not of:
-        raise ValueError(f"'{value['op']}' takes {count or 'one or more'} values")
+        raise ValueError(f"operation '{value['op']}' of a formula takes {count or 'one or more'} operands")
     if own and not (isinstance(value["key"], str) and all(_are_numbers(value[key]) for key in "ab") and value["b"]):
-        raise ValueError("a filter must have the coefficients b and a, and a key")
+        raise ValueError("operation 'filter' of a formula needs lists of coefficients, b and a, and a key")
     for part in of:
         check_formula(part)
 
@@ -75,7 +82,7 @@ class _Record(FileModel):
 
 
 class _Columns(_Record):
-    """Columns of one observation or action term."""
+    """Names, unit and scale of the columns of one observation or action term."""
 
     name: str
     size: int = Field(ge=1)
@@ -89,7 +96,7 @@ class _Columns(_Record):
         for key in ("scale", *own):
             values = getattr(self, key)
             if values is not None and len(values) != self.size:
-                raise ValueError(f"{key} has {len(values)} values for {self.size} columns")
+                raise ValueError(f"{key} has {len(values)} values, but the term has {self.size} columns")
         return self
 
 
@@ -115,7 +122,10 @@ class ActionColumns(_Columns):
 
 
 class LayoutRecord(_Record):
-    """Columns of observations and actions, and time steps, that a policy needs its environment to have."""
+    """Entry `layout`: the columns of observations and actions, and the time steps, that a policy was trained with.
+
+    An environment must have the same layout to run the policy.
+    """
 
     observations: dict[str, list[ObservationColumns]]
     actions: list[ActionColumns]
@@ -125,7 +135,10 @@ class LayoutRecord(_Record):
 
 
 class _Formula(_Record):
-    """Formula with a flag `closed`: whether `value` is computed from the simulation, without the task's own code."""
+    """Formula for columns of a term.
+
+    `closed` is true if `value` is a formula on the state of the simulation, which needs no code of the task.
+    """
 
     @model_validator(mode="after")
     def _check_value(self) -> Self:
@@ -133,9 +146,9 @@ class _Formula(_Record):
         if value is not None:
             check_formula(value)
         if closed and value is None:
-            raise ValueError("'closed' is true, so 'value' must be a formula")
+            raise ValueError("'value' must be a formula, because 'closed' is true")
         if not closed and isinstance(self, ObservationFormula) and not _is_external_input(value):
-            raise ValueError("'closed' is false, so 'value' must be {'given': 'observation/NAME'}")
+            raise ValueError("'value' must be {'given': 'observation/NAME'}, because 'closed' is false")
         return self
 
 
@@ -155,7 +168,7 @@ class ObservationFormula(_Formula):
 
 
 class ControlFormula(_Formula):
-    """Formula that computes some controls of the model (`MjData.ctrl`) from `action` and `command`."""
+    """Formula of an action term: it computes the elements `ctrl` of `MjData.ctrl` from `action` and `command`."""
 
     name: Name
     func: Name
@@ -186,14 +199,14 @@ class JointRecord(_Record):
 
 
 class ActuatorRecord(_Record):
-    """An actuator of the model; a list of them has the order of `MjData.ctrl`."""
+    """An actuator of the model. Lists of actuators have the order of `MjData.ctrl`."""
 
     name: Name
     range: tuple[float, float] | None
 
 
 class DeploymentRecord(_Record):
-    """Description of the environment for programs that run the policy without rlcli."""
+    """Entry `deployment`: description of the environment for programs that run the policy without rlcli."""
 
     joints: list[JointRecord]
     actuators: list[ActuatorRecord]
@@ -206,7 +219,7 @@ class DeploymentRecord(_Record):
 
 
 def layout_of(checkpoint: Checkpoint, policy: Policy) -> LayoutRecord:
-    """Return the layout of a checkpoint after a check that it fits the policy.
+    """Return the layout (columns of observations and actions) of a checkpoint, and check that it fits the policy.
 
     Raises:
         CheckpointError: if there is no layout, or one with other numbers of columns.
@@ -224,12 +237,12 @@ def layout_of(checkpoint: Checkpoint, policy: Policy) -> LayoutRecord:
 
 
 def deployment_of(checkpoint: Checkpoint, policy: Policy, found: object = None) -> DeploymentRecord | None:
-    """Return the deployment record of a checkpoint; None if there is no record.
+    """Return the checkpoint's description of the environment for programs without rlcli; None if it has none.
 
     Args:
         checkpoint: the checkpoint.
         policy: its policy.
-        found: a record from another source, used if the checkpoint has none.
+        found: a description to use if the checkpoint has none.
 
     Raises:
         CheckpointError: if the record is malformed, or does not fit the policy.
@@ -249,7 +262,7 @@ def deployment_of(checkpoint: Checkpoint, policy: Policy, found: object = None) 
 
 
 def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: object, randomized: bool) -> list[str]:
-    """Return the keys in which the records of a checkpoint and of an environment of its task differ.
+    """Return the keys in which the layout and deployment record of a checkpoint differ from those of an environment.
 
     Formulas are not compared.
 
@@ -268,7 +281,10 @@ def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: o
 
 
 def _comparable_parts(deployment: Any, randomized: bool) -> dict[str, Any]:
-    """Return the entries of a description that depend neither on the engine nor on formulas."""
+    """Return the part of a deployment record that can be compared: no formulas, and nothing the engine decides.
+
+    With `randomized`, gains and the start state are left out, too.
+    """
     terms = {group: [_without_values(t) for t in found] for group, found in deployment["observations"].items()}
     rest = {key: deployment[key] for key in ("actuators", "commands", *(() if randomized else ("start",)))}
     gains = ("default", "stiffness", "damping") if randomized else ()

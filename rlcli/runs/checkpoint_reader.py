@@ -38,18 +38,21 @@ _MAX_FILES = 4096
 
 
 class FormatError(CheckpointError):
-    """A checkpoint of another format than this rlcli reads, such as that of a newer rlcli."""
+    """Error for a checkpoint in a format that this rlcli does not read, such as that of a newer rlcli."""
 
 
 class FileEntry(FileModel):
-    """Entry of a manifest for one file: its size [bytes] and its sha256."""
+    """Entry of manifest.json for one file of the checkpoint: its size [bytes] and its sha256."""
 
     size: Count
     sha256: Annotated[str, Field(max_length=64)]
 
 
 class Shard(FileModel):
-    """Manifest entry of a file with the rows `start` to `stop` - 1 of a log, such as a replay buffer."""
+    """Entry of manifest.json for one file of a log, which is data in rows, such as a replay buffer.
+
+    A log is split into several files (shards); this one has the rows `start` to `stop` - 1.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -61,7 +64,9 @@ class Shard(FileModel):
     @model_validator(mode="after")
     def _check_not_empty(self) -> Self:
         if self.start >= self.stop:
-            raise ValueError("start must be below stop")
+            raise ValueError(
+                f"rows {self.start} to {self.stop}: start must be below stop; use an older checkpoint: RUN@step:N"
+            )
         return self
 
     @property
@@ -71,7 +76,7 @@ class Shard(FileModel):
 
 
 class _Log(FileModel):
-    """Manifest entry of a log, such as a replay buffer: its rows `first` to `stop` - 1, and their files."""
+    """Entry of manifest.json for a log, such as a replay buffer: its rows `first` to `stop` - 1, and their files."""
 
     first: Count
     stop: Count
@@ -80,12 +85,14 @@ class _Log(FileModel):
     @model_validator(mode="after")
     def _check_order(self) -> Self:
         if self.first > self.stop:
-            raise ValueError("first must not be above stop")
+            raise ValueError(
+                f"rows {self.first} to {self.stop}: first must not be above stop; use an older checkpoint: RUN@step:N"
+            )
         return self
 
 
 class _Manifest(FileModel):
-    """The entries of a manifest that every reader needs."""
+    """The entries of manifest.json that every use of a checkpoint needs."""
 
     step: Count
     files: Annotated[dict[FileName, FileEntry], Field(max_length=_MAX_FILES)]
@@ -110,7 +117,7 @@ class _Header(RootModel[Annotated[dict[str, _TensorEntry], Field(max_length=20_0
 
 
 class _State(FileModel):
-    """Values besides tensors that every trainer saves. A trainer checks the values that only it saves."""
+    """Values of state.json that every trainer saves. Each trainer checks its further values itself."""
 
     iteration: Count = 0
     env_steps: Count = 0
@@ -122,7 +129,10 @@ class _State(FileModel):
 
 
 class _Statistics(FileModel):
-    """Sums over the episodes of recent iterations, as (episodes, return, length, success)."""
+    """Statistics of finished episodes in state.json.
+
+    `recent` has a row (episodes, sum of returns, sum of lengths, successes) for each recent iteration.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
@@ -132,7 +142,10 @@ class _Statistics(FileModel):
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A checkpoint folder with a checked manifest; each file is checked when it is read."""
+    """A checkpoint: a folder with files of a training at one step. Each file is checked when it is read.
+
+    `manifest` is the content of manifest.json, which lists the files with their sizes and hashes.
+    """
 
     folder: Path
     manifest: dict[str, Any]
@@ -152,10 +165,10 @@ class Checkpoint:
         return parse_json(self._data(name, JSON_LIMIT), self.folder / name)
 
     def tensors(self, part: str, limit: int | None = None) -> dict[str, Tensor]:
-        """Read the tensors of a part of the checkpoint, such as `policy`.
+        """Read the tensors of the file PART.safetensors of the checkpoint.
 
         Args:
-            part: the name of the part.
+            part: the name of the part, such as `policy` or `trainer`.
             limit: largest size of the file [bytes]; None: the default of the part, at most a third of the memory.
 
         Raises:
@@ -189,18 +202,23 @@ class Checkpoint:
         """
         missing = [part for part in PARTS if f"{part}.safetensors" not in self.manifest["files"]]
         if missing:
-            message = f"{self.folder} has no {missing[0]}.safetensors"
-            raise CheckpointError(message, hint="--init-from starts a new run with its policy")
+            message = f"{self.folder} cannot be resumed: it has no {missing[0]}.safetensors"
+            raise CheckpointError(message, hint="use --init-from to start a new run with the policy of the checkpoint")
         values = self.json("state.json")
         _check_state(values, self.step, self.folder / "state.json")
         if values["policy"] != self.json("policy.json"):
-            raise CheckpointError(f"{self.folder}: state.json and policy.json have different policies; use RUN@step:N")
+            raise CheckpointError(
+                f"{self.folder} is corrupt: state.json and policy.json have different policies"
+                "; use an older checkpoint: RUN@step:N"
+            )
         self.policy()
         parts = [name.removesuffix(".safetensors") for name in self.manifest["files"] if name.endswith(".safetensors")]
         tensors = {part: self.tensors(part) for part in parts}
         obs = tensors["trainer"].get("observations")
         if obs is not None and (obs.dim() != 2 or obs.shape[1] != values["policy"]["observation_size"]):
-            raise CheckpointError(f"{self.folder}: 'observations' has wrong shape {tuple(obs.shape)}; use RUN@step:N")
+            raise CheckpointError(
+                f"{self.folder}: 'observations' has wrong shape {tuple(obs.shape)}; use an older checkpoint: RUN@step:N"
+            )
         file = self.folder / "trainer.safetensors"  # `self.policy()` has checked the tensors of the policy
         for name, value in tensors["trainer"].items():
             if value.is_floating_point() and not bool(value.isfinite().all()):
@@ -210,7 +228,7 @@ class Checkpoint:
         return TrainerState(tensors, values, {name: self._rows(name) for name in self.shards()})
 
     def verify(self, *, whole: bool) -> None:
-        """Read and check the policy, or with `whole` everything that a resumed training needs.
+        """Read and check the policy, or with `whole` all that is needed to resume the training.
 
         Raises:
             CheckpointError: at the first error.
@@ -238,10 +256,15 @@ class Checkpoint:
         first, stop, shards = log.first, log.stop, log.shards
         starts = [shard.start for shard in shards] + [stop]
         if [shard.stop for shard in shards] != starts[1:] or starts[0] > first:
-            raise CheckpointError(f"{self.folder}/manifest.json is corrupt: '{name}' lacks rows; use RUN@step:N")
+            raise CheckpointError(
+                f"{self.folder}/manifest.json is corrupt: '{name}' lacks rows; use an older checkpoint: RUN@step:N"
+            )
         size, limit = sum(shard.size for shard in shards), available_memory() // 3
         if size > limit:
-            raise CheckpointError(f"{self.folder}: '{name}' needs {size:,} bytes (limit {limit:,}); free some memory")
+            raise CheckpointError(
+                f"{self.folder}: '{name}' needs {size:,} bytes of memory, at most {limit:,} are used"
+                "; end other programs"
+            )
 
         def read(start: int, end: int) -> dict[str, Tensor]:
             parts = []
@@ -251,7 +274,10 @@ class Checkpoint:
                     rows = slice(max(start, shard.start) - shard.start, min(end, shard.stop) - shard.start)
                     parts.append({column: values[rows] for column, values in columns.items()})
             if any(set(part) != set(parts[0]) for part in parts):
-                raise CheckpointError(f"{self.folder}: the parts of '{name}' have different columns; use RUN@step:N")
+                raise CheckpointError(
+                    f"{self.folder} is corrupt: the parts of '{name}' have different columns"
+                    "; use an older checkpoint: RUN@step:N"
+                )
             return {column: torch.cat([part[column] for part in parts]) for column in parts[0]} if parts else {}
 
         return Rows(first, stop, read)
@@ -262,7 +288,9 @@ class Checkpoint:
         columns = _tensors(data, file)
         for column, values in columns.items():
             if values.shape[:1] != (shard.stop - shard.start,):
-                raise CheckpointError(f"{file} is corrupt: rows of '{column}' are missing; use RUN@step:N")
+                raise CheckpointError(
+                    f"{file} is corrupt: rows of '{column}' are missing; use an older checkpoint: RUN@step:N"
+                )
         return columns
 
     def _data(self, name: str, limit: int) -> bytes:
@@ -276,8 +304,8 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     """Open a checkpoint and check its manifest; each file is checked when it is read.
 
     Raises:
-        CheckpointError: if it is missing, incomplete or corrupt.
-        FormatError: if it has another format.
+        CheckpointError: if the checkpoint is missing, incomplete or corrupt.
+        FormatError: if it has a format that this rlcli does not read.
     """
     file = folder / "manifest.json"
     data = read_file(file, JSON_LIMIT, missing=f"{folder} is not a checkpoint: it has no manifest.json; check the path")
@@ -293,7 +321,10 @@ def open_checkpoint(folder: Path) -> Checkpoint:
 
 
 def steps(checkpoints: Path) -> list[int]:
-    """Return the steps of a run's checkpoints, ascending; links and folders with other names are ignored."""
+    """Return the environment steps of the checkpoints in a run's folder `checkpoints`, ascending.
+
+    Links and folders with other names are ignored.
+    """
     if checkpoints.is_symlink() or not checkpoints.is_dir():
         return []
     names = [entry.name for entry in checkpoints.iterdir() if not entry.is_symlink()]
@@ -301,12 +332,15 @@ def steps(checkpoints: Path) -> list[int]:
 
 
 def sha256(data: bytes) -> str:
-    """Return the hash of a file's content that a manifest stores."""
+    """Return the SHA-256 of a file's content, as manifest.json stores it."""
     return hashlib.sha256(data).hexdigest()
 
 
 def _verified(file: Path, size: int, digest: str, limit: int) -> bytes:
-    """Return the content of a file after a check of its size and hash."""
+    """Return the content of a file, and check its size and its SHA-256, which manifest.json stores.
+
+    A file of more than `limit` bytes is not read.
+    """
     data = read_file(file, limit, size=size, missing=f"{file} is missing; choose an older checkpoint: RUN@step:N")
     if len(data) != size:
         raise manifest_error(file, f"{len(data)} bytes were read, but the manifest has {size}")
@@ -319,7 +353,7 @@ def _tensors(data: bytes, file: Path) -> dict[str, Tensor]:
     """Return the tensors of a safetensors file after a check of its header."""
     length = int.from_bytes(data[:8], "little")
     if length > min(_HEADER_LIMIT, len(data) - 8):
-        raise CheckpointError(f"{file} is corrupt: not a safetensors file; use RUN@step:N")
+        raise CheckpointError(f"{file} is corrupt: not a safetensors file; use an older checkpoint: RUN@step:N")
     check_json(_Header, parse_json(data[8 : 8 + length], file), file)  # shapes that torch accepts
     try:
         return safetensors.torch.load(data)
@@ -328,13 +362,13 @@ def _tensors(data: bytes, file: Path) -> dict[str, Tensor]:
 
 
 def _check_state(values: dict[str, Any], step: int, file: Path) -> None:
-    """Check the values of state.json that every trainer saves."""
+    """Check the content of state.json: the values that every trainer saves. `step` is the step in manifest.json."""
     check_json(_State, values, file)
     if values.get("env_steps", step) != step:
         found = values["env_steps"]
         raise CheckpointError(
             f"{file} is corrupt: its step is {found}, but manifest.json has step {step};"
-            " choose another checkpoint with RUN@step:N"
+            " use another checkpoint: RUN@step:N"
         )
     for key, entry in values.items():
         if key.partition(".")[0] == "statistics":

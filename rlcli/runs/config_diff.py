@@ -41,7 +41,10 @@ _EMPTY: tuple[Any, ...] = (None, {})
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One difference between two sides; None stands for a value that one side does not have."""
+    """One difference between two runs or configurations, left and right.
+
+    `where` names the key, file, metric or tensor that differs. None stands for a value that one side does not have.
+    """
 
     where: str
     left: Any
@@ -55,7 +58,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """The differences of one part of two sides; `compared` describes how much was compared, such as `120 keys`."""
+    """Result of the comparison of one part, such as the configurations; `compared` says how much was compared."""
 
     name: str
     compared: str
@@ -86,7 +89,7 @@ def run_values(run: Run) -> Values:
 
 
 def task_values(resolved: Resolved) -> Values:
-    """Return the configuration of a task with its chosen agent and all defaults. A task has no seed."""
+    """Return the configuration of a task with the chosen agent and all defaults, but without a seed."""
     from rlcli.config.dump import origins, to_data
 
     data, places = to_data(resolved), origins(resolved)
@@ -94,7 +97,7 @@ def task_values(resolved: Resolved) -> Values:
 
 
 def compare_values(left: Values, right: Values) -> Section:
-    """Return every key in which two configurations differ, physics first."""
+    """Compare two configurations: find every key whose values differ, in the order of `CATEGORIES`."""
     absent = (None, None)
     keys = list(dict.fromkeys([*left, *right]))
     pairs = {path: (left.get(path, absent), right.get(path, absent)) for path in keys}
@@ -109,7 +112,10 @@ def compare_values(left: Values, right: Values) -> Section:
 
 
 def compare_files(left: Mapping[str, str], right: Mapping[str, str]) -> Section:
-    """Compare the files of two tasks, given as file name -> sha256. Models are physics, Python files are MDP."""
+    """Compare the files of two tasks, from file name -> SHA-256.
+
+    Differing Python files are of the category MDP, all others (robot models) of the category physics.
+    """
     keys = list(dict.fromkeys([*left, *right]))
     found = [
         Difference(name, left.get(name), right.get(name), category="MDP" if name.endswith(".py") else "physics")
@@ -124,7 +130,7 @@ def category(path: Path, *, observes_images: bool = False) -> str:
 
     Args:
         path: the path of the key; `agent` stands for the chosen agent.
-        observes_images: whether the policy observes images.
+        observes_images: whether the policy observes images; then colours and lights are not cosmetic.
     """
     if path[0] == "play" and len(path) > 1:
         return category(path[1:], observes_images=observes_images)
@@ -149,7 +155,7 @@ def as_text(value: object) -> str:
 
 
 def _override_path(path: Path, data: Mapping[str, Any]) -> Path:
-    """Return the path that an override uses: `agents.NAME` of the chosen agent becomes `agent`."""
+    """Return the path of a key as an override writes it: `agents.NAME` of the chosen agent becomes `agent`."""
     agents = data.get("agents")
     if path[0] != "agents" or len(path) < 2 or not isinstance(agents, dict):
         return path

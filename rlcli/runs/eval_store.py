@@ -42,7 +42,7 @@ Name = Annotated[str, Field(max_length=500)]
 
 
 class _EvaluationRecord(FileModel):
-    """Entries of a saved evaluation that rlcli reads; the document may have more."""
+    """Entries of a saved evaluation that rlcli reads; the file may have more."""
 
     command: Literal["eval"]
     episodes: Annotated[int, Field(ge=1)]
@@ -77,12 +77,17 @@ def write_evaluation(run: Run, step_name: str, document: Mapping[str, Any]) -> P
 
 
 def read_evaluation(run: Run, step_name: str) -> dict[str, Any] | None:
-    """Return the newest evaluation of a run's checkpoint; None if there is none.
+    """Return the saved result of `rlcli eval` for a run's checkpoint; None if there is none.
 
-    These entries are checked: `episodes`, `seed`, `return` and `length` (mean, std, low, high; for a single episode low
-    and high are None), `reward_terms` (the same for each term, by name), `terminations` (rate, low, high for each
-    term, by name), `diverged`, `diverged_by`. `success` (rate, low, high) and `conditions` (by name: `held`, a share;
-    `value`, a mean, `at_least` and `at_most`, where the condition has them) are missing for a task without success.
+    These entries of the result are checked: `episodes`, `seed`, `return` and `length` (mean, std, low, high; for a
+    single episode low and high are None), `reward_terms` (the same for each term, by name), `terminations` (rate, low,
+    high for each term, by name), `diverged`, `diverged_by`. `success` (rate, low, high) and `conditions` (by name:
+    `held`, a share; `value`, a mean, `at_least` and `at_most`, where the condition has them) are missing for a task
+    without success.
+
+    Args:
+        run: the run.
+        step_name: name of the checkpoint's folder.
 
     Raises:
         CheckpointError: if the file is malformed.

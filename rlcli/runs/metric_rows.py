@@ -16,7 +16,7 @@ _LARGEST = 1e300
 
 
 def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
-    """Yield the rows, the oldest first; an incomplete last line, left by a killed process, is skipped.
+    """Yield the rows of a run's metrics, the oldest first; an incomplete last line of a killed process is skipped.
 
     Args:
         run: the run.
@@ -31,7 +31,7 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
             for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), start=1):
                 size += len(line)
                 if size > _MOST_BYTES:
-                    raise CheckpointError(f"{run.metrics} is larger than {_MOST_BYTES:,} bytes; shorten it")
+                    raise CheckpointError(f"{run.metrics} is larger than {_MOST_BYTES:,} bytes; delete old lines")
                 if not line.endswith(b"\n") and len(line) < LONGEST_LINE:
                     return
                 row = parse_row(line)
@@ -46,7 +46,7 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
 
 
 def parse_row(line: bytes) -> dict[str, Any] | None:
-    """Return the numbers of one line; None if it is not JSON with integers `iteration` and `step`."""
+    """Return metric name -> number of one line; None if it is not JSON with integers `iteration` and `step`."""
     try:
         row = json.loads(line)
     except (ValueError, RecursionError):

@@ -1,4 +1,7 @@
-"""States and scores of the runs in a folder, read from their files alone: fast for thousands of untrusted runs."""
+"""Summary of each run in a folder, with state, progress and scores, for `rlcli runs`.
+
+It is read from the files of the runs alone, which may be untrusted, and is fast for thousands of runs.
+"""
 
 import contextlib
 import math
@@ -31,7 +34,7 @@ time stamp this far in the future is one of another clock."""
 
 @dataclass(slots=True)
 class Overview:
-    """Summary of one run, or of a broken folder where a run should be."""
+    """Summary of one run, or of a folder that should be a run but cannot be read."""
 
     folder: Path
     task: str
@@ -68,13 +71,13 @@ class Overview:
 
 
 def overviews(runs_dir: Path) -> list[Overview]:
-    """Return all runs under a folder, the newest first; those without a readable start time come last."""
+    """Return the summaries of all runs under a folder, the newest first; those without a start time come last."""
     found = [overview(folder) for folder in run_folders(runs_dir)]
     return sorted(found, key=lambda run: (run.started or "", run.folder.name), reverse=True)
 
 
 def overview(folder: Path) -> Overview:
-    """Return the overview of a folder; for a broken one, its `reason` is the error message."""
+    """Return the summary of a run's folder; if it cannot be read, the state is `broken` and `reason` the message."""
     try:
         run = open_run(folder)
     except (CheckpointError, OSError) as error:
@@ -86,7 +89,7 @@ def overview(folder: Path) -> Overview:
 
 
 def overview_of(run: Run) -> Overview:
-    """Return the overview of an opened run."""
+    """Return the summary of an opened run."""
     record = run.record
     state, reason = state_of(run)
     overview = Overview(
@@ -136,12 +139,12 @@ def state_of(run: Run) -> tuple[str, str | None]:
 
 
 def newest_rows(run: Run) -> list[dict[str, Any]]:
-    """Return the newest rows of `metrics.jsonl`, the oldest of them first."""
+    """Return the last rows of a run's `metrics.jsonl`, as many as a limited part of the file has, the oldest first."""
     return [*_rows_backwards(run)][::-1]
 
 
 def _rows_backwards(run: Run) -> Iterator[dict[str, Any]]:
-    """Yield the newest rows, the newest first; corrupt lines are skipped."""
+    """Yield the last rows of a run's `metrics.jsonl`, the newest first; corrupt lines are skipped."""
     for size in (_TAIL_BYTES, 2 * _MAX_ROW_BYTES):
         data, whole = _tail(run, size)
         lines = data.split(b"\n")[0 if whole else 1 : -1]  # the text after the last newline is still being written
@@ -151,7 +154,10 @@ def _rows_backwards(run: Run) -> Iterator[dict[str, Any]]:
 
 
 def _tail(run: Run, limit: int) -> tuple[bytes, bool]:
-    """Return the end of `metrics.jsonl` and whether it is the whole file; nothing if it cannot be read."""
+    """Return the last `limit` bytes of `metrics.jsonl`, and whether they are the whole file.
+
+    If the file cannot be read, it counts as empty.
+    """
     try:
         return read_tail(run.metrics, limit)
     except (OSError, CheckpointError):
@@ -212,7 +218,7 @@ def count(value: object) -> int | None:
 
 
 def times(run: Run) -> tuple[float | None, float | None]:
-    """Return the time since the start of a run and its training time [s]; None if unknown, as after a clock change."""
+    """Return the time since the start of a run, and the time that it has trained [s]; None if the clock was changed."""
     started = seconds_since(run.record.get("started"))
     age = max(0.0, started) if -_STARTING_S < started < math.inf else None
     before, since = run.record.get("trained_s"), run.record.get("since")

@@ -18,7 +18,7 @@ SHIPPED = "shipped"
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Chosen policy: the folder of a checkpoint or a bundle, and the reason for the choice."""
+    """The policy that a command uses: the folder of a checkpoint or a bundle, and the reason for the choice."""
 
     folder: Path
     why: str
@@ -29,7 +29,7 @@ class Choice:
 
     @property
     def agent(self) -> str | None:
-        """Name of the task's agent that a bundle was trained with; a run's configuration has its own agent."""
+        """Name of the agent that a bundle was trained with; None for a run, whose configuration names it."""
         return None if self.bundle is None else self.bundle.manifest.get("agent")
 
     def source(self, named: TaskSource | None) -> TaskSource:
@@ -61,7 +61,9 @@ def choose(
     *,
     any_task: bool = False,
 ) -> Choice:
-    """Return the policy of a reference; without one, that of the task's newest run, else the task's shipped policy.
+    """Return the policy that a reference names.
+
+    Without a reference it is that of the task's newest run; if the task has no run, it is the task's shipped policy.
 
     Args:
         reference: RUN, RUN@best, RUN@step:N, a folder, `latest` or `shipped`.

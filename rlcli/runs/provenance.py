@@ -1,4 +1,7 @@
-"""Record of everything besides the configuration that may change the bits of a run: versions, sources, hardware."""
+"""Record of what may change the results of a run besides its configuration: versions, source code, hardware.
+
+It is stored in run.json, so that a later run can be compared.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +49,10 @@ _MAX_BYTES = 64 * 1024**2
 
 
 def environment_record(resolved: Resolved, engine_threads: int, torch_threads: int) -> dict[str, Any]:
-    """Return the part of the record that needs no heavy imports; `built_record` returns the rest."""
+    """Return the part of the record that is known before the environment is built; `built_record` returns the rest.
+
+    It imports neither torch nor MuJoCo.
+    """
     return {
         "rlcli": rlcli.__version__,
         "python": platform.python_version(),
@@ -65,7 +71,7 @@ def environment_record(resolved: Resolved, engine_threads: int, torch_threads: i
 
 
 def built_record(model: mujoco.MjModel, device: str) -> dict[str, Any]:
-    """Return the part of the record that needs the built environment: torch's settings and the compiled model."""
+    """Return the part of the record that needs the built environment: torch's settings, the compiled model's hash."""
     import torch
 
     denormal = torch.tensor([1e-310], dtype=torch.float64)
@@ -85,7 +91,10 @@ def built_record(model: mujoco.MjModel, device: str) -> dict[str, Any]:
 
 
 def versions(resolved: Resolved) -> dict[str, str]:
-    """Return the versions of PACKAGES, of the packages of the task, trainer and format, and of their requirements."""
+    """Return package -> version of every package that may change the results.
+
+    These are `PACKAGES`, the packages of the task, of the trainer and of the task's format, and what they require.
+    """
     found = {name: _version(name) for name in PACKAGES}
     owners = []
     if resolved.source.distribution:
@@ -106,7 +115,7 @@ def versions(resolved: Resolved) -> dict[str, str]:
 
 
 def sources(resolved: Resolved) -> dict[str, str]:
-    """Return the sha256 of each file of the task, one of rlcli's source code, and one of the format's source code."""
+    """Return name -> SHA-256 of each file of the task, and of the source code of rlcli and of the task's format."""
     root = resolved.source.root.resolve()
     digests = {}
     for file in _task_files(resolved):
@@ -129,7 +138,7 @@ def file_digest(file: Path) -> str | None:
 
 
 def model_digest(model: mujoco.MjModel) -> str:
-    """Return the sha256 of the numbers of a compiled model, without textures, materials, skins and file paths."""
+    """Return the SHA-256 of a compiled model's numbers, without those of textures, materials, skins and file paths."""
     import numpy as np
 
     digest = hashlib.sha256()
@@ -148,7 +157,12 @@ def model_digest(model: mujoco.MjModel) -> str:
 
 
 def differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Return (name, was, now) for each entry that both records have and that differs; nested entries are flattened."""
+    """Return (dotted name, old value, new value) of each entry that two records have and that differs.
+
+    Args:
+        was: a record of this module, such as that of a run.
+        now: another one.
+    """
     rows = []
     for entry in ENTRIES:
         if entry not in was or entry not in now:
@@ -166,7 +180,7 @@ def _flat(name: str, value: object) -> dict[str, Any]:
 
 
 def _task_files(resolved: Resolved) -> Iterator[Path]:
-    """Yield the task's Python files, its models and their assets. The YAML is in the run, resolved."""
+    """Yield the task's Python files, its models and their assets, but not its YAML, which the run stores itself."""
     source = resolved.source
     pending = [*source.term_files, *([source.task_file] if source.task_file else []), *sorted(source.root.glob("*.py"))]
     for entity in resolved.task.scene.entities.values():

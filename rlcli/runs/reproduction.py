@@ -1,4 +1,4 @@
-"""Reproduction of a run: whether it is possible, what has changed since, and at which iterations to compare."""
+"""Reproduction of a run by `rlcli reproduce`: whether it can be equal, what has changed, and what to compare."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +20,7 @@ def require_reproducible(run: Run) -> None:
     """Check that a run can be reproduced bit by bit: it was trained by one process on a CPU.
 
     Raises:
-        UsageError: for any other run, and for a run without an iteration.
+        UsageError: if it was not, or has no finished iteration.
     """
     device, processes = str(run.record.get("device", "cpu")), run.record.get("processes", 1)
     if device != "cpu":
@@ -35,28 +35,33 @@ def require_reproducible(run: Run) -> None:
 
 
 def changed_entries(run: Run, now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Return (name, then, now) for each recorded entry that affects the results and has changed."""
+    """Return (name, value of the run, present value) of what has changed since a run and affects its results.
+
+    `now` is the record of the present software and machine, from `rlcli.runs.provenance`.
+    """
     return [row for row in differences(run.record, now) if row[0] not in IRRELEVANT]
 
 
 def milestones(run: Run, until: int) -> list[int]:
-    """Return the iterations up to `until` at which a run has a checkpoint, and `until` itself, for a comparison."""
+    """Return the iterations at which a reproduction is compared: those with a checkpoint below `until`, and `until`."""
     saved = [open_checkpoint(run.checkpoints / f"{step:012d}").manifest for step in steps(run.checkpoints)]
     iterations = [entry["iteration"] for entry in saved if isinstance(entry.get("iteration"), int)]
     return sorted({i for i in iterations if 0 < i < until} | {until})
 
 
 def create_reproduction(original: Run, runs_dir: Path, name: str, now: Mapping[str, Any]) -> tuple[Run, Path | None]:
-    """Create a run with the configuration, seed and threads of another; return it and the initial checkpoint of both.
+    """Create a run with the configuration, seed and threads of another run.
+
+    Return it and the checkpoint from which both start, or None if they start with random weights.
 
     Args:
         original: the run to reproduce.
         runs_dir: folder of the new run.
         name: part of the name of its folder.
-        now: the record of the present software and machine.
+        now: the record of the present software and machine, from `rlcli.runs.provenance`.
 
     Raises:
-        CheckpointError: if the initial checkpoint has changed.
+        CheckpointError: if the checkpoint from which both start has changed.
     """
     was = original.record
     initial = Path(was["init_from"]) if was.get("init_from") else None

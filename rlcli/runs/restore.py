@@ -1,4 +1,4 @@
-"""Task, configuration and compatibility checks of a saved run, used by play, eval and resume."""
+"""Task and configuration of a saved run, and checks that a checkpoint fits an environment, as play and resume need."""
 
 import os
 import shlex
@@ -38,13 +38,13 @@ def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
 def recorded_task(
     record: Mapping[str, Any], what: str, run: str | None = None, named: TaskSource | None = None
 ) -> TaskSource:
-    """Return the task of a record made by `TaskSource.record`, as it is installed now.
+    """Find the task that a run or another file has stored as a record (`TaskSource.record`), as it is installed now.
 
     Args:
         record: the record.
         what: name of the task in messages, such as `the task of RUN`.
         run: the run that holds the record, if there is one.
-        named: see `source_of`.
+        named: the task on the command line, if there is one. If it is not installed, its code is used.
 
     Raises:
         TaskError: if the task is not installed any more.
@@ -79,7 +79,14 @@ def _untrusted_code_error(record: Mapping[str, Any], what: str, run: str | None)
 def resolve_run(
     run: Run, *, play: bool, flags: Mapping[str, Any] | None = None, named: TaskSource | None = None
 ) -> Resolved:
-    """Return the configuration of a run, changed by flags of the command line; `named`: see `source_of`."""
+    """Return the configuration of a run, changed by flags of the command line.
+
+    Args:
+        run: the run.
+        play: whether to apply the task's `play:` changes.
+        flags: dotted key -> value.
+        named: the task on the command line, if there is one. If it is not installed, its code is used.
+    """
     return resolve(source_of(run, named), play=play, flags=flags)
 
 
@@ -141,14 +148,19 @@ def _table(rows: Sequence[tuple[str, str, str]]) -> list[str]:
 
 
 def _differing_rows(record: Mapping[str, Any], current: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Return a row (name, in the checkpoint, now) for each field that differs."""
+    """Return a row (name, value in the checkpoint, value now) for each term that differs between two layouts.
+
+    Args:
+        record: the layout in a checkpoint.
+        current: the layout of an environment.
+    """
     was, now = _fields(record), _fields(current)
     names = [name for name in {**was, **now} if _differ(was.get(name), now.get(name))]
     return [(name, _text(was.get(name)), _text(now.get(name))) for name in names]
 
 
 def _fields(record: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Return the terms and the control period by their names in the table."""
+    """Return the terms and the control period of a layout, by their names in the table of differences."""
     fields: dict[str, Mapping[str, Any]] = {}
     for group, terms in record.get("observations", {}).items():
         for position, term in enumerate(terms):
@@ -165,7 +177,10 @@ _CONTRACT = ("name", "size", "elements", "scale", "offset", "clip", "history", "
 
 
 def _differ(was: Mapping[str, Any] | None, now: Mapping[str, Any] | None) -> bool:
-    """Return whether a term differs in a key that checkpoint and environment both have (older ones lack some keys)."""
+    """Return whether a term of a checkpoint, `was`, differs from the environment's, `now`, in a key of both.
+
+    Checkpoints of older versions lack some keys.
+    """
     if was is None or now is None:
         return True
     common = [key for key in _CONTRACT if key in was and key in now]
@@ -185,7 +200,7 @@ def _text(term: Mapping[str, Any] | None) -> str:
 
 
 def _rounded(value: object) -> Any:
-    """Return numbers with six significant digits: the last bits of a model's values depend on the compiling machine."""
+    """Return a number, or a list of numbers, as text with six digits: further digits depend on the machine."""
     if isinstance(value, list):
         return "[" + ", ".join(str(_rounded(item)) for item in value) + "]"
     return f"{value:.6g}" if isinstance(value, float) else value

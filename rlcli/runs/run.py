@@ -44,7 +44,7 @@ _NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 
 @dataclass(slots=True)
 class Run:
-    """Folder of one training run. `record` is the content of run.json."""
+    """Folder of one training run. `record` is the content of run.json: its task, seed, state and environment."""
 
     folder: Path
     record: dict[str, Any] = field(default_factory=dict)
@@ -80,7 +80,7 @@ class Run:
             raise CheckpointError(f"{self.config}:{error.line}:{error.column} is corrupt: {error.message}") from None
 
     def findings(self) -> list[str]:
-        """Return the findings of the training's health checks, a sentence each."""
+        """Return what the health checks of the training have found, a sentence for each finding."""
         return [f"{each['check']}: {each['message']}; try {each['hint']}" for each in self.record.get("health", ())]
 
     def update(self, **entries: Any) -> None:
@@ -114,7 +114,14 @@ class Run:
 
 
 def create_run(runs_dir: Path, task: str, name: str | None, config: str, record: Mapping[str, Any]) -> Run:
-    """Create and lock a new run with its configuration; runs that start in the same second get different folders.
+    """Create and lock a new run; runs that start in the same second get different folders.
+
+    Args:
+        runs_dir: the folder of runs.
+        task: name of the task.
+        name: part of the name of the run's folder; None: the name is only a time.
+        config: the resolved configuration, as YAML.
+        record: the first content of run.json.
 
     Raises:
         UsageError: if the name cannot be part of a folder's name.
@@ -132,7 +139,8 @@ def new_folder(runs_dir: Path, task: str, name: str | None) -> Path:
     """
     require_name(name)
     if len(os.fsencode(task)) > 255:
-        raise UsageError(f"the task's name has {len(os.fsencode(task))} bytes, but a folder's name at most 255")
+        message = f"the task's name has {len(os.fsencode(task))} bytes, but a folder's name at most 255"
+        raise UsageError(message, hint="give the task a shorter name")
     parent = runs_dir / task
     stem = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S") + (f"-{name}" if name else "")
     with disk_errors(parent):
@@ -153,7 +161,7 @@ def require_name(name: str | None) -> None:
 
 
 def initialize_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
-    """Write the configuration and the record of a new run into its empty folder, and lock it.
+    """Write config.yaml and run.json (`record`) of a new run into its empty folder, and lock it.
 
     Raises:
         MachineError: if the folder cannot be written; it is deleted.
@@ -168,7 +176,7 @@ def initialize_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
 
 
 def open_run(folder: Path) -> Run:
-    """Open an existing run, and check its record and its files' types.
+    """Open an existing run, check run.json, and check that its files are regular files.
 
     Raises:
         CheckpointError: if the folder is not a valid run.
@@ -236,7 +244,7 @@ def is_locked(folder: Path) -> bool:
 
 
 def _can_share(handle: int) -> bool:
-    """Return whether a lock file can get a shared lock, which ends when the handle is closed."""
+    """Return whether no process holds the lock of an opened lock file: then a shared lock on it is possible."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -258,14 +266,14 @@ def _can_share(handle: int) -> bool:
 
 
 def require_own(run: Run, *parts: str) -> None:
-    """Check that paths to be written stay in the run: no link leads out of it, and no pipe or device is among them.
+    """Check that files of a run can be written safely: no link leads out of the run, and none is a pipe or device.
 
     Args:
         run: the run.
         parts: files and folders in the run; a folder stands for everything in it.
 
     Raises:
-        CheckpointError: with the path that does not belong in a run.
+        CheckpointError: with the first path that must not be in a run.
     """
     count = 0
     pending = [run.folder / part for part in parts]
@@ -297,7 +305,7 @@ def _require_task_name(name: str) -> str:
 
 
 class TaskRecord(FileModel):
-    """Record of a task in an untrusted file. Every entry is a name or a path."""
+    """Entry `task` of run.json or of another untrusted file: the task's name, and where it comes from."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, PrintableText | None] = Field(init=False)
@@ -308,12 +316,12 @@ class TaskRecord(FileModel):
 
 
 class _InstalledTask(TaskRecord):
-    """Record of a run's task, which must name the origin of the task."""
+    """Entry `task` of run.json, which must say where the task comes from: a folder or an installed distribution."""
 
     @model_validator(mode="after")
     def _check_origin(self) -> Self:
         if not (self.folder or self.distribution):
-            raise ValueError("give folder or distribution, the origin of the task")
+            raise ValueError("the origin of the task is missing: 'folder' or 'distribution'; the file is damaged")
         return self
 
 

@@ -27,12 +27,14 @@ _ROWS = 4096
 
 
 def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until: int | None = None) -> list[Section]:
-    """Compare two runs: find all differences of configuration and environment, and the first one of each other part.
+    """Compare two runs, part by part.
+
+    Of configuration and environment all differences are found, of each other part only the first one.
 
     Args:
         left: a run.
         right: another run.
-        sections: the parts to compare.
+        sections: the parts to compare, some of `SECTIONS`.
         until: last environment step of the metrics and checkpoints that are compared; None: compare all, so that a
             longer run differs.
 
@@ -92,7 +94,7 @@ def _metrics(left: Run, right: Run, until: int | None) -> Section:
 
 
 def _rows(run: Run, until: int | None) -> Iterator[dict[str, Any]]:
-    """Return the rows of a run's metrics up to an environment step."""
+    """Return the rows of a run's metrics up to the environment step `until`; all rows if it is None."""
     rows = read_rows(run, strict=True)
     return rows if until is None else takewhile(lambda row: row["step"] <= until, rows)
 
@@ -106,7 +108,7 @@ def _weights(left: Run, right: Run, until: int | None) -> Section:
 
 
 def _checkpoint_differences(left: Run, right: Run, steps: Sequence[int]) -> Iterator[Difference]:
-    """Yield the differences between the checkpoints of two runs, the oldest first."""
+    """Yield the differences between the checkpoints of two runs at these environment steps, in this order."""
     for step in steps:
         one, other = (_open_checkpoint(run, step) for run in (left, right))
         for part in _parts(one, other):
@@ -120,7 +122,7 @@ def _checkpoint_differences(left: Run, right: Run, steps: Sequence[int]) -> Iter
 
 
 def _parts(one: Checkpoint, other: Checkpoint) -> list[str]:
-    """Return the parts of both checkpoints: policy and trainer first, the others by name."""
+    """Return the names of the tensor files of two checkpoints without suffix: policy, trainer, then the others."""
     names = {name for saved in (one, other) for name in saved.manifest["files"] if name.endswith(".safetensors")}
     order = ("policy.safetensors", "trainer.safetensors")
     ordered = sorted(names, key=lambda name: (order.index(name) if name in order else len(order), name))
@@ -145,7 +147,10 @@ def _compare_tensors(left: Mapping[str, Tensor], right: Mapping[str, Tensor], pr
 
 
 def _compare_elements(left: Tensor, right: Tensor, where: str) -> Iterator[Difference]:
-    """Yield the first element whose bits differ, or the difference of types and shapes."""
+    """Yield the first element in which two tensors differ, bit by bit; or the difference of their types and shapes.
+
+    `where` is the name of the tensors in the result.
+    """
     import torch
 
     kinds = [f"{str(value.dtype).removeprefix('torch.')} {list(value.shape)}" for value in (left, right)]
@@ -163,7 +168,7 @@ def _compare_elements(left: Tensor, right: Tensor, where: str) -> Iterator[Diffe
 
 
 def _compare_logs(one: Checkpoint, other: Checkpoint) -> Iterator[Difference]:
-    """Yield the differing elements of replay buffers; their rows may be split into files in other ways."""
+    """Yield the differences between the replay buffers of two checkpoints, however their rows are split into files."""
     if not one.shards() and not other.shards():
         return
     left, right = one.state().logs, other.state().logs
@@ -192,7 +197,7 @@ def _first_unequal(left: Mapping[Any, Any], right: Mapping[Any, Any], keys: Iter
 
 
 def _presence(word: str, left: bool, right: bool) -> tuple[str | None, str | None]:
-    """Return both sides of a `Difference` of an entry that one side lacks: `word` if it exists, else None."""
+    """Return the two values of a `Difference` for an entry that may exist: `word` where it exists, else None."""
     return word if left else None, word if right else None
 
 

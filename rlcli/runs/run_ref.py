@@ -15,7 +15,12 @@ _log = logging.getLogger(__name__)
 
 
 def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[Run, str]:
-    """Find a run by its folder, its name, or `latest`; return it and the reason for the choice.
+    """Find a run by its folder, its name, or `latest`; return it and the reason for the choice, as text.
+
+    Args:
+        reference: the folder, the name, or `latest`.
+        runs_dir: the folder of runs.
+        task: name of the task that the run must have; None: any.
 
     Raises:
         CheckpointError: if there is no such run.
@@ -68,12 +73,12 @@ def _runs_of_task(reference: str, runs_dir: Path) -> list[Run]:
 
 
 def list_runs(runs_dir: Path, task: str | None) -> list[Run]:
-    """Return the runs under a folder, the oldest first; other folders and broken runs are skipped."""
+    """Return the runs of a task (None: of all tasks) in the folder of runs, the oldest first, without broken ones."""
     return _list_runs(runs_dir, task)[0]
 
 
 def _list_runs(runs_dir: Path, task: str | None) -> tuple[list[Run], list[CheckpointError]]:
-    """Return the runs of a task (None: all), the oldest first, and the errors of the broken ones."""
+    """Return the runs of a task (None: of all tasks), the oldest first, and the errors of runs that cannot be read."""
     runs, refused = _opened(run_folders(runs_dir))
     if task is None:
         return runs, list(refused.values())
@@ -82,7 +87,7 @@ def _list_runs(runs_dir: Path, task: str | None) -> tuple[list[Run], list[Checkp
 
 
 def _first_of(refused: list[CheckpointError]) -> str:
-    """Return the reason why the first broken run is skipped, and how many others are."""
+    """Return the message of the first error, and the number of further errors: runs that were skipped."""
     more = f"; {len(refused) - 1} more are skipped" if len(refused) > 1 else ""
     return refused[0].message + more
 
@@ -115,7 +120,7 @@ def find_checkpoint(
         reference: the reference.
         runs_dir: the folder of runs.
         task: the task that the run must be of; None: any.
-        whole: a valid checkpoint can be resumed; otherwise only its policy is checked.
+        whole: whether the whole checkpoint must be valid, so that it can be resumed; otherwise only its policy.
 
     Returns:
         The run, the checkpoint's folder, and the reason for the choice.
@@ -138,21 +143,33 @@ def find_checkpoint(
     if which == "best":
         best = run.record.get("best")
         if best not in have:
-            message = f"{run.folder} has no best checkpoint: it was not evaluated"
-            raise CheckpointError(message, hint="leave out @best for the newest")
+            raise CheckpointError(
+                f"{run.folder} has no best checkpoint: it was not evaluated",
+                hint="leave out @best to use the newest checkpoint",
+            )
         return run, run.checkpoints / f"{best:012d}", "its best evaluation"
     kind, _, number = which.partition(":")
     if kind == "step" and re.fullmatch("[0-9]{1,30}", number):
         if int(number) not in have:
-            message = f"{run.folder} has no checkpoint at step {number}"
-            raise CheckpointError(message, hint=f"steps: {listing(map(str, have))}")
+            raise CheckpointError(
+                f"{run.folder} has no checkpoint at step {number}",
+                hint=f"it has checkpoints at these steps: {listing(map(str, have))}",
+            )
         return run, run.checkpoints / f"{int(number):012d}", "as named"
-    message = f"'{reference}' does not name a checkpoint"
-    raise CheckpointError(message, hint="RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest")
+    raise CheckpointError(
+        f"'{reference}' does not name a checkpoint",
+        hint="write RUN, RUN@best, RUN@step:N, a checkpoint folder, or latest",
+    )
 
 
 def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Path, str]:
-    """Return the newest valid checkpoint and the reason for the choice; warn of each newer, corrupt one.
+    """Return the newest valid checkpoint of a run, and the reason for the choice; warn of each newer, corrupt one.
+
+    Args:
+        run: the run.
+        have: environment steps of its checkpoints.
+        why: the reason why the run was chosen.
+        whole: whether the whole checkpoint must be valid, or only its policy.
 
     Raises:
         CheckpointError: if the newest intact one has another format, or is the untrained policy of step 0.
@@ -174,7 +191,7 @@ def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Pat
             message = f"{run.folder} has no intact checkpoint but that of step 0, before the training"
             raise CheckpointError(message, hint="restore a newer one from a copy; RUN@step:0 names that of step 0")
         return folder, f"{why}, its newest {'good ' if skipped else ''}checkpoint"
-    raise AssertionError("find_checkpoint refuses a run without checkpoints")
+    raise AssertionError("a run without checkpoints came here, although find_checkpoint refuses it")
 
 
 def default_runs_dir() -> Path:

@@ -1,4 +1,4 @@
-"""Reading of untrusted files: plain files of limited size, strict JSON, and pydantic models of the JSON's content."""
+"""Safe reading of untrusted files, such as those of a downloaded run: limited size, strict JSON, checked content."""
 
 import contextlib
 import errno
@@ -35,7 +35,7 @@ class FileModel(BaseModel):
 
 def _require_printable(text: str) -> str:
     if not text.isprintable():
-        raise ValueError("the text must have only characters that can be printed")
+        raise ValueError("the text has a character that cannot be printed, such as a control character; remove it")
     return text
 
 
@@ -70,7 +70,7 @@ def check_json(kind: type[Model], value: object, file: Path, *keys: str, hint: s
 
 
 def _find_half_character(value: object, path: tuple[str | int, ...] = ()) -> str:
-    """Return the dotted key of the first text with a single surrogate; an empty text if there is none."""
+    r"""Return the dotted key of the first text in JSON data with half of a surrogate pair (`\ud800`); else ''."""
     if isinstance(value, str):
         return messages.dotted(path) if re.search("[\ud800-\udfff]", value) else ""
     parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
@@ -116,7 +116,7 @@ def read_file(file: Path, limit: int, *, size: int | None = None, missing: str |
 
 
 def manifest_error(file: Path, difference: str) -> CheckpointError:
-    """Return the error for a file that differs from the manifest."""
+    """Return the error for a file of a checkpoint that differs from manifest.json; `difference` says how."""
     return CheckpointError(f"{file} is corrupt: {difference}", hint="choose an older checkpoint: RUN@step:N")
 
 
@@ -135,7 +135,7 @@ def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
 
 @contextlib.contextmanager
 def _opened(file: Path) -> Iterator[tuple[BinaryIO, int]]:
-    """Context with an opened plain file and its size [bytes]; errors in the block name the file."""
+    """Open a regular file for a `with` block, and give its size [bytes]; errors in the block name the file."""
     try:
         if file.is_symlink():
             raise CheckpointError(f"{file} is a link; replace it by the file itself")
@@ -159,7 +159,7 @@ def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:
     """Parse a JSON object strictly: unique keys, finite numbers with at most 20 digits, at most 32 levels of nesting.
 
     Raises:
-        CheckpointError: for any other text.
+        CheckpointError: if the text is not such an object; the message names the file.
     """
     try:
         text = data if isinstance(data, str) else data.decode()
@@ -225,7 +225,7 @@ def refuse_links(folder: Path) -> None:
 
 
 class _StrictError(ValueError):
-    """Refusal of JSON that the standard parser accepts, such as a duplicate key."""
+    """Error for JSON that Python's parser accepts and rlcli refuses, for example with a duplicate key."""
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -233,7 +233,7 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(value) != len(pairs):
         seen: set[str] = set()
         twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-        raise _StrictError(f"key '{twice[:40]}' appears twice")
+        raise _StrictError(f"key '{twice[:40]}' appears twice in an object")
     return value
 
 

@@ -44,7 +44,15 @@ def read_seeds(text: str) -> list[int]:
 def create_study(
     runs_dir: Path, task: str, name: str | None, config: str, record: Mapping[str, Any], seeds: Sequence[int]
 ) -> Path:
-    """Create a folder with a waiting run for each seed.
+    """Create the folder of a study, which is one training with several seeds: a run for each seed, not started yet.
+
+    Args:
+        runs_dir: the folder of runs.
+        task: name of the task.
+        name: part of the name of the study's folder; None: the name is only a time.
+        config: the resolved configuration, as YAML.
+        record: the first content of each run's run.json.
+        seeds: the seeds.
 
     Raises:
         UsageError: if the name cannot be part of a folder's name.
@@ -71,7 +79,7 @@ class _StudyRuns(FileModel):
 
 
 def read_study(folder: Path, kind: str = "seeds") -> dict[str, Any]:
-    """Read and check the record of a study.
+    """Read and check study.json of a study. `kind` is `seeds` (runs of several seeds) or `sweep`.
 
     Raises:
         CheckpointError: if the folder is not a study of this kind, or its record is malformed.
@@ -81,15 +89,15 @@ def read_study(folder: Path, kind: str = "seeds") -> dict[str, Any]:
     )
     check_json(_StudyRecord, record, folder / STUDY)
     if record["kind"] != kind:
-        raise CheckpointError(f"{folder} has kind {record['kind']}, expected {kind}; choose another folder")
+        raise CheckpointError(f"{folder} is of kind {record['kind']}, expected {kind}; choose another folder")
     return record
 
 
 def runs_of(folder: Path, record: Mapping[str, Any]) -> list[Path]:
-    """Return the folders of a study's runs.
+    """Return the folders of a study's runs. `record` is the content of study.json.
 
     Raises:
-        CheckpointError: if the record has a name that no run of a study has.
+        CheckpointError: if it names a run that is not `seed-N`.
     """
     names = check_json(_StudyRuns, record, folder / STUDY).runs
     return [folder / name for name in names]

@@ -1,4 +1,4 @@
-"""Trust in task code that a run or a recording names: it is loaded only if the user has used it before.
+"""Protection against foreign code: the code of a task that a run or a recording names is loaded only if it is trusted.
 
 Installed tasks are always trusted. A run may also name a task folder or a configuration in Python; its author chose
 them, so they are untrusted. They are loaded only after the user has named them on a command line of this machine. The
@@ -42,12 +42,12 @@ def is_known(record: Mapping[str, Any]) -> bool:
 
 
 def named_code(record: Mapping[str, Any]) -> str:
-    """Return the task code that a record names, as it is written on a command line."""
+    """Return the task's folder or `FILE.py:NAME` from a task's record, as one writes it on a command line."""
     return str(record.get("python") or record["folder"])
 
 
 def _key(record: Mapping[str, Any]) -> str:
-    """Return the text that identifies a task's code: the real path of its folder, or `FILE:ATTRIBUTE`."""
+    """Return the text that identifies the code of a task's record: the real path of its folder, or `FILE:ATTRIBUTE`."""
     if not record.get("python"):
         return str(Path(str(record["folder"])).resolve())
     path, attribute = python_place(str(record["python"]))  # resolved as the loader does it
@@ -64,7 +64,7 @@ def _record_use(key: str) -> None:
 
 
 def _file(key: str) -> Path:
-    """Return the file that records the use of a task."""
+    """Return the file that exists if the user has named the task before; `key`, from `_key`, identifies its code."""
     import platformdirs
 
     folder = os.environ.get("RLCLI_STATE_DIR") or platformdirs.user_state_dir("rlcli")

@@ -1,4 +1,4 @@
-"""Reading of files saved by torch and Stable-Baselines3; only tensors and plain data are unpickled."""
+"""Safe reading of models saved by torch and Stable-Baselines3: only tensors and plain data are unpickled."""
 
 import io
 import pickletools
@@ -40,13 +40,13 @@ VEC_NORMALIZE_HINT = (
 
 
 def read_archive_file(file: Path) -> bytes:
-    """Read a whole file of at most 4 GiB and a quarter of the memory."""
+    """Read a whole file; a file above 4 GiB or a quarter of the memory is refused."""
     limit = min(_MAX_BYTES, available_memory() // 4)
     return read_file(file.resolve(), limit, missing=f"there is no file {file}; check the path")
 
 
 def read_member(file: Path, name: str) -> bytes:
-    """Read a member of a zip file after a check of all members."""
+    """Return the content of the member `name` of a zip file. All members are checked before."""
     data = read_archive_file(file)
     if data[:1] == b"\x80":
         raise CheckpointError(f"{file} is a pickle, which rlcli does not open", hint=VEC_NORMALIZE_HINT)
@@ -57,7 +57,10 @@ def read_member(file: Path, name: str) -> bytes:
 
 
 def _archive(data: bytes, where: str) -> zipfile.ZipFile:
-    """Open a zip file; check that all members are plain files of plausible sizes with safe names."""
+    """Open a zip file, and check that all members are plain files with safe names and not too large.
+
+    `where` names the file in messages.
+    """
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
         members = archive.infolist()
@@ -102,14 +105,21 @@ def _content(archive: zipfile.ZipFile, name: str, where: str) -> bytes:
 
 
 def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
-    """Load nested dictionaries of tensors and numbers from a .pt file; a pickle with other types is refused."""
+    """Load nested dictionaries of tensors and numbers from a .pt file; a pickle with other types is refused.
+
+    Args:
+        data: content of the file.
+        where: name of the file in messages.
+    """
     if data[:4] != b"PK\x03\x04":
         kind = "a plain pickle or a file of torch before 1.6" if data[:1] == b"\x80" else "not a torch file"
         raise CheckpointError(f"{where} is {kind}, which rlcli does not open", hint="save it again with torch.save")
     archive = _archive(data, where)
     described = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
     if len(described) != 1 or archive.getinfo(described[0]).file_size > _PICKLE_LIMIT:
-        raise CheckpointError(f"{where} is not a torch file: bad data.pkl; save it again with torch.save")
+        raise CheckpointError(
+            f"{where} is not a torch file: its data.pkl is missing or too large; save it again with torch.save"
+        )
     _require_tensors_only(_content(archive, described[0], where), where)
     try:
         with warnings.catch_warnings(action="ignore"):
@@ -123,7 +133,7 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
 
 
 def _require_tensors_only(description: bytes, where: str) -> None:
-    """Check the opcodes of a pickle without executing them."""
+    """Check that a pickle, which is not executed, creates only tensors and plain data. `where` names its file."""
     try:
         for opcode, argument, _ in pickletools.genops(description):
             if opcode.name in _REFUSED_OPCODES or (opcode.name == "GLOBAL" and argument not in _ALLOWED):

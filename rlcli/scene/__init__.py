@@ -1,1 +1,1 @@
-"""Scene of a task: MJCF, entities, actuators, sensors and terrain."""
+"""Scene of a task: the MuJoCo model of its robots and objects, with actuators, sensors and terrain, and their state."""

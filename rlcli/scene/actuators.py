@@ -93,7 +93,7 @@ class ActuatorModel(TensorState):
         self._ctrl[:, self._controls] = (self.applied_effort / self._gear).to(self._ctrl.dtype)
 
     def reset(self, selection: Selection) -> None:
-        """Set the targets of new episodes to the default pose and draw their delays."""
+        """At the start of episodes in the selected environments, set the default pose as target and draw the delays."""
         selection.write(self.targets, selection.read_view(self._default_targets))
         selection.write(self.computed_effort, 0.0)
         selection.write(self.applied_effort, 0.0)
@@ -108,7 +108,10 @@ class ActuatorModel(TensorState):
         super().load_state_dict(state)
 
     def _delayed_targets(self, history: Tensor) -> Tensor:
-        """Return the targets of `delay` physics steps ago, or the first ones of the episode. (num_envs, 3, k)"""
+        """Return the position, velocity and effort targets that act now, after the delay. (num_envs, 3, k)
+
+        They are those of `delay` physics steps ago, or the first ones of the episode. `history` has the past targets.
+        """
         now = self.targets[:, None]
         # the first step of an episode fills the whole history
         is_first = self._is_first_step[:, None, None, None]
@@ -132,12 +135,14 @@ class ActuatorModel(TensorState):
 
 
 class JointCommand:
-    """Writer of commands of one kind to joints that MuJoCo's own actuators or actuator models drive.
+    """Writer of an action term's commands (efforts, positions or velocities) to some joints of a robot.
+
+    The joints are driven by MuJoCo's own actuators or by actuator models of the configuration.
 
     Args:
         entity: the robot.
         kind: motor (efforts), position or velocity.
-        columns: joint columns, in the order of the commands.
+        columns: indices of the joints in the robot, in the order of the commands.
 
     Raises:
         NameProblem: for a joint without an actuator of this kind.
@@ -172,7 +177,7 @@ class JointCommand:
                 self._model_targets.append((actuator.targets[:, _ROW[kind]], from_columns, to_joints))
 
     def write(self, command: Tensor) -> None:
-        """Write the controls and joint targets, which hold until the next call. command (num_envs, columns)"""
+        """Set the commands of the joints, which hold until the next call. command (num_envs, columns)"""
         if self._has_native:
             own = command if self._all_native else command[:, self._sources]
             own = own if self._factor is None else own * self._factor

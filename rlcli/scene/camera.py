@@ -71,7 +71,7 @@ class CameraSensor(LazySensor):
         return self._image
 
     def on_moved(self, selection: Selection) -> None:
-        """Render the selected environments again, if the image has been read in this step."""
+        """Render the selected environments again after their bodies were moved, if the image has been read already."""
         if self._current:
             self._render(ids_of(selection))
 
@@ -80,7 +80,7 @@ class CameraSensor(LazySensor):
         self._renderers.close()
 
     def _render(self, ids: NDArray[np.int64]) -> None:
-        """Render some environments, an equal share in each thread."""
+        """Render the environments `ids`, an equal share in each thread."""
         engine, config, camera, pixels = self._engine, self.config, self._camera, self._pixels
 
         def render_share(share: NDArray[np.int64], renderer: CameraRenderer) -> None:
@@ -93,7 +93,7 @@ class CameraSensor(LazySensor):
 
 
 class CameraRenderer:
-    """OpenGL context with its buffers, which one thread makes, uses and frees.
+    """Renderer of one thread: an OpenGL context with its buffers. The same thread must make, use and free it.
 
     Args:
         model: model of the scene.
@@ -122,7 +122,7 @@ class CameraRenderer:
         self._option = mujoco.MjvOption()
 
     def load_state(self, engine: ReplayableEngine, env: int) -> None:
-        """Load the part of a world's state and model that affects its image."""
+        """Load what affects the image of an environment from its state and its model; `render` draws it."""
         if engine.expanded_fields():
             if self._model is self._shared_model:
                 self._model = copy.copy(self._shared_model)
@@ -138,7 +138,10 @@ class CameraRenderer:
             mujoco.mj_tendon(model, data)
 
     def render(self, camera: int, config: CameraSensorConfig, out: NDArray[Any]) -> None:
-        """Render the last loaded world into `out`. (h, w, c)"""
+        """Render the environment that was loaded last into the array `out`. (h, w, c)
+
+        `camera` is the camera's index in the model, `config` its configuration.
+        """
         scene, flags = self._scene, mujoco.mjtRndFlag
         self._view.fixedcamid = camera
         mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._view, _VISIBLE_CATEGORIES, scene)
@@ -166,7 +169,7 @@ class CameraRenderer:
 
 
 class RendererPool:
-    """Threads that render, each with a `CameraRenderer`.
+    """Threads that render images in parallel, each with a `CameraRenderer` of its own.
 
     Args:
         model: model of the scene.
@@ -207,7 +210,7 @@ class RendererPool:
         return len(self._threads)
 
     def run(self, work: Sequence[Callable[[CameraRenderer], None]]) -> None:
-        """Run each function in a thread of its own and wait for all of them.
+        """Call each function in a thread of its own, with the thread's renderer, and wait for all of them.
 
         Raises:
             MachineError: after `close`, or in a process that was forked from the one that opened the contexts.
@@ -257,7 +260,10 @@ _Orders = queue.SimpleQueue[tuple[Callable[[CameraRenderer], None], Future[None]
 
 
 def _render_orders(model: mujoco.MjModel, width: int, height: int, orders: _Orders, ready: Future[None]) -> None:
-    """Run the orders in a thread of their own: OpenGL requires that one thread makes, uses and frees a context."""
+    """Body of a rendering thread: open an OpenGL context and call the functions in the queue `orders` with it.
+
+    OpenGL requires that one thread makes, uses and frees a context. `ready` gets the error if it cannot be opened.
+    """
     try:
         renderer = CameraRenderer(model, width, height)
     except BaseException as error:
@@ -285,7 +291,7 @@ def _end_threads(orders: list[_Orders], threads: list[threading.Thread], process
 
 
 def _set_clip_planes(view: mujoco.MjvGLCamera, near: float, far: float) -> None:
-    """Set the near and the far plane without changing the field of view."""
+    """Set the distances of a camera's near and far clipping planes [m] without changing its field of view."""
     if not view.orthographic:
         for name in ("center", "width", "bottom", "top"):  # MuJoCo measures them on the near plane
             value = getattr(view, f"frustum_{name}") * near / view.frustum_near
@@ -294,7 +300,7 @@ def _set_clip_planes(view: mujoco.MjvGLCamera, near: float, far: float) -> None:
 
 
 def _depths(nearness: NDArray[np.float32], view: mujoco.MjvGLCamera, *, along_ray: bool) -> NDArray[np.float32]:
-    """Return the depths of a depth buffer that is 1 at the near plane and 0 at the far one. (h, w) [m]
+    """Convert OpenGL's depth buffer, which is 1 at the near plane and 0 at the far one, to depths [m]. (h, w)
 
     Depths are along the camera's axis, or along the ray through each pixel; 0 where nothing is seen.
     """
@@ -311,7 +317,7 @@ def _depths(nearness: NDArray[np.float32], view: mujoco.MjvGLCamera, *, along_ra
 
 
 def _ray_lengths(height: int, width: int, view: mujoco.MjvGLCamera) -> NDArray[np.float32]:
-    """Return the length of the ray through each pixel to depth 1, the bottom row first. (h, w)"""
+    """Return the length of the ray through each pixel up to a depth of 1, the bottom row first. (h, w)"""
     rows, columns = ((np.arange(count) + 0.5) / count for count in (height, width))
     half = view.frustum_width or 0.5 * (view.frustum_top - view.frustum_bottom) * width / height
     y = (view.frustum_bottom + rows * (view.frustum_top - view.frustum_bottom)) / view.frustum_near
@@ -321,7 +327,10 @@ def _ray_lengths(height: int, width: int, view: mujoco.MjvGLCamera) -> NDArray[n
 
 
 def _downsample(values: NDArray[Any], samples: int) -> NDArray[Any]:
-    """Return the means of s x s blocks, with the top row first instead of last. (h s, w s, c) -> (h, w, c)"""
+    """Return an image of the means of s x s samples, with the top row first instead of last.
+
+    s is `samples`. (h s, w s, c) -> (h, w, c)
+    """
     if samples > 1:
         rows = np.stack([values[k::samples] for k in range(samples)]).sum(axis=0, dtype=np.float32)
         values = np.stack([rows[:, k::samples] for k in range(samples)]).sum(axis=0) / np.float32(samples * samples)

@@ -41,7 +41,11 @@ _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 class Entity:
-    """Robot or object of the scene. Its joints are the hinges and slides in the model's order, without a free root."""
+    """Robot or object of the scene, in all environments.
+
+    Its joints are the hinges and slides in the model's order, without a free root. Methods that write or read a state
+    take the environments as a `selection`; their tensors have one row for each selected environment.
+    """
 
     def __init__(self, name: str, config: EntityConfig, engine: Engine, sim: SimData) -> None:
         self.name = name
@@ -76,7 +80,9 @@ class Entity:
         return self.root_qpos is not None
 
     def select(self, alias: str, patterns: str | Sequence[str]) -> tuple[Columns, list[str]]:
-        """Return an index into this entity's columns, and the names of the elements that it selects.
+        """Find elements (joints, bodies, ...) of this entity by their names.
+
+        Return the index that selects them in the entity's tensors, such as `data.joint_pos`, and their names.
 
         Args:
             alias: the kind of element: Joints, Bodies, ...
@@ -94,7 +100,10 @@ class Entity:
         return self._index(positions), [names[p] for p in positions]
 
     def actuators_of(self, kind: str) -> list[tuple[int, int]]:
-        """Return (joint column, actuator id) of every joint with a MuJoCo actuator of a kind: motor, position, ..."""
+        """Return (index of the joint in the entity, id of the actuator in the model) of every actuator of a kind.
+
+        The kind is motor, position, velocity or other. Actuator models of the configuration do not count.
+        """
         model = self.engine.model
         columns = {joint: column for column, joint in enumerate(self.joint_ids.tolist())}
         found = []
@@ -168,7 +177,7 @@ class Entity:
         return rotate(quat, cross(angular_b, com.expand_as(angular_b)))
 
     def floating(self) -> tuple[int, int]:
-        """Return the first column of the root's free joint in qpos and in qvel.
+        """Return the index of the root's free joint in qpos, and its index in qvel.
 
         Raises:
             TaskError: if the root is fixed to the world.
@@ -181,7 +190,16 @@ class Entity:
         return as_index(positions, self.engine.device)
 
     def _target(self, field: Tensor, field_columns: Tensor, joints: Columns) -> tuple[Field, Columns]:
-        """Return the engine's field and the columns of some joints in it; for consecutive columns, a view of these."""
+        """Return where to write values of some joints: the tensor, and the columns in it.
+
+        Args:
+            field: qpos or qvel of all environments.
+            field_columns: the column of each joint of the entity in it.
+            joints: which joints, as an index into the entity's joints.
+
+        Returns:
+            For consecutive columns a view of them with all its columns; otherwise the field with the joints' columns.
+        """
         index = (joints.start, joints.stop, joints.step) if isinstance(joints, slice) else (id(joints),)
         key = (id(field_columns), *index)
         if key not in self._targets:
@@ -200,7 +218,10 @@ class Entity:
 
 
 def _ids(model: mujoco.MjModel, entity: str, kind: mujoco.mjtObj, count: int) -> NDArray[np.int64]:
-    """Return the ids of the elements whose names have the entity's prefix."""
+    """Return the ids of the model's elements of a kind that belong to an entity, by the prefix of their names.
+
+    `count` is the number of elements of this kind in the model.
+    """
     names = [mujoco.mj_id2name(model, kind, i) or "" for i in range(count)]
     return np.array([i for i, name in enumerate(names) if name.startswith(f"{entity}/")], dtype=np.int64)
 

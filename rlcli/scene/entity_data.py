@@ -101,7 +101,7 @@ class EntityData:
         return self._once("joint_vel", lambda: self._sim.qvel[:, self._dof_index])
 
     def joint_pos_of(self, joints: Columns) -> Tensor:
-        """Return `joint_pos[:, joints]`; a view that is created only once. (num_envs, k) [m or rad]"""
+        """Return `joint_pos[:, joints]`; the view is made once. (num_envs, k) [m or rad]"""
         return self._pos.of(self.joint_pos, joints)
 
     def joint_vel_of(self, joints: Columns) -> Tensor:
@@ -401,7 +401,7 @@ class EntityData:
         return middle - half, middle + half
 
     def _columns_of(self, bodies: Columns) -> tuple[Columns, Columns]:
-        """Return the columns of bodies and of the roots of their kinematic trees in the model, looked up once."""
+        """Return the ids in the model of some bodies, and of the roots of their kinematic trees, looked up once."""
         found = self._body_columns.get(id(bodies))
         if found is None:
             model, device = self._entity.engine.model, self._entity.engine.device
@@ -413,13 +413,13 @@ class EntityData:
         return found[1:]
 
     def _velocity_at(self, points: Tensor, bodies: Columns, roots: Columns) -> Tensor:
-        """Return the velocity of a point of each body, world frame. (num_envs, bodies, 3) [m/s]"""
+        """Return the velocity of a point of each body; `roots` are the roots of their trees. (num_envs, bodies, 3)"""
         # MuJoCo's cvel is the velocity at the centre of mass of the body's kinematic tree
         velocity = self._sim.derived_columns("cvel", bodies)
         return velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(points, roots))
 
     def _from_tree_com(self, points: Tensor, roots: Columns) -> Tensor:
-        """Return the vectors to points from the centres of mass of the kinematic trees with some root bodies."""
+        """Return the vectors to points from the centres of mass of kinematic trees, given by their root bodies."""
         return points - self._sim.derived_columns("subtree_com", roots)
 
     def _body_force(self, name: str) -> Tensor:
@@ -431,7 +431,7 @@ class EntityData:
         return self._sim.derived_field(name)
 
     def _once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
-        """Return a value derived from the state, and compute it only if the state has changed since the last call."""
+        """Return the value `name`; `compute` is called only if the state has changed since the last call."""
         stamp, value = self._cache.get(name, (-1, None))
         if stamp != self._sim.stamp or value is None:
             value = compute()

@@ -1,4 +1,4 @@
-"""Model of one entity before it is attached to a scene: an MJCF, or a body with one geom."""
+"""Model (MjSpec) of one robot or object before it is attached to a scene: its MJCF, or a single shape."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def entity_spec(
         entity: configuration of the entity.
         root: the task's folder.
         installed: whether the task is installed: the files of an installed task are trusted.
-        compiled: whether to compile a copy of the model, too.
+        compiled: whether to check by compiling that MuJoCo accepts the model.
 
     Raises:
         SceneProblem: if the MJCF cannot be read.
@@ -41,7 +41,7 @@ def entity_spec(
 
 
 def name_all(child: mujoco.MjSpec) -> None:
-    """Name the elements that the MJCF leaves unnamed: an entity finds its elements by the prefix of their names."""
+    """Give a name to every element of a model that has none: in the scene, entities find their elements by name."""
     for kind in ("body", "joint", "site", "sensor", "actuator", "geom", "tendon", "pair"):
         elements = child.bodies[1:] if kind == "body" else getattr(child, f"{kind}s")  # the first body is the world
         used = {element.name for element in elements}
@@ -55,7 +55,7 @@ def name_all(child: mujoco.MjSpec) -> None:
 
 
 def frame_of_start_pose(child: mujoco.MjSpec, entity: EntityConfig) -> tuple[FloatArray, FloatArray]:
-    """Return position and quaternion of the frame to attach a model to, so that its root has the start pose."""
+    """Return position and quaternion of the frame to which a model is attached, so that its root has its start pose."""
     pos, quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
     element: Any = child.worldbody.first_body()
     while element is not None:  # the root, then the <frame> elements around it
@@ -69,7 +69,7 @@ def frame_of_start_pose(child: mujoco.MjSpec, entity: EntityConfig) -> tuple[Flo
 
 
 def write_masses(child: mujoco.MjSpec) -> None:
-    """Set the mass and inertia of every body explicitly: attaching would lose the MJCF's `settotalmass`."""
+    """Set the mass and inertia of every body of a model explicitly: attaching would lose the MJCF's `settotalmass`."""
     with warnings.catch_warnings(action="ignore"):  # MuJoCo has deprecated the attribute, but models still use it
         model = child.compile()
     for body in child.bodies[1:]:
@@ -83,7 +83,7 @@ def write_masses(child: mujoco.MjSpec) -> None:
 
 
 def _orientation(element: Any) -> FloatArray:
-    """Return the orientation of a body or frame of a specification, which may be given as Euler angles."""
+    """Return the orientation of a body or frame of an MjSpec as a quaternion; the MJCF may have Euler angles."""
     quat = np.array(element.quat)
     if element.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:
         compiler = element.compiler
@@ -93,7 +93,7 @@ def _orientation(element: Any) -> FloatArray:
 
 
 def _product(pos: FloatArray, quat: FloatArray, pos2: FloatArray, quat2: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the composition of two poses: the second one, given in the frame of the first."""
+    """Return the product of two poses: the pose in the world of pose 2, which is given in the frame of pose 1."""
     product = np.empty(3), np.empty(4)
     mujoco.mju_mulPose(*product, pos, quat, pos2, quat2)
     return product
@@ -102,7 +102,7 @@ def _product(pos: FloatArray, quat: FloatArray, pos2: FloatArray, quat2: FloatAr
 def _load_mjcf(
     entity: EntityConfig, path: tuple[str, ...], root: Path, installed: bool, compiled: bool
 ) -> mujoco.MjSpec:
-    """Read the MJCF of an entity."""
+    """Read the MJCF of an entity. `path` is the key of the model in the configuration, for messages."""
     assert entity.model is not None
     try:
         file = model_file(root, entity.model).resolve()
@@ -126,7 +126,7 @@ def _load_mjcf(
 
 
 def _shape_model(entity: EntityConfig) -> mujoco.MjSpec:
-    """Return a model of one body with one geom."""
+    """Return the model of an entity with `shape`: one body with one geom."""
     assert entity.shape is not None
     assert entity.size is not None
     child = mujoco.MjSpec()

@@ -8,7 +8,7 @@ from rlcli.config.schema import GroundConfig, LightsConfig
 
 
 def add_ground_plane(spec: mujoco.MjSpec, ground: GroundConfig) -> None:
-    """Add a ground plane."""
+    """Add a ground plane to the model of a scene."""
     add_materials(spec)
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[ground.size / 2, ground.size / 2, 1.0],
@@ -17,7 +17,7 @@ def add_ground_plane(spec: mujoco.MjSpec, ground: GroundConfig) -> None:
 
 
 def add_materials(spec: mujoco.MjSpec) -> None:
-    """Add the material of the ground and the sky."""
+    """Add the material of the ground, and the sky, to the model of a scene."""
     spec.add_texture(
         name="ground", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
         rgb1=[0.86, 0.88, 0.90], rgb2=[0.77, 0.79, 0.82], width=512, height=512,
@@ -31,7 +31,7 @@ def add_materials(spec: mujoco.MjSpec) -> None:
 
 
 def add_lights(spec: mujoco.MjSpec, lights: LightsConfig) -> None:
-    """Add ambient light (dome) and directional light (distant); the full strength is an intensity of 1000."""
+    """Add ambient light (dome) and directional light (distant) to a model; an intensity of 1000 is full strength."""
     headlight = spec.visual.headlight
     if lights.dome is not None:
         strength = min(1.0, lights.dome.intensity / 1000.0)

@@ -1,4 +1,4 @@
-"""Default state of an entity: its joints and its root, from the MJCF and the entity's configuration."""
+"""Default state of an entity, to which resets return: its joints and its root, from the MJCF and the configuration."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def default_joint_state(entity: Entity) -> tuple[Tensor, Tensor]:
 
 
 def joint_speed_limits(entity: Entity) -> Tensor:
-    """Return the speed limit of each joint: its `velocity_limit`, or else the no-load speed of its dc_motor. (k,)"""
+    """Return the speed limit of each joint: `velocity_limit` of the joint, or else of its actuator model. (k,)"""
     names, config = entity.joint_names, entity.config
     limits = torch.full((len(names),), torch.inf)
     for motor in config.actuators.values():
@@ -47,7 +47,7 @@ def joint_speed_limits(entity: Entity) -> Tensor:
 
 
 def values_by_joint(value: float | Mapping[str, float], names: Sequence[str]) -> Tensor:
-    """Return the value of each joint; the keys of a mapping are names or regular expressions. (k,)
+    """Return the value of each joint in `names`, from one value for all or from a mapping by name or regex. (k,)
 
     Raises:
         NameProblem: if a mapping has no value for a joint, or a key that matches no joint.
@@ -61,7 +61,7 @@ def values_by_joint(value: float | Mapping[str, float], names: Sequence[str]) ->
 
 
 def default_root_state(entity: Entity) -> Tensor:
-    """Return the default root pose and velocity, from the MJCF and the entity's configuration. (13,)
+    """Return the default pose and velocity of the root: position, quaternion, linear and angular velocity. (13,)
 
     Raises:
         NameProblem: if `init` has a velocity of the root, but the root has no free joint.

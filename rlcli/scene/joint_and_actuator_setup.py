@@ -1,4 +1,4 @@
-"""Joint settings of the configuration, written into the model, and the actuators that are added to it."""
+"""Joints and actuators of a scene's model: joint settings of the configuration, and actuators that the MJCF lacks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _KNOWN_ACTUATORS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtDyn.mjDYN_NONE
 
 @dataclass(frozen=True, slots=True)
 class ActuatorNeed:
-    """Request of an action term for actuators of a kind on some joints of an entity."""
+    """Actuators that an action term needs: their kind, and the joints of an entity. `path` is the term's key."""
 
     entity: str
     joints: str | list[str]
@@ -28,7 +28,7 @@ class ActuatorNeed:
 
 
 class SceneJoints:
-    """Writer of joint settings and actuators into a scene, for the hinges and slides of its entities.
+    """Writer of joint settings and actuators into the model of a scene, for the hinges and slides of its entities.
 
     Args:
         spec: specification of the scene.
@@ -79,7 +79,7 @@ class SceneJoints:
                     self._add_actuator(name, names[position], change.actuator)
 
     def add_motors_of_actuator_models(self, name: str, entity: EntityConfig) -> None:
-        """Give every joint of an actuator model one motor without limits, in place of its actuators."""
+        """Replace the actuators of every joint that an actuator model drives by one motor without limits."""
         names = self._joint_names(name)
         owner: dict[str, str] = {}
         for key, config in entity.actuators.items():
@@ -96,7 +96,7 @@ class SceneJoints:
                 motor.set_to_motor()
 
     def _match(self, path: tuple[str, ...], patterns: str | list[str], names: list[str]) -> list[int]:
-        """Return the positions of matching joints; report patterns that do not fit as a problem at `path`."""
+        """Return the indices of the joint names that match; a pattern that does not fit becomes a problem at `path`."""
         try:
             return match(patterns, names, "joint")
         except NameProblem as problem:
@@ -104,7 +104,7 @@ class SceneJoints:
             return []
 
     def _set_gains_and_limits(self, joint: str, change: JointConfig) -> None:
-        """Set gains and limits of a joint's actuators."""
+        """Set the gains and effort limits that `change` has on the actuators of a joint."""
         for actuator in self._spec.actuators:
             if actuator.target != joint or actuator.trntype != mujoco.mjtTrn.mjTRN_JOINT:
                 continue
@@ -149,7 +149,7 @@ class SceneJoints:
 
 
 def joint_settings(entity: EntityConfig, joint: str) -> JointConfig:
-    """Return the settings of a joint; of several matching patterns, later ones override earlier ones."""
+    """Return the settings of a joint from `joints` of its entity; if several patterns match, later ones win."""
     merged: dict[str, object] = {}
     for pattern, change in entity.joints.items():
         with contextlib.suppress(NameProblem):  # the pattern matches other joints only
@@ -164,7 +164,7 @@ def model_actuator_kind(model: mujoco.MjModel, actuator: int) -> str:
 
 
 def _actuator_kind(actuator: Any) -> str:
-    """Return the kind of an actuator of a specification or of a compiled model."""
+    """Return the kind of an actuator of an MjSpec or of a compiled model: motor, position, velocity or other."""
     kinds = (actuator.trntype, actuator.dyntype, actuator.gaintype, actuator.biastype)
     *known, bias = (int(np.asarray(kind).item()) for kind in kinds)  # arrays of one element in a compiled model
     gain, biases = actuator.gainprm[0], actuator.biasprm

@@ -18,7 +18,7 @@ class LazySensor(ABC):
         """Whether the values have been computed from the present state."""
 
     def update(self, dt: float) -> None:
-        """Drop the values: a step has moved the bodies."""
+        """Mark the values as outdated: a step of `dt` seconds has moved the bodies."""
         self._current = False
 
     def reset(self, selection: Selection) -> None:
@@ -27,7 +27,7 @@ class LazySensor(ABC):
 
     @abstractmethod
     def on_moved(self, selection: Selection) -> None:
-        """Compute the values of the selected environments again, if the values have been read in this step."""
+        """Compute the values of environments whose bodies were moved again, if they have been read in this step."""
 
     def close(self) -> None:
         """Do nothing: the sensor holds no resources."""
@@ -37,5 +37,5 @@ class LazySensor(ABC):
         return {}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Drop the values: the loaded state has moved the bodies."""
+        """Mark the values as outdated: the loaded state has moved the bodies."""
         self._current = False

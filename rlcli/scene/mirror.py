@@ -23,7 +23,7 @@ _TOLERANCE = 1e-3
 
 
 class EntityMirror:
-    """Pairs of joints of an entity that mirror each other; a joint on the plane is its own partner.
+    """Mirror image of an entity: the partner of each joint. A joint on the mirror plane is its own partner.
 
     Raises:
         TaskError: for a joint or a body without a partner.
@@ -42,7 +42,7 @@ class EntityMirror:
                 self._pair(body)
 
     def reflect(self, qpos: Tensor, qvel: Tensor, to_qpos: Tensor, to_qvel: Tensor) -> None:
-        """Write the mirror image of this entity's joint state. (n, nq), (n, nv), (n, nq), (n, nv)"""
+        """Write the mirror image of this entity's part of a state to `to_qpos` and `to_qvel`. (n, nq) and (n, nv)"""
         model = self._model
         for joint, (partner, sign) in self.joints.items():
             q, v, to_q, to_v = (
@@ -56,7 +56,7 @@ class EntityMirror:
                 to_qvel[:, to_v] = sign * qvel[:, v]
 
     def _pair(self, body: int) -> None:
-        """Find the partner of a body among the children of its parent's partner, and pair their joints."""
+        """Find the mirror image of a body, a child of the mirror image of its parent, and pair the joints of both."""
         model, data = self._model, self._data
         partner = body
         if body != self._root:
@@ -74,7 +74,10 @@ class EntityMirror:
             self.joints[joint] = other, self._sign(body, joint, other)
 
     def _sign(self, body: int, joint: int, other: int) -> int:
-        """Return the sign of a pair of joints; +1 for the free joint of the root."""
+        """Return the sign with which the coordinate of joint `other` follows from that of its partner, `joint`.
+
+        It is +1 for the free joint of the root.
+        """
         model, data, kind = self._model, self._data, self._model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             return 1
@@ -96,7 +99,7 @@ class EntityMirror:
         return TaskError(f"{name} {reason}: the model is not symmetric about {plane}")
 
     def _distance(self, points: Points, point: Points) -> Points:
-        """Return the distance of points from the mirror image of a point. (..., 3), (3,) -> (...)"""
+        """Return the distances of `points` from the mirror image of `point`. (..., 3), (3,) -> (...)"""
         root = self._data.xpos[self._root]
         away: Points = np.linalg.norm((points - root) @ self._axes - (point - root) @ self._axes * VECTOR, axis=-1)
         return away

@@ -1,4 +1,4 @@
-"""Cost of an MJCF element: how many ordinary elements take as much time and memory to compile."""
+"""Estimate of the time and memory to compile an element of an untrusted MJCF, in units of an ordinary element."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ ENDLESS = 1e18
 
 
 def element_cost(name: str, attributes: dict[str, str]) -> float:
-    """Return the cost of an element, in ordinary elements."""
+    """Return the cost of an element with this tag: how many ordinary elements take as much time and memory."""
 
     def numbers(key: str) -> list[float]:
         return [max(1.0, number_of(word)) for word in attributes.get(key, "").split()]
@@ -39,7 +39,7 @@ def element_cost(name: str, attributes: dict[str, str]) -> float:
 
 
 def mjcf_number(text: str) -> float:
-    """Return the number that a text of an MJCF spells; NaN for any other text."""
+    """Return the number in an attribute of an MJCF; NaN for text that is no number."""
     try:
         return float(text)
     except ValueError:
@@ -47,7 +47,7 @@ def mjcf_number(text: str) -> float:
 
 
 def number_of(text: str | None) -> float:
-    """Return a number, which may end in MuJoCo's K, M, G, T, P or E; 0 for text that MuJoCo will refuse."""
+    """Return the number in an attribute, which may end in K, M, G, T, P or E (`10M`); 0 for text MuJoCo will refuse."""
     text = (text or "").strip()
     factor = {"k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40, "p": 2**50, "e": 2**60}.get(text[-1:].lower(), 1)
     value = mjcf_number(text[:-1] if factor != 1 else text)

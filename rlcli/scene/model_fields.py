@@ -1,4 +1,4 @@
-"""Model fields that may differ between environments: their elements, values, and the constants derived from them."""
+"""Fields of the MuJoCo model, such as body_mass, whose values may differ between environments (randomisation)."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ DERIVED_FROM = {
 
 
 class ModelField:
-    """Some elements of a model field in every environment, and their original values.
+    """Some values of a model field, such as the masses of some bodies, in every environment, and their original values.
 
     Args:
         entity: the entity that has the elements.
         name: name of the field.
-        elements: index into the entity's names of that kind; None for a field of the whole model.
-        axes: selected values of each element; None for all.
+        elements: which bodies, joints and so on of the entity, as an index; None for a field of the whole model.
+        axes: which values of each element, for example [2] for z; None: all.
 
     Raises:
         ValueError: for a field that cannot differ between environments, or an axis that it does not have.
@@ -78,16 +78,16 @@ class ModelField:
         """Values of the compiled model. (elements, axes)"""
 
     def write(self, selection: Selection, values: Tensor) -> None:
-        """Set the selected environments' values. (rows, elements, axes)"""
+        """Set the values in the selected environments, one row for each of them. (rows, elements, axes)"""
         selection.write(self.values, values.to(self.values.dtype).flatten(1), self.columns)
 
     def read(self, selection: Selection) -> Tensor:
-        """Return the selected environments' values. (rows, elements, axes)"""
+        """Return the values in the selected environments, one row for each of them. (rows, elements, axes)"""
         return selection.read(self.values, self.columns).view(-1, *self.shape)
 
 
 def element_ids(entity: Entity, name: str, elements: Columns) -> list[int]:
-    """Return the rows of a model field that belong to an index into the entity's names, in its order."""
+    """Return the rows of the model field `name` that belong to some elements of an entity, in the same order."""
     if name in ("qpos0", "qpos_spring"):
         rows = entity.qpos_columns.cpu()
     elif name.startswith("dof_"):
@@ -98,7 +98,7 @@ def element_ids(entity: Entity, name: str, elements: Columns) -> list[int]:
 
 
 def model_rows(engine: Engine, name: str) -> np.ndarray:
-    """Return the values of a field in the compiled model, one element per row. (elements, values each)
+    """Return the values of the model field `name` in the compiled model, one element per row. (elements, values each)
 
     Raises:
         ValueError: for a field that cannot differ between environments.

@@ -1,4 +1,4 @@
-"""Matching of names and regular expressions against the names of a model, in the order of the configuration."""
+"""Matching of names and regular expressions in a configuration against the names of joints, bodies, ... of a model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TOKEN = re.compile(
 
 
 class NameProblem(ValueError):
-    """A name or regular expression that does not fit the model; `hint` lists the names that exist."""
+    """Error for a name or regular expression that does not fit the model; `hint` says what to do."""
 
     def __init__(self, message: str, hint: str | None = None) -> None:
         super().__init__(message)
@@ -33,7 +33,7 @@ class NameProblem(ValueError):
 
 
 class SceneProblem(NameProblem):
-    """A part of the scene's configuration that does not fit the models; `path` is its key in the YAML."""
+    """Error in the scene's configuration: a part that does not fit the models; `path` is its key in the YAML."""
 
     def __init__(self, path: tuple[str, ...], message: str, hint: str | None = None) -> None:
         super().__init__(message, hint)
@@ -41,9 +41,9 @@ class SceneProblem(NameProblem):
 
 
 def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> list[int]:
-    """Return the positions of the names that the patterns match in full.
+    """Return the indices of the names that match one of the patterns completely.
 
-    Positions are in the order of the patterns; the matches of one regular expression are in the order of `names`.
+    They are in the order of the patterns; the matches of one regular expression are in the order of `names`.
 
     Args:
         patterns: names or regular expressions.
@@ -65,10 +65,15 @@ def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> lis
 
 
 def match_values(values: Mapping[str, Value], names: Sequence[str], what: str) -> list[Value | None]:
-    """Return the value of each name in a mapping from names or regular expressions; None for a name without a match.
+    """Return the value of each of the names from a mapping; None for a name that no key of the mapping matches.
+
+    Args:
+        values: name or regular expression -> value.
+        names: names of the model.
+        what: the kind of element, for messages: joint, body, ...
 
     Raises:
-        NameProblem: under the conditions of `match`.
+        NameProblem: if a key matches no name or is no regular expression, or if two keys match the same name.
     """
     found: list[Value | None] = [None] * len(names)
     owner: dict[int, str] = {}
@@ -101,7 +106,7 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
 
 @dataclass(slots=True)
 class _Part:
-    """A regular expression or one group of it, as far as it has been read."""
+    """What is known of a regular expression, or of one group in it, while it is read from left to right."""
 
     repeats: int = 0
     """Number of quantifiers * + {m,n} in the present alternative."""
@@ -114,7 +119,7 @@ class _Part:
     _most: tuple[int, int] = (0, 0)
 
     def most(self) -> tuple[int, int]:
-        """Return the largest `repeats` and the largest `options` of an alternative."""
+        """Return the largest `repeats` and the largest `options` of all alternatives (separated by `|`) so far."""
         return max(self._most[0], self.repeats), max(self._most[1], self.options)
 
     def next_alternative(self) -> None:
@@ -125,7 +130,7 @@ class _Part:
 
 
 def _require_cheap(pattern: str, length: int) -> None:
-    """Refuse a regular expression whose comparison with a name of some length could take more than a second.
+    """Check that a regular expression can be compared with a name of `length` characters in less than a second.
 
     Python's `re` tries all ways in which k repetitions can share the characters of a name: binomial(length + k, k). If
     a repeated part is variable itself, the number grows exponentially with the length.

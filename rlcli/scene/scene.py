@@ -33,7 +33,11 @@ View = TypeVar("View")
 
 
 class Scene:
-    """Scene under construction; a direct task's `set_up_scene` may change `spec` until it is compiled."""
+    """Scene of a task while its model is built from the configuration.
+
+    `spec` is the model; a direct task may change it in `set_up_scene`, until it is compiled. Mistakes of the
+    configuration are collected in `problems`.
+    """
 
     def __init__(self, config: SceneConfig, sim: SimConfig, root: Path, *, installed: bool = False) -> None:
         quiet_mujoco()  # when a model is attached, MuJoCo logs each option that differs from the scene's
@@ -59,12 +63,12 @@ class Scene:
         self._add_sensors()
 
     def add(self, view: View) -> View:
-        """Register a view, which is bound to the simulation after the model is compiled."""
+        """Register an object for access to the simulation, such as a sensor's; it is connected after compilation."""
         self.views.append(view)
         return view
 
     def compile(self, *, on_cpu: bool = True) -> mujoco.MjModel:
-        """Compile the scene to an MjModel, for the CPU engine or for MuJoCo Warp.
+        """Compile the scene to an MjModel, for the CPU engine or (`on_cpu` false) for MuJoCo Warp.
 
         Raises:
             ConfigError: if MuJoCo refuses the model.
@@ -83,7 +87,7 @@ class Scene:
         return model
 
     def broken_models(self) -> Iterator[SceneProblem]:
-        """Compile the model of each entity by itself and yield the problems, which name the file."""
+        """Compile the model of each entity by itself, and yield a problem, with the file, for each broken one."""
         for name, entity in self.config.entities.items():
             try:
                 entity_spec(name, entity, self.root, installed=self.installed, compiled=True)
@@ -99,7 +103,7 @@ class Scene:
             self.attach(name, entity, child)
 
     def attach(self, name: str, entity: EntityConfig, child: mujoco.MjSpec) -> None:
-        """Add an entity to the scene; its model is `child`, also if `entity.model` is another one."""
+        """Add an entity with the model `child` to the scene; `entity.model` is not read."""
         self.config.entities[name] = entity
         name_all(child)
         if child.compiler.settotalmass > 0:
@@ -120,7 +124,7 @@ class Scene:
         self.joints.add_motors_of_actuator_models(name, entity)
 
     def _set_options(self) -> None:
-        """Set the options of `sim`, which override those of the MJCF."""
+        """Set the physics options that the key `sim` of the task has; they override those of the MJCF."""
         option = self.spec.option
         option.timestep = self.sim.dt
         option.gravity = self.sim.gravity

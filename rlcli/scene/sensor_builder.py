@@ -1,4 +1,7 @@
-"""Sensors that a scene adds to its model, and their specifications for the classes that read them."""
+"""Builder that adds the sensors of a task to the model of its scene.
+
+For each sensor it returns a specification, from which `rlcli.scene.sensors` makes the object that reads the sensor.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,10 @@ _DRAWN_GROUPS = (0, 1, 2)
 
 @dataclass(frozen=True, slots=True)
 class ContactSensorSpec:
-    """Contact sensor in the model: its bodies, and the MJCF sensors of each body, whose forces are added up."""
+    """Contact sensor, as it was added to the model: its bodies, and the names of the MJCF sensors of each body.
+
+    The forces of the sensors of a body are added up.
+    """
 
     config: ContactSensorConfig
     bodies: list[str]
@@ -33,7 +39,7 @@ class ContactSensorSpec:
 
 @dataclass(frozen=True, slots=True)
 class RaySensorSpec:
-    """Ray sensor in the model: the full name of its body, and the geom groups that it sees (None: all)."""
+    """Ray sensor, as it was added to the model: the full name of its body, and the geom groups it sees (None: all)."""
 
     config: RaySensorConfig
     body: str
@@ -44,7 +50,7 @@ class RaySensorSpec:
 
 @dataclass(frozen=True, slots=True)
 class CameraSensorSpec:
-    """Camera sensor in the model: the full name of its camera."""
+    """Camera sensor, as it was added to the model: the full name of its camera."""
 
     config: CameraSensorConfig
     camera: str
@@ -62,7 +68,7 @@ class SensorBuilder:
         self._ground = ground
 
     def add(self, name: str, config: SensorConfig) -> SensorSpec:
-        """Add a sensor.
+        """Add a sensor to the model, and return its specification. `name` is its name in the task.
 
         Raises:
             SceneProblem: if the configuration does not fit the models.
@@ -75,7 +81,10 @@ class SensorBuilder:
         return self._rays(config, path)
 
     def _contacts(self, name: str, config: ContactSensorConfig, path: tuple[str, ...]) -> ContactSensorSpec:
-        """Add an MJCF sensor for each pair of a body and a partner, which measures net force and contact count."""
+        """Add a contact sensor: an MJCF sensor for each pair of a body and an element that may touch it.
+
+        `path` is the sensor's key in the configuration, for messages.
+        """
         prefix = f"{config.entity}/"
         bodies = self._bodies(config.entity, config.bodies, path, "bodies")
         if not any(map(self._can_touch, bodies)):
@@ -100,7 +109,7 @@ class SensorBuilder:
     def _contact_partners(
         self, config: ContactSensorConfig, path: tuple[str, ...]
     ) -> list[tuple[mujoco.mjtObj, str] | None]:
-        """Return type and name of the elements whose contacts count; None for any element."""
+        """Return type and name of each element whose contacts with the sensor's bodies count; None: any element."""
         against = config.against
         if against is None:
             return [None]
@@ -148,7 +157,7 @@ class SensorBuilder:
         return CameraSensorSpec(config, prefix + config.camera)
 
     def _body(self, entity: str, pattern: str | None, path: tuple[str, ...]) -> str:
-        """Return the full name of the one matching body of an entity; of its first body if there is no pattern."""
+        """Return the full name, `entity/body`, of the one body that a pattern matches; without one, of the root."""
         bodies = self._bodies(entity, ".*" if pattern is None else pattern, path, "body")
         if pattern is not None and len(bodies) > 1:
             short = listing([body.removeprefix(f"{entity}/") for body in bodies])
@@ -156,7 +165,7 @@ class SensorBuilder:
         return bodies[0]
 
     def _bodies(self, entity: str, patterns: str | list[str], path: tuple[str, ...], key: str) -> list[str]:
-        """Return the full names of the matching bodies of an entity."""
+        """Return the full names, `entity/body`, of the bodies that patterns match; `key` names them in messages."""
         if entity not in self._entities:
             hint = did_you_mean(entity, self._entities) or f"entities: {listing(self._entities)}"
             raise SceneProblem((*path, "entity"), f"no entity '{entity}' in the scene", hint)
@@ -168,7 +177,7 @@ class SensorBuilder:
             raise SceneProblem((*path, key), str(problem), problem.hint) from None
 
     def _can_touch(self, body: str) -> bool:
-        """Return whether a geom of the body can have contacts."""
+        """Return whether a geom of a body, given by its full name, can have contacts."""
         geoms = self._spec.body(body).geoms
         paired = {name for pair in self._spec.pairs for name in (pair.geomname1, pair.geomname2)}
         return any(geom.contype or geom.conaffinity or (geom.name and geom.name in paired) for geom in geoms)
@@ -179,7 +188,7 @@ class SensorBuilder:
         return [geom for geom in self._spec.worldbody.geoms if geom.name == "ground"]
 
     def _group_of_ground(self, path: tuple[str, ...]) -> int:
-        """Move the ground to a geom group of its own and return it: rays select geoms by group."""
+        """Move the ground to a geom group without other geoms, and return the group: rays select geoms by group."""
         ground = self._ground_geoms()
         if not ground:
             raise SceneProblem(path, "the scene has no ground", "add scene.ground or scene.terrain, or write sees: all")

@@ -85,7 +85,10 @@ class ContactSensor(TensorState):
         self.contact_time *= found
 
     def reset(self, selection: Selection) -> None:
-        """Clear times and history of new episodes; read the start forces if `sim.forces_after_reset`."""
+        """Clear times and history of the selected environments, in which episodes start.
+
+        With `sim.forces_after_reset`, forces of the start state are read.
+        """
         for values in (self._times, self._flags, self.force_history):
             selection.write(values, 0)
         if self._sim.engine.forces_after_reset:
@@ -104,7 +107,7 @@ class ContactSensor(TensorState):
         return {name: getattr(self, name) for name in _STATE_NAMES}
 
     def _measure(self, sensordata: Tensor) -> tuple[Tensor, Tensor]:
-        """Return net forces (rows, k, 3), and whether each body is in contact (rows, k)."""
+        """Return the net force on each body (rows, k, 3), and whether it is in contact (rows, k), from readings."""
         values = torch.unflatten(sensordata[:, self._columns], 1, (-1, self._others, 4))  # count, force
         total = values[:, :, 0]
         for other in range(1, self._others):
@@ -176,12 +179,14 @@ class RaySensor(LazySensor):
         images = rays * torch.tensor([1.0, -1.0, 1.0]).repeat(2)
         distances, partners = (images[:, None] - rays).abs().amax(dim=2).min(dim=1)
         if float(distances.max()) > 1e-4:
-            raise TaskError(f"ray {int(distances.argmax())} of the sensor on '{self._config.body}' has no mirror image")
+            ray, body = int(distances.argmax()), self._config.body
+            message = f"ray {ray} of the ray sensor on body '{body}' has no mirror image"
+            raise TaskError(message, hint="make its pattern symmetric about the x-z plane")
         found: list[int] = partners.tolist()
         return found
 
     def on_moved(self, selection: Selection) -> None:
-        """Cast the rays of the selected environments again, if rays have been cast in this step."""
+        """Cast the rays of environments whose bodies were moved again, if rays have been cast in this step."""
         if not self._current:
             return
         position, quat = self._pose()
@@ -196,7 +201,10 @@ class RaySensor(LazySensor):
                 buffer.copy_(values)
 
     def _rays(self, position: Tensor, quat: Tensor, selection: Selection | None = None) -> tuple[Tensor, ...]:
-        """Return distances, misses, sensor positions, and x, y and z of the end points, in the order of `_buffers`."""
+        """Cast the rays from poses of the sensor's body.
+
+        Return distances, misses, sensor positions, and x, y and z of the end points, in the order of `_buffers`.
+        """
         self._sim.forward_moved()
         axes = self._axes(quat)
         position = position + _rotated(axes, self._offset)[:, 0]
@@ -215,7 +223,10 @@ class RaySensor(LazySensor):
         return distance, missed, position, *(points + directions * distance[..., None]).unbind(2)
 
     def _down_from(self, position: Tensor, axes: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return x and y of rays that point straight down, (rows, r) each, and their common height (rows, 1) [m]."""
+        """Return x and y of the start points of rays straight down, (rows, r) each, and their height (rows, 1) [m].
+
+        `position` and `axes` are those of the sensor in the world.
+        """
         ahead, left, _ = self._starts.unbind(1)
         x, y, z = position[:, None].unbind(2)
         if axes is None:
@@ -233,7 +244,10 @@ class RaySensor(LazySensor):
         return self._sim.derived_field("xpos")[:, self._body], self._sim.derived_field("xquat")[:, self._body]
 
     def _axes(self, quat: Tensor) -> Tensor | None:
-        """Return the axes of the sensor's frame in the world as rows; None for the world's axes. (rows, 3, 3)"""
+        """Return the axes of the sensor's frame in the world, from the orientation of its body. (rows, 3, 3)
+
+        The axes are the rows of a matrix for each environment; None: they are the world's axes.
+        """
         if self._config.alignment == "world":
             return None
         x, y, z = (rotate(quat, axis.expand(len(quat), 3)) for axis in self._unit)
@@ -251,7 +265,7 @@ Sensor = ContactSensor | RaySensor | CameraSensor
 
 
 def make_sensors(specs: Mapping[str, SensorSpec], sim: SimData, entities: Mapping[str, Entity]) -> dict[str, Sensor]:
-    """Make the sensors of a compiled scene, in the order of `specs`."""
+    """Make the objects that read the sensors of a compiled scene, by name, in the order of `specs`."""
     cameras = {name: spec for name, spec in specs.items() if isinstance(spec, CameraSensorSpec)}
     sensors: dict[str, Sensor] = dict(make_cameras(cameras, sim.engine))
     for name, spec in specs.items():
@@ -275,15 +289,15 @@ def _pattern(config: RaySensorConfig) -> tuple[Tensor, Tensor]:
 
 
 def _line(size: float, resolution: float) -> Tensor:
-    """Return centred points at a distance of `resolution` that fit in `size` [m]."""
+    """Return the coordinates of points on a line, centred at 0: every `resolution`, as many as fit in `size` [m]."""
     count = math.floor(size / resolution + 1e-6) + 1
     return (torch.arange(count) - (count - 1) / 2) * resolution
 
 
 def _rotated(axes: Tensor | None, vectors: Tensor) -> Tensor:
-    """Return vectors of the sensor's frame in the world frame. (r, 3) -> (rows, r, 3)
+    """Rotate vectors from the sensor's frame to the world frame. (r, 3) -> (rows, r, 3)
 
-    There is one row if the sensor's frame is the world's (axes None).
+    `axes` are the sensor's axes in the world, for each environment; None: those of the world, with a single row.
     """
     if axes is None:
         return vectors[None]

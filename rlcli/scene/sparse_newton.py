@@ -21,7 +21,7 @@ _AUTO_SPARSE = 60
 
 
 def avoid_sparse_newton(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Let a model that the bug can affect use the dense solver; warn if its MJCF demands the sparse one."""
+    """Choose the dense solver for a model that the bug can affect; warn if its MJCF demands the sparse one."""
     option = model.opt
     sparse = option.jacobian == mujoco.mjtJacobian.mjJAC_SPARSE
     automatic = option.jacobian == mujoco.mjtJacobian.mjJAC_AUTO and model.nv >= _AUTO_SPARSE
@@ -76,5 +76,5 @@ def _contact_couples(model: mujoco.MjModel) -> bool:
 
 
 def _moves(model: mujoco.MjModel) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return which bodies have degrees of freedom, of their own or of a parent; a mocap body has none."""
+    """Return for each body whether physics can move it: it or a parent has degrees of freedom. (nbody,)"""
     return np.asarray(model.body_treeid >= 0)

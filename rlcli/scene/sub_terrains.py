@@ -1,4 +1,4 @@
-"""Sub-terrains: the heights of one patch of terrain, or the blocks that it is built of.
+"""Shapes of ground (stairs, slopes, waves, ...): the heights of one patch of terrain, or the blocks it is built of.
 
 A patch is an array of heights [m] at the corners of its cells, with x along the first axis. The heights along its edges
 are 0, so that any two patches fit together.
@@ -21,7 +21,7 @@ _EPS = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Upright block: two opposite corners in the patch, and the height of its top [m]."""
+    """Upright block of terrain: x and y of two opposite corners, and the height of its top [m]."""
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -30,7 +30,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class PatchSite:
-    """Size, resolution and difficulty of one patch of the terrain."""
+    """What the shape of one patch of terrain depends on besides its kind: size, resolution, difficulty, randomness."""
 
     size: tuple[float, float]
     """Extent along x and y [m]."""
@@ -53,13 +53,13 @@ class PatchSite:
         return x[:, None], y[None]
 
     def at_difficulty(self, ends: tuple[float, float]) -> float:
-        """Return the value at the patch's difficulty; `ends` are the values at difficulty 0 and 1."""
+        """Interpolate a parameter at the patch's difficulty; `ends` are its values at difficulty 0 and 1."""
         return ends[0] + (ends[1] - ends[0]) * self.difficulty
 
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """Heights and blocks of a generated patch."""
+    """A generated patch of terrain: its heights, and its blocks."""
 
     heights: Heights
     """Heights of the patch's surface, blocks included; 0 along the edges [m]."""
@@ -68,7 +68,7 @@ class Patch:
 
 
 def make_patch(config: schema.PatchConfig, site: PatchSite) -> Patch:
-    """Return a patch of a kind of sub-terrain, of the size and the difficulty of `site`."""
+    """Return a patch of terrain: the kind of ground that `config` describes, with the size and difficulty of `site`."""
     heights_or_blocks = _MAKERS[type(config)](config, site)
     if isinstance(heights_or_blocks, np.ndarray):
         return Patch(_with_zero_edges(heights_or_blocks))
@@ -79,7 +79,7 @@ def make_patch(config: schema.PatchConfig, site: PatchSite) -> Patch:
 
 
 def ring(outer: Block, inner: Block) -> list[Block]:
-    """Return four blocks that fill the area between two rectangles, at the height of the outer one."""
+    """Return four blocks that fill the area between an outer and an inner rectangle, at the height of the outer one."""
     (x0, y0), (x1, y1) = outer.low, outer.high
     (left, front), (right, back) = inner.low, inner.high
     return [
@@ -126,7 +126,7 @@ def _obstacles(config: schema.ObstaclesPatchConfig, site: PatchSite) -> Heights:
 
 
 def _stones(config: schema.StonesPatchConfig, site: PatchSite) -> Heights:
-    """Return rows of stones over a pit, each row shifted at random."""
+    """Return the heights of rows of stepping stones over a pit; each row is shifted at random."""
     heights = site.flat() - config.depth
     width, gap = site.at_difficulty((config.width[1], config.width[0])), site.at_difficulty(config.gap)
     x = 0.0
@@ -141,7 +141,7 @@ def _stones(config: schema.StonesPatchConfig, site: PatchSite) -> Heights:
 
 
 def _stairs(config: schema.StairsPatchConfig, site: PatchSite) -> list[Block]:
-    """Return the steps as rings of four blocks each, from the outside inwards, and the platform."""
+    """Return stairs on four sides: for each step a ring of four blocks, from the outside inwards, and a platform."""
     rise = site.at_difficulty(config.step_height) * (-1.0 if config.inverted else 1.0)
     steps = int((min(site.size) - config.platform) / 2 / config.step_width + _EPS)
 
@@ -181,19 +181,19 @@ _MAKERS: dict[type[schema.PatchConfig], Callable[[Any, PatchSite], Heights | lis
 
 
 def _edge_distance(site: PatchSite) -> Heights:
-    """Return the distance of every height from the nearest edge [m]."""
+    """Return the distance of every point of the height field of a patch from the nearest edge [m]."""
     x, y = site.axes()
     return np.minimum(np.minimum(x, site.size[0] - x), np.minimum(y, site.size[1] - y))
 
 
 def _platform_block(platform: float, site: PatchSite) -> Block:
-    """Return a block of height 0 in the middle of a patch."""
+    """Return a square block of height 0 in the middle of a patch; `platform` is its edge length [m]."""
     low, high = (tuple((edge + sign * platform) / 2 for edge in site.size) for sign in (-1, 1))
     return Block(low, high, 0.0)  # type: ignore[arg-type]
 
 
 def _cover_with_block(heights: Heights, site: PatchSite, block: Block) -> None:
-    """Set the heights that a block covers to the height of its top."""
+    """Set the heights of the points that a block covers to the height of its top."""
     x, y = site.axes()
     inside_x = (x[:, 0] >= block.low[0] - _EPS) & (x[:, 0] <= block.high[0] + _EPS)
     inside_y = (y[0] >= block.low[1] - _EPS) & (y[0] <= block.high[1] + _EPS)

@@ -46,7 +46,7 @@ TerrainProblem = tuple[tuple[str, ...], str, str | None]
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """Generated terrain: its height field, its boxes, and the origin of each patch."""
+    """A generated terrain, before it is added to a model: its height field, its boxes, and the origin of each patch."""
 
     heights: Heights
     """Heights of the height field, x along the first axis, its middle at the world's origin [m]."""
@@ -65,7 +65,7 @@ class Ground:
 
 
 def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProblem]:
-    """Yield the problems of a terrain's configuration."""
+    """Yield the mistakes in a terrain's configuration. `root` is the task's folder, in which a file of heights is."""
     if isinstance(config, schema.TerrainHeightsConfig):
         yield from _file_problems(config, root)
         return
@@ -87,7 +87,7 @@ def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProbl
 
 
 def make_ground(config: TerrainConfig, root: Path) -> Ground:
-    """Make the heights, blocks and origins of a terrain; the same configuration gives the same ground."""
+    """Generate a terrain, or read its heights from a file in `root`; the same configuration gives the same ground."""
     if isinstance(config, schema.TerrainHeightsConfig):
         heights = _read_heights(root / config.file).astype(np.float64)
         nx, ny = heights.shape
@@ -114,7 +114,7 @@ def make_ground(config: TerrainConfig, root: Path) -> Ground:
 
 
 def add_ground(spec: mujoco.MjSpec, ground: Ground, material: str) -> None:
-    """Add a terrain to a model: a height field, boxes, and a border."""
+    """Add a terrain to a model: a height field, boxes, and a flat border. `material` is the name of their material."""
     body, prefix = spec.worldbody.add_body(name=TERRAIN_BODY), f"//{TERRAIN_BODY}"
     add_geom = functools.partial(body.add_geom, material=material, friction=[ground.friction, 0.005, 0.0001])
     nx, ny = ground.heights.shape
@@ -165,7 +165,7 @@ class Terrain:
 
     @property
     def rows(self) -> int:
-        """Number of levels."""
+        """Number of levels of difficulty, which are the rows of patches."""
         return len(self.origins)
 
     def start(self, seed: int) -> None:
@@ -187,7 +187,7 @@ class Terrain:
         self._set_levels(selection, torch.where(levels >= self.rows, drawn, levels.clamp(min=0)))
 
     def scatter(self, selection: Selection) -> None:
-        """Move environments to random levels; their columns do not change."""
+        """Move environments to random levels; their kind of ground (column of patches) does not change."""
         self._set_levels(selection, selection.stream(_SCATTER).choice(self.rows))
 
     def _set_levels(self, selection: Selection, levels: Tensor) -> None:
@@ -195,7 +195,7 @@ class Terrain:
         selection.write(self._env_origins, self.origins[levels, selection.read_view(self.types)])
 
     def place_entities(self, entities: Iterable[Entity], selection: Selection) -> None:
-        """Set the pose of floating and mocap entities to the default pose, moved by the environment's origin."""
+        """Put floating and mocap entities at their default pose on the patch of the environment."""
         for entity in entities:
             if entity.is_floating or entity.mocap >= 0:
                 default = selection.read_view(entity.data.default_root_state)
@@ -203,7 +203,7 @@ class Terrain:
                 entity.write_root_pose(selection, position, default[:, 3:7])
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return a copy of the terrain level of each environment."""
+        """Return the state to save: a copy of the terrain level of each environment."""
         return {"levels": self.levels.clone()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -216,7 +216,7 @@ class Terrain:
 def _choose_patch(
     config: schema.TerrainGeneratorConfig, row: int, column: int, draw: np.random.Generator
 ) -> tuple[schema.PatchConfig, float]:
-    """Return the kind and the difficulty of a patch."""
+    """Return the kind of ground and the difficulty (0 to 1) of the patch at a row and a column; `draw` is random."""
     kinds = list(config.sub_terrains.values())
     shares = np.cumsum([kind.proportion for kind in kinds])
     low, high = config.difficulty
@@ -230,14 +230,14 @@ def _choose_patch(
 
 
 def _spawn_height(heights: Heights, resolution: float) -> float:
-    """Return the height of the highest point in the middle of a patch [m]."""
+    """Return the height at which environments start: that of the highest point in the middle of a patch [m]."""
     reach = round(_SPAWN_HALF_WIDTH / resolution)
     x, y = (n // 2 for n in heights.shape)
     return float(heights[max(0, x - reach) : x + reach + 1, max(0, y - reach) : y + reach + 1].max())
 
 
 def _heights_below_blocks(patch: Patch) -> Heights:
-    """Return heights that stay below the blocks of a patch [m]."""
+    """Return heights for the height field of a patch with boxes, which stay below the boxes [m]."""
     lowest = min(block.top for block in patch.blocks)
     inside = np.zeros_like(patch.heights)
     inside[1:-1, 1:-1] = lowest - 0.05 if lowest < 0.0 else 0.0  # 5 cm lower, so that no two surfaces coincide
@@ -250,7 +250,10 @@ def _shifted(block: Block, offset: NDArray[np.float64]) -> Block:
 
 
 def _border(half: list[float], width: float) -> list[Block]:
-    """Return the blocks of the flat ground around a height field."""
+    """Return the blocks of the flat ground around a height field.
+
+    `half` is half of the height field's extent along x and y, `width` the width of the flat ground [m].
+    """
     if width == 0.0:
         return []
     x, y = half
@@ -258,7 +261,10 @@ def _border(half: list[float], width: float) -> list[Block]:
 
 
 def _patch_problems(patch: schema.PatchConfig, edge: float, resolution: float) -> Iterator[tuple[str, str, str | None]]:
-    """Yield key, message and hint for each problem of a sub-terrain."""
+    """Yield key, message and hint for each mistake in the settings of one kind of ground.
+
+    `edge` is the shorter edge of a patch, `resolution` the distance between two heights [m].
+    """
     platform = getattr(patch, "platform", 0.0)
     if platform >= edge:
         yield "platform", f"a platform of {platform:g} m does not fit in a patch of {edge:g} m", "make it smaller"
@@ -294,7 +300,7 @@ def _read_heights(file: Path) -> NDArray[Any]:
 
 
 def _file_problems(config: schema.TerrainHeightsConfig, root: Path) -> Iterator[TerrainProblem]:
-    """Yield the problems of a terrain's height file."""
+    """Yield the mistakes in the configuration of a terrain from a file, and in the file, which is in `root`."""
     file = (root / config.file).resolve()
     if not file.is_relative_to(root.resolve()):
         yield ("file",), f"'{config.file}' lies outside the task's folder {root}", "move it inside"

@@ -1,4 +1,4 @@
-"""Lookup of the height of points above the ground, in the heights of a terrain."""
+"""Lookup of the height of points above a terrain, which ray sensors use instead of casting rays (`lookup: true`)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rlcli.scene.terrain import Ground
 
 
 class HeightTable:
-    """Heights of a terrain without boxes; each cell has two triangles, as in MuJoCo's height fields."""
+    """Heights of a terrain without boxes, interpolated on two triangles per cell, as MuJoCo's height fields are."""
 
     def __init__(self, ground: Ground, device: torch.device) -> None:
         self._nx, self._ny = ground.heights.shape

@@ -72,7 +72,7 @@ def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False, com
         file: MJCF of the model.
         roots: folders that must contain the model and all files that it loads.
         installed: whether the model belongs to an installed package, whose size is trusted.
-        compiled: whether to compile a copy, too.
+        compiled: whether to check by compiling that MuJoCo accepts the model.
 
     Raises:
         BadModel: if the model is refused, or MuJoCo cannot read it.
@@ -152,7 +152,7 @@ class _Text:
 
 @dataclass(slots=True)
 class _MjcfScan:
-    """Parser that checks a model and all files that it includes or loads."""
+    """Parser that checks an MJCF (`main`) and all files that it includes or loads, which must lie in `roots`."""
 
     main: Path
     roots: list[Path]
@@ -168,7 +168,7 @@ class _MjcfScan:
     """File, line, element and file name of each asset to load."""
 
     def read(self, file: Path) -> float:
-        """Parse the model and the files that it refers to, and check the assets that it loads; return its cost.
+        """Parse a model and the files that it refers to, and check the assets that it loads; return its cost.
 
         Raises:
             BadModel: if anything is refused.
@@ -183,7 +183,7 @@ class _MjcfScan:
         return self._model_cost(file.resolve(), ()) + loaded
 
     def file_of(self, error: str) -> str:
-        """Return the files that an error of MuJoCo may be about: those with the line and the words that it names.
+        """Return the files, as text, that an error message of MuJoCo may be about: with the line and words it names.
 
         MuJoCo gives elements of included files the line 0.
         """
@@ -195,7 +195,7 @@ class _MjcfScan:
         return " or ".join(found[:3]) or str(self.main)
 
     def _model_cost(self, file: Path, parents: tuple[Path, ...]) -> float:
-        """Return the cost of a model, with the models that it attaches.
+        """Return the cost to compile a model and the models that it attaches. `parents` are the models that attach it.
 
         Raises:
             BadModel: if the model attaches itself, on which MuJoCo would crash.
@@ -228,7 +228,7 @@ class _MjcfScan:
         return self._costs[file]
 
     def _included(self, file: Path, copies: float, parents: tuple[Path, ...]) -> list[tuple[Path, float, _Text]]:
-        """Return a file and those that it includes: path, number of copies, text."""
+        """Return (path, number of copies, content) of a file and of those that it includes; `parents` include it."""
         if file in parents:
             raise BadModel(f"{file}: the file includes itself; remove this include")
         text = self._texts[file]
@@ -240,7 +240,7 @@ class _MjcfScan:
         return found
 
     def _read_text(self, file: Path, level: int) -> None:
-        """Parse a file and the files that it includes or attaches."""
+        """Parse a file and the files that it includes or attaches. `level`: how deep the file itself is included."""
         if file.suffix.lower() not in _TEXT:
             allowed = ", ".join(_TEXT)
             raise BadModel(f"{file}: not MJCF; give a text file ({allowed}): compiled models (.mjb) are not opened")
@@ -324,7 +324,7 @@ class _MjcfScan:
             self._max_cost, self.costliest = cost, source
 
     def _allowed_files(self, file: Path, line: int, element: str, name: str) -> Iterator[Path]:
-        """Yield the existing files that MuJoCo may open for a file name; MuJoCo reports a file that does not exist."""
+        """Yield the existing files that MuJoCo may open for the file name in an element of an MJCF."""
         if "\0" in name or "://" in name:
             raise BadModel(f"{file}:{line}: {element}: '{name}' is not a file name; correct it")
         seen: set[Path] = set()
@@ -362,7 +362,7 @@ class _MjcfScan:
 
 
 def _has_words(file: Path, number: int, words: Sequence[str]) -> bool:
-    """Return whether a line of a file (0: any) has these words."""
+    """Return whether line `number` of a file (0: the whole file) has these words."""
     text = read_plain(file, _MAX_TEXT).decode("utf-8", "replace")
     lines = text.splitlines()
     part = text if number == 0 else lines[number - 1] if number <= len(lines) else ""
@@ -370,7 +370,7 @@ def _has_words(file: Path, number: int, words: Sequence[str]) -> bool:
 
 
 def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str]) -> None:
-    """Refuse sizes that are too large, and numbers that are not finite; a range may be infinite."""
+    """Check the attributes of an element: no size too large, all numbers finite; only a range may be infinite."""
     for key, value in attributes.items():
         limit = _MAX_MEMORY if key == "memory" else 1_000_000
         if name == "size" and number_of(value) > limit:
@@ -384,7 +384,7 @@ def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str])
 
 
 def _check_options(spec: mujoco.MjSpec, file: Path) -> None:
-    """Refuse options that MuJoCo accepts but that break every simulation."""
+    """Check that a model has no options that MuJoCo accepts but with which no simulation works."""
     option = spec.option
     if not (math.isfinite(option.timestep) and option.timestep > 0):
         raise BadModel(f"{file}: option timestep is {option.timestep:g}; it must be above 0")

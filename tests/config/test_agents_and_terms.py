@@ -72,8 +72,8 @@ def test_agent_names_exclude_default(task):
             ["rewards.aliv=null", "rewards.nea=null", "decimation=0"],
             [
                 "override 'decimation=0': decimation: expected a whole number >= 1, found 0",
-                "override 'rewards.aliv=null': rewards.aliv: there is nothing to remove; did you mean 'alive'?",
-                "override 'rewards.nea=null': rewards.nea: there is nothing to remove; did you mean 'near'?",
+                "override 'rewards.aliv=null': rewards.aliv: there is no such term to remove; did you mean 'alive'?",
+                "override 'rewards.nea=null': rewards.nea: there is no such term to remove; did you mean 'near'?",
             ],
         ),
         (

@@ -301,7 +301,7 @@ def test_floating_entity_is_pushed_horizontally(world):
         ("joint_damping.hinge=1:2", "the value is 0 for hinge", "abs:"),
         ("body_mass.weightless=1:2", "0 for weightless", "abs:"),
         ("effort_limit.slide=1:2", "no actuator matches 'slide'", "hinge"),
-        ("gravity.arm=1:2", "to the whole world", "leave out 'arm'"),
+        ("gravity.arm=1:2", "to the whole world, not to an element", "leave out 'arm'"),
         ("tendon_stiffness=1:2", "the model has no tendons", None),
         ("geom_size.rod=abs:1:2", "make the 3 values of", "leave out abs:"),
         ("observation_noise.poss=0:1", "no observation matches 'poss'", "did you mean 'pos'"),

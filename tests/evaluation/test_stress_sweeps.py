@@ -67,7 +67,7 @@ def test_share_inverts_between(text):
         ("body_mass=1:inf", "'inf' is not a number"),
         ("body_mass=nan", "'nan' is not a number"),
         ("body_mass=1:2:3:4", "write the range as"),
-        ("body_mass=1:2:x", "is not a whole number of points"),
+        ("body_mass=1:2:x", "is not a number of points; write a whole number"),
         ("body_mass=1:2:1", "1 points"),
         ("body_mass=1:2:99999", "99999 points"),
         ("body_mass=0:2", "mass must be above 0"),

@@ -113,9 +113,9 @@ def test_value_beyond_its_limit_exits_9(cli, meter, limits, failed):
 @pytest.mark.parametrize(
     ("limit", "message"),
     [
-        (("--fail-under", "clok=1"), "the task logs no value 'clok'"),
+        (("--fail-under", "clok=1"), "the evaluation has no metric 'clok'"),
         (("--fail-under", "clok=1"), "did you mean 'clock'?"),
-        (("--fail-over", "clock.low=1"), "the task logs no value 'clock.low'"),
+        (("--fail-over", "clock.low=1"), "the evaluation has no metric 'clock.low'"),
         (("--fail-over", "success.low=1"), "--fail-over 'success.low=1' is not"),
         (("--fail-over", "lenght=1"), "--fail-over 'lenght=1' is not"),
     ],

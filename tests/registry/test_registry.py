@@ -87,7 +87,7 @@ BROKEN = {
     "wrong": ("SPEC = {'package': 'x'}\n", "is a dict, expected a TaskSpec"),
     "newer": (IMPORT + "SPEC = TaskSpec(__name__, 'x', api=99)\n", "needs plugin API 99; this rlcli has 1"),
     "future": (IMPORT + "SPEC = TaskSpec(__name__, 'x', wings=2)\n", "TypeError"),
-    "terms": (IMPORT + "SPEC = TaskSpec(__name__, 'x', terms='a.b')\n", "terms must be a tuple"),
+    "terms": (IMPORT + "SPEC = TaskSpec(__name__, 'x', terms='a.b')\n", "terms of a TaskSpec must be a tuple"),
     "nofile": (IMPORT + "SPEC = TaskSpec(__name__, 'x')\n", "task.yaml does not exist"),
     "nopackage": (IMPORT + "SPEC = TaskSpec('no.such', 'x')\n", "No module named 'no'"),
     "module": (IMPORT + "SPEC = TaskSpec('json.decoder', 'x')\n", "is not a package"),

@@ -193,7 +193,7 @@ def test_many_episodes_without_tensors_are_refused_early(cli, task):
     recorded(task, Path("r.safetensors"), 2, 2)
     forged("r.safetensors", lambda header: header.update(episodes=header["episodes"] * 100_000))
     message = expect_code(cli("replay", "r.safetensors"), 5).err
-    assert "the header has 200000 episodes, but the file" in message
+    assert "the file is damaged: 200000 episodes, but only" in message
 
 
 def test_mistake_in_a_recorded_configuration_names_the_recording(cli, task):

@@ -73,7 +73,9 @@ BROKEN = {
         "is broken", SPEC, {"entry_points": "[rlcli.tasks]\nnames-no-object-task = names_no_object\n"}
     ),
     "newer-api": Case("needs plugin API 99", IMPORT + "SPEC = TaskSpec(__name__, 'x', api=99)\n"),
-    "api-is-text": Case("api must be a whole number", IMPORT + "SPEC = TaskSpec(__name__, 'x', api='2')\n"),
+    "api-is-text": Case(
+        "api of a TaskSpec must be a whole number", IMPORT + "SPEC = TaskSpec(__name__, 'x', api='2')\n"
+    ),
     "unknown-field": Case("unexpected keyword argument 'wings'", IMPORT + "SPEC = TaskSpec(__name__, 'x', wings=2)\n"),
     "no-yaml": Case("does not exist", SPEC),
     "yaml-invalid": Case("task.yaml:1:1", SPEC, with_files(task_yaml="decimation: -2\n")),

@@ -176,7 +176,7 @@ def test_task_from_other_folder_is_other_sweep(tmp_path):
 def test_malformed_study_file_is_checkpoint_error(tmp_path, text):
     open_or_join(tmp_path)
     (tmp_path / "study.json").write_text(text)
-    with pytest.raises(CheckpointError, match=r"study\.json|has kind seeds"):
+    with pytest.raises(CheckpointError, match=r"study\.json|is of kind seeds"):
         read_sweep(tmp_path)
 
 

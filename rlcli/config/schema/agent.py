@@ -1,4 +1,4 @@
-"""Settings that all trainers share."""
+"""Schema of the settings of an agent that all trainers share."""
 
 import math
 from typing import Annotated, Any, Self
@@ -21,10 +21,10 @@ class AutopsyConfig(StrictModel):
 
 
 def parse_threshold(text: str) -> tuple[str, float]:
-    """Return the metric and the value of `success=0.99`, `return=200` or `length=250`.
+    """Return the metric and the value of a threshold such as `success=0.99`, `return=200` or `length=250`.
 
     Raises:
-        ValueError: for anything else.
+        ValueError: if the text is not such a threshold.
     """
     key, _, number = text.partition("=")
     value = float_or_nan(number)
@@ -42,7 +42,7 @@ def _check_threshold(text: str) -> str:
 
 
 class AgentConfig(StrictModel):
-    """Settings that all trainers share; the settings of each trainer extend them."""
+    """Settings of an agent that all trainers share. Each trainer has a subclass with its own settings."""
 
     trainer: str
     """Name of the trainer, for example ppo or sb3 (entry-point group rlcli.trainers)."""

@@ -24,7 +24,7 @@ def _fraction(value: object) -> Any:
 
 
 class _FractionString:
-    """Annotation of a number that may be written as a fraction such as `1/120`, also in the JSON Schema."""
+    """Annotation for a number that may also be written as a fraction, such as `1/120`."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_before_validator_function(_fraction, handler(source))
@@ -52,9 +52,9 @@ def _nonzero(message: str) -> AfterValidator:
 
 @dataclass(frozen=True)
 class _Limits:
-    """Annotation that refuses numbers beyond which quotients, integers or 32-bit numbers overflow.
+    """Annotation that refuses numbers outside of a range, because they would overflow in later computations.
 
-    The reference pages do not list these limits, because no sensible number reaches them.
+    The reference pages do not list the range, because no sensible number is outside of it.
     """
 
     smallest: float

@@ -62,7 +62,7 @@ class LightsConfig(StrictModel):
 
 
 class JointConfig(StrictModel):
-    """Changes of joints of an entity. null keeps the value of the MJCF."""
+    """New values for the joints of an entity. null keeps the value of the MJCF."""
 
     damping: NotNegative | None = None
     """Viscous damping [N s/m or N m s/rad]."""

@@ -10,7 +10,7 @@ _MAX_RAYS = 1_000_000
 
 
 class TouchedConfig(StrictModel):
-    """The other side of the contacts that a contact sensor measures."""
+    """The bodies of an entity with which a contact sensor measures contacts (its key `against`)."""
 
     entity: str
     """Name of an entity."""
@@ -126,7 +126,7 @@ class CameraSensorConfig(StrictModel):
     @model_validator(mode="after")
     def _relations(self) -> Self:
         if self.entity is None and (self.camera or self.body):
-            raise ValueError("camera and body belong to an entity: set entity")
+            raise ValueError("the keys camera and body need the key entity: set it, or remove them")
         placed = sorted({"body", "eye", "lookat", "fov"} & self.model_fields_set)
         if self.camera is not None and placed:
             keys = ", ".join(placed)

@@ -27,7 +27,7 @@ Columns = Number | Annotated[list[Number], Field(min_length=1)]
 
 
 class _TermFunction:
-    """Annotation of the name of a term. A configuration in Python may have the function instead of its name."""
+    """Annotation for the name of a term's function. A configuration in Python may have the function itself."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         name = core_schema.str_schema(strict=True)
@@ -210,7 +210,7 @@ class DelayConfig(StrictModel):
     @model_validator(mode="after")
     def _one_unit(self) -> Self:
         if (self.steps is None) == (self.seconds is None):
-            raise ValueError("give either steps or seconds")
+            raise ValueError("a delay has either steps or seconds: give one of the two")
         return self
 
     def step_range(self, step_dt: float) -> tuple[int, int]:
@@ -234,7 +234,7 @@ class DelayConfig(StrictModel):
 
 
 class ObservationConfig(TermConfig):
-    """An observation term. The steps are applied in the order of the keys: modifiers, noise, bias, ..., history."""
+    """An observation term. modifiers, noise, bias, clip, scale, delay and history change its value, in this order."""
 
     modifiers: list[ModifierConfig] = []
     """Operations on the value, applied first and in this order."""
@@ -307,6 +307,6 @@ class SuccessConfig(TermConfig):
 
 
 def bound_text(condition: Mapping[str, Any]) -> str:
-    """Return the bounds of a condition of success as text, as in `at most 0.1`; the empty text without a bound."""
+    """Return the bounds of a condition of success as text, such as `at most 0.1`; the empty text if it has none."""
     keys = ("at_least", "at_most")
     return " and ".join(f"{key.replace('_', ' ')} {condition[key]:g}" for key in keys if condition.get(key) is not None)

@@ -1,4 +1,4 @@
-"""Schema of uneven ground: a generator of patches, or a height field from a file."""
+"""Schema of uneven ground: a grid of generated patches (square pieces of ground), or a height field from a file."""
 
 from typing import Annotated, Literal
 
@@ -8,7 +8,7 @@ from rlcli.config.schema.base import Count, NotNegative, Positive, Range, ShareR
 
 
 class PatchConfig(StrictModel):
-    """Keys that all sub-terrains share. The two values of a pair belong to difficulty 0 and to difficulty 1."""
+    """Keys that all kinds of generated ground share. In their other keys, a pair of values is [easiest, hardest]."""
 
     proportion: NotNegative = 1.0
     """Share of the columns (without curriculum: of the patches), relative to the other sub-terrains."""
@@ -135,9 +135,9 @@ SubTerrainConfig = Annotated[
 
 
 class TerrainGeneratorConfig(StrictModel):
-    """Terrain generator: a grid of patches. Difficulty rises by row, and each column has one kind of ground.
+    """Terrain generator: a grid of patches, each with a kind of ground and a difficulty.
 
-    Environments start in the middle of a patch.
+    Difficulty rises by row, and each column has one kind of ground. Environments start in the middle of a patch.
     """
 
     kind: Literal["generator"]
