@@ -64,7 +64,7 @@ test-all: $(VENV)/.dev
 test-faults test-faults-long: export RLCLI_TEST_SEED ?= $(shell date +%Y%m%d)
 
 test-faults: $(VENV)/.dev
-	RLCLI_TEST_SIZE=full $(BIN)/python -m pytest -n 2 tests/faults
+	RLCLI_TEST_SIZE=full $(BIN)/python -m pytest -n 2 --timeout 1200 tests/faults
 
 test-faults-long: $(VENV)/.dev
 	RLCLI_TEST_SIZE=long $(BIN)/python -m pytest -n 2 --timeout 7200 tests/faults

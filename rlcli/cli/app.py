@@ -21,7 +21,7 @@ from rlcli.cli.ui.options import CHOOSE, add_command
 from rlcli.config.settings_file import read_settings
 from rlcli.errors import INTERRUPTED, CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
 from rlcli.machine import AddressSpaceCheck, MatplotlibFinder, delay_garbage_collection, memory_error
-from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
+from rlcli.registry import OWN, TRAINERS, catalog, exit_refused, load_entry, load_object, malformed_metadata_ignored
 from rlcli.safe_text import remember_given
 from rlcli.settings import settings_file, use_settings
 from rlcli.trainers import TrainerSpec
@@ -104,7 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
     remember_given([*arguments, *(value for name, value in os.environ.items() if name.startswith("RLCLI_"))])
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
     console.has_document = False  # an earlier command of this process may have printed one
-    with console.stdout_kept(), malformed_metadata_ignored():
+    with console.stdout_kept(), malformed_metadata_ignored(), exit_refused():
         code = _run(_with_values(arguments))
     try:
         if sys.stdout is not None:
@@ -164,7 +164,7 @@ def _run(arguments: list[str]) -> int:
                 console.info(line)
             return 2
         failure: RlcliError = UsageError("no command given", hint="rlcli --help lists the commands")
-    except (Exception, KeyboardInterrupt) as error:
+    except (Exception, KeyboardInterrupt, SystemExit) as error:
         failure = _as_rlcli_error(error, arguments)
         is_expected = isinstance(error, ClickException | KeyboardInterrupt | typer.Abort)
         if failure.kind == "bug" or (console.debug and not is_expected):

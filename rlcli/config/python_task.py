@@ -23,7 +23,7 @@ from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, bu
 from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing
 from rlcli.formats import Note
 from rlcli.registry import TaskSource, import_file, is_framework, load_module, load_object
-from rlcli.registry.formats import Format, format_of_module, installed_formats, require_module
+from rlcli.registry.formats import Format, call_usable, format_of_module, require_module
 from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registrations
 
 _log = logging.getLogger(__name__)
@@ -244,7 +244,7 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     folder, form = FilePath(file).parent, format_of_module(value.__rlcli_task__.__module__)
     files = sorted(folder.glob(_AGENTS))
     if form is not None and form.spec.agents_beside:
-        files += form.load(form.spec.agents_beside)(folder)
+        files += form.call(form.spec.agents_beside, folder)
     return value, _agents_in_modules([module]) or _agents_in_modules(map(import_file, files))
 
 
@@ -389,7 +389,7 @@ def _read_agent(task: PythonTask, name: str, agent: object) -> dict[str, Any] | 
     """
     if isinstance(agent, FilePath):
         read = task.format.spec.agent_file if task.format is not None else ""
-        return task.format.load(read)(agent, name, task.notes) if task.format is not None and read else None
+        return task.format.call(read, agent, name, task.notes) if task.format is not None and read else None
     if isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__"):
         return agent_data(agent, task.notes)
     return None
@@ -418,5 +418,4 @@ def error_location(error: BaseException) -> str:
 
 def _hint(error: BaseException) -> str | None:
     """Return the hint of an installed format about an error of a task's code; None if no format has one."""
-    hints = (form.load(form.spec.hint)(error) for form in installed_formats() if form.spec.hint)
-    return next((hint for hint in hints if hint is not None), None)
+    return next((hint for hint in call_usable(lambda spec: spec.hint, error) if hint is not None), None)

@@ -129,7 +129,7 @@ class TaskCheck:
         if not unknown:
             return False
         for form in formats.installed_formats():
-            found = form.load(form.spec.read)(document, self.source) if form.spec.read else None
+            found = form.call(form.spec.read, document, self.source) if form.spec.read else None
             if found is not None:
                 self.layers.merge(found.data, found.origin)
                 if found.agents_origin is not None:
@@ -408,8 +408,8 @@ class TaskCheck:
     def _require_direct(self, data: Mapping[str, Any]) -> None:
         """Check that a direct task has no terms but those of `success`, and the settings of another format's class."""
         if self.format is not None and self.format.spec.check:
-            key, check = self.format.spec.key, self.format.load(self.format.spec.check)
-            for path, message, hint in check(data.get(key, {})):
+            key = self.format.spec.key
+            for path, message, hint in self.format.call(self.format.spec.check, data.get(key, {})):
                 self.problem((key, *path), message, hint)
         for section in SECTIONS:
             if section != "success" and data.get(section):

@@ -20,7 +20,7 @@ from rlcli.registry.entries import (
 from rlcli.registry.find import find_task, task_source
 from rlcli.registry.folders import folder_task, python_config, python_place, python_task
 from rlcli.registry.formats import is_framework
-from rlcli.registry.imports import load_entry
+from rlcli.registry.imports import exit_refused, load_entry
 from rlcli.registry.models import chosen_model, model_file
 from rlcli.registry.packages import installed_task, is_offered, package_folder, packaged_task, task_of_file
 from rlcli.registry.task_imports import import_file, load_module, load_object
@@ -36,6 +36,7 @@ __all__ = [
     "TaskSource",
     "catalog",
     "chosen_model",
+    "exit_refused",
     "find_entry",
     "find_task",
     "folder_task",

@@ -7,7 +7,7 @@ import functools
 import json
 import logging
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 from rlcli.errors import DependencyError, TaskError, pip_install
 from rlcli.formats import FormatSpec
 from rlcli.registry.entries import FORMATS, OWN, Entry, catalog, find_entry
-from rlcli.registry.imports import load_entry, load_spec
+from rlcli.registry.imports import PluginError, call_entry, load_entry, load_spec
 from rlcli.registry.task_location import TaskSource
 
 _log = logging.getLogger(__name__)
@@ -46,6 +46,14 @@ class Format:
             TaskError: if the plugin is broken.
         """
         return load_entry(replace(self.entry, value=reference), object)
+
+    def call(self, reference: str, *arguments: Any) -> Any:
+        """Import a function of the format by a reference of its spec, and call it. A generator is read to its end.
+
+        Raises:
+            PluginError: for any error of the plugin.
+        """
+        return call_entry(replace(self.entry, value=reference), *arguments)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +124,18 @@ def usable_formats() -> Iterator[Format]:
 
 def find_in_formats(path: Path) -> TaskSource | None:
     """Return the task of a folder or file in an installed format; None if no working format recognises it."""
-    tasks = (form.load(form.spec.find)(path) for form in usable_formats() if form.spec.find)
+    tasks = call_usable(lambda spec: spec.find, path)
     return next((task for task in tasks if task is not None), None)
+
+
+def call_usable(reference: Callable[[FormatSpec], str], *arguments: Any) -> Iterator[Any]:
+    """Call a function of every installed format that has it. For a broken format, log a warning instead."""
+    for form in usable_formats():
+        try:
+            if reference(form.spec):
+                yield form.call(reference(form.spec), *arguments)
+        except PluginError as error:
+            _log.warning(error)
 
 
 def format_of_key(keys: Mapping[str, Any]) -> Format | None:

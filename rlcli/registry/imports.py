@@ -11,9 +11,9 @@ import threading
 import traceback
 from collections.abc import Iterator
 from importlib import metadata
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
-from rlcli.errors import DependencyError, TaskError
+from rlcli.errors import DependencyError, RlcliError, TaskError
 from rlcli.formats import FormatSpec
 from rlcli.progress import track
 from rlcli.registry.entries import Entry
@@ -25,6 +25,10 @@ _log = logging.getLogger(__name__)
 _SLOW_S = 10
 """Time after which a plugin that is still imported is named [s]."""
 _Spec = TypeVar("_Spec", TaskSpec, TrainerSpec, FormatSpec)
+
+
+class PluginError(TaskError):
+    """Error in the code of a plugin."""
 
 
 def load_spec(entry: Entry, kind: type[_Spec], what: str) -> _Spec:
@@ -54,20 +58,8 @@ def load_entry(entry: Entry, kind: type) -> Any:
         TaskError: for any error of the plugin, with the name of its distribution.
         DependencyError: raised by the plugin itself, passed on.
     """
-    try:
-        with track(f"plugin {entry.qualified} ({entry.value})"), _named_if_slow(entry):
-            value = import_object(entry.value)
-    except DependencyError:
-        raise
-    except BaseException as error:
-        if isinstance(error, KeyboardInterrupt):
-            raise
-        reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        raise TaskError(
-            f"plugin {entry.distribution} {entry.version}: entry point '{entry.name}' = {entry.value} cannot be"
-            f" imported: {reason}{error_location(error)}",
-            hint=_newer_rlcli(entry) or f"update or uninstall {entry.distribution}",
-        ) from error
+    with _plugin_named(entry, "cannot be imported", DependencyError):
+        value = import_object(entry.value)
     if not isinstance(value, kind):
         raise TaskError(
             f"plugin {entry.distribution} {entry.version}: entry point '{entry.name}' = {entry.value} is a"
@@ -76,17 +68,70 @@ def load_entry(entry: Entry, kind: type) -> Any:
     return value
 
 
+def call_entry(entry: Entry, *arguments: Any) -> Any:
+    """Import the function that an entry names, and call it. A generator is read to its end.
+
+    Raises:
+        PluginError: for any error of the plugin, with the name of its distribution.
+        RlcliError: raised by the plugin itself, passed on.
+    """
+    function = load_entry(entry, object)
+    with _plugin_named(entry, "failed", RlcliError), contain_side_effects():
+        value = function(*arguments)
+        return list(value) if isinstance(value, Iterator) else value
+
+
 @contextlib.contextmanager
-def _named_if_slow(entry: Entry) -> Iterator[None]:
-    """Log a warning if the `with` block, which imports a plugin, takes longer than `_SLOW_S`."""
-    text = f"plugin {entry.distribution} {entry.version}: the import of {entry.value} takes more than {_SLOW_S} s"
-    timer = threading.Timer(_SLOW_S, _log.warning, [f"{text}; if it does not end, exclude it with RLCLI_PLUGINS=none"])
+def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> Iterator[None]:
+    """Name a plugin in errors of the `with` block, which runs its code, and in a warning if it exceeds `_SLOW_S`.
+
+    Args:
+        entry: the plugin's entry.
+        failure: what the message states about the entry point before the reason.
+        passed_on: class of errors that are passed on, like Ctrl-C.
+
+    Raises:
+        PluginError: for any other error.
+    """
+    plugin = f"plugin {entry.distribution} {entry.version}: "
+    text = f"{plugin}{entry.value} takes more than {_SLOW_S} s; if it does not end, exclude it with RLCLI_PLUGINS=none"
+    timer = threading.Timer(_SLOW_S, _log.warning, [text])
     timer.daemon = True
     timer.start()
     try:
-        yield
+        with track(f"plugin {entry.qualified} ({entry.value})"):
+            yield
+    except (passed_on, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        raise PluginError(
+            f"{plugin}entry point '{entry.name}' = {entry.value} {failure}: {reason}{error_location(error)}",
+            hint=_newer_rlcli(entry) or f"update or uninstall {entry.distribution}",
+        ) from error
     finally:
         timer.cancel()
+        timer.join()  # a process with a second thread cannot be forked safely
+
+
+@contextlib.contextmanager
+def exit_refused() -> Iterator[None]:
+    """Make `os._exit` an error in the `with` block: code of a plugin would end the command without a message.
+
+    Other processes, such as children that a library forks, and other threads still end.
+    """
+    before, process, thread = os._exit, os.getpid(), threading.get_ident()
+
+    def refuse(status: int) -> NoReturn:
+        if (os.getpid(), threading.get_ident()) != (process, thread):
+            before(status)
+        raise SystemExit(f"it called os._exit({status})")
+
+    os._exit = refuse
+    try:
+        yield
+    finally:
+        os._exit = before
 
 
 def import_object(reference: str) -> Any:
@@ -111,7 +156,7 @@ def contain_side_effects() -> Iterator[None]:
 
 def error_location(error: BaseException) -> str:
     """Return ` (file:line)` of the code that raised an error; empty if the message has it already (SyntaxError)."""
-    frames = traceback.extract_tb(error.__traceback__)
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
     if isinstance(error, SyntaxError) or not frames or frames[-1].filename.startswith("<frozen"):
         return ""
     return f" ({frames[-1].filename}:{frames[-1].lineno})"

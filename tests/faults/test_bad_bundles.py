@@ -10,7 +10,7 @@ import torch
 from support.bad_checkpoints import PLAYED, Bomb, Case, forged, named, setting
 from support.fault_sizes import amount, chosen
 from support.saved_states import rehash
-from test_bad_checkpoints import command, run_with_limits, snapshot
+from test_bad_checkpoints import command, run_reader, snapshot
 
 from rlcli.cli.app import main
 from rlcli.errors import CheckpointError
@@ -73,16 +73,14 @@ CASES = [case for case in named() if applies(case)]
 
 
 @pytest.mark.parametrize("case", [*chosen(CASES, 40), *bundle_damages()], ids=lambda case: case.name)
-def test_damaged_bundle_is_refused_and_unchanged(case, bundle_folder, capfd):
+def test_damaged_bundle_is_refused_and_unchanged(case, bundle_folder, child, capfd):
     case.damage(bundle_folder)
     before = snapshot(bundle_folder)
     readers = {"play", "export"} & set(case.readers)
     if case.name == "layout step_dt 5.0":  # a plausible number: only the task knows that it is not its own
         readers = {"play"}
     for reader in sorted(readers):
-        arguments = command(reader, bundle_folder)
-        code = run_with_limits(arguments) if case.bomb else main(arguments)
-        out, err = capfd.readouterr()
+        code, out, err = run_reader(case, command(reader, bundle_folder), child, capfd)
         assert code == 5, f"{case.name}, {reader}: exit {code}\n{err}"
         assert "Traceback" not in err
         assert "\x1b[2J" not in err

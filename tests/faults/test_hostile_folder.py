@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.child_processes import SMALL
+from support.child_processes import PATIENCE, SMALL
 from support.fault_sizes import FIRST_SEED, chosen
 
 import rlcli
@@ -36,7 +36,7 @@ def command(folder, *words, limit=None):
         cwd=folder,
         capture_output=True,
         text=True,
-        timeout=200,
+        timeout=PATIENCE,
         preexec_fn=restrict,
         env={**os.environ, "XDG_CACHE_HOME": str(folder / "cache"), "OMP_NUM_THREADS": "1"},
     )

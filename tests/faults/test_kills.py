@@ -250,7 +250,7 @@ def test_killed_writer_leaves_a_complete_file_or_none(child, uninterrupted, tmp_
     for folder in ("whole", "killed"):
         shutil.copytree(uninterrupted("sb3-ppo")[0], tmp_path / folder / "runs" / "cartpole" / "r")
     begin = time.monotonic()
-    assert child(tmp_path / "whole", *WRITERS[name]).ended(200).code == 0
+    assert child(tmp_path / "whole", *WRITERS[name]).ended().code == 0
     took, draw, folder = time.monotonic() - begin, random.Random(FIRST_SEED), tmp_path / "killed"
     expected = written(tmp_path / "whole" / name)
     for _ in range(amount(2, 5, 40)):
@@ -259,7 +259,7 @@ def test_killed_writer_leaves_a_complete_file_or_none(child, uninterrupted, tmp_
         os.kill(process.pid, signal.SIGKILL)
         process.ended()
         assert written(folder / name) in ({}, expected)
-    ended = child(folder, *WRITERS[name]).ended(200)
+    ended = child(folder, *WRITERS[name]).ended()
     assert ended.code == 0, ended.err
     assert written(folder / name) == expected
     assert not list(folder.glob(".out*")), "files of the killed processes"

@@ -8,6 +8,7 @@ import time
 
 import pytest
 from support import mjcf_grammar, mjcf_mutants
+from support.child_processes import PATIENCE
 from support.fault_sizes import amount, chosen, seeds
 
 from rlcli.cli.app import main
@@ -248,10 +249,10 @@ def task(tmp_path):
 def test_bad_model_is_refused_by_name_before_it_is_opened(name, task):
     text, reason = NAMED[name]
     (task / "model.xml").write_text(text)
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(ConfigError) as caught:
         make_env(resolve(folder_task(task)))
-    assert time.perf_counter() - begin < 20
+    assert time.process_time() - begin < 10
     assert "model" in str(caught.value)
     assert reason in str(caught.value)
     assert "task.yaml:6:" in str(caught.value)
@@ -298,10 +299,10 @@ def test_large_model_is_first_compiled_under_limits(tmp_path, monkeypatch):
     assert len(read_mjcf(file, [tmp_path]).geoms) > 6_000  # much, and within the limits
     monkeypatch.setattr(untrusted_mjcf, "TIME_S", 1)
     file.write_text(model(body=many.replace("6000", "400000")))
-    begin = time.perf_counter()
+    begin = os.times()
     with pytest.raises(BadModel, match=r"model\.xml: compiling takes more than"):
         read_mjcf(file, [tmp_path])
-    assert time.perf_counter() - begin < 20
+    assert os.times().children_user - begin.children_user < 5
 
 
 def test_system_without_limits_reads_models(tmp_path, monkeypatch):
@@ -321,7 +322,7 @@ def test_system_without_limits_reads_models(tmp_path, monkeypatch):
 def test_mutated_models_are_accepted_or_refused_without_a_crash(first, tmp_path):
     count = amount(1, 10)
     line = [sys.executable, mjcf_mutants.__file__, str(first), str(count), str(tmp_path)]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=280)
+    done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     assert done.stdout.count("taken") == count
 
@@ -331,7 +332,7 @@ def test_mutated_models_are_accepted_or_refused_without_a_crash(first, tmp_path)
 def test_models_of_the_grammar_are_accepted_or_refused_with_a_place(first, tmp_path):
     count = amount(20, 100)
     line = [sys.executable, mjcf_grammar.__file__, str(first * count), str(count), str(tmp_path)]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=280)
+    done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
 
 

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from support.child_processes import SMALL
+from support.child_processes import PATIENCE, SMALL
 from support.fault_sizes import chosen
 from support.run_comparison import assert_same_run, newest
 
@@ -152,14 +152,14 @@ def test_closed_output_pipe_does_not_stop_the_training(child, tmp_path, uninterr
     loud = [word for word in TRAIN if word != "-q"]
     faults = [{"kind": "slow", "call": STEP, "pattern": "", "nth": 60, "seconds": 0.001}]
     process = child(tmp_path, "train", *loud, faults=faults, output=output)
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + PATIENCE
     while not slow_moments(tmp_path) and time.monotonic() < deadline:
         time.sleep(0.005)
     if "err" in streams:
         assert os.read(readers[-1], 10)
     for reader in readers:
         os.close(reader)
-    status = process.ask(wait=process.pid, seconds=60)["status"]
+    status = process.ask(wait=process.pid, seconds=PATIENCE)["status"]
     assert status == 0
     assert_same_run(run_in(tmp_path), uninterrupted)
 
@@ -176,5 +176,5 @@ def test_closed_terminal_does_not_stop_a_run_that_ignores_sighup(child, tmp_path
     assert os.read(terminal, 10)
     os.close(name)
     os.close(terminal)
-    assert process.ask(wait=process.pid, seconds=60)["status"] == 0
+    assert process.ask(wait=process.pid, seconds=PATIENCE)["status"] == 0
     assert_same_run(run_in(tmp_path), uninterrupted)

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from support import hostile_runs
+from support.child_processes import PATIENCE
 from support.fault_sizes import chosen
 
 from rlcli.cli.app import COMMANDS, GROUPS, main
@@ -54,12 +55,12 @@ def at(tmp_path, good, monkeypatch):
 def cli(capfd):
     def run(*arguments):
         capfd.readouterr()
-        begin = time.perf_counter()
+        begin = time.process_time()
         code = main([str(argument) for argument in arguments])
         out, err = capfd.readouterr()
         assert "Traceback" not in err, err
         assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]", out + err), repr(out + err)
-        return SimpleNamespace(code=code, out=out, err=err, took=time.perf_counter() - begin)
+        return SimpleNamespace(code=code, out=out, err=err, took=time.process_time() - begin)
 
     return run
 
@@ -252,10 +253,10 @@ def test_modules_in_the_current_folder_are_not_imported(at, good):
     (metadata / "METADATA").write_text("Name: evil\nVersion: 1.0\n")
     (metadata / "entry_points.txt").write_text("[rlcli.tasks]\ncartpole = evil:TASK\nevil = evil:TASK\n")
     line = [sys.executable, "-m", "rlcli", "show", "evil"]
-    done = subprocess.run(line, cwd=at.run, capture_output=True, text=True, timeout=60, env=os.environ.copy())
+    done = subprocess.run(line, cwd=at.run, capture_output=True, text=True, timeout=PATIENCE, env=os.environ.copy())
     assert done.returncode == 4, done.stderr
     line = [sys.executable, "-m", "rlcli", "play", "--checkpoint", ".", "--viewer", "none", "scene.num_envs=2"]
-    done = subprocess.run(line, cwd=at.run, capture_output=True, text=True, timeout=120, env=os.environ.copy())
+    done = subprocess.run(line, cwd=at.run, capture_output=True, text=True, timeout=PATIENCE, env=os.environ.copy())
     assert done.returncode == 0, done.stderr
     assert not at.canary.exists()
 

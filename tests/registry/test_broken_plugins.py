@@ -198,7 +198,7 @@ def test_ctrl_c_during_probe_start_kills_processes(broken_plugins, monkeypatch):
     ("flags", "named"),
     [
         ([], "rlcli validate: plugin slow:slow-task (slow:SPEC), 0:10 so far"),
-        (["-q"], "warning: plugin slow 1.0: the import of slow:SPEC takes more than 10 s; if it does not end, exclude"),
+        (["-q"], "warning: plugin slow 1.0: slow:SPEC takes more than 10 s; if it does not end, exclude"),
     ],
 )
 def test_plugin_that_hangs_is_named(plugins, flags, named):

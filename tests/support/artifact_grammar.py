@@ -246,7 +246,7 @@ def run(seed, good, folder):
         out, err = io.StringIO(), io.StringIO()
         begin, code = time.process_time(), None
         signal.signal(signal.SIGALRM, hang)
-        signal.alarm(6 * SECONDS)
+        signal.alarm(20 * SECONDS)
         try:
             with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
                 code = main(words)

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 SERVER = Path(__file__).with_name("child_server.py")
+PATIENCE = 600
+"""Longest time to wait for a child process [s]; other processes may use the cores."""
 SMALL = ("scene.num_envs=4", "sim.engine_threads=1", "agent.torch_threads=1", "-q")
 
 
@@ -29,7 +31,7 @@ class Child:
     output: Path
     ask: Callable[..., dict[str, Any]]
 
-    def ended(self, seconds: float = 60) -> Ended:
+    def ended(self, seconds: float = PATIENCE) -> Ended:
         code = self.ask(wait=self.pid, seconds=seconds)["status"]
         assert code is not None, f"did not end:\n{self.said()}"
         return Ended(code, self.output.with_suffix(".out").read_text(), self.said())
@@ -41,7 +43,7 @@ class Child:
         """Return whether the process runs; a zombie does not."""
         return Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
 
-    def until(self, condition: Callable[[], Any], seconds: float = 60) -> Any:
+    def until(self, condition: Callable[[], Any], seconds: float = PATIENCE) -> Any:
         """Wait until a condition holds."""
         deadline = time.monotonic() + seconds
         while not (found := condition()):
@@ -53,7 +55,10 @@ class Child:
 
 @contextmanager
 def warm_parent() -> Iterator[Callable[..., Child]]:
-    """Yield a function that starts `rlcli ARGUMENTS` in a folder; faults are arguments of `fault_points.plant`."""
+    """Yield a function that starts `rlcli ARGUMENTS` in a folder; faults are arguments of `fault_points.plant`.
+
+    With `memory`, the child may use this many bytes more than its parent, and 60 s of processor time.
+    """
     variables = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "GOMP_SPINCOUNT": "1000"}
     for name in ("RLCLI_RUNS_DIR", "RLCLI_TEST_SIZE"):
         variables.pop(name, None)
@@ -75,6 +80,7 @@ def warm_parent() -> Iterator[Callable[..., Child]]:
         faults: list[dict[str, Any]] | None = None,
         ignored: tuple[str, ...] = (),
         output: Path | None = None,
+        memory: int | None = None,
     ) -> Child:
         output = output or folder / f"child-{time.monotonic_ns()}"
         start = {
@@ -83,6 +89,7 @@ def warm_parent() -> Iterator[Callable[..., Child]]:
             "output": str(output),
             "faults": faults or [],
             "signals": list(ignored),
+            "memory": memory,
         }
         return Child(ask(start=start)["pid"], output, ask)
 
@@ -90,5 +97,5 @@ def warm_parent() -> Iterator[Callable[..., Child]]:
         yield child
     finally:
         server.stdin.close()
-        server.wait(timeout=60)
+        server.wait(timeout=PATIENCE)
         server.stdout.close()

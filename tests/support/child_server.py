@@ -6,13 +6,15 @@ Speaks JSON lines: {"start": {...}} forks and answers with a pid, {"wait": pid, 
 import importlib
 import json
 import os
+import resource
 import signal
 import sys
 import time
 from pathlib import Path
 
 WARM = (
-    "rlcli.cli.commands.train", "rlcli.cli.ui.progress_view", "rlcli.envs.managed", "rlcli.envs.direct",
+    "rlcli.cli.commands.train", "rlcli.cli.commands.export", "rlcli.cli.commands.play",
+    "rlcli.cli.ui.progress_view", "rlcli.envs.managed", "rlcli.envs.direct",
     "rlcli.rl.sb3.trainer", "rlcli.rl.ppo.trainer",
     "rlcli.training.setup", "rlcli.training.runner",
     "rlcli.training.loggers", "rlcli.training.checkpoint_writer", "rlcli.training.loop",
@@ -64,7 +66,12 @@ def waited(pid: int, seconds: float) -> int | None:
 
 
 def run_child(
-    arguments: list[str], folder: str, output: str, faults: list[dict[str, object]], signals: list[str]
+    arguments: list[str],
+    folder: str,
+    output: str,
+    faults: list[dict[str, object]],
+    signals: list[str],
+    memory: int | None,
 ) -> None:
     """Run a command line in a folder as the child, with faults in its system calls, and exit."""
     os.chdir(folder)
@@ -76,6 +83,10 @@ def run_child(
         os.close(handle)
     for name in signals:
         signal.signal(getattr(signal, name), signal.SIG_IGN)
+    if memory is not None:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + memory,) * 2)
+        resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
     from support import fault_points
 
     for fault in faults:

@@ -177,7 +177,7 @@ def run(seed, folder):
     out, err = io.StringIO(), io.StringIO()
     begin, code = time.process_time(), None
     signal.signal(signal.SIGALRM, hang)
-    signal.alarm(60)
+    signal.alarm(20 * SECONDS)
     try:
         with contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             code = main(words)

@@ -191,7 +191,7 @@ def run(seed, folder):
         code = 1
         try:
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-            signal.alarm(SECONDS + 5)
+            signal.alarm(20 * SECONDS)  # other processes may use the cores
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
             resource.setrlimit(resource.RLIMIT_AS, (2 * MEMORY, 2 * MEMORY))
@@ -211,6 +211,8 @@ def run(seed, folder):
         return message, "exception"
     if used.ru_maxrss * 1024 > MEMORY:
         return message, f"{used.ru_maxrss >> 10} MB"
+    if used.ru_utime + used.ru_stime > SECONDS:
+        return message, f"{used.ru_utime + used.ru_stime:.0f} s of processor time"
     return message, "" if message == "taken" else complaint(message, folder)
 
 

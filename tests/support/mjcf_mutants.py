@@ -46,7 +46,7 @@ def try_mutants(seed, folder):
     """Read and compile mutants in a child process; return 0 if each was accepted or refused with a message."""
     import resource
 
-    signal.alarm(60)
+    signal.alarm(600)
     resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     warnings.simplefilter("ignore")
