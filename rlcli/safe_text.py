@@ -2,8 +2,8 @@
 
 import math
 import re
+from collections import deque
 from collections.abc import Iterable
-from pathlib import Path
 
 UNSAFE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2028\u2029\u2066-\u2069\ud800-\udfff]")
 """Characters that must not reach a terminal: control characters except tab and newline, line separators, marks that
@@ -21,30 +21,58 @@ def shorten(value: object, limit: int, mark: str = "...") -> str:
 
 _LONG = re.compile(r"""\S{201,}|(?<!\w)'[^']{199,}'|"[^"]{199,}\"""")
 """A word or a quoted text of over 200 characters."""
-_MAX_LINE = 2000
-"""Longest line of a message [characters]."""
-_given: list[str] = []
-"""Words of the command line that are long or have characters that are not printable, the longest first."""
+_MAX_ECHO, _MAX_LINE = 200, 2000
+"""Longest part of an input that a message repeats, and longest line of a message [characters]."""
+_inputs: deque[str] = deque(maxlen=1000)
+"""Words of the command line and texts of files that are longer than `_MAX_ECHO` when they are printed."""
+_input_pieces: set[int] = set()
+"""Hashes of all parts of `_inputs` with `_MAX_ECHO` + 1 characters; empty until a long message needs them."""
 
 
 def remember_given(words: Iterable[str]) -> None:
-    """Store long and unprintable words of the command line and of its environment variables; messages shorten them."""
-    parts = {part for word in map(str, words) for part in (word, str(Path(word)), *word.split("=", 1))}
-    parts |= {part.strip() for part in parts}
-    # typer escapes control characters in its messages
-    parts |= {re.sub("[\x00-\x1f\x7f-\x9f]", lambda found: rf"\x{ord(found[0]):02x}", part) for part in parts}
-    parts |= set(map(printable, parts))
-    _given[:] = sorted((part for part in parts if len(part) > 200 or not part.isprintable()), key=len, reverse=True)
+    """Forget all inputs, and store the words of a command line and of its environment variables."""
+    _inputs.clear()
+    remember_input(words)
+
+
+def remember_input(texts: Iterable[str]) -> None:
+    """Store long texts from a command line or a file; messages shorten what they repeat of them."""
+    _input_pieces.clear()
+    for text in texts:
+        if len(text) > _MAX_ECHO or not text.isprintable():
+            # typer escapes control characters in its messages
+            typer_form = re.sub("[\x00-\x1f\x7f-\x9f]", lambda found: rf"\x{ord(found[0]):02x}", text)
+            forms = {printable(text), printable(typer_form)}
+            _inputs.extend(form for form in forms if len(form) > _MAX_ECHO)
 
 
 def message_line(text: str) -> str:
     """Return the text of a message on one line.
 
-    Characters that are not printable are escaped. Words, quotes and arguments of over 200 characters are cut.
+    Characters that are not printable are escaped. Words, quotes and parts of inputs of over 200 characters are cut.
     """
-    for part in _given:
-        text = text.replace(part, _cut(printable(part), 200))
-    return _cut(_LONG.sub(lambda found: _cut(found[0], 200), printable(text[: 10 * _MAX_LINE])), _MAX_LINE)
+    line = _without_echoes(printable(text[: 10 * _MAX_LINE]))
+    return _cut(_LONG.sub(lambda found: _cut(found[0], _MAX_ECHO), line), _MAX_LINE)
+
+
+def _without_echoes(line: str) -> str:
+    """Return a line in which every part that repeats over `_MAX_ECHO` characters of an input in one piece is cut."""
+    size = _MAX_ECHO + 1
+    if len(line) < size or not _inputs:
+        return line
+    if not _input_pieces:
+        _input_pieces.update(hash(text[at : at + size]) for text in _inputs for at in range(len(text) - _MAX_ECHO))
+    at = 0
+    while at + size <= len(line):
+        end = at + size
+        if hash(line[at:end]) in _input_pieces:
+            while end < len(line) and hash(line[end + 1 - size : end + 1]) in _input_pieces:
+                end += 1
+            line = line[:at] + _cut(line[at:end], _MAX_ECHO) + line[end:]
+            at += _MAX_ECHO
+        else:
+            at += 1
+    return line
 
 
 def printable(text: str) -> str:

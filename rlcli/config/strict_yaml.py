@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 from yaml import events
 
-from rlcli.safe_text import read_number
+from rlcli.safe_text import read_number, remember_input
 
 MAX_BYTES = 256 * 1024
 MAX_DEPTH = 32
@@ -207,6 +207,7 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
         raise YamlError(f"the value is longer than {MAX_SCALAR} characters; shorten it", event.start_mark)
     if _SURROGATE.search(text):
         raise YamlError("half of a surrogate pair (\\ud800 to \\udfff) is not a character; remove it", event.start_mark)
+    remember_input([text])
     if not event.implicit[0]:  # quoted or block: always text
         return text
     if key and text == "<<":

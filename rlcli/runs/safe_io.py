@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from rlcli.config import messages
 from rlcli.errors import CheckpointError
+from rlcli.safe_text import remember_input
 
 JSON_LIMIT = 4 * 2**20
 """Largest JSON file [bytes]."""
@@ -257,6 +258,8 @@ def _short_int(text: str) -> int:
 def _check_depth(value: object) -> None:
     level = [value]
     for _ in range(_MAX_DEPTH):
+        names = [name for item in level if isinstance(item, dict) for name in item]
+        remember_input([*names, *(item for item in level if isinstance(item, str))])
         level = [
             inner
             for outer in level

@@ -262,7 +262,7 @@ def test_task_file_of_the_grammar_is_refused_by_the_command(seed, child, tmp_pat
     (tmp_path / "task").mkdir()
     (tmp_path / "task" / "task.yaml").write_text(text, encoding="utf-8", errors="surrogatepass")
     ended = child(tmp_path, "validate", "./task", *(word for word in words if "\ud800" not in word)).ended()
-    assert not yaml_grammar.complaint(ended.code, ended.err, 0.0)
+    assert not yaml_grammar.complaint(ended.code, ended.err, 0.0, [text, *words])
 
 
 @pytest.mark.parametrize("seed", seeds(1, 5, 50))

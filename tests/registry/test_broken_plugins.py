@@ -9,9 +9,9 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from support.broken_plugins import BROKEN
+from support.broken_plugins import BROKEN, FILES
 
-from rlcli.registry import catalog
+from rlcli.registry import catalog, exit_refused
 from rlcli.registry.probe import probe
 
 pytestmark = pytest.mark.processes
@@ -221,3 +221,54 @@ def test_probe_of_many_hanging_plugins_takes_little_more_than_one(plugins):
     assert time.monotonic() - before < 40
     reasons = [rows[entry.qualified].broken for entry in entries if entry.distribution == "slow0"]
     assert reasons == ["did not load within 5 s"] * 2 + ["not loaded, because 2 others did not load within 5 s"] * 2
+
+
+ENDS = {
+    "os._exit(0)": "SystemExit: it called os._exit(0)",
+    "__import__('sys').exit(0)": "SystemExit: 0",
+    "1 / 0": "ZeroDivisionError: division by zero",
+}
+FORMAT = "import os\nfrom rlcli.formats import FormatSpec\nSPEC = FormatSpec('x', {part})\ndef f(*_):\n    {ends}\n"
+PARTS = {
+    "import": "import os\n{ends}\n",
+    "find": FORMAT.replace("{part}", "find='bad:f'"),
+    "read": FORMAT.replace("{part}", "read='bad:f'"),
+    "check": FORMAT.replace("{part}", "key='mine', check='bad:f'").replace("{ends}", "yield {ends}"),
+}
+DIRECT = "from rlcli.envs.direct import DirectTask\nclass Task(DirectTask):\n    num_observations = num_actions = 1\n"
+COMMANDS = [("validate", "./task"), ("train", "./task", "--max-iterations", "1", "--logger", "none", "-q")]
+
+
+@pytest.mark.parametrize("ends", list(ENDS))
+@pytest.mark.parametrize("part", list(PARTS))
+def test_format_plugin_that_ends_the_process_is_named(plugins, command, tmp_path, part, ends):
+    """Neither a command nor its exit code is lost, wherever the plugin ends the process."""
+    plugins("bad", PARTS[part].format(ends=ends), entry_points="[rlcli.formats]\nbad = bad:SPEC\n")
+    folder = tmp_path / "here" / "task"
+    folder.mkdir(parents=True)
+    for name, text in FILES.items():
+        (folder / name).write_text(text)
+    if part in ("read", "check"):
+        (folder / "task.yaml").write_text(FILES["task.yaml"] + "mine: {a: 1}\n")
+    if part == "check":
+        (folder / "task.py").write_text(DIRECT)
+    for words in COMMANDS:
+        done = command(*words)
+        sys.modules.pop("bad", None)
+        line = next(line for line in done.stderr.splitlines() if ": plugin bad 1.0: " in line)
+        assert ENDS[ends] in line
+        assert "__init__.py:" in line
+        # a task that does not need the format is read
+        assert done.returncode == (0 if part in ("import", "find") else 4), done.stderr
+        assert "Traceback" not in done.stderr
+    assert command("list-tasks").returncode == 0
+
+
+def test_children_and_threads_may_end_while_a_command_runs():
+    with exit_refused():
+        child = os.fork()
+        if child == 0:
+            os._exit(7)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+        with pytest.raises(SystemExit, match=r"it called os\._exit\(3\)"):
+            os._exit(3)
