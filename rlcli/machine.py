@@ -4,6 +4,7 @@ import contextlib
 import errno
 import gc
 import hashlib
+import logging
 import os
 import platform
 import re
@@ -19,6 +20,8 @@ from types import ModuleType
 
 from rlcli.errors import DependencyError, DeviceError, MachineError, RlcliError, UsageError, one_line, pip_install
 from rlcli.safe_text import read_number
+
+_log = logging.getLogger(__name__)
 
 _GROUPS, _OWN_GROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _NO_LIMIT = 1 << 60
@@ -188,6 +191,8 @@ def require_address_space(least: int = 1 << 30) -> None:
 def require_memory(size: int, what: str) -> None:
     """Check that enough memory is free. Without this check, the system may kill the process later.
 
+    Log a warning if a large part of the free memory is needed, because `size` is only a lower bound.
+
     Args:
         size: the memory [bytes].
         what: what needs the memory, for the message.
@@ -199,6 +204,8 @@ def require_memory(size: int, what: str) -> None:
     if size > free:
         message = f"{what} need at least {size / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free on this machine"
         raise DeviceError(message, hint="use fewer environments: --num-envs")
+    if size > free / 4:
+        _log.warning(f"{what} need at least {size / 2**30:.1f} GiB of the {free / 2**30:.1f} GiB that are free")
 
 
 class AddressSpaceCheck:

@@ -40,9 +40,14 @@ def remember_input(texts: Iterable[str]) -> None:
     _input_pieces.clear()
     for text in texts:
         if len(text) > _MAX_ECHO or not text.isprintable():
-            # typer escapes control characters in its messages
+            # typer escapes control characters and some quotes in its messages
             typer_form = re.sub("[\x00-\x1f\x7f-\x9f]", lambda found: rf"\x{ord(found[0]):02x}", text)
-            forms = {printable(text), printable(typer_form)}
+            forms = {
+                printable(text),
+                printable(typer_form),
+                printable(typer_form).replace("'", r"\'"),
+                repr(text)[1:-1],
+            }
             _inputs.extend(form for form in forms if len(form) > _MAX_ECHO)
 
 

@@ -1,5 +1,7 @@
 """Tests of the CPU engine: each world equals a simulation in plain MuJoCo."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -49,6 +51,18 @@ def test_engine_refuses_more_worlds_than_memory_holds(monkeypatch):
         engine_of(model_of(), 1_000_000)
     assert no.value.hint == "use fewer environments: --num-envs"
     assert engine_of(model_of(), 1000).num_envs == 1000
+
+
+def test_engine_states_the_memory_of_many_worlds_before_it_builds_them(monkeypatch, caplog):
+    monkeypatch.setattr("rlcli.machine.available_memory", lambda: 2**24)
+    monkeypatch.setattr("rlcli.sim.batch_worlds.make_batch", None)
+    with pytest.raises(TypeError):  # nothing is built
+        engine_of(model_of(), 3000)
+    assert re.search(r"3000 environments need at least 0\.0 GiB of the 0\.0 GiB that are free", caplog.text)
+    caplog.clear()
+    with pytest.raises(TypeError):
+        engine_of(model_of(), 100)
+    assert not caplog.text
 
 
 @pytest.mark.parametrize("threads", [1, 3])
