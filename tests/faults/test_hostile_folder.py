@@ -54,7 +54,7 @@ def hostile(folder):
 @pytest.mark.parametrize(
     "words",
     [
-        ("doctor",),
+        ("doctor", "--probe-timeout", "300"),
         ("list-tasks", "--probe"),
         (*TRAIN, "--seeds", "2"),
         (*TRAIN, "scene.workers=2"),
@@ -101,7 +101,7 @@ def test_command_with_too_little_memory_names_it(mib, tmp_path):
 EVAL = ("eval", "cartpole", "scene.num_envs=4", "--policy", "zero", "--episodes", "4")
 HEAVY = {
     "train": TRAIN,
-    "train many": (*TRAIN, "scene.num_envs=100000"),
+    "train many": (*TRAIN, "scene.num_envs=100000", "agent.n_steps=2", "agent.n_epochs=1"),
     "seeds": (*TRAIN, "--seeds", "2"),
     "workers": (*TRAIN, "scene.workers=2"),
     "resume": ("train", "--resume", "latest", "--max-iterations", "2", "-q"),
