@@ -565,7 +565,7 @@ def test_repeated_tensor_does_not_fill_the_memory(monkeypatch):
     monkeypatch.setattr("rlcli.training.import_policy.available_memory", lambda: 2**26)
     one = torch.zeros(1000, 1000)
     torch.save({"model_state_dict": {f"actor.{i}.weight": one for i in range(50)}}, "model.pt")
-    assert "more than" in refused("rsl-rl", "model.pt")
+    assert "over 16,777,216 bytes" in refused("rsl-rl", "model.pt")
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,12 @@ LEG = """
         </body></body></body>"""
 
 
+@pytest.fixture
+def go1_mjcf():
+    """Return the function that writes the MJCF of the four-legged robot."""
+    return go1
+
+
 def go1(driven: bool) -> str:
     """Return a four-legged robot, with position actuators as in Menagerie's file, or without any as in mjlab's."""
     places = {"FR": (1, -1), "FL": (1, 1), "RR": (-1, -1), "RL": (-1, 1)}

@@ -7,7 +7,6 @@ import sys
 
 import pytest
 import torch
-from support.installed_plugins import go1
 
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
@@ -48,10 +47,10 @@ def test_stand_in_has_task_spaces_and_runs(models, task, joints):
     assert env.divergences == 0
 
 
-def test_gains_and_limits_come_from_task_with_and_without_actuators(models):
+def test_gains_and_limits_come_from_task_with_and_without_actuators(models, go1_mjcf):
     values = []
     for driven in (True, False):
-        (models / "unitree_go1" / "go1.xml").write_text(go1(driven))
+        (models / "unitree_go1" / "go1.xml").write_text(go1_mjcf(driven))
         model = make("go1-velocity", 1).engine.model
         assert model.nu == 12
         order = model.actuator_trnid[:, 0].argsort()

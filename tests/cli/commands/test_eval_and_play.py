@@ -109,7 +109,7 @@ def test_malformed_limit_is_usage_error(cli, coin, text):
 def test_limit_of_unknown_term_suggests_name(cli, coin):
     done = cli("eval", coin, "--policy", "zero", "--episodes", 2, "--fail-under", "terminations.time_ot=0.5")
     assert done.code == 2
-    assert "no terminations.time_ot" in done.err
+    assert "the evaluation has no 'time_ot' in terminations" in done.err
     assert "did you mean 'time_out'" in done.err
 
 
