@@ -93,8 +93,8 @@ def test_missing_model_error_says_what_to_install(task, tmp_path):
     robot = task.partition("-")[0]
     assert "the model is not on this machine: RLCLI_MODELS is not set; no Python package 'mjlab'" in error["message"]
     assert error["hint"] == (
-        f"set RLCLI_MODELS to a folder that holds unitree_{robot}/{robot}.xml, or install the package mjlab,"
-        " which contains it"
+        f"set RLCLI_MODELS to a folder that holds unitree_{robot}/{robot}.xml, or install the distribution"
+        " that has the package mjlab"
     )
     assert len(done.stderr.splitlines()) <= 2
     shown = rlcli("show", task, PYTHONPATH=_without_mjlab())
