@@ -307,7 +307,8 @@ def _vec_normalize(file: Path) -> dict[str, Tensor]:
     """Read the normaliser of SB3's VecNormalize from a safetensors file."""
     data = read_archive_file(file)
     if data[:1] == b"\x80" or file.suffix == ".pkl":
-        raise CheckpointError(f"{file} is a pickle, which rlcli does not open", hint=VEC_NORMALIZE_HINT)
+        message = f"{file} is a pickle, which rlcli does not open; --normalizer takes a .safetensors file"
+        raise CheckpointError(message, hint=VEC_NORMALIZE_HINT)
     try:
         stats = safetensors.torch.load(data)
     except (SafetensorError, RuntimeError, ValueError, KeyError) as error:
