@@ -291,7 +291,7 @@ class TaskCheck:
         model = load_entry(replace(entry, value=spec.algorithms[algorithm]), type)
         if not issubclass(model, AgentConfig):
             raise TaskError(
-                f"plugin {entry.distribution} {entry.version}: {model.__name__} is no AgentConfig; report it to its authors"
+                f"plugin {entry.distribution} {entry.version}: {model.__name__} is no AgentConfig; report it"
             )
         return spec, model
 

@@ -183,7 +183,9 @@ class _Push:
         names = [*floating, *joints]
         found = match(sweep.element, names, "entity or joint")
         if len(found) != 1:
-            raise NameProblem(f"the pattern matches several names: {listing(names[i] for i in found)}", "choose one")
+            raise NameProblem(
+                f"the pattern matches several names: {listing(names[i] for i in found)}", "name one of them"
+            )
         name = names[found[0]]
         self._root, self._joint = floating.get(name), joints.get(name)
 

@@ -308,7 +308,7 @@ def _read_heights(file: Path) -> NDArray[Any]:
         try:
             return np.asarray(np.lib.format.read_array(opened, allow_pickle=False, max_header_size=_MAX_HEADER))
         except (MemoryError, RecursionError, SyntaxError, TokenError) as error:  # errors of a malicious header
-            raise ValueError(f"its header is malformed ({type(error).__name__}); use numpy.save") from None
+            raise ValueError(f"the header of the file is malformed ({type(error).__name__}); use numpy.save") from None
 
 
 def _file_problems(config: schema.TerrainHeightsConfig, root: Path) -> Iterator[TerrainProblem]:

@@ -228,7 +228,7 @@ class Task(DirectTask):
         ("{gain: 6, count: 1}", "params.gain: expected a number <= 5, found 6"),
         ("{mode: c, count: 1}", "params.mode: expected 'a' or 'b', found 'c'"),
         ("{count: 1.5}", "params.count: expected a whole number, found 1.5"),
-        ("{limits: [1], count: 1}", "params.limits: expected a list of 2, found [1]"),
+        ("{limits: [1], count: 1}", "params.limits: expected a list of 2 values, found [1]"),
         ("3", "params: expected a mapping, found 3"),
     ],
 )
