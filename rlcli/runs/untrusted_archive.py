@@ -32,6 +32,10 @@ _ALLOWED = {
 }
 """Global names that the pickle in a .pt file may contain; a file with another name is refused."""
 _REFUSED_OPCODES = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "PERSID"}
+_SAVE_HINT = (
+    "save it again in Python: torch.save({'model_state_dict': policy.state_dict()}, 'model.pt') for RSL-RL,"
+    " model.save('model.zip') for Stable-Baselines3"
+)
 VEC_NORMALIZE_HINT = (
     "a pickle can run code, so rlcli opens none; if you trust the file, convert it in Python:"
     " v = pickle.load(open('vecnormalize.pkl', 'rb')).obs_rms; safetensors.numpy.save_file("
@@ -119,7 +123,7 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
         raise CheckpointError(
             f"{where} is {kind}, which rlcli does not open; accepted is a .pt file of torch 1.6 or newer with only"
             " tensors",
-            hint="write one in Python: torch.save(policy.state_dict(), 'policy.pt')",
+            hint=_SAVE_HINT,
         )
     archive = _archive(data, where)
     described = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
@@ -133,11 +137,9 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
             saved = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception:  # torch's own message advises to unpickle the file without any check
         message = f"{where} is corrupt, or has more than tensors, numbers and text"
-        raise CheckpointError(
-            message, hint="save only the weights: torch.save(policy.state_dict(), 'policy.pt')"
-        ) from None
+        raise CheckpointError(message, hint=_SAVE_HINT) from None
     if not isinstance(saved, Mapping):
-        raise CheckpointError(f"{where} is not a mapping of names to tensors; save the `state_dict()` of the policy")
+        raise CheckpointError(f"{where} is not a mapping of names to tensors", hint=_SAVE_HINT)
     return saved
 
 
@@ -147,9 +149,7 @@ def _require_tensors_only(description: bytes, where: str) -> None:
         for opcode, argument, _ in pickletools.genops(description):
             if opcode.name in _REFUSED_OPCODES or (opcode.name == "GLOBAL" and argument not in _ALLOWED):
                 found = f"names '{str(argument)[:80]}'" if argument is not None else "creates objects"
-                raise CheckpointError(
-                    f"{where} {found}, which is not a tensor; save only the `state_dict()` of the policy"
-                )
+                raise CheckpointError(f"{where} {found}, which is not a tensor", hint=_SAVE_HINT)
     except CheckpointError:
         raise
     except Exception as error:
