@@ -165,7 +165,7 @@ def test_read_reports_unreadable_file_with_position(tmp_path):
     (problem,) = caught.value.problems
     assert (problem.where, problem.message) == (
         str(tmp_path / "none.yaml"),
-        "cannot be read: No such file or directory; check the path",
+        "the file cannot be read: No such file or directory; check the path",
     )
     (tmp_path / "big.yaml").write_text("a: 1\n" * 60_000)
     with pytest.raises(ConfigError) as caught:
