@@ -226,7 +226,7 @@ def test_layout_needs_recorded_file(managed):
     ("change", "says"),
     [
         ("order", "column 0 was 'angle[hinge]' and is 'rate[hinge]'"),
-        ("gone", "had 2 columns and has 1; the first difference is column 1"),
+        ("gone", "the group had 2 columns and has 1; the first difference is column 1"),
         ("scale", "'rate': scale was [0.1] and is [0.2]"),
         ("group", "this group is new"),
     ],
@@ -254,7 +254,8 @@ def test_layout_finds_changed_actions(direct):
     direct.replace("num_actions = 1", "num_actions = 2")
     direct.replace("self.params.max_effort * actions", "self.params.max_effort * actions[:, :1]")
     ((finding,), _) = only(direct, "layout")
-    assert (finding.where, finding.message) == ("actions", "had 1 columns and has 2; the first difference is column 1")
+    message = "the group had 1 columns and has 2; the first difference is column 1"
+    assert (finding.where, finding.message) == ("actions", message)
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"observations": 3}'])
