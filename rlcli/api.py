@@ -95,7 +95,9 @@ def train(
     """
     _check(seed, overrides)
     if task is None and resume is None:
-        raise UsageError("train() needs a task, or a run to resume", hint='as in train("cartpole")')
+        raise UsageError(
+            "train() needs a task, or a run to resume", hint='as in train("cartpole") or train(resume=RUN)'
+        )
     request = TrainingRequest(
         Path(runs_dir or default_runs_dir()),
         source=None if task is None else find_task(task),
@@ -208,7 +210,10 @@ def _check(seed: object, overrides: object) -> None:
     if not isinstance(seed, SupportsIndex) or not 0 <= operator.index(seed) <= MAX_SEED:
         raise UsageError(f"seed is {shorten(repr(seed), 40)}; give an integer from 0 to 2^62")
     if isinstance(overrides, str):
-        raise UsageError(f"overrides is the text '{shorten(overrides, 40)}'", hint="give a list, as in overrides=[...]")
+        raise UsageError(
+            f"overrides must be a list, found the text '{shorten(overrides, 40)}'",
+            hint="give a list, as in overrides=[...]",
+        )
 
 
 def _find(checkpoint: Path | str | None, task: str | None, runs_dir: Path | str | None) -> Path:

@@ -95,7 +95,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.metadata = {**_metadata(env), "autoreset_mode": self.mode}
         if render_mode not in (None, "rgb_array"):
             raise ValueError(
-                f"render_mode must be 'rgb_array' or None, found {render_mode!r}; `rlcli play` has viewers"
+                f"render_mode must be 'rgb_array' or None, found {render_mode!r}; to watch a policy, use `rlcli play`"
             )
         self.render_mode = render_mode
         self.single_observation_space = observation_space(env)

@@ -140,13 +140,13 @@ def _require_words(arguments: list[str]) -> None:
     for position, word in enumerate(arguments):
         if not word or (word.startswith("--") and word.endswith("=")):
             name = word or (arguments[position - 1] if position else "rlcli")
-            raise UsageError(f"there is an empty word at {name.rstrip('=')}", hint="give a value, or leave it out")
+            raise UsageError(f"there is an empty word after {name.rstrip('=')}", hint="give a value, or leave it out")
     words = dict.fromkeys(arguments, "a word of the command line") | {
         value: name for name, value in os.environ.items() if name.startswith("RLCLI_")
     }
     for word, place in words.items():
         if any("\ud800" <= character <= "\udfff" for character in word):  # Python's form of other bytes
-            raise UsageError(f"{place} is not UTF-8: '{word}'", hint="rename the file or folder")
+            raise UsageError(f"{place} is not UTF-8: '{word}'", hint="rename the file or folder that it names")
 
 
 def _run(arguments: list[str]) -> int:

@@ -68,6 +68,13 @@ def model_path(path: Path, form: Format | None, problems: list[Problem]) -> Path
     name = ".".join(map(str, path[1:]))
     if form is None:
         hint = f"set scene.entities.{name}.model"
-        problems.append(Problem(f"--model {name}", "", "this task names its model files itself", hint))
+        problems.append(
+            Problem(
+                f"--model {name}",
+                "",
+                "the option is for tasks of other frameworks; this task names its model files itself",
+                hint,
+            )
+        )
     keys = form.spec.models.split(".") if form is not None and form.spec.models else ()
     return tuple(name if key == "{name}" else key for key in keys)

@@ -76,7 +76,7 @@ class Layers:
             last = _index(target, last, taken)
             old = target[last]
         elif not isinstance(target, dict):
-            raise LookupError(f"'{taken[-1]}' is a value, not a mapping")
+            raise LookupError(f"'{taken[-1]}' is a single value; leave out the keys after it")
         else:
             old = target.get(last)
         taken = (*taken, last)
@@ -119,7 +119,7 @@ class Layers:
             index = _index(target, step, taken)
             return target[index], (*taken, index)
         if not isinstance(target, dict):
-            raise LookupError(f"'{taken[-1]}' is a value, not a mapping")
+            raise LookupError(f"'{taken[-1]}' is a single value; leave out the keys after it")
         path = (*taken, step)
         if target.get(str(step)) is None:
             target[str(step)] = {}
@@ -157,7 +157,9 @@ def read(file: FilePath, name: str | None = None, *, pipe: bool = False) -> Docu
     try:
         return strict_yaml.load(read_plain(file, strict_yaml.MAX_BYTES, pipe=pipe))
     except OSError as error:
-        raise ConfigError([Problem(name, "", f"cannot be read: {error.strerror or error}; check the path")]) from None
+        raise ConfigError(
+            [Problem(name, "", f"the file cannot be read: {error.strerror or error}; check the path")]
+        ) from None
     except YamlError as error:
         place = f"{name}:{error.line}:{error.column}" if error.line else name
         raise ConfigError([Problem(place, "", error.message)]) from None
@@ -210,10 +212,12 @@ def parse_override(text: str) -> tuple[Path, Any]:
     where = override_place(text)
     match = _OVERRIDE.fullmatch(text)
     if match is None:
-        raise ConfigError([Problem(where, "", "is not an override; write KEY.PATH=VALUE, as in scene.num_envs=64")])
+        raise ConfigError(
+            [Problem(where, "", "an override has the form KEY.PATH=VALUE; write for example scene.num_envs=64")]
+        )
     path = parse_address(match[1])
     if len(path) > strict_yaml.MAX_DEPTH:
-        message = f"the key has {len(path)} parts; {strict_yaml.MAX_DEPTH} are allowed"
+        message = f"the key has {len(path)} parts; at most {strict_yaml.MAX_DEPTH} are allowed"
         raise ConfigError([Problem(where, "", message)])
     try:
         return path, strict_yaml.load_value(match[match.lastindex or 0])

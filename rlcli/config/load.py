@@ -80,7 +80,10 @@ class Resolved:
             message = "this task has no agent to train"
             hint = "add agents: {default: NAME, NAME: {trainer: sb3, ...}}"
             if names:
-                message, hint = "no default among the agents", f"--agent {' or '.join(names)}"
+                message, hint = (
+                    "the task has several agents and no default",
+                    f"choose one: --agent {' or '.join(names)}",
+                )
             raise ConfigError([self.problem(("agents",), message, hint)])
         return self.agent, self.trainer
 
@@ -155,7 +158,7 @@ def check_all(source: TaskSource, *, config_file: FilePath | None = None, overri
     check.read_task(check.document(check.changes(overrides, {})))
     names = agent_names(check.layers)
     if len(names) > MAX_AGENTS:
-        message = f"{len(names)} agents; {MAX_AGENTS} are allowed"
+        message = f"the task has {len(names)} agents; at most {MAX_AGENTS} are allowed"
         raise ConfigError([Problem(check.layers.place(("agents",)), "agents", message)])
     problems: list[Problem] = []
     unchecked: list[str] = []

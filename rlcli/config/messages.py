@@ -112,7 +112,7 @@ def _message(
     length = _length(model, path)
     if length is not None and kind in ("missing", "too_short", "too_long"):
         value: Any = functools.reduce(operator.getitem, path, data)  # type: ignore[arg-type]
-        return f"expected a list of {length}, found {format_value(value)}", None, path
+        return f"expected a list of {length} values, found {format_value(value)}", None, path
     hint = None
     if isinstance(found, str):
         choices = [word.strip("'") for item in items for word in _choices(item)]

@@ -283,7 +283,7 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         found[wanted] = registrations[wanted]
     if wanted and wanted not in found:
         known = did_you_mean(wanted, found) or f"it registers {listing(found)}"
-        raise TaskError(f"{source.root} does not register '{wanted}'", hint=known)
+        raise TaskError(f"{source.root} does not register a task '{wanted}'", hint=known)
     if not wanted and len(found) != 1:
         hint = f"name one: {listing(f'{source.root}:{name}' for name in found)}" if found else None
         raise TaskError(f"{source.root} registers {len(found)} tasks with {CONFIGURATION}, expected 1", hint=hint)

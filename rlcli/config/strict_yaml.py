@@ -126,7 +126,9 @@ def _events(text: str) -> Iterator[events.Event]:
         while loader.check_event():
             yield loader.get_event()
     except (ValueError, OverflowError):  # an escape such as "\\U00110000"
-        raise YamlError("an escape is not a Unicode character; correct it", loader.get_mark()) from None
+        raise YamlError(
+            "an escape (\\x, \\u or \\U) is not a Unicode character; correct it", loader.get_mark()
+        ) from None
     finally:
         loader.dispose()
 

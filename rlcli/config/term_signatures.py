@@ -166,7 +166,9 @@ def signature_of(term: Any, name: str) -> Signature:
         file, source = inspect.getsourcefile(term), inspect.getsource(term)
         node = ast.parse(textwrap.dedent(source)).body[0]
     except (OSError, TypeError, SyntaxError, IndexError):
-        raise SignatureError("its source code cannot be read; define the term in a .py file, at module level") from None
+        raise SignatureError(
+            "the source code of a term cannot be read; define the term in a .py file, at module level"
+        ) from None
     call: ast.stmt | None = node
     if isinstance(node, ast.ClassDef):
         call = constructor(SourceClass(Path(file or "?"), node), ClassSearch())
@@ -226,7 +228,9 @@ def _params_model(signature: Signature, section: str) -> type[schema.TermConfig]
         raise SignatureError(signature.error)
     reserved = (*SECTIONS[section].model_fields, "params")
     if taken := [p.name for p in signature.parameters if p.name in reserved]:
-        raise SignatureError(f"rename parameter '{taken[0]}': every term of {section} has a key of this name")
+        raise SignatureError(
+            f"the parameter '{taken[0]}' must be renamed: every term of {section} has a key of this name"
+        )
     fields: dict[str, Any] = {p.name: (p.type, ... if p.required else p.default) for p in signature.parameters}
     return _model(signature.name, _closed(section), fields)
 
@@ -323,21 +327,23 @@ def first_paragraph(docstring: str) -> str:
 
 def _positional_error(call: ast.FunctionDef, is_class: bool) -> str | None:
     extra = [a.arg for a in call.args.args[2 if is_class else 1 :] if a.arg != "selection"]
-    return f"parameter '{extra[0]}' must be keyword-only: put it after a '*'" if extra else None
+    return f"the parameter '{extra[0]}' must be keyword-only: put it after a '*'" if extra else None
 
 
 def _selector_error(parameters: list[Parameter]) -> str | None:
     selectors = [p.name for p in parameters if p.alias in SELECTORS]
     if selectors and not any(p.name == "entity" and p.alias == "Entity" for p in parameters):
-        return f"'{selectors[0]}' selects elements of an entity, so the term also needs 'entity: Entity'"
+        return f"the parameter '{selectors[0]}' selects elements of an entity; add a parameter 'entity: Entity'"
     return None
 
 
 def _parameter(argument: ast.arg, default: ast.expr | None) -> Parameter:
     if argument.annotation is None:
-        raise SignatureError("has no annotation; write one, as in `scale: float`")
+        raise SignatureError("every parameter needs an annotation; write one, as in `scale: float`")
     if argument.arg.startswith("_"):
-        raise SignatureError("starts with an underscore, which a YAML key must not; rename it")
+        raise SignatureError(
+            "the name of a parameter is a key in YAML, so it must not start with an underscore; rename the parameter"
+        )
     return Parameter(
         argument.arg,
         annotation_type(argument.annotation),

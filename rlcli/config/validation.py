@@ -98,7 +98,7 @@ class TaskCheck:
         """
         self.problems += problems
         if len(self.problems) > MAX_PROBLEMS:
-            text = f"more than {MAX_PROBLEMS} mistakes; the first ones are listed"
+            text = f"there are more than {MAX_PROBLEMS} mistakes; the first ones are listed"
             raise ConfigError([Problem(self.source.label, "", text), *self.problems[:MAX_PROBLEMS]])
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
@@ -175,7 +175,7 @@ class TaskCheck:
         if wanted is not None:
             if wanted in names:
                 return wanted
-            self.add(Problem("--agent", "", f"no agent '{wanted}'", hint(wanted)))
+            self.add(Problem("--agent", "", f"the task has no agent '{wanted}'", hint(wanted)))
             return None
         self.apply([change for change in changes if change[0][:2] == ("agents", "default")], None)
         at: Path = ("agents", "default")
@@ -183,14 +183,14 @@ class TaskCheck:
         if isinstance(default, dict):
             for kind in default:
                 if kind not in _DEVICES:
-                    self.problem((*at, kind), f"no device '{kind}'", f"devices: {listing(_DEVICES)}")
+                    self.problem((*at, kind), f"there is no device '{kind}'", f"write one of {listing(_DEVICES)}")
             kind = device.partition(":")[0]
             at = (*at, kind if kind in default else "cpu")
             default = self.layers.get(at)
         if default is None:
             return names[0] if len(names) == 1 else None
         if default not in names:
-            self.problem(at, f"no agent {messages.format_value(default)}", hint(str(default)))
+            self.problem(at, f"the task has no agent {messages.format_value(default)}", hint(str(default)))
             return None
         return str(default)
 
@@ -291,7 +291,7 @@ class TaskCheck:
         model = load_entry(replace(entry, value=spec.algorithms[algorithm]), type)
         if not issubclass(model, AgentConfig):
             raise TaskError(
-                f"plugin {entry.distribution} {entry.version}: {model.__name__} must be a subclass of AgentConfig"
+                f"plugin {entry.distribution} {entry.version}: {model.__name__} is no AgentConfig; report it"
             )
         return spec, model
 
@@ -343,7 +343,7 @@ class TaskCheck:
         model = base
         name = entry.get("func")
         if "func" not in entry and (similar := did_you_mean(str(path[-1]), self._siblings(path))):
-            self.problem(path, f"no term '{path[-1]}'", similar)  # a misspelt term in an override
+            self.problem(path, f"there is no term '{path[-1]}' to change", similar)  # a misspelt term in an override
             return None
         if isinstance(name, str):
             signature = self.vocabulary.find(section, name)
@@ -367,7 +367,7 @@ class TaskCheck:
         other = self.vocabulary.other_section(section, name)
         hint = f"'{name}' is a term of {other}" if other else did_you_mean(name, known)
         what = section if section == "success" else section.removesuffix("s")
-        self.problem(path, f"no {what} term '{name}'", hint or f"terms: {listing(known, 60)}")
+        self.problem(path, f"there is no {what} term '{name}'", hint or f"terms: {listing(known, 60)}")
 
     def _params(self, data: Mapping[str, Any]) -> dict[str, Any] | None:
         """Return the parameters of a direct task, checked against `Params` in its source; None if not valid."""

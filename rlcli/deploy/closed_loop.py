@@ -404,7 +404,9 @@ class _PlainMujocoRunner:
 
 
 def _metadata_error(error: Exception) -> CheckpointError:
-    return CheckpointError(f"the metadata does not fit the model; export again: {type(error).__name__}: {error}")
+    return CheckpointError(
+        f"the metadata in the exported file does not fit the model; export again: {type(error).__name__}: {error}"
+    )
 
 
 def _control_bounds(controller: Any, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

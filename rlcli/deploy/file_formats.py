@@ -142,7 +142,9 @@ def require_self_contained(data: bytes, file: Path) -> None:
         raise CheckpointError(f"{file} is not a valid ONNX file; export it again") from None
     for value in _external_tensors(model):
         where = next((entry.value for entry in value.external_data if entry.key == "location"), "?")
-        raise CheckpointError(f"{file} stores '{value.name[:60]}' in another file, {where[:80]!r}; save it in one file")
+        raise CheckpointError(
+            f"{file} stores '{value.name[:60]}' in another file, {where[:80]!r}; export it as one file"
+        )
 
 
 def _external_tensors(part: Any) -> Iterator[Any]:

@@ -116,7 +116,7 @@ def shared_memory_check(free: int) -> Check:
     if free >= LOW_SHARED_BYTES:
         return Check("shared memory", "ok", found, details=details)
     text = f"{found}: too little for several GPUs"
-    return Check("shared memory", "warning", text, "docker run --shm-size=8g", details)
+    return Check("shared memory", "warning", text, "in a container, give it more: docker run --shm-size=8g", details)
 
 
 def graphics_check(answers: dict[str, Answer]) -> Check:

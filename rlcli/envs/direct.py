@@ -187,7 +187,9 @@ class DirectEnv(VecEnv):
             message = f"task '{source.name}' is broken: {source.task}: {type(error).__name__}: {error}"
             raise TaskError(message) from error
         if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
-            raise TaskError(f"task '{source.name}' is broken: derive {source.task} from DirectTask")
+            raise TaskError(
+                f"task '{source.name}' is broken: {source.task} is not a DirectTask; derive it from DirectTask"
+            )
         return task_class
 
     def _import_task(self, reference: str) -> Any:

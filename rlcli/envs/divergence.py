@@ -63,7 +63,10 @@ class DivergenceGuard:
         if engine.asynchronous and self._env.observers.on_divergence and engine.described_divergences:
             self._env.observers.run_on_divergence(engine.described_divergences, pending=False)
         for what in not_finite:
-            raise DivergedError(f"{what} is not finite shortly before step {self._env.common_step}; lower sim.dt")
+            raise DivergedError(
+                f"{what} is not finite shortly before step {self._env.common_step}; lower"
+                " sim.dt, or look for divisions by 0"
+            )
 
     def after_physics(self) -> Tensor | None:
         """Refresh the state after physics, and return diverged environments to a finite one.

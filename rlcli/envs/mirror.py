@@ -159,7 +159,8 @@ class _MirrorTest:
                 other = entity.joint_names[entity.joint_ids.tolist().index(partner)]
                 if other not in elements:
                     raise TaskError(
-                        f"action '{term.name}' drives joint '{element}', but not its mirror image '{other}'; add it"
+                        f"action '{term.name}' drives joint '{element}', but not its mirror image '{other}'; add"
+                        " that joint"
                     )
                 index.append(start + elements.index(other))
                 sign.append(own)

@@ -43,7 +43,7 @@ def split(total: int, shards: int) -> list[Shard]:
         ValueError: for fewer than two environments per shard.
     """
     if shards > 1 and total < 2 * shards:
-        raise ValueError(f"{total} environments are too few for {shards} workers: each needs at least two")
+        raise ValueError(f"{total} environments are too few for {shards} workers: each needs two; lower scene.workers")
     sizes = [total // shards + (number >= shards - total % shards) for number in range(shards)]
     if shards > 1 and sizes[0] == sizes[-1]:
         sizes[0], sizes[-1] = sizes[0] - 1, sizes[-1] + 1

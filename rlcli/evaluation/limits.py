@@ -64,7 +64,9 @@ class Limit:
         """Return the sentence that says why an evaluation fails this limit; None if it does not fail."""
         value = self.value_in(summary)
         if value is None:
-            return f"{self.key} needs two or more episodes with finite values; the limit is {self.value:g}"
+            return (
+                f"{self.key} is unknown: it needs two or more episodes with finite values; the limit is {self.value:g}"
+            )
         if self.is_minimum and value < self.value:
             return f"{self.key} is {value:.6g}, below {self.value:g}"
         if not self.is_minimum and value > self.value:

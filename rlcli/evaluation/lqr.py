@@ -175,4 +175,7 @@ def _coordinates(env: VecEnv) -> list[str]:
 
 
 def _no_regulator(resolved: Resolved, why: str) -> UsageError:
-    return UsageError(f"there is no LQR of {resolved.source.name}: {why}", hint="use --policy trained, zero or random")
+    return UsageError(
+        f"there is no LQR (linear-quadratic regulator) of {resolved.source.name}: {why}",
+        hint="use --policy trained, zero or random",
+    )

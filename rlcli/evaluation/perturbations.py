@@ -183,7 +183,9 @@ class _Push:
         names = [*floating, *joints]
         found = match(sweep.element, names, "entity or joint")
         if len(found) != 1:
-            raise NameProblem(f"the pattern matches several names: {listing(names[i] for i in found)}", "choose one")
+            raise NameProblem(
+                f"the pattern matches several names: {listing(names[i] for i in found)}", "name one of them"
+            )
         name = names[found[0]]
         self._root, self._joint = floating.get(name), joints.get(name)
 
@@ -280,12 +282,12 @@ class ModelPerturbation:
             raise NameProblem(f"the value is 0 for {listing(names)}, so a factor changes nothing", hint)
         if field == "body_mass" and bool((now == 0).any()):
             massless = [name for name, mass in zip(names, now[0].tolist(), strict=True) if mass == 0]
-            raise NameProblem(f"no mass to change on {listing(massless)}", "name other bodies")
+            raise NameProblem(f"the bodies {listing(massless)} have no mass to change", "name other bodies")
         if sweep.parameter == "effort_limit":
             limited = env.engine.model.actuator_forcelimited[rows].astype(bool).tolist()
             if unlimited := [name for name, has in zip(names, limited, strict=True) if not has]:
                 hint = "give the joint an effort_limit, or name other actuators"
-                raise NameProblem(f"no effort limit on {listing(unlimited)}", hint)
+                raise NameProblem(f"the actuators {listing(unlimited)} have no effort limit to change", hint)
         self._affected = ~values.isnan() & ((values != 1.0) | sweep.absolute)
 
     def apply(self) -> Tensor | None:
@@ -408,7 +410,7 @@ def _axes(env: VecEnv, field: str, sweep: Sweep) -> list[int] | None:
     value = np.asarray(getattr(env.engine.model, field)) if field != "opt.gravity" else np.zeros((1, 3))
     width = value[:1].size
     if sweep.absolute and not own and width > 1:
-        raise NameProblem(f"abs: would make the {width} values of {field} equal", "use a factor: leave out abs:")
+        raise NameProblem(f"with abs: the {width} values of {field} would become equal", "use a factor: leave out abs:")
     return None
 
 

@@ -137,7 +137,7 @@ def unknown_parameter(name: str, fields: Sequence[str]) -> UsageError:
     own = [*PHYSICAL, *SIGNALS]
     near = did_you_mean(name, [*own, *fields])
     message = f"--sweep: there is no parameter '{name}'"
-    return UsageError(message, hint=near or f"{listing(own)}, or a field of the model")
+    return UsageError(message, hint=near or f"write one of {listing(own)}, or the name of a field of MuJoCo's model")
 
 
 def _read(text: str, points: int) -> Sweep:

@@ -116,5 +116,5 @@ def _require_separate_actuators(terms: list[BoundTerm]) -> None:
         for sink, element in zip(getattr(term.instance, "sinks", ()), term.instance.elements, strict=False):
             first = owner.setdefault(sink, term)
             if first is not term:
-                message = f"'{element}' is driven by '{first.name}' already; remove one of the two terms"
+                message = f"the action '{first.name}' drives '{element}' already; remove one of the two actions"
                 raise ConfigError([term.resolved.problem(term.path, message)])

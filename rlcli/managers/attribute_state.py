@@ -111,14 +111,15 @@ class AttributeState:
             holder = vars(holder).get(step)
             if not _is_helper(holder):
                 raise ValueError(
-                    f"the saved '{attribute}' is no attribute of {type(self._owner).__name__}: restore its old code"
+                    f"the saved value '{attribute}' has no attribute in {type(self._owner).__name__}: restore its"
+                    " old code"
                 )
         on_class = getattr(type(holder), name, None)  # a method or a property is not state
         allowed = name.isidentifier() and not name.startswith("__") and (bool(path) or name not in self._excluded)
         if not allowed or not _is_saved_kind(on_class) or not _is_saved_kind(vars(holder).get(name)):
             raise ValueError(
-                f"the file has '{attribute}', which {type(self._owner).__name__} does not save: the file is damaged, or"
-                " the code has changed"
+                f"the file has a value '{attribute}', which {type(self._owner).__name__} does not save: the file is"
+                " damaged, or the code has changed; use another file, or restore the old code"
             )
         return holder, name
 
@@ -152,14 +153,16 @@ class AttributeState:
             return
         if not (current is None or isinstance(current, Tensor | np.ndarray)):
             raise ValueError(
-                f"the saved '{path}' is a tensor, but not in {type(self._owner).__name__}: restore its old code"
+                f"the saved value '{path}' is a tensor, but not in {type(self._owner).__name__}: restore its old code"
             )
         if isinstance(container, dict):
             container[key] = value.clone()
         elif isinstance(container, list):
             container[int(key) : int(key) + 1] = [value.clone()]
         else:
-            raise ValueError(f"the saved '{path}' is no value in {type(self._owner).__name__}: restore its old code")
+            raise ValueError(
+                f"the saved value '{path}' does not exist in {type(self._owner).__name__}: restore its old code"
+            )
 
 
 def _item(container: object, key: str) -> Any:

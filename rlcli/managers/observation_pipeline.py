@@ -145,7 +145,7 @@ class Pipeline:
             setting = torch.tensor(value, dtype=torch.float32, device=self._context.device)
         if setting.dim() == 1 and len(setting) != self.width:
             raise self.term.error(
-                f"has {len(setting)} values; give 1, or one for each of the term's columns ({self.width})",
+                f"{key} has {len(setting)} values; give 1, or one for each of the term's columns ({self.width})",
                 *key.split("."),
             )
         return setting

@@ -63,14 +63,16 @@ class TunableValues:
                 near = did_you_mean(key, names)
                 have = f"settings that may change there: {listing(names)}" if names else None
                 hint = f"{near}; {have}" if near and have else near or have
-                raise NameProblem(f"a curriculum cannot change '{address}': {where} no changeable '{key}'", hint)
+                raise NameProblem(
+                    f"a curriculum cannot change '{address}': {where} no setting '{key}' that may change", hint
+                )
             value = _member(value, key)
             if _is_number(value):
                 try:
                     return self._opened(path[: depth + 1], value)[tuple(int(index) for index in path[depth + 1 :])]
                 except (ValueError, IndexError):
                     rest = ".".join(path[depth + 1 :])
-                    raise NameProblem(f"a curriculum cannot change '{address}': no element '{rest}' there") from None
+                    raise NameProblem(f"a curriculum cannot change '{address}': it has no element '{rest}'") from None
         raise NameProblem(f"a curriculum cannot change '{address}': it must name a number or a list of numbers")
 
     def _opened(self, path: Path, value: object) -> Tensor:

@@ -93,7 +93,7 @@ class ResetJointsWithinLimits(JointTerm):
         names = element_names(self.entity, "Joints", self.joints)
         if not all(finite):
             unlimited = [name for name, limited in zip(names, finite, strict=True) if not limited]
-            raise NameProblem(f"joints without limits: {listing(unlimited)}", "choose joints that have a range")
+            raise NameProblem(f"these joints have no limits: {listing(unlimited)}", "choose joints that have a range")
         self._count = len(names)
 
     def __call__(self, selection: Selection) -> None:

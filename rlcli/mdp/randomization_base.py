@@ -237,7 +237,7 @@ def require_supported(
     bad = [name for name in element_names(entity, kind, index) if not able[name]]
     if bad:
         can = [name for name, fine in able.items() if fine]
-        message = f"{kind.lower()} {problem}: {listing(bad)}"
+        message = f"the term cannot change {kind.lower()} {problem}: {listing(bad)}"
         raise NameProblem(message, f"{hint}; {kind.lower()} of '{entity.name}' that work: {listing(can)}")
 
 

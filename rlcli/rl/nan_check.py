@@ -39,8 +39,8 @@ def require_finite(
         where = where or (f"first at [{', '.join(map(str, index))}]" if index else "")
         count = f" in {int(bad.sum())} of {bad.numel()} values" if bad.numel() > 1 else ""
         raise DivergedError(
-            f"{name} is not finite{count}{f' ({where})' if where else ''}, in iteration {iteration}; the tensors before"
-            " it are finite",
+            f"{name} is not finite{count}{f' ({where})' if where else ''}, in iteration {iteration}; all tensors"
+            " that were computed before it are finite",
             hint=hint,
         )
 

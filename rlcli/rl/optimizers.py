@@ -64,11 +64,17 @@ def _require_slots(optimizer: torch.optim.Optimizer, state: Mapping[int, Mapping
     owned = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     for number, slots in state.items():
         if not 0 <= number < len(owned):
-            raise ValueError(f"trainer: the saved optimiser state has a parameter {number}; the agent has {len(owned)}")
+            raise ValueError(
+                f"trainer: the saved optimiser state has a parameter {number}; the agent has {len(owned)}: the file is"
+                " damaged, or the agent has changed"
+            )
         parameter = owned[number]
         missing = _SLOTS.get(type(optimizer).__name__, set()) - set(slots)
         if missing:
-            raise ValueError(f"trainer: the saved optimiser state of parameter {number} lacks {sorted(missing)[0]}")
+            raise ValueError(
+                f"trainer: the saved optimiser state of parameter {number} lacks {sorted(missing)[0]}: the file"
+                " is damaged"
+            )
         for name, value in slots.items():
             expected = () if name == "step" else tuple(parameter.shape)
             if tuple(value.shape) != expected or not value.is_floating_point():

@@ -156,7 +156,10 @@ def _require_same_policy(checkpoint: Checkpoint, fresh: Path, output: Path) -> N
     before, after = checkpoint.policy(), open_bundle(fresh).policy()
     pairs = zip(before.state_dict().values(), after.state_dict().values(), strict=True)
     if before.spec != after.spec or not all(torch.equal(value, written) for value, written in pairs):
-        raise VerdictError(f"{output} is not kept: the written policy differs; export it again")
+        raise VerdictError(
+            f"{output} is not kept: the policy read back from it differs from that of {checkpoint.folder}; export it"
+            " again, and report the bug if this repeats"
+        )
 
 
 def _portable_task(record: object) -> dict[str, Any]:

@@ -232,7 +232,10 @@ def layout_of(checkpoint: Checkpoint, policy: Policy) -> LayoutRecord:
     )
     for kind, found, expected in sizes:
         if found != expected:
-            raise CheckpointError(f"{file} does not fit policy.json: {found} columns of {kind}, expected {expected}")
+            raise CheckpointError(
+                f"{file} does not fit policy.json: {found} columns of {kind}, expected {expected}; the checkpoint is"
+                " damaged: use another one"
+            )
     return layout
 
 
@@ -257,7 +260,10 @@ def deployment_of(checkpoint: Checkpoint, policy: Policy, found: object = None) 
     ends = [0] + [term.columns[1] for term in terms]
     widths = [term.columns[1] - term.columns[0] for term in terms]
     if begins != ends or any(width <= 0 or width % t.history for width, t in zip(widths, terms, strict=True)):
-        raise CheckpointError(f"{file}: deployment: its columns differ from the policy's; train again")
+        raise CheckpointError(
+            f"{file}: the record of the observation and action columns (deployment) does not fit the policy; the"
+            " checkpoint is damaged: use another one"
+        )
     return record
 
 

@@ -358,7 +358,9 @@ def _tensors(data: bytes, file: Path) -> dict[str, Tensor]:
     try:
         return safetensors.torch.load(data)
     except (SafetensorError, RuntimeError, ValueError, KeyError, MemoryError) as error:
-        raise CheckpointError(f"{file} is corrupt: {' '.join(str(error).split())}") from None
+        raise CheckpointError(
+            f"{file} is corrupt: {' '.join(str(error).split())}; use an older checkpoint: RUN@step:N"
+        ) from None
 
 
 def _check_state(values: dict[str, Any], step: int, file: Path) -> None:

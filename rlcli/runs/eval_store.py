@@ -105,5 +105,7 @@ def read_evaluation(run: Run, step_name: str) -> dict[str, Any] | None:
 
 def _file(run: Run, step_name: str) -> Path:
     if not _STEP.fullmatch(step_name):
-        raise CheckpointError(f"'{step_name[:40]}' is not the name of a checkpoint's folder; give a step, 12 digits")
+        raise CheckpointError(
+            f"'{step_name[:40]}' is not the name of a checkpoint's folder; give its step in 12 digits"
+        )
     return run.folder / FOLDER / f"{step_name}.json"

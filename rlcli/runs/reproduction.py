@@ -68,7 +68,9 @@ def create_reproduction(original: Run, runs_dir: Path, name: str, now: Mapping[s
     if initial is not None:
         policy = open_checkpoint(initial).manifest["files"].get("policy.safetensors", {}).get("sha256")
         if policy != was.get("init_from_sha256", policy):
-            raise CheckpointError(f"{initial}: its policy has changed since the run started from it; restore it")
+            raise CheckpointError(
+                f"the policy in {initial} has changed since the run started from it; restore the old file"
+            )
     kept: dict[str, Any] = {
         key: was[key]
         for key in ("seed", "device", "task", "agent", "init_from", "init_from_sha256", "given", "torch_threads")

@@ -99,7 +99,10 @@ def require_fit(checkpoint: Checkpoint, layout: Layout) -> None:
     try:
         differing = _differing_rows(checkpoint.manifest["layout"], layout.record())
     except (AttributeError, KeyError, TypeError, ValueError):
-        raise CheckpointError(f"{checkpoint.folder}: manifest.json has a malformed layout; use RUN@step:N") from None
+        raise CheckpointError(
+            f"{checkpoint.folder}: the record of the observation and action columns (layout) in manifest.json is"
+            " damaged; use another checkpoint: RUN@step:N"
+        ) from None
     if not differing:
         return
     table = _table([("field", "in the checkpoint", "now"), *differing])

@@ -173,7 +173,7 @@ def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:
         )
         _check_depth(value)
     except _StrictError as error:
-        raise CheckpointError(f"{file} is corrupt: {error}") from None
+        raise CheckpointError(f"{file} is corrupt: {error}; restore it from a copy") from None
     except (ValueError, RecursionError):
         raise CheckpointError(f"{file} is corrupt: not JSON; restore it from a copy") from None
     if not isinstance(value, dict):

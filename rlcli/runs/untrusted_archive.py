@@ -32,6 +32,10 @@ _ALLOWED = {
 }
 """Global names that the pickle in a .pt file may contain; a file with another name is refused."""
 _REFUSED_OPCODES = {"STACK_GLOBAL", "INST", "OBJ", "NEWOBJ", "NEWOBJ_EX", "EXT1", "EXT2", "EXT4", "PERSID"}
+_SAVE_HINT = (
+    "save it again in Python: torch.save({'model_state_dict': policy.state_dict()}, 'model.pt') for RSL-RL,"
+    " model.save('model.zip') for Stable-Baselines3"
+)
 VEC_NORMALIZE_HINT = (
     "a pickle can run code, so rlcli opens none; if you trust the file, convert it in Python:"
     " v = pickle.load(open('vecnormalize.pkl', 'rb')).obs_rms; safetensors.numpy.save_file("
@@ -49,7 +53,10 @@ def read_member(file: Path, name: str) -> bytes:
     """Return the content of the member `name` of a zip file. All members are checked before."""
     data = read_archive_file(file)
     if data[:1] == b"\x80":
-        raise CheckpointError(f"{file} is a pickle, which rlcli does not open", hint=VEC_NORMALIZE_HINT)
+        raise CheckpointError(
+            f"{file} is a pickle, which rlcli does not open; give the .zip file of a model of Stable-Baselines3",
+            hint="write it in Python: model.save('model.zip')",
+        )
     archive = _archive(data, str(file))
     if name not in archive.namelist():
         raise CheckpointError(f"{file} has no {name}; save the model with Stable-Baselines3")
@@ -67,7 +74,7 @@ def _archive(data: bytes, where: str) -> zipfile.ZipFile:
     except Exception as error:  # zipfile raises many types of errors for malformed numbers
         raise CheckpointError(f"{where} is not a valid zip file: {one_line(error)}; save it again") from None
     if len(members) > _MAX_MEMBERS:
-        raise CheckpointError(f"{where} has {len(members)} members; at most {_MAX_MEMBERS} are allowed")
+        raise CheckpointError(f"{where} has {len(members)} members; at most {_MAX_MEMBERS} are allowed; save it again")
     seen: set[str] = set()
     for member in members:
         name = member.filename
@@ -84,7 +91,7 @@ def _archive(data: bytes, where: str) -> zipfile.ZipFile:
         }
         for reason, applies in refused.items():
             if applies:
-                raise CheckpointError(f"{where} has a member {name[:60]!r} that is refused: {reason}")
+                raise CheckpointError(f"{where} has a member {name[:60]!r} that is refused: {reason}; save it again")
         seen.add(name.casefold())
     total, limit = sum(member.file_size for member in members), min(_MAX_BYTES, available_memory() // 4)
     if total > limit:
@@ -113,7 +120,11 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
     """
     if data[:4] != b"PK\x03\x04":
         kind = "a plain pickle or a file of torch before 1.6" if data[:1] == b"\x80" else "not a torch file"
-        raise CheckpointError(f"{where} is {kind}, which rlcli does not open", hint="save it again with torch.save")
+        raise CheckpointError(
+            f"{where} is {kind}, which rlcli does not open; accepted is a .pt file of torch 1.6 or newer with only"
+            " tensors",
+            hint=_SAVE_HINT,
+        )
     archive = _archive(data, where)
     described = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
     if len(described) != 1 or archive.getinfo(described[0]).file_size > _PICKLE_LIMIT:
@@ -126,9 +137,9 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
             saved = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception:  # torch's own message advises to unpickle the file without any check
         message = f"{where} is corrupt, or has more than tensors, numbers and text"
-        raise CheckpointError(message, hint="save a state_dict again with torch.save") from None
+        raise CheckpointError(message, hint=_SAVE_HINT) from None
     if not isinstance(saved, Mapping):
-        raise CheckpointError(f"{where} is not a mapping of names to tensors; save a state_dict")
+        raise CheckpointError(f"{where} is not a mapping of names to tensors", hint=_SAVE_HINT)
     return saved
 
 
@@ -138,7 +149,7 @@ def _require_tensors_only(description: bytes, where: str) -> None:
         for opcode, argument, _ in pickletools.genops(description):
             if opcode.name in _REFUSED_OPCODES or (opcode.name == "GLOBAL" and argument not in _ALLOWED):
                 found = f"names '{str(argument)[:80]}'" if argument is not None else "creates objects"
-                raise CheckpointError(f"{where} {found}, which is not a tensor; save only tensors")
+                raise CheckpointError(f"{where} {found}, which is not a tensor", hint=_SAVE_HINT)
     except CheckpointError:
         raise
     except Exception as error:

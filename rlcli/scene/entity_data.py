@@ -426,7 +426,8 @@ class EntityData:
         if not self._computes_body_forces:
             raise ValueError(
                 "the term reads accelerations or forces of bodies, which MuJoCo computes only if a sensor needs them;"
-                " mark it with rlcli.task.reads_body_forces, or add an accelerometer, force or torque sensor to MJCF"
+                " mark it with rlcli.task.reads_body_forces, or add an accelerometer, force or torque sensor to the"
+                " MJCF"
             )
         return self._sim.derived_field(name)
 

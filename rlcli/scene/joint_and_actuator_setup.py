@@ -86,7 +86,9 @@ class SceneJoints:
             path = ("scene", "entities", name, "actuators", key, "joints")
             for joint in [names[position] for position in self._match(path, config.joints, names)]:
                 if joint in owner:
-                    self._problems.append(SceneProblem(path, f"'{owner[joint]}' has joint '{joint}', too; remove one"))
+                    self._problems.append(
+                        SceneProblem(path, f"joint '{joint}' belongs to '{owner[joint]}' already; remove one")
+                    )
                     continue
                 owner[joint] = key
                 target = f"{name}/{joint}"

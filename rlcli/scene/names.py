@@ -139,7 +139,7 @@ def _require_cheap(pattern: str, length: int) -> None:
         NameProblem: if the pattern is too long or too costly.
     """
     if len(pattern) > _MAX_PATTERN:
-        raise NameProblem(f"a pattern has {len(pattern):,} characters; at most {_MAX_PATTERN:,} are allowed")
+        raise NameProblem(f"the pattern has {len(pattern):,} characters; at most {_MAX_PATTERN:,} are allowed")
     parts = [_Part()]
     for token in _TOKEN.findall(pattern):
         part = parts[-1]
@@ -158,11 +158,15 @@ def _require_cheap(pattern: str, length: int) -> None:
             part.options, part.varies = part.options + 1, True
         elif token in "*+" or (token[0] == "{" and len(token) > 1):
             if part.last_varies:
-                raise NameProblem(f"'{pattern}' repeats a part that is variable itself; write it without nesting")
+                raise NameProblem(
+                    f"the pattern '{pattern}' repeats a part that varies itself, as in (a*)*; write a simpler one"
+                )
             if token in "*+" or "," in token:
                 part.repeats, part.varies, part.last_varies = part.repeats + 1, True, True
         else:
             part.last_varies = False
     repeats, options = parts[0].most()
     if min(math.comb(length + repeats, repeats), 10**9) * 2.0 ** min(options, 100) > _MAX_STEPS:
-        raise NameProblem(f"'{pattern}' has {repeats + options} of the quantifiers * + ? {{m,n}}; use fewer")
+        raise NameProblem(
+            f"the pattern '{pattern}' has {repeats + options} of the quantifiers * + ? {{m,n}}; use fewer"
+        )

@@ -270,17 +270,29 @@ def _patch_problems(patch: schema.PatchConfig, edge: float, resolution: float) -
         yield "platform", f"a platform of {platform:g} m does not fit in a patch of {edge:g} m", "make it smaller"
     for key in ("spacing", "step_width", "cell"):
         if (part := getattr(patch, key, edge)) * _MAX_PARTS < edge:
-            yield key, f"{part:g} m divides a patch of {edge:g} m into more than {_MAX_PARTS} parts", "make it larger"
+            yield (
+                key,
+                f"a {key} of {part:g} m divides a patch of {edge:g} m into more than {_MAX_PARTS} parts",
+                "make it larger",
+            )
     fine = "set a smaller resolution, or boxes: true"
     if isinstance(patch, schema.StairsPatchConfig) and not patch.boxes and patch.step_width < 2 * resolution:
-        yield "step_width", f"{patch.step_width:g} m needs a resolution of half that, not {resolution:g} m", fine
+        yield (
+            "step_width",
+            f"a step of {patch.step_width:g} m needs a resolution of half that, not {resolution:g} m",
+            fine,
+        )
     if isinstance(patch, schema.GridPatchConfig) and not patch.boxes and patch.cell < 2 * resolution:
-        yield "cell", f"{patch.cell:g} m needs a resolution of half that, not {resolution:g} m", fine
+        yield "cell", f"a cell of {patch.cell:g} m needs a resolution of half that, not {resolution:g} m", fine
     if isinstance(patch, schema.ObstaclesPatchConfig | schema.StonesPatchConfig):
         if patch.width[1] > edge:
-            yield "width", f"{patch.width[1]:g} m does not fit in a patch of {edge:g} m", "make it smaller"
+            yield "width", f"a width of {patch.width[1]:g} m does not fit in a patch of {edge:g} m", "make it smaller"
         if patch.width[0] < resolution:
-            yield "width", f"{patch.width[0]:g} m is less than a cell of {resolution:g} m", "set a smaller resolution"
+            yield (
+                "width",
+                f"a width of {patch.width[0]:g} m is less than a cell of {resolution:g} m",
+                "set a smaller resolution",
+            )
 
 
 def _read_heights(file: Path) -> NDArray[Any]:
@@ -296,7 +308,7 @@ def _read_heights(file: Path) -> NDArray[Any]:
         try:
             return np.asarray(np.lib.format.read_array(opened, allow_pickle=False, max_header_size=_MAX_HEADER))
         except (MemoryError, RecursionError, SyntaxError, TokenError) as error:  # errors of a malicious header
-            raise ValueError(f"its header is malformed ({type(error).__name__}); use numpy.save") from None
+            raise ValueError(f"the header of the file is malformed ({type(error).__name__}); use numpy.save") from None
 
 
 def _file_problems(config: schema.TerrainHeightsConfig, root: Path) -> Iterator[TerrainProblem]:

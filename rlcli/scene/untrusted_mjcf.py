@@ -374,7 +374,7 @@ def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str])
     for key, value in attributes.items():
         limit = _MAX_MEMORY if key == "memory" else 1_000_000
         if name == "size" and number_of(value) > limit:
-            raise BadModel(f'{file}:{line}: size {key}="{value[:40]}" is too large; {limit:,} is allowed')
+            raise BadModel(f'{file}:{line}: size {key}="{value[:40]}" is too large; at most {limit:,} is allowed')
         if key in _NAMES or key.startswith("file") or name in ("text", "config") or not _NOT_FINITE.search(value):
             continue
         for word in value.split():

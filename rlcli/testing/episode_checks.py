@@ -37,11 +37,13 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the same seed and actions give the same trajectory, in a new environment and after reset(seed)."""
     env, other = subject.env(episode_steps=12), subject.env(episode_steps=12)
     first, second, third = (record_outputs(one, random_actions(one, subject.bound, 30)) for one in (env, other, env))
-    message = "differs between two new environments with the same seed and actions"
+    message = "the value differs between two new environments with the same seed and actions"
     hint = "draw from the selection (uniform, normal, choice) or self.draws(env_ids) instead of torch.rand, numpy"
     findings = list(compare_trajectories(env, (first, second), message, f"{hint} or time"))
     if not findings:
-        message = "differs between a new environment and the same one after reset(seed), with the same actions"
+        message = (
+            "the value differs between a new environment and the same one after reset(seed), with the same actions"
+        )
         hint = "clear all state of the last episode in the term's reset(selection), or in reset_idx"
         findings = list(compare_trajectories(env, (first, third), message, hint))
     yield from findings
@@ -144,7 +146,7 @@ def partial_reset(subject: TaskUnderTest) -> Iterator[Finding]:
             if rows:
                 later = f", {number} steps later" if number else ""
                 where = "the simulation's state" if name == "state" else name
-                message = f"of environments {rows} changed when {_ENDING} were reset{later}"
+                message = f"values of environments {rows} changed when {_ENDING} were reset{later}"
                 hint = "write only the rows of the selection or of env_ids, and do not average over environments"
                 yield error_at(where, f"{message}; they must stay bit-identical", hint)
                 return
@@ -275,7 +277,7 @@ def repeated_observation(subject: TaskUnderTest) -> Iterator[Finding]:
     hint = "compute it only from the state; advance histories and counters when actions are applied"
     for where, (before, after) in _observe_twice(_env_pair(subject)).items():
         if not equal_values(before, after):
-            yield error_at(where, "changes when it is computed a second time in the same state", hint)
+            yield error_at(where, "the observation changes when it is computed a second time in the same state", hint)
 
 
 def _observe_twice(pair: _EnvPair) -> dict[str, tuple[Tensor, Tensor]]:
@@ -313,6 +315,6 @@ def observation_after_reset(subject: TaskUnderTest) -> Iterator[Finding]:
     for before, after in pairwise(observations):
         rows = [row for row in running if not equal_values(before[row], after[row])]
         if rows:
-            message = f"of running environments {rows} changes when {_ENDING} are reset"
+            message = f"the observation of running environments {rows} changes when {_ENDING} are reset"
             yield error_at("obs_buf", message, "compute each row only from the state of its environment")
             return

@@ -29,9 +29,9 @@ class HostSyncGuard(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torc
         """Raise for operations that force a host sync, and execute all others."""
         name = func.overloadpacket.__name__
         if name in SYNC_OPS:
-            raise HostSyncError(f"'{name}' forces a host sync; compute with tensors only")
+            raise HostSyncError(f"'{name}' forces a host sync (the CPU waits for the GPU); compute with tensors only")
         if name in COPY_OPS:
             raise HostSyncError(f"'{name}' copies numbers from the host; create the tensor in __init__")
         if name in _MASKED and any(isinstance(i, Tensor) and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
-            raise HostSyncError(f"'{name}' with a mask forces a host sync; use torch.where")
+            raise HostSyncError(f"'{name}' with a mask forces a host sync (the CPU waits for the GPU); use torch.where")
         return func(*args, **(kwargs or {}))

@@ -108,7 +108,7 @@ def silent_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     for name in _weighted_terms(evidence):
         values = [rollout.terms[name] for rollout in evidence.rollouts if name in rollout.terms]
         if values and not any(bool(v.any()) for v in values):
-            message = f"is 0 in all {steps} steps of {len(evidence.rollouts)} fixed policies"
+            message = f"the term is 0 in all {steps} steps of {len(evidence.rollouts)} fixed policies"
             hint = "check its thresholds, joints and sensors, give it a softer slope, or remove it"
             yield warning_at(f"rewards.{name}", message, hint, {"steps": steps})
 
@@ -130,7 +130,7 @@ def dominant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     for name, found in shares.items():
         if found and min(found) >= DOMINANT:
             others = ", ".join(other for other in active if other != name)
-            message = f"is {min(found):.1%} or more of the reward's size under every fixed policy"
+            message = f"the term is {min(found):.1%} or more of the reward's size under every fixed policy"
             message += f": {others} have no effect"
             hint = "lower its weight, or raise the weights of the others"
             yield warning_at(f"rewards.{name}", message, hint, {"share": min(found)})
@@ -146,7 +146,7 @@ def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     if not ends_early or value == 0.0:  # with terminations, any other constant rewards long or short episodes
         reason = "" if ends_early else ", and no episode ends early"
         where = "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf"
-        message = f"is {value:g} in every step of all fixed policies{reason}: there is nothing to learn"
+        message = f"the reward is {value:g} in every step of all fixed policies{reason}: there is nothing to learn"
         yield error_at(where, message, "compute the reward from the state or the action", {"value": value})
 
 
@@ -197,7 +197,7 @@ def constant_observation(evidence: RolloutEvidence) -> Iterator[Remark]:
     for where, values in _columns(evidence):
         if bool((values == values[:, :1]).all()):
             low = float(values.min())
-            value = f"is {low:g}" if len(values) == 1 else "is the same"
+            value = f"the value is {low:g}" if len(values) == 1 else "every pixel is the same"
             hint = "leave the column out, or compute it from the state"
             yield error_at(where, f"{value} in every step of every fixed policy", hint, {"value": low})
 
@@ -211,9 +211,10 @@ def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
         usual, largest = _quantile(sizes, 0.99), float(sizes.max())
         if bool((values == values[:, :1]).all()) or (largest >= SMALL and usual <= LARGE):
             continue
-        message = f"is never larger than {largest:.3g}; below {SMALL:g} its effect is lost among the others"
+        message = f"the value is never larger than {largest:.3g}; below {SMALL:g} its effect is lost among the others"
         if usual > LARGE:
-            message = f"is larger than {usual:.3g} in 1 % of the steps; policies learn well from sizes up to {LARGE:g}"
+            message = f"the value is larger than {usual:.3g} in 1 % of the steps; policies learn"
+            message += f" well from sizes up to {LARGE:g}"
         factor = 10.0 ** round(math.log10(1.0 / (usual if usual > LARGE else largest)))
         hint = f"scale: {factor:g}, or let the agent normalise (normalize_observations: true)"
         yield warning_at(where, message, hint, {"usual": usual, "largest": largest})
@@ -240,7 +241,7 @@ def saturated_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
     for name, share in rollout.limited.items():
         if share >= SATURATED:
             bound = evidence.subject.bound
-            message = f"is at its limit in {share:.0%} of the steps under random actions within +-{bound:g}"
+            message = f"the value is at its limit in {share:.0%} of the steps under random actions within +-{bound:g}"
             yield warning_at(name, message, hint, {"share": share})
 
 
@@ -268,7 +269,7 @@ def dead_action(evidence: RolloutEvidence) -> Iterator[Remark]:
             if moved > DEAD:
                 break
         if moved <= DEAD:
-            message = f"moves nothing: after {steps} steps at +-{bound:g} the state differs by {moved:.1g}"
+            message = f"the action moves nothing: after {steps} steps at +-{bound:g} the state differs by {moved:.1g}"
             message += " from the state without this action"
             hint = "check its actuator, and that scale, gear and limit are not 0"
             yield error_at(f"actions, column {column} ({name})", message, hint, {"moved": moved, "steps": steps})
@@ -354,7 +355,7 @@ def horizon(evidence: RolloutEvidence) -> Iterator[Remark]:
         if NEAREST <= round(ahead / steps, 9) <= FARTHEST:  # rounded: 1 / (1 - 0.99) is a little less than 100
             continue
         fitting = 1.0 - 1.0 / max(2.0, 0.25 * steps)
-        message = f"gives a horizon of {ahead:.3g} steps ({ahead * resolved.task.step_dt:.2g} s)"
+        message = f"this gamma gives a horizon of {ahead:.3g} steps ({ahead * resolved.task.step_dt:.2g} s)"
         message += f", and an episode has {steps} ({resolved.task.episode_length_s:g} s)"
         numbers = {"gamma": gamma, "horizon": ahead, "episode": steps}
         hint = f"{fitting:.3g} gives a horizon of a quarter of the episode"

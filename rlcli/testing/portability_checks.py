@@ -49,7 +49,7 @@ def threads(subject: TaskUnderTest) -> Iterator[Finding]:
         torch.manual_seed(0)
         trajectories.append(record_outputs(env, random_actions(env, subject.bound, STEPS)))
     hint = "remove everything that depends on engine_threads or on the number of cores"
-    yield from compare_trajectories(env, trajectories, "differs between 1 and 3 engine threads", hint)
+    yield from compare_trajectories(env, trajectories, "the value differs between 1 and 3 engine threads", hint)
 
 
 FEW = 3
@@ -78,7 +78,7 @@ def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
         make = error_at
         hint = "compute each row only from its environment; torch's sum over dim 0, atan2 and pow round differently for"
         hint += " other sizes (rlcli.sim.rotations has an atan2 that does not)"
-    message = f"differs between {subject.num_envs} and {FEW} environments{reason}"
+    message = f"the value differs between {subject.num_envs} and {FEW} environments{reason}"
     yield from compare_trajectories(many, (of_many, of_few), message, hint, make)
 
 
@@ -107,7 +107,7 @@ def checkpoint(subject: TaskUnderTest) -> Iterator[Finding]:
     if unsaved := env.unsaved_state():
         hint = f"no checkpoint can hold {', '.join(unsaved)}; {hint}"
     hint += "; else a resumed run differs from an uninterrupted one"
-    yield from compare_trajectories(env, trajectories, "differs after saving and restoring", hint)
+    yield from compare_trajectories(env, trajectories, "the value differs after saving and restoring", hint)
 
 
 def _continue(env: VecEnv, actions: list[Tensor]) -> list[dict[str, Tensor]]:
@@ -133,7 +133,7 @@ def policy(subject: TaskUnderTest) -> Iterator[Finding]:
         return
     name = bundle.manifest["task"]["name"]
     if name != subject.source.name:
-        message = f"is a policy for '{name}'"
+        message = f"the folder has a policy for '{name}'"
         yield error_at(str(folder), message, f"export a policy for {subject.source.name}")
 
 
@@ -152,7 +152,9 @@ def layout(subject: TaskUnderTest) -> Iterator[Finding]:
     try:
         recorded = _groups(json.loads(read_plain(file, JSON_LIMIT)))
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-        yield error_at(file.name, f"is not a recorded layout: {error!r}", "write it again: --record-layout")
+        yield error_at(
+            file.name, f"the file has no record of the columns: {error!r}", "write it again: --record-layout"
+        )
         return
     current = _groups(json.loads(json.dumps(subject.env().layout.record())))
     for where in {**recorded, **current}:
@@ -168,12 +170,12 @@ def _groups(record: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
 def _changed(then: list[dict[str, Any]] | None, now: list[dict[str, Any]] | None) -> str | None:
     """Return the first difference between the recorded and the present terms as text; None if they are equal."""
     if then is None or now is None:
-        return "is new" if then is None else "is gone"
+        return "this group is new" if then is None else "this group does not exist any more"
     before, after = _columns(then), _columns(now)
     first = next((n for n, (old, new) in enumerate(zip(before, after, strict=False)) if old != new), None)
     if len(before) != len(after):
         at = min(len(before), len(after)) if first is None else first
-        return f"had {len(before)} columns and has {len(after)}; the first difference is column {at}"
+        return f"the group had {len(before)} columns and has {len(after)}; the first difference is column {at}"
     if first is not None:
         return f"column {first} was '{before[first]}' and is '{after[first]}'"
     for old_term, new_term in zip(then, now, strict=True):
@@ -217,8 +219,8 @@ def speed(subject: TaskUnderTest) -> Iterator[Finding]:
     (file, line), _ = max((own or loops).items(), key=lambda item: item[1])
     yield warning_at(
         f"{file}:{line}",
-        f"runs {lines[0][file, line]} times with {SMALL} environments and {lines[1][file, line]} times with {LARGE}:"
-        f" a Python loop over environments; a step takes {seconds[0] * 1e3:.1f} and {seconds[1] * 1e3:.1f} ms"
+        f"the line runs {lines[0][file, line]} times with {SMALL} environments and {lines[1][file, line]} times with"
+        f" {LARGE}: a Python loop over environments; a step takes {seconds[0] * 1e3:.1f} and {seconds[1] * 1e3:.1f} ms"
         f" ({rate:,.0f} steps/s)",
         "compute all rows at once: tensor[:, column], torch.where, selection.write",
     )
@@ -284,7 +286,9 @@ def captured(subject: TaskUnderTest) -> Iterator[Finding]:
         if isinstance(env, DirectEnv) and env.not_recorded is not None:
             raise NotRunError(env.not_recorded)
         if type(task_of(env)).reset_idx is not DirectTask.reset_idx:
-            raise NotRunError("reset_idx takes ids, so a GPU cannot record it; `reset(selection)` could be recorded")
+            raise NotRunError(
+                "reset_idx takes ids, which a CUDA graph cannot record; write `reset(selection)` to run on a GPU"
+            )
     env = _warp_env(subject)
     action = torch.zeros(FEW_WORLDS, env.layout.action_size)
     env.reset(seed=env.seed)

@@ -54,7 +54,7 @@ def yaml_round_trip(subject: TaskUnderTest) -> Iterator[Finding]:
             again = to_data(resolve(replace(subject.source, config=file)))
         except ConfigError as error:
             for problem in error.problems:
-                message = f"cannot be read back from YAML: {problem.message}"
+                message = f"the value cannot be read back from YAML: {problem.message}"
                 hint = problem.hint or "use a value that YAML has (finite numbers, text, lists)"
                 yield error_at(problem.path or subject.source.label, message, hint)
             return
@@ -62,7 +62,7 @@ def yaml_round_trip(subject: TaskUnderTest) -> Iterator[Finding]:
     for path in {**before, **after}:
         was, now = before.get(path), after.get(path)
         if was != now and not (isinstance(was, list | tuple) and list(was) == now):  # YAML has no tuples
-            message = f"is {was!r}, and {now!r} after writing and reading the configuration"
+            message = f"the value is {was!r}, and {now!r} after writing and reading the configuration"
             yield error_at(dotted(path), message, "a run stores its configuration as YAML: use a value that YAML has")
 
 
@@ -114,7 +114,7 @@ def _check_outputs(
 def _check_shape(name: str, value: Tensor, expected: tuple[int, ...]) -> Iterator[Finding]:
     found = tuple(value.shape)
     if found != expected:
-        message = f"has shape {found}, expected {expected} for {expected[0]} environments"
+        message = f"the tensor has shape {found}, expected {expected} for {expected[0]} environments"
         hint = "return one row for each environment, and fill buffers in place: buf[:] = ..."
         yield error_at(name, message, hint)
 
@@ -130,7 +130,7 @@ def _check_dtype(name: str, value: Tensor, _: tuple[int, ...]) -> Iterator[Findi
     found = str(value.dtype).removeprefix("torch.")
     if found not in allowed:
         hint = "end a term with .float() or a comparison; fill buffers in place: buf[:] = ..."
-        yield error_at(name, f"is {found}, expected {' or '.join(allowed)}", hint)
+        yield error_at(name, f"the tensor is {found}, expected {' or '.join(allowed)}", hint)
 
 
 def _task_outputs(env: VecEnv) -> Iterator[tuple[str, Tensor, tuple[int, ...]]]:
@@ -183,7 +183,7 @@ def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
         for where, columns in observation_parts(recording.env, group):
             values = obs[:, :, columns]
             if bool((values == values[0, 0]).all()) and where not in fixed:
-                value = f"is {float(values[0, 0]):g}" if values.shape[2] == 1 else "is the same"
+                value = f"the value is {float(values[0, 0]):g}" if values.shape[2] == 1 else "every pixel is the same"
                 message = f"{value} in {subject.num_envs} environments and {len(obs)} observations"
                 hint = "compute the column from the state, or leave it out: a policy cannot learn from it"
                 yield error_at(where, message, hint)
@@ -212,9 +212,9 @@ def aliasing(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the outputs of a step are not changed during the next step, and that actions are not changed."""
     recording = subject.recording()
     for name, step in recording.late_writes.items():
-        message = f"was changed in place at step {step}, while a trainer still uses it"
+        message = f"the tensor was changed in place at step {step}, while a trainer still uses it"
         yield error_at(name, message, "write into a tensor of your own, or clone() first")
     for name, step in recording.shared.items():
         if name not in recording.late_writes:
-            message = f"shares its memory with that of the step before, at step {step}"
+            message = f"the tensor shares its memory with that of the step before, at step {step}"
             yield error_at(name, message, "return a new tensor instead of a buffer that the term reuses")

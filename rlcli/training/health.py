@@ -279,7 +279,10 @@ def observations(health: Health) -> Found:
         share = health.median(metric) or 0.0
         if share > 0.9 and health.struggles(0.1):
             name = metric.partition("Health/clipped/")[2] or "normalised observations"
-            yield f"{share:.0%} of the values of '{name}' are at the clip", "a wider clip, or a smaller scale"
+            yield (
+                f"{share:.0%} of the values of '{name}' are at the limits of the clip",
+                "a wider clip, or a smaller scale",
+            )
 
 
 def actions_at_bound(health: Health) -> Found:

@@ -184,12 +184,16 @@ def create_imported_run(
 def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:
     """Return float32 copies of untrusted tensors; check that they are plain, finite and not larger than the file."""
     if not isinstance(saved, Mapping):
-        raise CheckpointError(f"{where} does not contain named weights; save the `state_dict()` of the policy")
+        raise CheckpointError(
+            f"{where} has no weights in model_state_dict or actor_state_dict; give a file model_N.pt of RSL-RL"
+        )
     named: dict[str, Tensor] = {}
     total, limit = 0, available_memory() // 4  # bytes
     for name, value in saved.items():
         if not isinstance(name, str) or type(value) not in (Tensor, torch.nn.Parameter):
-            raise CheckpointError(f"{where}: '{str(name)[:60]}' is not a tensor; save only tensors")
+            raise CheckpointError(
+                f"{where}: '{str(name)[:60]}' is not a tensor; save only the `state_dict()` of the policy"
+            )
         if value.layout != torch.strided or value.device.type != "cpu" or value.is_complex() or value.is_quantized:
             layout, dtype = (str(part).removeprefix("torch.") for part in (value.layout, value.dtype))
             found = f"'{name[:60]}' is a {layout} {dtype} tensor on {value.device}"
@@ -307,7 +311,8 @@ def _vec_normalize(file: Path) -> dict[str, Tensor]:
     """Read the normaliser of SB3's VecNormalize from a safetensors file."""
     data = read_archive_file(file)
     if data[:1] == b"\x80" or file.suffix == ".pkl":
-        raise CheckpointError(f"{file} is a pickle, which rlcli does not open", hint=VEC_NORMALIZE_HINT)
+        message = f"{file} is a pickle, which rlcli does not open; --normalizer takes a .safetensors file"
+        raise CheckpointError(message, hint=VEC_NORMALIZE_HINT)
     try:
         stats = safetensors.torch.load(data)
     except (SafetensorError, RuntimeError, ValueError, KeyError) as error:

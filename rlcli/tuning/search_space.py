@@ -24,7 +24,7 @@ _OBJECTIVE = re.compile(
 )
 _MAX_BOUND = {int: 2**53, float: 1e300}
 """Largest bounds of a range: a float represents each such integer exactly, and the width of a range is finite."""
-HINT = "KEY=LOW:HIGH, KEY=log:LOW:HIGH or KEY=A,B,C"
+HINT = "write --param KEY=LOW:HIGH, KEY=log:LOW:HIGH or KEY=A,B,C"
 
 
 @dataclass(frozen=True, slots=True)

@@ -340,7 +340,7 @@ def _locked(file: Path) -> Iterator[None]:
     try:
         lock = FileLock(file).acquire(timeout=120)
     except Timeout:
-        raise MachineError(f"another process holds {file}; wait for its end") from None
+        raise MachineError(f"another process uses {file}; wait for its end") from None
     except OSError as error:
         raise disk_error(file, error) from error
     with lock:

@@ -50,10 +50,10 @@ def refusal_reason(port: int, path: str, request_headers: Mapping[str, Sequence[
             return f"the header {name} appears twice"
     host = [value.lower() for value in request_headers.get("host", ())]
     if not host or host[0] not in allowed_hosts(port):
-        return "the Host header does not name this machine"
+        return f"the Host header does not name this machine; open http://localhost:{port}/"
     route = path.partition("?")[0]
     if not path.startswith("/") or ".." in route or "\\" in route or "%" in route:
-        return "no such path"
+        return f"the viewer has no such path; open http://localhost:{port}/"
     upgrades = any("upgrade" in value.lower() for value in request_headers.get("connection", ()))
     is_websocket = upgrades or "upgrade" in request_headers
     if is_websocket and route not in SOCKETS:

@@ -93,7 +93,10 @@ class LocomotionTask(DirectTask):
         raise NotImplementedError
 
     def at_limits(self, position: Tensor) -> Tensor:
-        """Return each joint's cost near a limit, before `limit_cost`; positions are in half ranges. (n, joints)"""
+        """Return each joint's cost near a limit, without the weight `limit_cost`. (n, joints)
+
+        position: joint positions scaled so that -1 and 1 are the limits. (n, joints)
+        """
         raise NotImplementedError
 
     def set_up_scene(self, scene) -> None:

@@ -80,22 +80,22 @@ def test_agent_names_exclude_default(task):
             TASK,
             ["decimation.x=1", "summary.x=1"],
             [
-                "override 'decimation.x=1': decimation.x: 'decimation' is a value, not a mapping",
-                "override 'summary.x=1': summary.x: 'summary' is a value, not a mapping",
+                "override 'decimation.x=1': decimation.x: 'decimation' is a single value; leave out the keys after it",
+                "override 'summary.x=1': summary.x: 'summary' is a single value; leave out the keys after it",
             ],
         ),
         (
             with_agents(f"{{default: {{gpu: a, tpu: a}}, a: {AGENT}}}"),
             [],
             [
-                "agents.default.gpu: no device 'gpu'; devices: cpu, cuda",
-                "agents.default.tpu: no device 'tpu'; devices: cpu, cuda",
+                "agents.default.gpu: there is no device 'gpu'; write one of cpu, cuda",
+                "agents.default.tpu: there is no device 'tpu'; write one of cpu, cuda",
             ],
         ),
         (
             with_agents(f"{{default: {{cpu: c}}, a: {AGENT}}}"),
             [],
-            ["agents.default.cpu: no agent 'c'; agents of this task: a"],
+            ["agents.default.cpu: the task has no agent 'c'; agents of this task: a"],
         ),
     ],
 )
@@ -135,7 +135,7 @@ def test_problem_of_flag_shows_flag_name(problems_of):
 def test_malformed_overrides_are_all_reported(problems_of):
     found = problems_of(TASK, "decimation", "sim.dt=[", "scene.num_envs=0")
     assert len(found) == 3
-    assert "is not an override; write KEY.PATH=VALUE" in found[0]
+    assert "an override has the form KEY.PATH=VALUE" in found[0]
 
 
 # --- what a task must have ---

@@ -103,9 +103,9 @@ def test_set_creates_mappings_with_override_origin():
         (("l", "-1"), "'l' is a list of length 2 without item '-1'; give an index from 0 to 1"),
         (("l", "x"), "'l' is a list of length 2 without item 'x'; give an index from 0 to 1"),
         (("l", "2", "y"), "'l' is a list of length 2 without item '2'; give an index from 0 to 1"),
-        (("n", "x"), "'n' is a value, not a mapping"),
-        (("n", "x", "y"), "'n' is a value, not a mapping"),
-        (("l", "0", "y"), "'0' is a value, not a mapping"),
+        (("n", "x"), "'n' is a single value; leave out the keys after it"),
+        (("n", "x", "y"), "'n' is a single value; leave out the keys after it"),
+        (("l", "0", "y"), "'0' is a single value; leave out the keys after it"),
     ],
 )
 def test_set_refuses_path_without_member(path, said):
@@ -165,7 +165,7 @@ def test_read_reports_unreadable_file_with_position(tmp_path):
     (problem,) = caught.value.problems
     assert (problem.where, problem.message) == (
         str(tmp_path / "none.yaml"),
-        "cannot be read: No such file or directory; check the path",
+        "the file cannot be read: No such file or directory; check the path",
     )
     (tmp_path / "big.yaml").write_text("a: 1\n" * 60_000)
     with pytest.raises(ConfigError) as caught:
@@ -206,7 +206,7 @@ def test_parse_override_returns_path_and_value(text, path, value):
 
 @pytest.mark.parametrize("text", ["a", "=1", "a..b=1", ".a=1", "a.=1", "a b=1", '"a=1', ""])
 def test_parse_override_refuses_other_forms(text):
-    with pytest.raises(ConfigError, match="is not an override"):
+    with pytest.raises(ConfigError, match="an override has the form"):
         parse_override(text)
 
 

@@ -74,7 +74,7 @@ def test_parse_override_reads_keys_and_yaml_values(text, path, value):
 
 @pytest.mark.parametrize("text", ["a", "=1", "a.=1", ".a=1", "a..b=1", 'a."b=1', "a b=1", ""])
 def test_parse_override_refuses_malformed_text(text):
-    with pytest.raises(ConfigError, match="is not an override"):
+    with pytest.raises(ConfigError, match="an override has the form"):
         parse_override(text)
 
 

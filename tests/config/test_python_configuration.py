@@ -187,8 +187,8 @@ def test_function_that_is_no_term_is_refused(root):
 
     for term, said in (
         (positional, "must be keyword-only"),
-        (untyped, "has no annotation"),
-        (abs, "source code cannot be read"),
+        (untyped, "every parameter needs an annotation"),
+        (abs, "source code of a term cannot be read"),
     ):
         with pytest.raises(ConfigError, match=said):
             make_env(cartpole(rewards={"own": RewardConfig(func=term, weight=1.0)}), root=root)

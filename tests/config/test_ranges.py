@@ -51,4 +51,4 @@ def test_terrain_patch_of_too_many_parts_is_refused():
         data = {"kind": "generator", "patch": (8.0, 8.0), "sub_terrains": {"it": patch}}
         config = TerrainGeneratorConfig.model_validate(data)
         found = [(where[-1], message) for where, message, _ in terrain_problems(config, Path())]
-        assert found == [(key, "1e-30 m divides a patch of 8 m into more than 2000 parts")]
+        assert found == [(key, f"a {key} of 1e-30 m divides a patch of 8 m into more than 2000 parts")]

@@ -91,10 +91,10 @@ def test_selectors_accept_names_or_lists(model, alias):
         ("x: list[dict]", "annotation 'dict'"),
         ("x: Optional[float]", "X | None"),
         ("x: Callable[[int], int]", "annotation 'Callable"),
-        ("x", "parameter 'x': has no annotation"),
+        ("x", "parameter 'x': every parameter needs an annotation"),
         ("x: 'float['", "annotation 'float[' is not valid Python"),
         ("x: float = math.pi", "the default 'math.pi' is not a literal"),
-        ("x: Joints", "the term also needs 'entity: Entity'"),
+        ("x: Joints", "add a parameter 'entity: Entity'"),
         ("weight: float", "every term of rewards has a key of this name"),
         ("_x: float", "underscore"),
     ],
@@ -107,7 +107,7 @@ def test_unsupported_signatures_are_refused_with_hint(problems_of, parameters, s
 
 def test_positional_parameters_are_refused(problems_of):
     (message,) = problems_of(OWN, files={"terms": "def own(env, x: float): ...\n"})
-    assert "parameter 'x' must be keyword-only: put it after a '*'" in message
+    assert "the parameter 'x' must be keyword-only: put it after a '*'" in message
 
 
 @pytest.mark.filterwarnings("error")
@@ -228,7 +228,7 @@ class Task(DirectTask):
         ("{gain: 6, count: 1}", "params.gain: expected a number <= 5, found 6"),
         ("{mode: c, count: 1}", "params.mode: expected 'a' or 'b', found 'c'"),
         ("{count: 1.5}", "params.count: expected a whole number, found 1.5"),
-        ("{limits: [1], count: 1}", "params.limits: expected a list of 2, found [1]"),
+        ("{limits: [1], count: 1}", "params.limits: expected a list of 2 values, found [1]"),
         ("3", "params: expected a mapping, found 3"),
     ],
 )
@@ -365,7 +365,7 @@ def test_dataclass_fields_are_parameters(tmp_path):
             ("gain", 2.0),
             ("axes", [2]),
         ]
-    assert terms["positional"].error == "parameter 'gain' must be keyword-only: put it after a '*'"
+    assert terms["positional"].error == "the parameter 'gain' must be keyword-only: put it after a '*'"
 
 
 def test_class_inherits_parameters_from_rlcli_mdp(tmp_path):

@@ -105,7 +105,7 @@ def test_regulator_refuses_a_task_with_the_reason(task, overrides, more, output)
     with pytest.raises(UsageError) as caught:
         regulator(task(*overrides, more=more), 1.0)
     assert output in caught.value.message
-    assert "there is no LQR of" in caught.value.message
+    assert "there is no LQR (linear-quadratic regulator) of" in caught.value.message
 
 
 @pytest.mark.slow

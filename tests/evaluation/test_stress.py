@@ -195,7 +195,11 @@ def test_stress_accepts_run_checkpoint_and_task(cli, only_run):
         (("cartpol", "--sweep", "gravity=1:2"), 4, "did you mean 'cartpole"),
         (("cartpole", "--checkpoint", "latest", "--sweep", "gravity=1:2"), 5, "rlcli train cartpole"),
         (("latest", "--sweep", "gravity=1:2"), 5, "no run"),
-        (("ant-direct", "--policy", "lqr", "--sweep", "gravity=1:2"), 2, "no LQR of ant-direct"),
+        (
+            ("ant-direct", "--policy", "lqr", "--sweep", "gravity=1:2"),
+            2,
+            "no LQR (linear-quadratic regulator) of ant-direct",
+        ),
     ],
 )
 def test_stress_usage_errors(cli, words, code, message):

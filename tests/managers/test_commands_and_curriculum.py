@@ -220,13 +220,13 @@ def test_state_dict_restores_curriculum(tmp_path):
 @pytest.mark.parametrize(
     ("address", "message"),
     [
-        ("rewards.alife.weight", "'rewards' has no changeable 'alife'"),
+        ("rewards.alife.weight", "'rewards' has no setting 'alife' that may change"),
         ("reward.alive.weight", "did you mean 'rewards'"),
-        ("rewards.alive.func", "'rewards.alive' has no changeable 'func'"),
+        ("rewards.alive.func", "'rewards.alive' has no setting 'func' that may change"),
         ("rewards.alive", "must name a number"),
-        ("rewards.alive.weight.0", "no element '0' there"),
-        ("sim.dt", "the task has no changeable 'sim'"),
-        ("terminations.time_out.time_out", "has no changeable 'time_out'"),
+        ("rewards.alive.weight.0", "it has no element '0'"),
+        ("sim.dt", "the task has no setting 'sim' that may change"),
+        ("terminations.time_out.time_out", "has no setting 'time_out' that may change"),
     ],
 )
 def test_curriculum_rejects_unknown_address(tmp_path, address, message):

@@ -162,7 +162,7 @@ class Fussy:
         ),
         (
             {"observations": {"policy": {"bad": {"func": "joint_pos", "scale": [1.0, 2.0]}}}},
-            "observations.policy.bad.scale: has 2 values; give 1, or one for each of the term's columns (1)",
+            "observations.policy.bad.scale: scale has 2 values; give 1, or one for each of the term's columns (1)",
         ),
     ],
 )

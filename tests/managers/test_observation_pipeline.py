@@ -203,9 +203,9 @@ def test_final_obs_does_not_advance_memory(tmp_path):
     [
         (
             {"noise": {"kind": "uniform", "low": [0.0, 0.0], "high": 1.0}},
-            "noise.low: has 2 values; give 1, or one for each of the term's columns (1)",
+            "noise.low: noise.low has 2 values; give 1, or one for each of the term's columns (1)",
         ),
-        ({"scale": [1.0, 2.0]}, "scale: has 2 values; give 1, or one for each of the term's columns (1)"),
+        ({"scale": [1.0, 2.0]}, "scale: scale has 2 values; give 1, or one for each of the term's columns (1)"),
         ({"delay": {"steps": [3, 1]}}, "delay.steps"),
         ({"noise": {"kind": "pink"}}, "noise"),
         ({"noise": {"kind": "uniform", "std": 1.0}}, "unknown key 'std'"),

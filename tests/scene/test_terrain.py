@@ -475,13 +475,13 @@ def test_invalid_terrain_raises_config_error_with_key(tmp_path, change, message,
         (None, "hill.npy", "terrain.file: no file 'hill.npy'"),
         (b"no numbers", "hill.npy", "terrain.file: 'hill.npy' is not a NumPy file"),
         (b"PK\3\4 and no zip", "hill.npy", "terrain.file: 'hill.npy' is not a NumPy file"),
-        (b"\x93NUMPY\1\0\x08\0{'descr\n", "hill.npy", "its header is malformed"),
+        (b"\x93NUMPY\1\0\x08\0{'descr\n", "hill.npy", "the header of the file is malformed"),
         (
             b"\x93NUMPY\1\0\x4f\0"
             + b"{'descr':'<f8','fortran_order':False,'shape':(1000000000000,1000)}".ljust(78)
             + b"\n",
             "hill.npy",
-            "its header is malformed",
+            "the header of the file is malformed",
         ),
         (np.zeros(5), "hill.npy", "must contain a table of heights, at least 2 by 2; found shape (5,)"),
         (np.full((3, 3), np.nan), "hill.npy", "must contain finite numbers"),

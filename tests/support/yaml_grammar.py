@@ -23,7 +23,7 @@ SECONDS = 10
 CODES = (0, 2, 3, 4, 7)
 PLACE = re.compile(
     r"^error: .*(task\.yaml|override '|--\w+|No such option|\.py|more\.yaml|[Uu]nexpected|[Ii]nvalid|no task"
-    r"|a word of the command line|there is an empty word at )"
+    r"|a word of the command line|there is an empty word after )"
 )
 
 

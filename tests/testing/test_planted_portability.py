@@ -226,9 +226,9 @@ def test_layout_needs_recorded_file(managed):
     ("change", "says"),
     [
         ("order", "column 0 was 'angle[hinge]' and is 'rate[hinge]'"),
-        ("gone", "had 2 columns and has 1; the first difference is column 1"),
+        ("gone", "the group had 2 columns and has 1; the first difference is column 1"),
         ("scale", "'rate': scale was [0.1] and is [0.2]"),
-        ("group", "is new"),
+        ("group", "this group is new"),
     ],
 )
 def test_layout_finds_changed_observations(change, says, managed):
@@ -254,14 +254,15 @@ def test_layout_finds_changed_actions(direct):
     direct.replace("num_actions = 1", "num_actions = 2")
     direct.replace("self.params.max_effort * actions", "self.params.max_effort * actions[:, :1]")
     ((finding,), _) = only(direct, "layout")
-    assert (finding.where, finding.message) == ("actions", "had 1 columns and has 2; the first difference is column 1")
+    message = "the group had 1 columns and has 2; the first difference is column 1"
+    assert (finding.where, finding.message) == ("actions", message)
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"observations": 3}'])
 def test_layout_finds_invalid_file(text, managed):
     (managed.write() / "task.layout.json").write_text(text)
     ((finding,), _) = only(managed, "layout")
-    assert "is not a recorded layout" in finding.message
+    assert "the file has no record of the columns" in finding.message
 
 
 def test_command_records_layout(managed, capsys):
@@ -404,7 +405,7 @@ def test_policy_accepts_fitting_shipped_policy(shipped):
         (lambda m: m["layout"].update(step_dt=0.02), "does not fit the installed task"),
         (lambda m: m["layout"]["observations"]["policy"].reverse(), "does not fit the installed task"),
         (lambda m: m.update(agent="nobody"), "nobody"),
-        (lambda m: m["task"].update(name="cartpole-direct"), "is a policy for 'cartpole-direct'"),
+        (lambda m: m["task"].update(name="cartpole-direct"), "has a policy for 'cartpole-direct'"),
         (lambda m: m["files"]["policy.safetensors"].update(sha256="0" * 64), "is corrupt"),
     ],
 )

@@ -101,7 +101,7 @@ def test_preset_replaces_file_only_with_overwrite(coin, cli, short_measurements)
         (["cartpoel"], 4, "cartpole"),
         (["./coin", "--save-preset", "no/such/p.yaml"], 10, "no folder"),
         (["./coin", "--save-preset", "coin.yaml/"], 2, "exists"),
-        (["./coin", "--save-preset", ""], 2, "empty word at --save-preset"),
+        (["./coin", "--save-preset", ""], 2, "empty word after --save-preset"),
         ([], 2, "TASK"),
     ],
 )

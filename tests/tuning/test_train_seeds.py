@@ -43,7 +43,7 @@ def test_malformed_seeds_are_usage_error(text):
     [
         (("--seeds", "0..1", "--seed", "3"), "contradict"),
         (("--seeds", "0..1", "--gpus", "1"), "contradict"),
-        (("--jobs", "2"), "--jobs needs several"),
+        (("--jobs", "2"), "--jobs sets how many trainings run at once"),
         (("--seeds", "3..1"), "empty"),
         (("--seeds", "0..1", "agent.learning_rat=1"), "learning_rate"),
     ],

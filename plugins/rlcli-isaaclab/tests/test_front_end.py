@@ -506,7 +506,7 @@ def test_package_with_several_tasks_requires_choice(package):
         resolve(find_task(str(folder)))
     assert find_task(f"{folder}:Other-v0").name == "Other-v0"
     assert resolve(find_task(f"{folder}:Other-v0")).task.decimation == 2
-    with pytest.raises(TaskError, match="does not register 'No-v0'"):
+    with pytest.raises(TaskError, match="does not register a task 'No-v0'"):
         resolve(find_task(f"{folder}:No-v0"))
 
 

@@ -377,7 +377,7 @@ def test_several_runners_beside_a_file_need_a_choice(unchanged):
     file = next(unchanged.glob("*env_cfg.py"))
     resolved = resolve(find_task(f"{file}:CartpoleEnvCfg"))
     assert resolved.agent is None
-    with pytest.raises(ConfigError, match="no default among the agents"):
+    with pytest.raises(ConfigError, match="the task has several agents and no default"):
         resolved.require_agent()
     assert resolve(find_task(f"{file}:CartpoleEnvCfg"), agent="Other").agent.num_steps == 8
 

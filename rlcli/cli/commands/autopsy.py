@@ -58,7 +58,10 @@ def command(
     """
     require_known(sort, list(_SORT_KEYS), "--sort", "orders")
     if video is not None and case is None:
-        raise UsageError("--video needs the number of a case", hint="rlcli autopsy RUN N --video FILE.mp4")
+        raise UsageError(
+            "--video needs the number of a recorded episode",
+            hint="rlcli autopsy RUN lists them; rlcli autopsy RUN N --video FILE.mp4",
+        )
     video = video_file(video, "autopsy.mp4")
     from rlcli.replay.failure_cases import list_failure_cases, why_no_cases
     from rlcli.runs.bundle import is_bundle
@@ -77,8 +80,8 @@ def command(
     elif case < len(cases):
         _print_case(found, cases[case], case, steps, video, named)
     else:
-        hint = f"give a case from 0 to {len(cases) - 1}" if cases else why_no_cases(found)
-        raise UsageError(f"no recorded episode {case} in {found.folder}", hint=hint)
+        hint = f"give a number from 0 to {len(cases) - 1}" if cases else why_no_cases(found)
+        raise UsageError(f"{found.folder} has no recorded episode {case}", hint=hint)
 
 
 def _refuse_bundle(folder: str, case: int | None) -> None:
@@ -91,7 +94,7 @@ def _refuse_bundle(folder: str, case: int | None) -> None:
         f" `rlcli eval --checkpoint {folder} --record FILE --record-mode failed`"
     )
     if case is not None:
-        raise UsageError(f"no recorded episode {case} in {folder}", hint=why)
+        raise UsageError(f"{folder} has no recorded episode {case}", hint=why)
     _print_no_cases(folder, why)
 
 

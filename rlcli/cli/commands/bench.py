@@ -129,7 +129,7 @@ def _report(
     for line in explanation(findings):
         console.data(line)
     if findings.unsteady:
-        console.warn("repeated measurements differ: end other programs on this machine")
+        console.warn("repeated measurements differ much: end other programs on this machine and measure again")
     changes = None if findings.recommended is None else bench.changes(findings.recommended.setting)
     if changes is not None and file is not None:
         write_atomic(file, bench_preset(resolved, changes, findings, machine, names_agent))

@@ -46,7 +46,7 @@ def command(
     torch.set_num_threads(1)
     if record:
         file = record_layout(task, agent=agent, overrides=overrides or (), config=config)
-        console.info(f"recorded the columns in {file}")
+        console.info(f"recorded the observation and action columns in {file}")
     checks: list[tuple[str, list[Finding] | None]] = []
     notes: dict[str, str] = {}
     findings = check_task(

@@ -66,7 +66,9 @@ def command(
             both = (one or _find(left[0], runs)[0], other or _find(right[0], runs)[0])
             equal = _compare_configurations(*both, left, right)
     except RecursionError:
-        raise CheckpointError(f"the files of {left[0]} or {right[0]} are damaged; train again") from None
+        raise CheckpointError(
+            f"the files of {left[0]} or {right[0]} are damaged; compare other runs, or train again"
+        ) from None
     if not equal:
         raise typer.Exit(9)
 
@@ -151,7 +153,7 @@ def _find(reference: str, runs: Path) -> tuple[Run, int | None]:
     if is_checkpoint_ref(reference):
         run, folder, _ = find_checkpoint(reference, runs)
         if not folder.resolve().name.isdecimal():
-            raise CheckpointError(f"{folder} is not in the checkpoints of a run; give RUN or RUN@step:N")
+            raise CheckpointError(f"the checkpoint {folder} is not in the folder of a run; give RUN or RUN@step:N")
         return run, int(folder.resolve().name)
     try:
         run, why = find_run(reference, runs)
@@ -170,5 +172,6 @@ def _require_step(run: Run, step: int) -> None:
     have = steps(run.checkpoints)
     if step not in have:
         raise CheckpointError(
-            f"{run.folder} has no checkpoint at step {step}", hint=f"steps: {listing(map(str, have))}"
+            f"{run.folder} has no checkpoint at step {step}",
+            hint=f"it has checkpoints at these steps: {listing(map(str, have))}",
         )

@@ -78,7 +78,10 @@ def _default_file(choice: Choice, format_: str) -> Path:
     from rlcli.runs.run import require_own
 
     if choice.run is None:
-        raise UsageError(f"{choice.folder} is not in a run", hint="give the file to write: --output FILE")
+        raise UsageError(
+            f"the checkpoint {choice.folder} is not in the folder of a run",
+            hint="give the file to write: --output FILE",
+        )
     require_own(choice.run, "exports")
     return choice.run.folder / "exports" / f"policy{FORMATS.get(format_, '')}"
 
@@ -89,7 +92,10 @@ def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | N
     from rlcli.runs.trusted_tasks import named_task
 
     if choice.run is None and choice.bundle is None:
-        raise UsageError(f"{choice.folder} is not in a run", hint="--verify needs a run: --checkpoint RUN")
+        raise UsageError(
+            f"the checkpoint {choice.folder} is not in the folder of a run",
+            hint="--verify needs a run: --checkpoint RUN",
+        )
     check_overwrites(file)
     return open_reference(choice, saved, None if task is None else named_task(task))
 

@@ -109,7 +109,9 @@ def _default_file(runs: list[Run]) -> Path:
     try:
         file.parent.mkdir(exist_ok=True)
     except OSError as error:
-        raise MachineError(f"cannot write {file}: {error.strerror or error}", hint="-o FILE.png") from None
+        raise MachineError(
+            f"cannot write {file}: {error.strerror or error}", hint="give another file: -o FILE.png"
+        ) from None
     return file
 
 

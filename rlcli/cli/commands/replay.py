@@ -68,7 +68,9 @@ def _print_episodes(trajectory: Trajectory, result: Replay, episodes: int, video
         text = (
             f"episode {difference.episode} differs first at step {difference.step} in {_values(difference, 'recorded')}"
         )
-        console.info("since the recording, the task, MuJoCo or the machine has changed: undo the change to repeat it")
+        console.info(
+            "since the recording, the task, MuJoCo or the machine has changed: undo the change to repeat the recording"
+        )
         values = {name: getattr(difference, name) for name in ("episode", "step", "field", "recorded", "replayed")}
     _print_result(trajectory, text, values, episodes=episodes, steps=result.steps, video=video, frames=frames)
 

@@ -89,7 +89,7 @@ def command(
     if task is None:
         raise UsageError("no task given", hint="rlcli sweep TASK --param agent.learning_rate=log:1e-4:1e-2")
     if task not in _OPTIONS and not param:
-        raise UsageError("no --param given", hint=f"--param {HINT}")
+        raise UsageError("no --param given", hint=HINT)
     check_optuna()
     with storage_errors(storage):
         if task == "show":

@@ -113,7 +113,10 @@ def _study(request: TrainingRequest, seeds: str | None, jobs: int | None, seed: 
         study = next((folder for folder in folders if (folder / STUDY).is_file()), None)
     if seeds is None and study is None:
         if jobs is not None:
-            raise UsageError("--jobs needs several trainings", hint="--seeds 0..4 --jobs 2")
+            raise UsageError(
+                "--jobs sets how many trainings run at once, but there is only one",
+                hint="add --seeds, as in --seeds 0..4 --jobs 2, or leave out --jobs",
+            )
         return None
     if seed is not None or request.gpus is not None or distributed.launched():
         other = "--seed" if seed is not None else "--gpus"

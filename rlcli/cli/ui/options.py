@@ -101,7 +101,7 @@ _NEEDED = {
     "record_mode": ("record", "--record FILE"),
     "overwrite": ("save_preset", "--save-preset FILE"),
     "episodes": ("verify", "--verify"),
-    "steps": ("case", "the number of a case"),
+    "steps": ("case", "the number of a recorded episode"),
 }
 """Option -> the parameter without which a command ignores it, and how the user writes that parameter."""
 
@@ -226,7 +226,7 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
     if output is None:
         return
     if output.suffix.lower() not in suffixes:
-        raise UsageError(f"'{output}' is not a {what}", hint=f"name it *{', *'.join(suffixes)}")
+        raise UsageError(f"'{output}' is not a {what}", hint=f"its name must end in {' or '.join(suffixes)}")
     require_regular(output)
     if not output.absolute().parent.is_dir():
         raise MachineError(f"cannot write {output}: there is no folder {output.absolute().parent}; create it")

@@ -44,7 +44,10 @@ def check_choice(
     if record_mode != "all":
         raise UsageError("--env and --episode choose one episode, --record-mode chooses among several: leave it out")
     if commands:
-        raise UsageError("--command would change the episode", hint="leave out --command, or --env and --episode")
+        raise UsageError(
+            "--command would change the episode that --env and --episode choose",
+            hint="leave out --command, or --env and --episode",
+        )
 
 
 def play_episode(

@@ -132,7 +132,9 @@ class CameraSensorConfig(StrictModel):
             keys = ", ".join(placed)
             raise ValueError(f"a camera of the MJCF has its own position and field of view: remove {keys}")
         if self.clip[0] >= self.clip[1]:
-            raise ValueError(f"clip: {self.clip[0]:g} is not below {self.clip[1]:g}; write [nearest, farthest]")
+            raise ValueError(
+                f"clip must be [nearest, farthest] in metres; {self.clip[0]:g} is not below {self.clip[1]:g}"
+            )
         if self.eye == self.lookat:
             raise ValueError("eye and lookat are the same point, so the camera has no direction: move one of them")
         return self

@@ -38,7 +38,9 @@ class RandomizeBodyMass(Randomization, BodyTerm):
         if self.with_inertia and any(is_massless):
             bodies = element_names(self.entity, "Bodies", self.bodies)
             names = [name for name, massless in zip(bodies, is_massless, strict=True) if massless]
-            raise NameProblem(f"bodies without mass: {listing(names)}", "choose others, or set with_inertia: false")
+            raise NameProblem(
+                f"these bodies have no mass: {listing(names)}", "choose others, or set with_inertia: false"
+            )
         self._inertia = ModelField(self.entity, "body_inertia", self.bodies) if self.with_inertia else None
 
     def __call__(self, selection: Selection) -> None:

@@ -36,7 +36,7 @@ class RnnConfig(StrictModel):
 
 
 class CnnConfig(StrictModel):
-    """CNN over each image of an observation, without padding, with the activation of the network behind it."""
+    """CNN over each image of an observation, without padding, with the activation of the MLP that follows."""
 
     channels: _Sizes = (16, 32)
     """Output channels of each layer."""

@@ -138,7 +138,10 @@ class TorchReplayBuffer(ReplayBuffer):
         """
         count = rows.stop - rows.first
         if not 0 <= count <= self.buffer_size:
-            raise ValueError(f"replay: {count} saved rows; raise `buffer_size`, which is {self.buffer_size}")
+            raise ValueError(
+                f"replay: the checkpoint has {count} rows, but buffer_size is {self.buffer_size}; raise"
+                " agent.buffer_size"
+            )
         saved = rows.read(rows.first, rows.stop)
         if count:
             own = {name: getattr(self, name)[:count] for name in _COLUMNS}

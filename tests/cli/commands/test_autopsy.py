@@ -116,14 +116,14 @@ def test_replay_with_changed_model_differs(trained, cli):
 def test_unknown_case_is_usage_error(trained, cli):
     shown = cli("autopsy", trained, "99", "--json")
     assert shown.code == 2
-    assert f"give a case from 0 to {len(files(trained)) - 1}" in shown.json["error"]["hint"]
+    assert f"give a number from 0 to {len(files(trained)) - 1}" in shown.json["error"]["hint"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--sort", "lenth"], "did you mean 'length'"),
-        (["--video", "x.mp4"], "--video needs the number of a case"),
+        (["--video", "x.mp4"], "--video needs the number of a recorded episode"),
         (["0", "--video", "x.avi"], "is not a video file"),
     ],
 )

@@ -399,7 +399,7 @@ def test_reproduce_of_run_with_initial_weights(cli, trained, run):
     replace(run / "checkpoints" / f"{128:012d}", "policy", lambda tensors: tensors["actor.0.bias"].zero_())
     result = cli("reproduce", second)
     assert result.code == 5
-    assert "its policy has changed since the run started from it" in result.err
+    assert "has changed since the run started from it" in result.err
 
 
 @pytest.mark.parametrize("change", [{"device": "cuda"}, {"processes": 2}])

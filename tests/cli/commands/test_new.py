@@ -76,7 +76,7 @@ def test_schema_has_own_terms_and_finds_mistakes(in_process, here):
         ("größe", "only letters a-z"),
         ("arm\n", "only letters a-z"),
         ("../arm", "did you mean 'arm'?"),
-        ("", "there is an empty word at new"),
+        ("", "there is an empty word after new"),
         ("a" * 65, "at most 64"),
         ("class", "a keyword of Python"),
         ("random", "Python's standard library"),

@@ -28,7 +28,7 @@ def test_empty_word_is_refused_with_its_option(cli, words, option):
     done = cli(*words)
     assert (done.code, done.err) == (
         2,
-        f"error: there is an empty word at {option}\nhint: give a value, or leave it out\n",
+        f"error: there is an empty word after {option}\nhint: give a value, or leave it out\n",
     )
 
 
@@ -70,7 +70,7 @@ def test_long_output_file_has_a_hint(cli):
         (("play", "cartpole", "--record-mode", "failed"), "--record-mode needs --record FILE"),
         (("bench", "cartpole", "--overwrite"), "--overwrite needs --save-preset FILE"),
         (("export", "cartpole", "--episodes", "8"), "--episodes needs --verify"),
-        (("autopsy", "latest", "--steps", "3"), "--steps needs the number of a case"),
+        (("autopsy", "latest", "--steps", "3"), "--steps needs the number of a recorded episode"),
     ],
 )
 def test_option_that_needs_another_is_refused_alone(cli, words, message):

@@ -179,7 +179,7 @@ def test_number_options_refuse_what_files_refuse(path, number, capsys):
 def test_number_options_refuse_an_empty_value(path, capsys):
     for option in number_options(path):
         assert main([*path, f"{option}="]) == 2
-        assert "there is an empty word at" in capsys.readouterr().err
+        assert "there is an empty word after" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("path", LEAVES, ids=ids)

@@ -120,7 +120,7 @@ def test_play_prints_viewer_and_reason(cli):
         (("--show", "0"), "'--show'"),
         (("--command", "vx"), "--command 'vx' is not NAME=NUMBER"),
         (("--command", "vx=fast"), "--command 'vx=fast' is not NAME=NUMBER"),
-        (("--command", ""), "there is an empty word at --command"),
+        (("--command", ""), "there is an empty word after --command"),
         (("--command", "vx=1"), "the task has no command 'vx'; hint: leave out --command"),
         (("--command", "vx=1", "--record", "x.safetensors"), "leave out --record or --command"),
     ],
