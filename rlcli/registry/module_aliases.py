@@ -27,6 +27,8 @@ _trees: dict[str, str] = {}
 """Module name of an imported package or folder -> name under which its own files import it."""
 _roots: list[Path] = []
 """Folders whose modules are executed as files of a task."""
+_known_paths: list[frozenset[str]] = []
+"""`sys.path` before the task file that is being executed; empty if none is."""
 
 
 class TaskFileLoader(SourceFileLoader):
@@ -35,7 +37,15 @@ class TaskFileLoader(SourceFileLoader):
     def exec_module(self, module: ModuleType) -> None:
         """Execute the file with the `__import__` of task files."""
         vars(module)["__builtins__"] = {**vars(builtins), "__import__": _import}
-        super().exec_module(module)
+        outermost = not _known_paths
+        if outermost:
+            _known_paths.append(frozenset(sys.path))
+        try:
+            super().exec_module(module)
+        finally:
+            if outermost:
+                _add_own_paths()
+                _known_paths.clear()
 
 
 def register_package(module: str, folder: Path, own_name: str) -> None:
@@ -85,8 +95,8 @@ class _TaskFinder(MetaPathFinder):
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, target: Any = None) -> ModuleSpec | None:
         """Return the spec of a file in a registered folder; None for any other module."""
-        if path is None and not _roots:
-            return None
+        if path is None:
+            _add_own_paths()
         if path is not None and name.partition(".")[0] not in _trees:
             return None
         spec = PathFinder.find_spec(name, path)
@@ -94,8 +104,19 @@ class _TaskFinder(MetaPathFinder):
             return None
         if not any(Path(spec.origin).is_relative_to(root) for root in _roots):
             return None
+        if path is None:
+            _trees.setdefault(name, name)  # its modules are files of the task, too
         spec.loader = TaskFileLoader(spec.loader.name, spec.loader.path)
         return spec
+
+
+def _add_own_paths() -> None:
+    """Treat folders that files of a task have added to `sys.path` as folders of the task, but not those of packages."""
+    for entry in sys.path if _known_paths else ():
+        folder = Path(entry).resolve()
+        installed = {"site-packages", "dist-packages"} & set(folder.parts) or Path(sys.prefix).is_relative_to(folder)
+        if entry and entry not in _known_paths[0] and folder not in _roots and not installed:
+            _roots.append(folder)
 
 
 def _import(

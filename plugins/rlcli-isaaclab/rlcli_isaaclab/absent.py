@@ -8,6 +8,7 @@ from types import ModuleType
 from typing import Any
 
 from rlcli.errors import TaskError
+from rlcli_isaaclab.format import LIBRARIES
 
 _REASONS = {
     "pink": ("Pink inverse kinematics needs Pinocchio", "use DifferentialInverseKinematicsActionCfg"),
@@ -29,7 +30,6 @@ _REASONS = {
     ),
     "read_file": ("it reads files of NVIDIA's server, and rlcli downloads nothing", "open a local file in the task"),
     "output[": ("rlcli's cameras have no such images", "use rgb, depth, distance_to_image_plane or distance_to_camera"),
-    "torchvision": ("the library is not installed", "pip install torchvision"),
     "nodal": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
     "deformable": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
     "omni": ("it belongs to Isaac Sim's USD stage", "change the model (MJCF) instead"),
@@ -43,6 +43,9 @@ _REASONS = {
 
 def reason_of(name: str) -> tuple[str, str]:
     """Return why rlcli does not have a name of Isaac Lab or Isaac Sim, and what to do."""
+    library = LIBRARIES.get(name.partition(".")[0])
+    if library is not None:
+        return "the library is not installed", f"pip install {library}"
     words = name.lower()
     return next(
         (texts for part, texts in _REASONS.items() if part in words),
@@ -53,10 +56,10 @@ def reason_of(name: str) -> tuple[str, str]:
 def absence(name: str, hint: str | None = None) -> TaskError:
     """Return the error that a name of Isaac Lab or Isaac Sim cannot be used."""
     reason, usual = reason_of(name)
-    return TaskError(f"{_user_place()}{name} cannot be used: {reason}", hint=hint or usual)
+    return TaskError(f"{user_place()}{name} cannot be used: {reason}", hint=hint or usual)
 
 
-def _user_place() -> str:
+def user_place() -> str:
     """Return `file:line: ` of the task's code that runs; empty if none does."""
     from rlcli.registry import is_framework
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rlcli_isaaclab.settings import Node, Report, as_float, kind_of, to_plain
+from rlcli_isaaclab.user_actuators import is_user_actuator
 
 _EXPLICIT = ("IdealPDActuator", "DCMotor", "DelayedPDActuator", "RemotizedPDActuator")
 _NETWORKS = ("ActuatorNetLSTM", "ActuatorNetMLP")
@@ -20,6 +21,7 @@ def read_actuators(
     order_joints: Callable[[list[str], Node], Any],
     entity: str,
     replaced: Mapping[str, Mapping[str, float]],
+    own: dict[tuple[str, str], Mapping[str, Any]],
 ) -> tuple[JointSettings, dict[str, Any]]:
     """Return the settings of the joints, and the explicit actuator models by group.
 
@@ -28,6 +30,7 @@ def read_actuators(
         order_joints: returns the names or regexes of a group's joints in the model's order.
         entity: name of the entity, for messages.
         replaced: group -> gains that replace its actuator network.
+        own: receives (entity, group) -> settings of the groups with a class of the user's.
     """
     joints: JointSettings = []
     models: dict[str, Any] = {}
@@ -48,6 +51,12 @@ def read_actuators(
         gains = {"stiffness": item.get("stiffness"), "damping": item.get("damping")}
         if kind == "ImplicitActuator":
             settings = {**gains, **passive, **_read_implicit_limits(item)}
+        elif is_user_actuator(item.data.get("class_type")):
+            own[entity, group] = item.data
+            item.skip(*item.data)
+            config = {"joints": order_joints(patterns, item), "kind": "pd"}
+            models[group] = to_plain(config | {key: value for key, value in gains.items() if value is not None})
+            settings = {**passive, "velocity_limit": item.get("velocity_limit")}
         elif kind in _NETWORKS and group not in replaced:
             what = f"the actuator network of '{kind}' is a TorchScript file, which rlcli does not load"
             gains_key = f"{group}: {{stiffness: S, damping: D}}"

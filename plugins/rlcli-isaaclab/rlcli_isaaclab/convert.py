@@ -13,6 +13,7 @@ from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.settings import Key, Node, Report, as_float
 from rlcli_isaaclab.term_reader import TermReader
+from rlcli_isaaclab.user_actuators import actuator_events
 
 
 def task(
@@ -54,6 +55,7 @@ def task(
     for section in ("events", "rewards", "terminations", "curriculum"):
         terms_of_section = (terms.read_terms(section, *member) for member in top.node(section).nodes())
         config[section] = {name: term for pairs in terms_of_section for name, term in pairs}
+    config["events"] |= actuator_events(scene.user_actuators)
     if not config["rewards"]:
         config["rewards"] = {"no_reward": {"func": "is_alive", "weight": 0.0}}
     config["commands"] = {name: terms.read_command(node) for name, node in top.node("commands").nodes()}
@@ -65,7 +67,7 @@ def task(
     if top.data.get("is_finite_horizon"):
         top.note("ignored", "is_finite_horizon", "rlcli always bootstraps at a time-out")
     top.skip("ui_window_class_type", "wait_for_textures", "rerender_on_reset", "export_io_descriptors", "log_dir")
-    top.skip("recorders", "teleop_devices", "xr", "is_finite_horizon")
+    top.skip("num_rerenders_on_reset", "recorders", "teleop_devices", "xr", "is_finite_horizon")
     if "seed" in top:
         top.note("ignored", "seed", "give the seed on the command line: --seed")
     report.stubs = terms.stubs
@@ -185,6 +187,7 @@ def _sim(node: Node) -> dict[str, Any]:
     if gravity != [0.0, 0.0, -9.81]:
         config["gravity"] = gravity
     node.skip("physics_prim_path", "use_fabric", "enable_scene_query_support", "render", "create_stage_in_memory")
+    node.skip("logging_level", "save_logs_to_file", "log_dir")
     if "device" in node:
         node.skip("device")
     material = node.data.get("physics_material")

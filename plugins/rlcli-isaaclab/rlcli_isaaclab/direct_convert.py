@@ -19,9 +19,10 @@ from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.sensor_facade import TerrainImporter
 from rlcli_isaaclab.settings import Node, Report
 from rlcli_isaaclab.term_reader import TermReader
+from rlcli_isaaclab.user_actuators import actuator_events
+from rlcli_isaaclab.user_files import reads_body_forces
 
 _KINDS = {"set_joint_effort_target": "motor", "set_joint_velocity_target": "velocity"}
-_BODY_FORCES = ("get_link_incoming_joint_force", "body_incoming_joint_wrench")
 
 
 def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]) -> PythonTask:
@@ -66,7 +67,8 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
     config["sim"] |= scene.integrator()
     terms = TermReader(scene, report, cfg)
     events = {name: term for member in top.node("events").nodes() for name, term in terms.read_terms("events", *member)}
-    hook = _Hooks(env_class, original, any(word in source for word in _BODY_FORCES))
+    events |= actuator_events(scene.user_actuators)
+    hook = _Hooks(env_class, original, reads_body_forces(source))
     config |= {
         "actions": {"action": {"func": hook("action", actions)}},
         "observations": {"policy": {"observation": {"func": hook("policy", observations)}}},
@@ -75,7 +77,11 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
             "terminated": {"func": hook("terminated")},
             "time_out": {"func": hook("time_out"), "time_out": True},
         },
-        "events": {**events, "reset": {"func": hook("reset"), "mode": "reset"}},
+        "events": {
+            **events,
+            **actuator_events(scene.user_actuators),
+            "reset": {"func": hook("reset"), "mode": "reset"},
+        },
     }
     if cfg.state_space:
         states = hook("critic", shape_of(cfg.state_space, "state_space"))

@@ -47,6 +47,12 @@ def fingers_contact_force_b(env: Any, contact_sensor_names: list[str], asset_cfg
     return quat_apply_inverse(robot.data.root_link_quat_w[:, None].expand(-1, force.shape[1], -1), force).flatten(1)
 
 
+def command_resample(env: Any, command_name: str, num_resamples: int = 1) -> Tensor:
+    """Whether the step draws a command again that was drawn `num_resamples` times in the episode. (num_envs,)"""
+    command = env.command_manager.get_term(command_name)
+    return (command.time_left < 1.5 * env.step_dt) & (command.command_counter == num_resamples)
+
+
 class reset_joints_within_limits_range(ManagerTermBase):  # noqa: N801  (Isaac Lab's name)
     """Event: joint positions and velocities from a range of each joint, or from a fraction of its soft limits."""
 
@@ -95,6 +101,7 @@ def _always(params: Mapping[str, Any]) -> bool:
 LAB_TERMS: dict[str, LabTerm] = {
     "last_action": LabTerm(last_action_of_term, lambda params: params.get("action_name") is not None),
     "reset_joints_within_limits_range": LabTerm(reset_joints_within_limits_range, _always),
+    "command_resample": LabTerm(command_resample, _always),
     "fingers_contact_force_b": LabTerm(fingers_contact_force_b, _always),
     "action_l2_clamped": LabTerm(action_l2_clamped, _always),
     "action_rate_l2_clamped": LabTerm(action_rate_l2_clamped, _always),

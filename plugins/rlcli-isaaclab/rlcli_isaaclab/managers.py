@@ -188,10 +188,19 @@ class CommandTerm(ManagerTermBase):
         self.metrics: dict[str, Tensor] = {}
         self.command_counter = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
 
+    rlcli_name: str
+    """Name of the term."""
+
     @property
     def command(self) -> Tensor:
         """Current command. (num_envs, k)"""
         raise NotImplementedError
+
+    @property
+    def time_left(self) -> Tensor:
+        """Time until the next resampling. (num_envs,) [s]"""
+        left: Tensor = self._env.managed.command_manager.time_left(self.rlcli_name)
+        return left
 
     def reset(self, env_ids: Any = None) -> dict[str, float]:
         """Reset the counter and the metrics. The environment samples the first command of an episode afterwards."""

@@ -15,8 +15,10 @@ from torch import Tensor
 
 from rlcli.config.term_signatures import SECTIONS, Parameter, builtin_terms
 from rlcli.errors import did_you_mean
+from rlcli_isaaclab.absent import absent_value
 from rlcli_isaaclab.config_class import MISSING, config_subclass, configclass
 from rlcli_isaaclab.curricula import modify_env_param, modify_term_cfg
+from rlcli_isaaclab.lab_terms import LAB_TERMS
 from rlcli_isaaclab.managers import ActionTermCfg, CommandTermCfg, SceneEntityCfg
 from rlcli_isaaclab.table import TERMS, Entry
 from rlcli_isaaclab.utils.math import sample_gaussian, sample_log_uniform, sample_uniform
@@ -160,6 +162,8 @@ def _has_counterpart(name: str) -> bool:
 def __getattr__(name: str) -> Any:
     if name.startswith("_"):
         raise AttributeError(name)
+    if not _has_counterpart(name) and name in LAB_TERMS:
+        return LAB_TERMS[name].function
     if not _has_counterpart(name):
         raise _UnknownTermError(name)
     return _function(name)
@@ -273,6 +277,8 @@ class UniformVelocityCommandCfg(CommandTermCfg):
         heading: Any = None
 
     class_type: Any = "UniformVelocityCommand"
+    goal_vel_visualizer_cfg: Any = absent_value("isaaclab.markers.config.GREEN_ARROW_X_MARKER_CFG")
+    current_vel_visualizer_cfg: Any = absent_value("isaaclab.markers.config.BLUE_ARROW_X_MARKER_CFG")
     asset_name: str = MISSING
     heading_command: bool = False
     heading_control_stiffness: float = 1.0
@@ -312,6 +318,8 @@ class UniformPoseCommandCfg(CommandTermCfg):
         yaw: Any = MISSING
 
     class_type: Any = "UniformPoseCommand"
+    goal_pose_visualizer_cfg: Any = absent_value("isaaclab.markers.config.FRAME_MARKER_CFG")
+    current_pose_visualizer_cfg: Any = absent_value("isaaclab.markers.config.FRAME_MARKER_CFG")
     asset_name: str = MISSING
     body_name: str = MISSING
     make_quat_unique: bool = False
@@ -331,6 +339,7 @@ class UniformPose2dCommandCfg(CommandTermCfg):
         heading: Any = MISSING
 
     class_type: Any = "UniformPose2dCommand"
+    goal_pose_visualizer_cfg: Any = absent_value("isaaclab.markers.config.GREEN_ARROW_X_MARKER_CFG")
     asset_name: str = MISSING
     simple_heading: bool = MISSING
     ranges: Any = MISSING

@@ -21,6 +21,7 @@ from rlcli.errors import did_you_mean
 from rlcli.registry.task_imports import import_from
 from rlcli_isaaclab.absent import absent_class, absent_function, absent_module, absent_value
 from rlcli_isaaclab.config_class import configclass
+from rlcli_isaaclab.format import LIBRARIES
 
 _OWN = "rlcli_isaaclab"
 _EXTRA = {
@@ -30,12 +31,12 @@ _EXTRA = {
     "isaaclab_contrib": ("multirotor", "action_terms"),
     "isaaclab.envs.mdp": ("mdp", "action_terms", "command_terms"),
     "isaaclab.sim": ("usd_stage", "usd_geometry"),
+    "isaaclab.utils.math": ("utils.poses",),
+    "isaaclab.actuators": ("actuator_classes",),
 }
 """Module of Isaac Lab -> modules of this package that define further names of it."""
 _SOURCE_PACKAGES = ("isaaclab_tasks", "isaaclab_assets")
 """Packages whose original files are imported if they are found: they only use other modules of Isaac Lab."""
-_LIBRARIES = ("toml", "torchvision", "trimesh")
-"""Libraries that come with Isaac Lab: an installed one is imported, a missing one raises an error when it is used."""
 _SIM = {"isaacsim.core.utils.torch": "isaacsim_torch", "isaacsim.core.utils.torch.rotations": "isaacsim_torch",
         "isaacsim.core.utils.torch.maths": "isaacsim_torch",
     "isaacsim.core.utils.torch.transformations": "isaacsim_torch"}  # fmt: skip
@@ -72,7 +73,7 @@ def module_of(name: str, file: str) -> ModuleType | None:
         if folder is not None:
             # the __init__.py of isaaclab_tasks imports every task, so that file is not run
             return import_from(folder, inner, run_start=top != "isaaclab_tasks")
-    if top in _LIBRARIES and importlib.util.find_spec(top) is not None:
+    if top in ("toml", "trimesh", *LIBRARIES) and importlib.util.find_spec(top) is not None:
         return None
     if top in ("toml", "trimesh"):
         return importlib.import_module(f"{_OWN}.{top}_reader" if top == "toml" else f"{_OWN}.triangle_mesh")

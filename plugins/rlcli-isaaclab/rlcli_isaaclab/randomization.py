@@ -58,7 +58,11 @@ class EventParameters:
     def range(self, name: str) -> Any:
         """Return a pair of numbers, or None if it is not set."""
         value = self.params.get(name)
-        return None if value is None else _pair(name, value)
+        if value is None:
+            return None
+        pair = _pair(name, value)
+        # as in Isaac Lab, the ends of a uniform distribution may be written from high to low
+        return pair if self.params.data.get("distribution") == "gaussian" else sorted(pair)
 
     def entity(self) -> TermConfig:
         """Return `entity`, unless it is the robot, which is the default of rlcli's terms."""

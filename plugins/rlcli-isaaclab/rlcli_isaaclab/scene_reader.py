@@ -29,6 +29,8 @@ class SceneReader:
         self.prims: dict[str, str] = {}
         """Entity -> the last part of its prim path."""
         self.sensors: dict[str, dict[str, Any]] = {}
+        self.user_actuators: dict[tuple[str, str], Mapping[str, Any]] = {}
+        """(entity, group) -> settings of the actuators with a class of the user's."""
         self.has_terrain = False
         self.frames: dict[str, dict[str, Any] | None] = {}
         """Frame transformers, and lights (None), which only the user's terms read."""
@@ -283,6 +285,7 @@ class SceneReader:
             lambda patterns, group: self.order_names(name, "joint", patterns, False, group.key),
             name,
             self._given.gains.get(name, {}),
+            self.user_actuators,
         )
         if explicit:
             entity["actuators"] = explicit

@@ -14,7 +14,7 @@ from rlcli_isaaclab import command_terms
 from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.curricula import ChangedSetting, modify_env_param
-from rlcli_isaaclab.lab_terms import LAB_TERMS
+from rlcli_isaaclab.lab_terms import LAB_TERMS, command_resample
 from rlcli_isaaclab.managers import CommandTerm
 from rlcli_isaaclab.mdp import MdpFunction
 from rlcli_isaaclab.object_reader import OBJECT_KEYS, ObjectReader
@@ -30,7 +30,7 @@ from rlcli_isaaclab.table import (
     Entry,
     finite_times,
 )
-from rlcli_isaaclab.term_values import builtin_name, is_entity, is_plain, triple
+from rlcli_isaaclab.term_values import builtin_name, is_entity, is_plain, order_ranges, triple
 
 _READS_COMMAND = "command_manager.get_term("
 _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
@@ -55,7 +55,9 @@ class TermReader(ObjectReader):
         super().__init__(scene, report, TermContext(cfg, scene.frames))
         self.data = data
         self._user_terms: dict[Any, Any] = {}
-        self.reads_commands = any(_READS_COMMAND in file_text(function) for function in _functions(data))
+        self.reads_commands = any(
+            function is command_resample or _READS_COMMAND in file_text(function) for function in _functions(data)
+        )
         """Whether the user's code reads or changes the object of a command, which must then be Isaac Lab's class."""
         self.stubs: dict[str, tuple[str, dict[str, Any]]] = {}
         """Functions whose code is not in the imported files: name -> (section, parameters)."""
@@ -90,6 +92,7 @@ class TermReader(ObjectReader):
         if node.data.get("heading_command") is False:
             for key in ("heading", "heading_stiffness", "rel_heading"):
                 config.pop(key, None)
+        order_ranges(signature, config)
         if kind == "NormalVelocityCommand":
             config |= {"mean": triple(ranges, "mean_vel"), "std": triple(ranges, "std_vel")}
             config["zero_prob"] = triple(ranges, "zero_prob")
@@ -186,6 +189,7 @@ class TermReader(ObjectReader):
             signature = builtin_terms(section)[ours]
             config = {"func": ours} | self._read_common(section, node)
             config |= self._read_params(signature, entry, params)
+            order_ranges(signature, config)
             if entry.note:
                 self.report.entries[(*node.key, "func")] = ("approximated", entry.note)
             if name in HEIGHT_TERMS and self.scene.has_terrain:

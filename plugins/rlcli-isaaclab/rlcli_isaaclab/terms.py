@@ -19,12 +19,13 @@ from torch import Tensor
 from rlcli.config.schema import Names, Number, StrictModel
 from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, SignatureError
 from rlcli.sim.selection import Selection
-from rlcli_isaaclab.config_class import to_dict
+from rlcli_isaaclab.config_class import is_missing, to_dict
 from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
 from rlcli_isaaclab.settings import to_plain
 from rlcli_isaaclab.substeps import Substeps
-from rlcli_isaaclab.user_files import file_text, source_text, unset_simple
+from rlcli_isaaclab.user_files import file_text, reads_body_forces, source_text, text_with_helpers, unset_simple
+from rlcli_isaaclab.utils.buffers import set_tensors, tensors_of
 
 _RESERVED = {name for model in SECTIONS.values() for name in model.model_fields} | {"params"}
 _PLAIN: dict[Any, Any] = {float: Number, int: int, bool: bool, str: str}
@@ -81,6 +82,7 @@ class UserTerm:
         self.target = functools.partial(_bind_term, self)
         if section == "events" and "set_coms(" in file_text(function):
             self.target.prepare = unset_simple  # type: ignore[attr-defined]
+        self.target.reads_body_forces = reads_body_forces(text_with_helpers(function))  # type: ignore[attr-defined]
         call = function.__call__ if self.is_class else function
         declared = list(inspect.signature(call).parameters.values())
         takes_env_ids = section in ("events", "curriculum")
@@ -214,6 +216,8 @@ def entity_data(settings: Any) -> dict[str, Any]:
             raise ValueError(f"{key} is not supported by rlcli; remove it")
     data = {"name": settings["name"]}
     for key in ("joint_names", "body_names"):
+        if is_missing(settings.get(key)):
+            raise ValueError(f"missing '{key}'; give it a value")
         if settings.get(key) is not None:
             value = settings[key]
             data[key] = value if isinstance(value, str) else list(value)
@@ -271,12 +275,11 @@ class _BoundObject:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of the object's tensors."""
-        return {name: value.clone() for name, value in vars(self.term).items() if isinstance(value, Tensor)}
+        return {name: value.clone() for name, value in tensors_of(self.term).items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore the tensors returned by `state_dict`."""
-        for name, value in state.items():
-            setattr(self.term, name, value.clone())
+        set_tensors(self.term, state)
 
 
 class _BoundClass(_Bound, _BoundObject):
@@ -365,6 +368,7 @@ def _bind_object(term: UserObject, env: Any, **params: Any) -> _BoundObject:
         cfg.resampling_time_range = tuple(env.config.commands[term.name].resampling_time_s)
     with building(env):
         made = term.function(cfg, facade)
+    made.rlcli_name = term.name
     return _BoundAction(made, env, term.name) if term.section == "actions" else _BoundCommand(made)
 
 

@@ -25,6 +25,34 @@ def _text(file: str) -> str:
     return Path(file).read_text(encoding="utf-8", errors="replace")
 
 
+def reads_body_forces(text: str) -> bool:
+    """Return whether code reads accelerations or joint forces of bodies, which MuJoCo computes only on demand."""
+    return any(word in text for word in _BODY_FORCES)
+
+
+def text_with_helpers(function: Any) -> str:
+    """Return the text of a function or class, and of the user's functions that it names."""
+    found: dict[Any, str] = {}
+    waiting = [function]
+    while waiting:
+        item = waiting.pop()
+        if item in found or is_framework(str(getattr(item, "__module__", ""))):
+            continue
+        found[item] = source_text(item)
+        methods = [m for m in vars(item).values() if inspect.isfunction(m)] if inspect.isclass(item) else [item]
+        for method in methods:
+            used = (method.__globals__.get(name) for name in method.__code__.co_names)
+            waiting += [other for other in used if inspect.isfunction(other)]
+        waiting += item.__bases__ if inspect.isclass(item) else ()
+    return "\n".join(found.values())
+
+
+_BODY_FORCES = (
+    *("get_link_incoming_joint_force", "body_incoming_joint_wrench", "body_acc_w", "body_com_acc_w"),
+    *("body_lin_acc_w", "body_ang_acc_w", "body_com_lin_acc_w", "body_com_ang_acc_w", "body_link_acc_w"),
+)
+
+
 def source_text(function: Any) -> str:
     """Return the text of a function; empty if it is unknown."""
     try:

@@ -2,6 +2,7 @@
 
 Usage: python corpus.py [--only WORD] [--stage NAME] [--out FILE.json], with the environment variable ISAACLAB_SOURCE at
 the folder `source` of Isaac Lab 2.3.2, or of its unpacked wheel. Each robot gets a stand-in model (`standins.py`).
+With `--package FOLDER` it runs the tasks that another package registers.
 """
 
 from __future__ import annotations
@@ -29,11 +30,10 @@ OUTSIDE = ("pick_place",)
 """Packages that Isaac Lab does not import by default."""
 
 
-def tasks(source: Path) -> dict[str, dict[str, Any]]:
-    """Return ID -> arguments of every registered task."""
+def tasks(package: Path) -> dict[str, dict[str, Any]]:
+    """Return ID -> arguments of every task that a package registers."""
     from rlcli.registry.task_imports import import_file, registrations
 
-    package = source / "isaaclab_tasks" / "isaaclab_tasks"
     import_file(package / "__init__.py")
     for file in sorted(package.rglob("__init__.py")):
         if any(word in str(file) for word in OUTSIDE):
@@ -214,6 +214,7 @@ def main_() -> None:
     parser.add_argument("--page", type=Path, help="page whose table is written from the results")
     parser.add_argument("--merge", type=Path, nargs="*", help="write the page from files of --out, and run nothing")
     parser.add_argument("--part", default="0/1", help="i/n: every n-th task")
+    parser.add_argument("--package", type=Path, help="folder of another package that registers tasks")
     options = parser.parse_args()
     rows: dict[str, Any]
     if options.merge:
@@ -226,7 +227,9 @@ def main_() -> None:
 
     import rlcli.envs.managed  # noqa: F401
 
-    found = tasks(source)
+    os.environ.setdefault("RLCLI_ISAACLAB", str(source))
+    package = (options.package or source / "isaaclab_tasks" / "isaaclab_tasks").resolve()
+    found = tasks(package)
     part, parts = map(int, options.part.split("/"))
     rows = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -235,7 +238,6 @@ def main_() -> None:
             direct = is_direct(found[name]["entry_point"])
             if number % parts != part or options.kind == ("manager" if direct else "direct"):
                 continue
-            package = source / "isaaclab_tasks" / "isaaclab_tasks"
             stage, reason, facts = isolated(
                 LIMIT_S, run, name, found[name], package, Path(folder) / name, options.stage, options.steps
             )

@@ -43,6 +43,7 @@ class ManagerBasedEnvCfg:
     actions: Any = MISSING
     events: Any = None
     rerender_on_reset: bool = False
+    num_rerenders_on_reset: int = 0
     wait_for_textures: bool = True
     xr: Any = None
     teleop_devices: Any = None
