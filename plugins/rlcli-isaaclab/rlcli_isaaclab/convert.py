@@ -102,7 +102,7 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         ConfigError: if a setting is missing or wrong.
     """
     top = Node(data, (), report)
-    policy, algorithm = top.node("policy"), top.node("algorithm")
+    policy, algorithm = _policy(top), top.node("algorithm")
     bound = top.get("clip_actions")
     config: dict[str, Any] = {
         "trainer": "ppo",
@@ -172,6 +172,32 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
             top.note("ignored", name, f"use {option}")
     report.finish(data)
     return config
+
+
+def _policy(top: Node) -> Node:
+    """Return the settings of the policy; those of RSL-RL 5, which has `actor` and `critic`, in the form of `policy`."""
+    if "policy" in top or "actor" not in top:
+        return top.node("policy")
+    actor, critic = top.node("actor"), top.node("critic")
+    for model in (actor, critic):
+        if model.get("class_name", "MLPModel") != "MLPModel":
+            top.report.problem(model.key, f"'{model.get('class_name')}' has no counterpart", "rlcli reads MLPModel")
+    distribution = actor.node("distribution_cfg")
+    if distribution.get("class_name", "GaussianDistribution").rpartition(".")[2] != "GaussianDistribution":
+        top.report.problem(distribution.key, "the distribution has no counterpart", "rlcli reads GaussianDistribution")
+    if critic.get("activation", "elu") != actor.get("activation", "elu"):
+        critic.note("approximated", "activation", "the critic has the activation of the actor")
+    data = {
+        "actor_hidden_dims": actor.get("hidden_dims"),
+        "critic_hidden_dims": critic.get("hidden_dims"),
+        "activation": actor.get("activation"),
+        "actor_obs_normalization": bool(actor.get("obs_normalization", False)),
+        "critic_obs_normalization": bool(critic.get("obs_normalization", False)),
+        "init_noise_std": distribution.get("init_std", 1.0),
+        "noise_std_type": distribution.get("std_type", "scalar"),
+    }
+    top.get("policy")
+    return Node(data, ("policy",), top.report)
 
 
 def _network(policy: Node, name: str) -> dict[str, Any]:

@@ -71,8 +71,7 @@ def module_of(name: str, file: str) -> ModuleType | None:
     if top in _SOURCE_PACKAGES and not inner.startswith("utils"):
         folder = _source_folder(top, Path(file).parent)
         if folder is not None:
-            # the __init__.py of isaaclab_tasks imports every task, so that file is not run
-            return import_from(folder, inner, run_start=top != "isaaclab_tasks")
+            return _of_source(name, folder, inner)
     if top in ("toml", "trimesh", *LIBRARIES) and importlib.util.find_spec(top) is not None:
         return None
     if top in ("toml", "trimesh"):
@@ -91,6 +90,22 @@ def module_of(name: str, file: str) -> ModuleType | None:
         what = f"Isaac Lab 2.3.2 has no module '{name}'"
         raise ModuleNotFoundError(f"{what}; {near}" if near else what, name=name)
     return _lab_module(name)
+
+
+def _of_source(name: str, folder: Path, inner: str) -> ModuleType:
+    """Return a module of the original files of a package.
+
+    Raises:
+        ModuleNotFoundError: if the package has no such module.
+    """
+    top = name.partition(".")[0]
+    try:
+        # the __init__.py of isaaclab_tasks imports every task, so that file is not run
+        return import_from(folder, inner, run_start=top != "isaaclab_tasks")
+    except ModuleNotFoundError as error:
+        if not str(error.name).endswith(f".{inner}"):
+            raise
+        raise ModuleNotFoundError(f"Isaac Lab's package '{top}' has no module '{name}' ({folder})", name=name) from None
 
 
 @functools.cache

@@ -10,7 +10,9 @@ from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError, TaskError
 from rlcli_isaaclab import namespace
 from rlcli_isaaclab.config_class import is_missing
+from rlcli_isaaclab.convert import agent
 from rlcli_isaaclab.format import LIBRARIES
+from rlcli_isaaclab.settings import Report
 
 torch.set_num_threads(1)
 
@@ -268,3 +270,76 @@ def test_unknown_attribute_of_a_sensor_has_file_and_line(tmp_path):
     resolved = with_scanner(tmp_path / "rover", "wrong")
     with pytest.raises(AttributeError, match=r"rover_env.py:\d+: a sensor of rlcli has no 'ray_strats'; did you mean"):
         stepped(resolved)
+
+
+ACTION_OF_TERM = """
+def arm(env):
+    term = env.action_manager.get_term("arm")
+    assert term._joint_names == ("arm",) and term.action_dim == 1
+    return env.scene["robot"].data.joint_pos[:, term._joint_ids].sum(dim=1)
+
+def wrong(env):
+    return env.action_manager.get_term("arm").raw_action
+"""
+
+
+def test_term_reads_the_joints_of_an_action(tmp_path):
+    reward = {"arm": "RewardTermCfg(func=arm, weight=1.0)"}
+    env, result = stepped(rover(tmp_path / "rover", ACTION_OF_TERM, rewards=reward))
+    assert result.reward == pytest.approx(env.entities["robot"].data.joint_pos[:, 0] * 0.02, abs=1e-4)
+
+
+def test_unknown_attribute_of_an_action_has_file_and_line(tmp_path):
+    resolved = rover(tmp_path / "rover", ACTION_OF_TERM, rewards={"arm": "RewardTermCfg(func=wrong, weight=1.0)"})
+    with pytest.raises(AttributeError, match=r"rover_env.py:\d+: an action of rlcli has no 'raw_action'; did you mean"):
+        stepped(resolved)
+
+
+HOLES = """
+from isaaclab.terrains.height_field.utils import height_field_to_mesh
+
+@height_field_to_mesh
+def holes(difficulty, cfg):
+    raise NotImplementedError
+"""
+
+
+def test_terrain_function_of_the_user_is_imported(tmp_path):
+    stepped(rover(tmp_path / "rover", HOLES))
+
+
+def test_missing_module_of_isaac_lab_has_its_name_and_the_users_line(tmp_path, monkeypatch):
+    package = tmp_path / "source" / "isaaclab_assets"
+    (package / "robots").mkdir(parents=True)
+    for folder in (package, package / "robots"):
+        (folder / "__init__.py").write_text("")
+    monkeypatch.setenv(namespace.SOURCE, str(tmp_path / "source"))
+    namespace._source_folder.cache_clear()
+    code = "from isaaclab_assets.robots.spider import SPIDER_CFG\n"
+    with pytest.raises(TaskError, match=r"no module 'isaaclab_assets.robots.spider'.*rover_env.py:\d+\)"):
+        rover(tmp_path / "rover", code)
+    namespace._source_folder.cache_clear()
+
+
+RUNNER_5 = {
+    "num_steps_per_env": 24, "max_iterations": 9, "save_interval": 5, "experiment_name": "x",
+    "actor": {"class_name": "MLPModel", "hidden_dims": [64, 32], "activation": "tanh", "obs_normalization": True,
+              "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 0.5, "std_type": "log"}},
+    "critic": {"class_name": "MLPModel", "hidden_dims": [16], "activation": "tanh", "obs_normalization": True},
+    "algorithm": {
+        "value_loss_coef": 1.0, "clip_param": 0.2, "entropy_coef": 0.01, "num_learning_epochs": 5,
+        "num_mini_batches": 4, "learning_rate": 1e-3, "gamma": 0.99, "lam": 0.95, "desired_kl": 0.01,
+        "max_grad_norm": 1.0,
+    },
+}  # fmt: skip
+
+
+def test_runner_of_rsl_rl_5():
+    config = agent(RUNNER_5, Report())
+    assert (config["actor"], config["critic"]) == (
+        {"hidden": [64, 32], "activation": "tanh"},
+        {"hidden": [16], "activation": "tanh"},
+    )
+    assert (config["init_std"], config["std"], config["normalize_observations"]) == (0.5, "log", True)
+    with pytest.raises(ConfigError, match="'RNNModel' has no counterpart"):
+        agent({**RUNNER_5, "actor": {**RUNNER_5["actor"], "class_name": "RNNModel"}}, Report())

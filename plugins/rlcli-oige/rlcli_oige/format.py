@@ -35,6 +35,7 @@ SPEC = FormatSpec(
                 "omni",
                 "pxr",
                 "carb",
+                "warp",
             ),
             "rlcli_oige.modules:find",
         ),

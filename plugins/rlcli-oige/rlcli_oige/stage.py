@@ -178,6 +178,8 @@ class Stage(Counterpart):
         self.parts: dict[str, dict[str, Prim]] = {}
         self.references: dict[str, str] = {}
         """Path of a prim -> USD file that the task refers to."""
+        self.labelled: set[str] = set()
+        """Paths of the prims with a semantic label, relative to their environment."""
         self.ignored: dict[str, str] = {}
         """Call of the task that has no effect -> where it is, and the reason."""
         self.lost: dict[str, str] = {}

@@ -22,8 +22,12 @@ import stand_ins
 NUM_ENVS, STEPS, ITERATIONS = 16, 200, 3
 START, END = "<!-- table of all tasks: plugins/rlcli-oige/tests/all_tasks.py -->", "<!-- end of the table -->"
 LIMIT_S = 600
-SHORT = {"CartpoleCamera": ["agent.num_steps=8", "agent.minibatch_size=null"]}
-"""Overrides of a task whose own rollouts take too long on a CPU: 256 images of each environment."""
+_FEW = ["agent.num_steps=8", "agent.minibatch_size=null"]
+SHORT = {
+    "CartpoleCamera": _FEW,
+    "TargetFollowing": ["oige.env.cameraWidth=64", "oige.env.cameraHeight=64", *_FEW],
+}
+"""Overrides of tasks whose own rollouts take too long on a CPU: 256 or 512 images of each environment."""
 
 
 def registered(checkout: Path) -> list[str]:
@@ -67,6 +71,7 @@ def step(name: str, config: str, models: list[str]) -> None:
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     words = [f'{MODELS}."{key}"="{file}"' for key, file in read_models(models).items()]
+    words += [word for word in SHORT.get(name, []) if not word.startswith("agent.")]
     resolved = resolve(task_source(config), overrides=words, flags={"scene.num_envs": NUM_ENVS})
     env = make_env(resolved, seed=0)
     env.reset(seed=0)
