@@ -166,14 +166,16 @@ def isolated(limit_s: float, function: Any, *arguments: Any) -> Any:
 
 
 def write_page(rows: dict[str, Any], page: Path) -> None:
-    """Write the table of the documentation from the results."""
+    """Write the table of the documentation from the results. Rows of tasks that were not run stay."""
     text = page.read_text(encoding="utf-8")
     start, end = "<!-- table -->\n", "<!-- end of table -->"
-    lines = [
+    head = [
         "| task | imports | validates | steps | trains | what is lost, or why it stops |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
-    for name, row in sorted(rows.items()):
+    table = text.partition(start)[2].partition(end)[0].splitlines()[len(head) :]
+    lines = {line.split("`")[1]: line for line in table}
+    for name, row in rows.items():
         marks = ["yes" if row["stage"] > i else "no" for i in range(len(STAGES))]
         if row["stage"] == row["last"] < len(STAGES):
             marks[row["last"] :] = ["not run"] * (len(STAGES) - row["last"])
@@ -181,9 +183,10 @@ def write_page(rows: dict[str, Any], page: Path) -> None:
             marks[-1] = "no agent"
         stops = row["stage"] < (row["last"] if row["agent"] else min(row["last"], STAGES.index("trains")))
         reason = re.sub(r"/\S*/", "", row["reason"]).replace("|", ";")[:300] if stops else lost(row.get("lost", ()))
-        lines.append(f"| `{name}` | {' | '.join(marks)} | {reason} |")
+        lines[name] = f"| `{name}` | {' | '.join(marks)} | {reason} |"
     before, after = text.partition(start)[0], text.partition(end)[2]
-    page.write_text(before + start + "\n".join(lines) + "\n" + end + after, encoding="utf-8")
+    ordered = [*head, *(lines[name] for name in sorted(lines))]
+    page.write_text(before + start + "\n".join(ordered) + "\n" + end + after, encoding="utf-8")
 
 
 USUAL = ("physx", "rigid_props", "articulation_props", "collision_props", "experiment_name", "run_name", "num_envs")
