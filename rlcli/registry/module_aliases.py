@@ -10,6 +10,7 @@ import builtins
 import contextlib
 import functools
 import importlib
+import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.abc import MetaPathFinder
@@ -20,6 +21,8 @@ from typing import Any
 
 from rlcli.registry.formats import Format, aliasing_formats
 
+_COMMON = ("gym", "numpy")
+"""Libraries that files of all formats mention."""
 _MOST_FILES = 200
 """Most files of a task in which names of formats are counted."""
 _python_import = builtins.__import__
@@ -102,12 +105,18 @@ class _TaskFinder(MetaPathFinder):
         spec = PathFinder.find_spec(name, path)
         if spec is None or not isinstance(spec.loader, SourceFileLoader) or spec.origin is None:
             return None
-        if not any(Path(spec.origin).is_relative_to(root) for root in _roots):
+        if not any(Path(spec.origin).is_relative_to(root) for root in (*_roots, *_folders_above())):
             return None
         if path is None:
             _trees.setdefault(name, name)  # its modules are files of the task, too
         spec.loader = TaskFileLoader(spec.loader.name, spec.loader.path)
         return spec
+
+
+def _folders_above() -> list[Path]:
+    """Return the folders of PYTHONPATH that contain a task: a repository's root, from which its files import."""
+    given = (Path(entry).resolve() for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry)
+    return [folder for folder in given if any(root.is_relative_to(folder) for root in _roots)]
 
 
 def _add_own_paths() -> None:
@@ -236,7 +245,7 @@ def _formats_for(first: str, file: str) -> tuple[Format, ...]:
     ]
     if len(forms) < 2 or not file.endswith(".py"):
         return tuple(forms)
-    shared = set.intersection(*(set(form.spec.aliases) for form in forms))
+    shared = {*_COMMON, *set.intersection(*(set(form.spec.aliases) for form in forms))}
     own = {form.name: tuple(set(form.spec.aliases) - shared) for form in forms}
     counts = {name: _mentions(file, aliases) for name, aliases in own.items()}
     if len(set(counts.values())) == 1:

@@ -23,6 +23,7 @@ from rlcli.errors import ConfigError, Problem, TaskError
 from rlcli_isaaclab.config_class import MISSING, configclass
 from rlcli_isaaclab.setup_scene import Setup, running
 from rlcli_isaaclab.sim import SimulationCfg
+from rlcli_isaaclab.user_files import placed
 
 MANAGED: ContextVar[Any] = ContextVar("managed")
 """The environment of rlcli for which an object of the task is created."""
@@ -287,7 +288,7 @@ def record(env_class: type[DirectRLEnv], cfg: Any) -> tuple[Setup, Any]:
     setup = Setup()
     with running(setup), building(_Shell(cfg)):
         try:
-            env_class(cfg)
+            placed(env_class, "cpu")(cfg)
         except _Recorded as recorded:
             return setup, recorded.env
     raise TaskError(f"{env_class.__name__}.__init__ does not call super().__init__(cfg, ...)", hint="add the call")

@@ -18,6 +18,7 @@ from rlcli.sim.selection import Selection
 from rlcli_isaaclab.direct_env import DirectRLEnv, building
 from rlcli_isaaclab.observation_noise import noise_model
 from rlcli_isaaclab.substeps import Substeps
+from rlcli_isaaclab.user_files import placed
 
 
 class HookTerm:
@@ -57,7 +58,7 @@ class DirectRunner:
         self.phase = "build"
         self._substeps = Substeps(managed, "direct task", self)
         with building(managed):
-            self.lab: DirectRLEnv = term.env_class(cfg)
+            self.lab: DirectRLEnv = placed(term.env_class, managed.device)(cfg)
         for asset in self.lab.scene.articulations.values():
             asset.start_wrenches(by_task=True)
         self.action_noise = noise_model(cfg.action_noise_model, managed)

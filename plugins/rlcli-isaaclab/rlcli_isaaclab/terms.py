@@ -24,7 +24,7 @@ from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
 from rlcli_isaaclab.settings import to_plain
 from rlcli_isaaclab.substeps import Substeps
-from rlcli_isaaclab.user_files import file_text, reads_body_forces, source_text, text_with_helpers, unset_simple
+from rlcli_isaaclab.user_files import file_text, placed, source_text, term_reads_body_forces, unset_simple
 from rlcli_isaaclab.utils.buffers import set_tensors, tensors_of
 
 _RESERVED = {name for model in SECTIONS.values() for name in model.model_fields} | {"params"}
@@ -82,7 +82,7 @@ class UserTerm:
         self.target = functools.partial(_bind_term, self)
         if section == "events" and "set_coms(" in file_text(function):
             self.target.prepare = unset_simple  # type: ignore[attr-defined]
-        self.target.reads_body_forces = reads_body_forces(text_with_helpers(function))  # type: ignore[attr-defined]
+        self.target.reads_body_forces = term_reads_body_forces(function)  # type: ignore[attr-defined]
         call = function.__call__ if self.is_class else function
         declared = list(inspect.signature(call).parameters.values())
         takes_env_ids = section in ("events", "curriculum")
@@ -367,7 +367,7 @@ def _bind_object(term: UserObject, env: Any, **params: Any) -> _BoundObject:
     if term.section == "commands":
         cfg.resampling_time_range = tuple(env.config.commands[term.name].resampling_time_s)
     with building(env):
-        made = term.function(cfg, facade)
+        made = placed(term.function, env.device)(cfg, facade)
     made.rlcli_name = term.name
     return _BoundAction(made, env, term.name) if term.section == "actions" else _BoundCommand(made)
 
@@ -434,9 +434,10 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
                 if isinstance(chosen, SceneEntityCfg) and isinstance(getattr(chosen, key), Tensor):
                     setattr(chosen, key, getattr(chosen, key).tolist())
     if not term.is_class:
-        return _Bound(term.function, term.section, facade, values)
+        return _Bound(placed(term.function, env.device), term.section, facade, values)
     with building(env):
-        instance = term.function(cfg=ManagerTermBaseCfg(func=term.function, params=values), env=facade)
+        cfg = ManagerTermBaseCfg(func=term.function, params=values)
+        instance = placed(term.function, env.device)(cfg=cfg, env=facade)
     return _BoundClass(instance, term.section, facade, values)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 
 from rlcli.registry import is_framework
+from rlcli.sim.device_names import on_cpu
 
 
 def file_text(function: Any) -> str:
@@ -30,8 +31,8 @@ def reads_body_forces(text: str) -> bool:
     return any(word in text for word in _BODY_FORCES)
 
 
-def text_with_helpers(function: Any) -> str:
-    """Return the text of a function or class, and of the user's functions that it names."""
+def term_reads_body_forces(function: Any) -> bool:
+    """Return whether a function or class, or a function of the user's that it names, reads such values."""
     found: dict[Any, str] = {}
     waiting = [function]
     while waiting:
@@ -44,13 +45,27 @@ def text_with_helpers(function: Any) -> str:
             used = (method.__globals__.get(name) for name in method.__code__.co_names)
             waiting += [other for other in used if inspect.isfunction(other)]
         waiting += item.__bases__ if inspect.isclass(item) else ()
-    return "\n".join(found.values())
+    return any(map(reads_body_forces, found.values()))
 
 
 _BODY_FORCES = (
     *("get_link_incoming_joint_force", "body_incoming_joint_wrench", "body_acc_w", "body_com_acc_w"),
     *("body_lin_acc_w", "body_ang_acc_w", "body_com_lin_acc_w", "body_com_ang_acc_w", "body_link_acc_w"),
 )
+
+
+def placed(target: Any, device: Any) -> Any:
+    """Return a function or class of the user's that runs on a device.
+
+    If the device is the CPU and the file names the device `cuda`, the code takes `cuda` for the CPU.
+    """
+    kinds = [kind for kind in reversed(getattr(target, "__mro__", (target,))) if not is_framework(kind.__module__)]
+    if str(device) != "cpu" or not any("cuda" in file_text(kind) for kind in kinds):
+        return target
+    if not inspect.isclass(target):
+        return on_cpu(target)
+    members = {name: on_cpu(f) for kind in kinds for name, f in vars(kind).items() if inspect.isfunction(f)}
+    return type(target.__name__, (target,), {**members, "__module__": target.__module__})
 
 
 def source_text(function: Any) -> str:

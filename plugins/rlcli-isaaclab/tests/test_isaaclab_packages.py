@@ -37,6 +37,16 @@ def test_package_in_a_folder_that_a_task_file_adds_to_sys_path(tmp_path):
     stepped(rover(tmp_path / "repository" / "tasks", code))
 
 
+def test_package_at_a_root_that_pythonpath_names(tmp_path, monkeypatch):
+    robots = tmp_path / "root" / "shared_robots_of_test"
+    robots.mkdir(parents=True)
+    (robots / "__init__.py").write_text("")
+    (robots / "gains.py").write_text("from isaaclab.utils import configclass\n\nSTIFFNESS = 3.0\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "root"))
+    monkeypatch.syspath_prepend(str(tmp_path / "root"))
+    stepped(rover(tmp_path / "root" / "tasks", "from shared_robots_of_test.gains import STIFFNESS\n"))
+
+
 @pytest.mark.parametrize("library", sorted(LIBRARIES))
 def test_missing_library_of_isaac_lab_is_named_when_it_is_used(tmp_path, monkeypatch, library):
     find = namespace.importlib.util.find_spec
@@ -343,3 +353,43 @@ def test_runner_of_rsl_rl_5():
     assert (config["init_std"], config["std"], config["normalize_observations"]) == (0.5, "log", True)
     with pytest.raises(ConfigError, match="'RNNModel' has no counterpart"):
         agent({**RUNNER_5, "actor": {**RUNNER_5["actor"], "class_name": "RNNModel"}}, Report())
+
+
+CUDA = """
+from isaaclab.managers import ManagerTermBase
+
+class Stored(ManagerTermBase):
+    def __init__(self, cfg, env):
+        super().__init__(cfg, env)
+        self.sum = torch.zeros(env.num_envs, device="cuda")
+
+    def __call__(self, env):
+        self.sum += torch.ones(env.num_envs).cuda()
+        return self.sum
+
+def sign(env):
+    return torch.ones(env.num_envs, device="cuda:0") + env.scene["robot"].data.joint_pos[:, 0].to("cuda") * 0.0
+"""
+
+
+def test_terms_that_name_the_device_cuda_run_on_the_cpu(tmp_path):
+    rewards = {name: f"RewardTermCfg(func={name}, weight=1.0)" for name in ("Stored", "sign")}
+    _, result = stepped(rover(tmp_path / "rover", CUDA, rewards=rewards))
+    assert result.reward.device.type == "cpu"
+    assert bool((result.reward > 0.0).all())
+
+
+def test_soft_limits_may_be_wider_than_the_joint_range(tmp_path):
+    spawn = "        spawn=sim_utils.UsdFileCfg("
+    wide = (spawn, f"        soft_joint_pos_limit_factor=1.8,\n{spawn}")
+    env, _ = stepped(rover(tmp_path / "rover", "", [wide]))
+    assert env.config.scene.entities["robot"].soft_joint_pos_limit_factor == 1.8
+
+
+def test_file_without_names_of_a_format_belongs_to_the_format_of_its_task(tmp_path):
+    folder = tmp_path / "rover"
+    kernels = "import numpy as np\nimport warp as wp\n\nONE = np.ones(1)\n\n\n@wp.func\ndef f(x):\n    return x\n"
+    (tmp_path / "kernels_of_test.py").write_text(kernels)
+    added = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nimport kernels_of_test\n"
+    with pytest.raises(TaskError, match=r"kernels_of_test.py:7: warp.func cannot be used: .* not installed"):
+        rover(folder, added)

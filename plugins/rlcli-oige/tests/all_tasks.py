@@ -111,20 +111,21 @@ def examine(name: str, checkout: Path, folder: Path, models: dict[str, Path]) ->
     return row
 
 
-def table(rows: list[dict[str, object]], checkout: Path) -> str:
-    """Return the rows as a Markdown table. Paths are relative to the checkout."""
+def table(rows: list[dict[str, object]], checkout: Path, old: str = "") -> str:
+    """Return the rows as a Markdown table. Paths are relative to the checkout; other tasks keep their row of `old`."""
     yes = {True: "yes", False: "no"}
-    lines = [
+    head = [
         "| Task | validates | builds | steps | trains | not simulated, or the reason |",
         "|---|---|---|---|---|---|",
     ]
+    lines = {line.split("|")[1].strip(): line for line in old.strip().splitlines()[len(head) :]}
     for row in rows:
         text = str(row["reason"]).replace(f"{checkout}/omniisaacgymenvs/", "") or ", ".join(
             f"`{part}`" for part in row["lost"]
         )  # type: ignore[attr-defined]
         cells = [str(row["task"]), *(yes[bool(row[key])] for key in ("validates", "builds", "steps", "trains")), text]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines[str(row["task"])] = f"| {' | '.join(cells)} |"
+    return "\n".join([*head, *lines.values()])
 
 
 def main(words: list[str]) -> None:
@@ -145,8 +146,8 @@ def main(words: list[str]) -> None:
     print(json.dumps(rows, indent=1))
     if page is not None:
         before, _, rest = page.read_text(encoding="utf-8").partition(START)
-        after = rest.partition(END)[2]
-        page.write_text(f"{before}{START}\n{table(rows, checkout)}\n{END}{after}", encoding="utf-8")
+        old, _, after = rest.partition(END)
+        page.write_text(f"{before}{START}\n{table(rows, checkout, old)}\n{END}{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":
