@@ -34,7 +34,7 @@ class _Arm(GymnasiumTask):
         super().post_reset()
 
     def velocities(self, selection: Selection, still: int) -> Tensor:
-        """Return small velocities for the arm, and 0 for the last `still` joints, which have no actuator. (rows, nv)"""
+        """Sample small joint velocities, with 0 for the last `still` joints, which have no actuator. (rows, nv)"""
         noise = self.noise(selection, 0.005, self.model.nv)
         noise[:, -still:] = 0.0
         return noise

@@ -1,4 +1,4 @@
-"""Explicit actuators as classes, which a task may subclass. Names as in `isaaclab.actuators`."""
+"""Actuator models that compute joint efforts, as classes that a task may subclass. Names as in `isaaclab.actuators`."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ class ActuatorBase:
     effort_limit: Tensor
 
     def reset(self, env_ids: Any) -> None:
-        """Forget the state of some environments."""
+        """Reset the actuator's state in some environments."""
 
     def compute(self, control_action: ArticulationActions, joint_pos: Tensor, joint_vel: Tensor) -> ArticulationActions:
         """Return the targets of the joints with the efforts for the next physics step."""
-        raise NotImplementedError(f"write {type(self).__name__}.compute")
+        raise NotImplementedError(f"class {type(self).__name__} has no method compute; implement it")
 
     def _parse_joint_parameter(self, cfg_value: Any, default_value: Any) -> Tensor:
         """Return a setting of every joint: a number, a mapping from regexes, or the default. (num_envs, joints)"""
         value = default_value if cfg_value is None else cfg_value
         if value is None:
-            raise ValueError("the setting has no value and no default")
+            raise ValueError("an actuator setting is None and has no default; give it a value")
         found = torch.zeros(self._num_envs, self.num_joints, device=self._device)
         if isinstance(value, dict):
             columns, _, values = resolve_matching_names_values(value, self.joint_names)
@@ -61,7 +61,7 @@ class ActuatorBase:
         return found
 
     def _clip_effort(self, effort: Tensor) -> Tensor:
-        """Return efforts within the limits."""
+        """Return efforts clipped to +-`effort_limit`."""
         return torch.clip(effort, -self.effort_limit, self.effort_limit)
 
 
@@ -87,7 +87,7 @@ class IdealPDActuator(ActuatorBase):
 
 
 class DCMotor(IdealPDActuator):
-    """A PD controller whose effort a torque-speed curve limits."""
+    """A PD controller whose effort is limited by the motor's torque-speed curve."""
 
     velocity_limit: Tensor
 

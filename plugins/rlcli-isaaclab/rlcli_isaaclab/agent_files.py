@@ -64,14 +64,14 @@ _WITHOUT_EFFECT = {*WITHOUT_EFFECT, "load_checkpoint", "load_path", "regularizer
 
 
 class _ReportSink:
-    """Receiver of the settings of rl_games' reader."""
+    """Receiver of what `RlGamesReader` finds: `data` has the agent's settings, `report` notes and mistakes."""
 
     def __init__(self, report: Report) -> None:
         self.report = report
         self.data: dict[str, Any] = {}
 
     def put(self, target: tuple[str | int, ...], value: Any, source: tuple[str | int, ...]) -> None:
-        """Set a setting of the agent."""
+        """Store a setting of the agent under its key, the first element of `target`."""
         self.data[str(target[0])] = value
 
     def note(self, path: tuple[str | int, ...], status: Status, text: str = "") -> None:
@@ -95,7 +95,7 @@ _SEPARATE = "actor and critic are always separate networks"
 
 
 def _mark_false(node: Node, key: str, why: str) -> None:
-    """Report a setting that rlcli does not have if it is false."""
+    """Report a key as approximated if its value is false: rlcli always behaves as if it were true."""
     if node.data.get(key) is False:
         node.report.entries[(*node.key, key)] = ("approximated", why)
 
@@ -108,11 +108,11 @@ def _cnn(layers: list[tuple[int, int, int]]) -> dict[str, Any]:
 def _read_skrl(top: Node) -> dict[str, Any]:
     agent, models = top.node("agent"), top.node("models")
     if agent.get("class") != "PPO":
-        top.report.problem(("agent", "class"), f"'{agent.get('class')}' has no counterpart in rlcli", "rlcli reads PPO")
+        top.report.problem(("agent", "class"), f"'{agent.get('class')}' has no counterpart in rlcli", "write PPO")
     policy, value = models.node("policy"), models.node("value")
     if policy.get("class") != "GaussianMixin":
         what = f"'{policy.get('class')}' has no counterpart in rlcli, whose actions are continuous"
-        top.report.problem(policy.key, what, "rlcli reads GaussianMixin")
+        top.report.problem(policy.key, what, "write GaussianMixin")
     actor, cnn = _skrl_network(policy)
     critic, _ = _skrl_network(value)
     rollouts = agent.require("rollouts") or 1
@@ -167,7 +167,8 @@ def _skrl_network(model: Node) -> tuple[dict[str, Any], dict[str, Any]]:
     activation = "elu"
     for container in model.get("network") or []:
         if container.get("type") not in (None, "linear"):
-            model.report.problem(model.key, f"a {container['type']} has no counterpart in rlcli", "write an MLP")
+            what = f"a network part of type '{container['type']}' has no counterpart in rlcli"
+            model.report.problem(model.key, what, "write type: linear")
         for layer in container.get("layers") or []:
             if isinstance(layer, dict) and "conv2d" in layer:
                 conv = layer["conv2d"]
@@ -186,7 +187,7 @@ def _skrl_network(model: Node) -> tuple[dict[str, Any], dict[str, Any]]:
 def _read_sb3(top: Node) -> dict[str, Any]:
     policy = top.node("policy_kwargs")
     if top.get("policy") != "MlpPolicy":
-        top.report.problem(("policy",), f"'{top.get('policy')}' is not read", "rlcli reads MlpPolicy")
+        top.report.problem(("policy",), f"'{top.get('policy')}' has no counterpart in rlcli", "write MlpPolicy")
     arch = policy.get("net_arch", [64, 64])
     shapes = arch if isinstance(arch, dict) else {"pi": arch, "vf": arch}
     activation = str(policy.get("activation_fn", "nn.Tanh")).rpartition(".")[2].lower()
@@ -211,7 +212,7 @@ def _read_sb3(top: Node) -> dict[str, Any]:
     if isinstance(found["learning_rate"], str):  # `lin_3e-4`: it decreases over the training
         found["learning_rate"], found["schedule"] = float(found["learning_rate"].removeprefix("lin_")), "linear"
     for key in ("normalize_value", "clip_obs", "target_kl", "squash_output"):
-        top.note("ignored", key, "rlcli's PPO has no such setting here")
+        top.note("ignored", key, "PPO with dialect: sb3 has no such setting in rlcli")
     policy.note("ignored", "squash_output", "actions are not squashed")
     policy.skip("ortho_init")
     top.skip("seed", "device", "policy_kwargs")

@@ -69,7 +69,7 @@ def task(
     top.skip("ui_window_class_type", "wait_for_textures", "rerender_on_reset", "export_io_descriptors", "log_dir")
     top.skip("num_rerenders_on_reset", "recorders", "teleop_devices", "xr", "is_finite_horizon")
     if "seed" in top:
-        top.note("ignored", "seed", "give the seed on the command line: --seed")
+        top.note("ignored", "seed", "set the seed on the command line: --seed N")
     report.stubs = terms.stubs
     report.finish(data, defaults)
     return {key: value for key, value in config.items() if value is not None}
@@ -119,7 +119,7 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
     }
     normalized = policy.get("actor_obs_normalization", top.get("empirical_normalization", False))
     if bool(policy.get("critic_obs_normalization", normalized)) != bool(normalized):
-        policy.note("approximated", "critic_obs_normalization", "actor and critic share one normalizer")
+        policy.note("approximated", "critic_obs_normalization", "actor and critic share one observation normalizer")
     config["normalize_observations"] = bool(normalized)
     if policy.get("class_name", "ActorCritic") == "ActorCriticRecurrent":
         config["rnn"] = {
@@ -169,24 +169,27 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         if top.data.get(name) == default:
             top.skip(name)
         elif top.data.get(name):
-            top.note("ignored", name, f"use {option}")
+            top.note("ignored", name, f"use the option {option} of rlcli")
     report.finish(data)
     return config
 
 
 def _policy(top: Node) -> Node:
-    """Return the settings of the policy; those of RSL-RL 5, which has `actor` and `critic`, in the form of `policy`."""
+    """Return the settings of actor and critic with the keys of `policy`.
+
+    RSL-RL 5 has the keys `actor` and `critic` instead of `policy`; they are translated.
+    """
     if "policy" in top or "actor" not in top:
         return top.node("policy")
     actor, critic = top.node("actor"), top.node("critic")
     for model in (actor, critic):
         if model.get("class_name", "MLPModel") != "MLPModel":
-            top.report.problem(model.key, f"'{model.get('class_name')}' has no counterpart", "rlcli reads MLPModel")
+            top.report.problem(model.key, f"'{model.get('class_name')}' has no counterpart in rlcli", "use MLPModel")
     distribution = actor.node("distribution_cfg")
     if distribution.get("class_name", "GaussianDistribution").rpartition(".")[2] != "GaussianDistribution":
-        top.report.problem(distribution.key, "the distribution has no counterpart", "rlcli reads GaussianDistribution")
+        top.report.problem(distribution.key, "it has no counterpart in rlcli", "use GaussianDistribution")
     if critic.get("activation", "elu") != actor.get("activation", "elu"):
-        critic.note("approximated", "activation", "the critic has the activation of the actor")
+        critic.note("approximated", "activation", "both networks have the activation of the actor")
     data = {
         "actor_hidden_dims": actor.get("hidden_dims"),
         "critic_hidden_dims": critic.get("hidden_dims"),
@@ -239,5 +242,5 @@ def _viewer(node: Node) -> dict[str, Any]:
         config["width"], config["height"] = resolution
     node.skip("cam_prim_path", "env_index", "asset_name", "body_name")
     if node.get("origin_type", "world") not in ("world", "env"):
-        node.note("ignored", "origin_type", "the camera does not move")
+        node.note("ignored", "origin_type", "the camera does not follow an asset")
     return config

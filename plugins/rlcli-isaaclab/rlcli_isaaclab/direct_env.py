@@ -31,7 +31,7 @@ MANAGED: ContextVar[Any] = ContextVar("managed")
 
 @contextlib.contextmanager
 def building(managed: Any) -> Iterator[None]:
-    """Make an environment the one whose USD stage the task's code reads, inside the `with` block."""
+    """Set the environment whose USD stage the task's code reads, for the duration of the `with` block."""
     token = MANAGED.set(managed)
     try:
         yield
@@ -40,7 +40,7 @@ def building(managed: Any) -> Iterator[None]:
 
 
 class DirectRLEnv(gymnasium.Env):
-    """A direct task. rlcli creates the object; the hooks are Isaac Lab's."""
+    """Base class of direct tasks; a subclass implements hooks such as `_get_rewards`. rlcli creates the object."""
 
     metadata = {"render_modes": [None]}  # noqa: RUF012  (gymnasium's)
 
@@ -204,7 +204,7 @@ class DirectMARLEnv(gymnasium.Env):
 
 @configclass
 class DirectRLEnvCfg:
-    """A direct task."""
+    """Configuration of a direct task."""
 
     viewer: Any = None
     sim: Any = SimulationCfg()
@@ -230,11 +230,11 @@ class DirectRLEnvCfg:
     log_dir: Any = None
 
     def __rlcli_environment__(self, entry: Any) -> None:
-        """Store the class of the environment that a registration names."""
+        """Store the environment class that the task's Gymnasium registration names, as a class or `module:Class`."""
         self.rlcli_class = entry
 
     def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
-        """Return this configuration as a task of rlcli, with the models that the user gives."""
+        """Return this configuration as a task of rlcli. `models` are those of `--model`."""
         from rlcli_isaaclab.direct_convert import direct_task
 
         return direct_task(self, _environment_class(self), root, models)
@@ -242,10 +242,10 @@ class DirectRLEnvCfg:
 
 @configclass
 class DirectMARLEnvCfg:
-    """A multi-agent task, which rlcli does not support."""
+    """Configuration of a multi-agent task, which rlcli does not support."""
 
     def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
-        """Raise the error that it cannot be used."""
+        """Raise ConfigError: rlcli does not support multi-agent tasks."""
         raise ConfigError(
             [
                 Problem(
@@ -295,7 +295,7 @@ def record(env_class: type[DirectRLEnv], cfg: Any) -> tuple[Setup, Any]:
 
 
 class _Recorded(BaseException):
-    """End of the part of `__init__` that needs no simulation. No `except Exception` of the task catches it."""
+    """Exception that leaves `__init__` after `_setup_scene`. No `except Exception` in the task catches it."""
 
     def __init__(self, env: DirectRLEnv) -> None:
         self.env = env

@@ -15,7 +15,7 @@ from rlcli_isaaclab.utils.math import quat_apply_inverse, sample_uniform
 
 @dataclass(frozen=True, slots=True)
 class LabTerm:
-    """A term in Isaac Lab's form."""
+    """A term of Isaac Lab that is run by a function of this module."""
 
     function: Any
     needed: Callable[[Mapping[str, Any]], bool]
@@ -39,7 +39,10 @@ def action_rate_l2_clamped(env: Any) -> Tensor:
 
 
 def fingers_contact_force_b(env: Any, contact_sensor_names: list[str], asset_cfg: Any = None) -> Tensor:
-    """Return forces on the sensors' bodies, of filtered objects or of everything, root frame. (num_envs, 3 k) [N]"""
+    """Return the contact forces that the named sensors measure, robot's root frame. (num_envs, 3 k) [N]
+
+    A sensor with filters counts only contacts with the filtered objects.
+    """
     robot = env.scene["robot" if asset_cfg is None else asset_cfg.name]
     data = [env.scene.sensors[name].data for name in contact_sensor_names]
     forces = [d.net_forces_w if d.force_matrix_w is None else d.force_matrix_w.sum(dim=2) for d in data]
@@ -48,7 +51,7 @@ def fingers_contact_force_b(env: Any, contact_sensor_names: list[str], asset_cfg
 
 
 def command_resample(env: Any, command_name: str, num_resamples: int = 1) -> Tensor:
-    """Whether the step draws a command again that was drawn `num_resamples` times in the episode. (num_envs,)"""
+    """Whether a command that was sampled `num_resamples` times in the episode is about to be resampled. (num_envs,)"""
     command = env.command_manager.get_term(command_name)
     return (command.time_left < 1.5 * env.step_dt) & (command.command_counter == num_resamples)
 

@@ -86,7 +86,7 @@ class ActionTermFacade:
             if bound.instance is self._term:
                 return self._manager.action[:, start : start + bound.instance.size]
             start += bound.instance.size
-        raise LookupError("the term does not belong to this environment")
+        raise LookupError("the action term does not belong to this environment")
 
 
 class ObservationManagerFacade(ManagerFacade):
@@ -162,7 +162,7 @@ class RewardManagerFacade(ManagerFacade):
         return {term.name: row for term, row in zip(self._manager.terms, self._manager._sums, strict=True)}
 
     def set_term_cfg(self, name: str, cfg: Any) -> None:
-        """Set the weight of a term to that of the settings."""
+        """Set the weight of a term to `cfg.weight`."""
         self.get_term_cfg(name).weight = cfg.weight
 
 

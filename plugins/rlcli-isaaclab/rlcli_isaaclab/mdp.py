@@ -78,7 +78,7 @@ def _default(env: Any, parameter: Parameter) -> Any:
 def _elements(
     env: Any, name: str, value: SceneEntityCfg, by_name: dict[str, Any], by_alias: dict[str, str]
 ) -> dict[str, Any]:
-    """Return the parameters of a built-in term for the elements that a `SceneEntityCfg` selects."""
+    """Return the parameters of a built-in term for the joints, bodies, ... that a `SceneEntityCfg` selects."""
     sensor = next((by_alias[kind] for kind in ("ContactSensor", "RaySensor") if kind in by_alias), None)
     if sensor is not None and value.name not in env.entities:
         whole = env.managed.sensors[value.name]
@@ -121,14 +121,15 @@ def find_term(name: str) -> tuple[str, str]:
 def _randomize_prop_by_op(
     data: Tensor, distribution_parameters: Any, dim_0_ids: Any, dim_1_ids: Any, operation: str, distribution: str
 ) -> Tensor:
-    """Draw new values of some rows and columns, in place. Isaac Lab's name for a function that user's events call."""
+    """Sample new values for some rows and columns of `data`, in place. Events of the user's own call this function."""
     samplers: dict[str, Any] = {
         "uniform": sample_uniform,
         "log_uniform": sample_log_uniform,
         "gaussian": sample_gaussian,
     }
     if operation not in ("add", "scale", "abs") or distribution not in samplers:
-        raise NotImplementedError(f"unknown operation '{operation}' or distribution '{distribution}'")
+        what = f"unknown operation '{operation}' or distribution '{distribution}'"
+        raise NotImplementedError(f"{what}; use add, scale or abs, and uniform, log_uniform or gaussian")
     rows = torch.arange(len(data), device=data.device) if dim_0_ids is None else torch.as_tensor(dim_0_ids)
     columns = torch.arange(data.shape[1], device=data.device)[dim_1_ids]
     drawn = samplers[distribution](*distribution_parameters, (len(rows), len(columns)), device=data.device)

@@ -63,8 +63,8 @@ SOURCE = "RLCLI_ISAACLAB"
 def module_of(name: str, file: str) -> ModuleType | None:
     """Return the module that replaces a module of Isaac Lab or Isaac Sim; None to import an installed one.
 
-    The files of `isaaclab_tasks` and `isaaclab_assets` are searched for in the folders above the importing file, in the
-    folder RLCLI_ISAACLAB and in an installed wheel of Isaac Lab.
+    The files of `isaaclab_tasks` and `isaaclab_assets` are searched for in the folders above `file`, which has the
+    import statement, in the folder RLCLI_ISAACLAB and in an installed wheel of Isaac Lab.
     """
     top, _, inner = name.partition(".")
     # `isaaclab_tasks.utils` is replaced by this package's `task_utils`
@@ -93,7 +93,7 @@ def module_of(name: str, file: str) -> ModuleType | None:
 
 
 def _of_source(name: str, folder: Path, inner: str) -> ModuleType:
-    """Return a module of the original files of a package.
+    """Import a module of `isaaclab_tasks` or `isaaclab_assets` from the original files in a folder.
 
     Raises:
         ModuleNotFoundError: if the package has no such module.
@@ -175,7 +175,7 @@ def lab_name(name: str) -> Any:
 
 
 def _settings_class(name: str, kind: Mapping[str, Any], full: str, qualified: str | None = None) -> Any:
-    """Return a configuration class of the table. Settings that rlcli cannot use are reported where they are read."""
+    """Return the configuration class that `names.json` describes. Readers report the settings that rlcli cannot use."""
     bases = tuple(base for base in map(_base, kind["bases"]) if isinstance(base, type)) or (object,)
     members: dict[str, Any] = {"__doc__": f"Settings of Isaac Lab's `{full}`.", "__module__": f"{_OWN}.namespace"}
     qualified = full.rpartition(".")[2] if qualified is None else qualified
@@ -197,7 +197,7 @@ def _settings_class(name: str, kind: Mapping[str, Any], full: str, qualified: st
 
 
 def _base(written: str) -> Any:
-    """Return a base class by its text in the table: `Name`, `module.Name` or `Name.Nested`."""
+    """Return a base class by its text in `names.json`: `Name`, `module.Name` or `Name.Nested`."""
     parts = written.split(".")
     while len(parts) > 1 and parts[0] not in _definitions():
         parts = parts[1:]
@@ -242,7 +242,7 @@ def _modules() -> frozenset[str]:
 
 @functools.cache
 def _definitions() -> dict[str, tuple[str, Any]]:
-    """Return name -> module that defines it, and its kind. Names of isaaclab itself win over others."""
+    """Return name -> (module that defines it, its entry in `names.json`). Names of isaaclab itself win over others."""
     found: dict[str, tuple[str, Any]] = {}
     for module, names in sorted(_table().items(), key=lambda item: item[0].split(".")[0] != "isaaclab"):
         for name, kind in names.items():

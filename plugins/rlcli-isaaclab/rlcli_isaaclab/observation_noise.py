@@ -62,7 +62,10 @@ def noise_model(cfg: Any, managed: Any) -> NoNoise:
     if isinstance(cfg.class_type, type):
         return cfg.class_type(cfg, managed.num_envs, str(managed.device))
     if kind not in models:
-        raise TaskError(f"the noise model '{kind}' has no counterpart in rlcli", hint="use NoiseModelCfg")
+        raise TaskError(
+            f"the noise model '{kind}' has no counterpart in rlcli",
+            hint="use NoiseModelCfg or NoiseModelWithAdditiveBiasCfg",
+        )
     return models[kind](cfg, managed)
 
 

@@ -110,7 +110,7 @@ class CameraView:
 
 
 class _Images(dict[str, Tensor]):
-    """Images by type of data."""
+    """Images by type of data, such as `rgb`; another type raises an error."""
 
     def __missing__(self, name: str) -> Tensor:
         raise absence(f"Camera.data.output[{name!r}]")
@@ -142,12 +142,12 @@ class TerrainImporter:
 
     @property
     def terrain_levels(self) -> Tensor:
-        """Level of each environment. (num_envs,) int64"""
+        """Terrain level (row of the terrain) of each environment. (num_envs,) int64"""
         return self._terrain.levels
 
     @property
     def terrain_types(self) -> Tensor:
-        """Column of each environment. (num_envs,) int64"""
+        """Column of the terrain on which each environment is. (num_envs,) int64"""
         return self._terrain.types
 
     @property
@@ -169,13 +169,13 @@ class TerrainImporter:
 
 
 def camera_or_sensor(sensor: Any) -> Any:
-    """Return the facade of a sensor."""
+    """Return a `CameraView` of a camera, or a `Sensor` of another sensor."""
     is_camera = getattr(getattr(sensor, "config", None), "kind", "") == "camera"
     return bound(CameraView if is_camera else Sensor, sensor)
 
 
 def bound(kind: Any, *parts: Any) -> Any:
-    """Return an object of a class that is connected with parts of the simulation."""
+    """Create an object of a class without `__init__`, and connect it by `bind` with parts of the simulation."""
     made = kind.__new__(kind)
     made.bind(*parts)
     return made

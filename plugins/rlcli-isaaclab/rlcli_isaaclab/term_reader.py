@@ -99,7 +99,7 @@ class TermReader(ObjectReader):
         return config
 
     def _read_user_command(self, kind: str, node: Node) -> dict[str, Any]:
-        """Return a command term for the user's own class. A YAML file has only its name: then write a stub."""
+        """Return a command term for the user's class. A YAML file has only its name: then record a stub to fill in."""
         config: dict[str, Any] = {"resampling_time_s": finite_times(node.require("resampling_time_range"))}
         class_type = node.data.get("class_type")
         node.skip("debug_vis")
@@ -117,7 +117,7 @@ class TermReader(ObjectReader):
         return config | self._read_user_object(class_type, node)
 
     def read_group(self, node: Node) -> dict[str, Any]:
-        """Return a group of observations."""
+        """Return the settings of an observation group."""
         config: dict[str, Any] = {}
         noisy = any("noise" in item for _, item in node.nodes())
         corrupt = node.get("enable_corruption", False)
@@ -152,7 +152,7 @@ class TermReader(ObjectReader):
             yield name if len(parts) == 1 else f"{name}_{suffix}", {"func": config["func"], **common, **config}
 
     def _moves_nothing(self, node: Node) -> bool:
-        """Return whether a reset of the root has a fixed base and only ranges of zero."""
+        """Return whether an event that resets the root changes nothing: a fixed base, and only ranges of zero."""
         params = node.data.get("params") or {}
         asset = params.get("asset_cfg") or {"name": "robot"}
         name = asset["name"] if isinstance(asset, Mapping) else asset.name
@@ -222,7 +222,7 @@ class TermReader(ObjectReader):
     def _read_again(
         self, section: str, term: list[str], settings: Mapping[str, Any]
     ) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield the address and the settings of the terms that one term of Isaac Lab becomes with other settings."""
+        """Translate one term of Isaac Lab with changed settings; yield (address, settings) of each term of rlcli."""
         reader = copy.copy(self)
         reader.report, reader.stubs = Report(), {}
         node = Node(settings, (section, *term), reader.report)
@@ -316,7 +316,7 @@ class TermReader(ObjectReader):
     def _read_selection(
         self, key: str, value: Any, by_alias: Mapping[str, Any], known: Mapping[str, Any], at: Key
     ) -> dict[str, Any]:
-        """Return the parameters for the elements that a `SceneEntityCfg` selects."""
+        """Return the parameters of a built-in term for the joints, bodies, ... that a `SceneEntityCfg` selects."""
         settings = value if isinstance(value, Mapping) else vars(value)
         stem = key.removesuffix("_cfg")
         config: dict[str, Any] = {}
@@ -346,13 +346,13 @@ class TermReader(ObjectReader):
     def _read_user_term(
         self, section: str, function: Any, name: str | None, node: Node, params: Node
     ) -> dict[str, Any]:
-        """Return a term for the user's own function. A YAML file has only its name: then write a stub."""
+        """Return a term for the user's function. A YAML file has only its name: then record a stub to fill in."""
         from rlcli_isaaclab.terms import entity_data, key_of
 
         common = self._read_common(section, node)
         if isinstance(function, MdpFunction) or (name is not None and name.split(".")[0] == "isaaclab"):
             near = did_you_mean(str(name), builtin_terms(section))
-            self.report.problem((*node.key, "func"), f"no {section.rstrip('s')} term '{name}'", near)
+            self.report.problem((*node.key, "func"), f"rlcli has no {section.rstrip('s')} term '{name}'", near)
             return {"func": str(name), **common}
         values = {key: params.get(key) for key in params.data}
         objects = {key: value for key, value in values.items() if not is_entity(value) and not is_plain(value)}
@@ -385,7 +385,7 @@ class TermReader(ObjectReader):
     def _user_term(
         self, function: Any, section: str, entities: frozenset[str], names: tuple[str, ...], objects: dict[str, Any]
     ) -> Any:
-        """Return the term of a function; the same object for the same arguments."""
+        """Return the `UserTerm` of a function; the same object for the same arguments."""
         from rlcli_isaaclab.terms import UserTerm
 
         key = (function, section, entities, names)
@@ -422,5 +422,7 @@ _LOOKS = ("randomize_visual_color", "randomize_visual_texture_material")
 
 def _find_signature(terms: Mapping[str, Signature], name: str) -> Signature:
     if name not in terms:
-        raise ConfigError([Problem("configuration", "commands", f"no term '{name}'", f"terms: {listing(terms)}")])
+        raise ConfigError(
+            [Problem("configuration", "commands", f"rlcli has no command term '{name}'", f"terms: {listing(terms)}")]
+        )
     return terms[name]

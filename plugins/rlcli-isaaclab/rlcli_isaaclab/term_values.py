@@ -1,4 +1,4 @@
-"""Questions about the values in Isaac Lab's term settings."""
+"""Helpers that classify and convert values in Isaac Lab's term settings."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _in_order(value: Any) -> Any:
 
 
 def triple(ranges: Node, name: str) -> list[float]:
-    """Return three numbers, by default zeros."""
+    """Return a setting of three numbers; zeros if it is not set."""
     return [as_float(v) for v in ranges.get(name, (0.0, 0.0, 0.0))]
 
 

@@ -111,7 +111,7 @@ class UserTerm:
         return self.function(*args, **params)
 
     def __rlcli_term__(self, name: str) -> Signature:
-        """Return the signature of the term under a name."""
+        """Return the signature of the term; `name` is the term's key in the task."""
         code = getattr(self.function, "__code__", None)
         file = Path(inspect.getsourcefile(self.function) or "?")
         summary = (inspect.getdoc(self.function) or "").split("\n")[0]
@@ -131,7 +131,7 @@ class UserTerm:
 
 
 class UserObject:
-    """The user's class `Name(cfg, env)` of an action or a command, as the term of one name.
+    """The user's class `Name(cfg, env)` of an action or a command, as one term.
 
     Args:
         function: the user's class.
@@ -155,7 +155,7 @@ class UserObject:
         return self.function(*args)
 
     def __rlcli_term__(self, name: str) -> Signature:
-        """Return the term's signature with this name; the parameters are the keys of its configuration class."""
+        """Return the signature of the term, whose key is `name`; its parameters are the keys of its configuration."""
         file = Path(inspect.getsourcefile(self.function) or "?")
         summary = (inspect.getdoc(self.function) or "").split("\n")[0]
         parameters = tuple(Parameter(key, Any, None, True, None) for key in self.original)
@@ -194,7 +194,7 @@ class SettingTerm:
         return self.function(*args)
 
     def __rlcli_term__(self, name: str) -> Signature:
-        """Return the signature of the term under a name; its parameters are the addresses that it changes."""
+        """Return the signature of the term, whose key is `name`; its parameters are the addresses that it changes."""
         file = Path(inspect.getsourcefile(self.function) or "?")
         addresses = tuple(Parameter(key, str, None, True, "Address") for key, _ in self.setting.addresses)
         return Signature(name, self.__name__, True, file, 1, "Changes a setting.", addresses, target=self.target)
@@ -382,7 +382,7 @@ def _bind_setting(term: SettingTerm, env: Any, **opened: Tensor) -> _BoundClass:
 
 
 def _set_members(target: Any, values: Mapping[str, Any]) -> None:
-    """Set members of a configuration object that differ from the values; a list replaces an equal tuple only then."""
+    """Set the members of a configuration object that differ from `values`; a list equals a tuple of equal items."""
     for name, value in values.items():
         now = getattr(target, name, None)
         if isinstance(value, Mapping) and hasattr(now, "__dataclass_fields__"):

@@ -45,7 +45,7 @@ class GeomPrim(Prim):
         self.model, self.body, self.geom = model, body, geom
 
     def GetTypeName(self) -> str:  # noqa: N802
-        """Return Mesh."""
+        """Return the text "Mesh"."""
         return "Mesh" if self.geom >= 0 else "Xform"
 
     def GetAttribute(self, name: str) -> None:  # noqa: N802

@@ -48,10 +48,10 @@ class ActuatorTerm:
 
     def __call__(self, *args: Any) -> Any:
         """Raise an error: only the bound term can be called."""
-        raise TypeError("bind the term first")
+        raise TypeError("an actuator's term cannot be called before it is bound to an environment")
 
     def __rlcli_term__(self, name: str) -> Signature:
-        """Return the term's signature with this name."""
+        """Return the signature of the term; `name` is the term's key in the task."""
         file = Path(inspect.getsourcefile(self.class_type) or "?")
         summary = (inspect.getdoc(self.class_type) or "").split("\n")[0]
         return Signature(name, self.__name__, True, file, 1, summary, (), target=self.target)

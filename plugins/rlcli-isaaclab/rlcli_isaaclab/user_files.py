@@ -1,4 +1,4 @@
-"""Texts of the user's files, and what a model needs for the calls in them."""
+"""Source code of the user's functions, which is searched for calls that a model must be prepared for."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ class Agent:
     notes: list[Note]
 
     def origin_at(self, at: Path) -> Callable[[Path], Origin]:
-        """Return the origins for a document that has the settings under the key `at`."""
+        """Return a function from a path in the task, below `at`, to file and line of the setting in the train YAML."""
         return lambda path: self.origin(path[len(at) :])
 
 

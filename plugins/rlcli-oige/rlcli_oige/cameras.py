@@ -55,14 +55,14 @@ class Replicator:
     def _render_product(self, camera: Any, resolution: tuple[int, int], **kwargs: Any) -> str:
         path, size = relative(str(camera)), (int(resolution[0]), int(resolution[1]))
         if self._path and (path, size) != (self._path, self._resolution):
-            raise TaskError(f"{user_location()}a task has one camera, and this is a second one: '{path}'")
+            raise TaskError(f"{user_location()}'{path}' is a second camera; rlcli has one per task: remove it")
         self._path, self._resolution = path, size
         return str(camera)
 
     def _annotator(self, name: str, *args: Any, **kwargs: Any) -> Any:
         if name != "instance_segmentation":
             hint = "use rgb images or instance_segmentation; tasks in rlcli's own format also have depth"
-            raise TaskError(f"{user_location()}the annotator '{name}' has no counterpart", hint=hint)
+            raise TaskError(f"{user_location()}the annotator '{name}' has no counterpart in rlcli", hint=hint)
         self._has_segmentation = True
         return Annotator(self._env)
 
@@ -87,7 +87,7 @@ class Replicator:
 
 
 def _of_model(prim: Prim) -> dict[str, Any]:
-    """Return the place of a camera of a robot's model.
+    """Return the settings (entity and camera) of a camera that is in a robot's MJCF.
 
     Raises:
         TaskError: if the model has no camera of the name.
@@ -101,7 +101,7 @@ def _of_model(prim: Prim) -> dict[str, Any]:
 
 
 def _of_stage(prim: Prim, width: int, height: int) -> dict[str, Any]:
-    """Return the place of a camera that the task has defined."""
+    """Return the settings (eye, lookat and fov) of a camera that the task has defined on the stage."""
     pos, rotation = _pose(prim)
     if rotation[2, 1] <= 0.0 or abs(rotation[2, 0]) > 1e-3:
         prim.stage.note_ignored(f"roll of {prim.prim_path}", "up in the image is the z axis of the world", lost=True)
@@ -184,7 +184,7 @@ warp_int32 = torch.int32
 
 
 def warp_to_torch(array: Tensor) -> Tensor:
-    """Return the data of an annotator, which are a tensor."""
+    """Return the data unchanged: an annotator's data are already a torch tensor."""
     return array
 
 

@@ -47,7 +47,7 @@ _HOOKS = (
 
 
 def _on_cpu(task_class: type) -> type:
-    """Return a task class whose own hooks take the device `cuda` for the CPU."""
+    """Return a subclass of a task class in whose hooks the device `cuda` means the CPU."""
     own = [hook for hook in _HOOKS if getattr(task_class, hook) is not getattr(RLTask, hook, None)]
     members = {hook: on_cpu(getattr(task_class, hook)) for hook in own}
     return type(task_class.__name__, (task_class,), {**members, "__module__": task_class.__module__})

@@ -1,6 +1,6 @@
 """Modules that the unchanged import lines of task files get: `omni.*`, `pxr`, `carb`, `gym`, `omniisaacgymenvs.*`.
 
-Names that rlcli has are those of the flat vocabulary, whatever the module is. Names whose calls have no effect in
+A name that `rlcli_oige` has is imported from there, whatever module the task names. Names whose calls have no effect in
 MuJoCo are recorded when they are called; all others can be imported and raise an error when they are used.
 """
 

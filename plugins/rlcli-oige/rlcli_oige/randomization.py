@@ -192,14 +192,14 @@ class Randomizer:
         return path
 
     def _acts_on_state(self, gate: Gate) -> bool:
-        """Return whether a gate acts on the state, which the task's reset overwrites."""
+        """Return whether a randomization acts on the state, which the task's reset overwrites, and not on the model."""
         return gate.path[-1] in VIEW_STATE
 
     def _sample(self, gate: Gate, ids: Tensor, step: int | None, size: int, shape: tuple[int, ...]) -> Tensor:
-        """Sample the values of a gate, one row per environment.
+        """Sample the values of one randomization, one row per environment.
 
         Args:
-            gate: what to sample.
+            gate: attribute and distribution.
             ids: environments.
             step: environment step that keys the samples of `on_interval`; None: the episode index keys them.
             size: number of values per environment.

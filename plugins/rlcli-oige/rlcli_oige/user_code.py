@@ -37,7 +37,7 @@ def error_location(error: BaseException) -> str:
 
 
 class MissingAttributeError(TaskError, AttributeError):
-    """Use of an attribute that the original class has, or may have, and its counterpart has not."""
+    """Error of a task that uses an attribute of Isaac Sim's class that rlcli's class does not have."""
 
 
 class Counterpart:

@@ -44,7 +44,7 @@ IGNORED: Mapping[str, str] = {
 
 
 class _Settings(StrictModel):
-    """Settings whose ignored keys are dropped before validation."""
+    """Base of settings: keys of rl_games without effect in rlcli (`IGNORED`) are dropped before validation."""
 
     @model_validator(mode="before")
     @classmethod

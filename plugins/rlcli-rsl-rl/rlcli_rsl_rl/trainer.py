@@ -301,7 +301,7 @@ def _require_batch(env: Environment, config: RunnerConfig) -> None:
 
 
 def _settings(env: Environment, config: RunnerConfig, groups: dict[str, list[str]]) -> dict[str, Any]:
-    """Return the settings in the form of RSL-RL 5."""
+    """Return the settings of RSL-RL's PPO (networks, algorithm, groups) as the dict that RSL-RL 5 reads."""
     algorithm: dict[str, Any] = config.algorithm.model_dump(exclude={"class_name", "rnd_cfg", "symmetry_cfg"})
     algorithm["class_name"] = PPO
     if config.algorithm.rnd_cfg is not None:

@@ -97,7 +97,7 @@ class CartDoublePendulumTask(DirectTask):
         )
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the observations as terms of a manager-based task."""
+        """Return the observations and actions as terms of a manager-based task, by section."""
         params = self.params
         return {
             "observations": [

@@ -36,7 +36,9 @@ class CircularBuffer:
     def append(self, data: Tensor) -> None:
         """Add a value for every environment. (batch, ...)"""
         if len(data) != self.batch_size:
-            raise ValueError(f"expected {self.batch_size} rows, found {len(data)}")
+            raise ValueError(
+                f"the buffer has {self.batch_size} environments, found {len(data)} rows; pass one row for each"
+            )
         data = data.to(self.device)
         if self._values is None:
             self._values = data.unsqueeze(1).repeat_interleave(self.max_length, dim=1)
@@ -61,7 +63,7 @@ class CircularBuffer:
 
 
 class DelayBuffer:
-    """Values that arrive some steps late, by a lag of each environment."""
+    """A buffer that returns values some steps late; each environment has its own lag."""
 
     def __init__(self, history_length: int, batch_size: int, device: Any) -> None:
         self.history_length, self.batch_size, self.device = max(0, history_length), batch_size, device

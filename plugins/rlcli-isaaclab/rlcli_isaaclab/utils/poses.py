@@ -28,14 +28,14 @@ def _turn(axis: str, angle: Tensor) -> Tensor:
 
 
 def make_pose(pos: Tensor, rot: Tensor) -> Tensor:
-    """Return matrices of positions and rotation matrices. (..., 4, 4)"""
+    """Return pose matrices from positions and rotation matrices. (..., 3), (..., 3, 3) -> (..., 4, 4)"""
     pose = torch.zeros(*pos.shape[:-1], 4, 4, dtype=pos.dtype, device=pos.device)
     pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rot, pos, 1.0
     return pose
 
 
 def unmake_pose(pose: Tensor) -> tuple[Tensor, Tensor]:
-    """Return positions and rotation matrices of matrices."""
+    """Return positions and rotation matrices of pose matrices. (..., 4, 4) -> (..., 3), (..., 3, 3)"""
     return pose[..., :3, 3], pose[..., :3, :3]
 
 
@@ -71,7 +71,7 @@ def quat_slerp(q1: Tensor, q2: Tensor, tau: float) -> Tensor:
 
 
 def rigid_body_twist_transform(v0: Tensor, w0: Tensor, t01: Tensor, q01: Tensor) -> tuple[Tensor, Tensor]:
-    """Return linear and angular velocities in a frame 1, whose pose in the frame 0 is t01, q01."""
+    """Convert linear and angular velocities from a frame 0 to a frame 1, whose pose in frame 0 is t01, q01."""
     return rotate_inverse(q01, v0 + cross(w0, t01)), rotate_inverse(q01, w0)
 
 
