@@ -108,7 +108,7 @@ def _cnn(layers: list[tuple[int, int, int]]) -> dict[str, Any]:
 def _read_skrl(top: Node) -> dict[str, Any]:
     agent, models = top.node("agent"), top.node("models")
     if agent.get("class") != "PPO":
-        top.report.problem(("agent", "class"), f"'{agent.get('class')}' has no counterpart in rlcli", "write PPO")
+        top.report.problem(("agent", "class"), f"'{agent.get('class')}' has no counterpart in rlcli", "rlcli reads PPO")
     policy, value = models.node("policy"), models.node("value")
     if policy.get("class") != "GaussianMixin":
         what = f"'{policy.get('class')}' has no counterpart in rlcli, whose actions are continuous"

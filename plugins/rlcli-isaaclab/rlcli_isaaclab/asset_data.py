@@ -68,7 +68,7 @@ class Data:
         except AttributeError:
             known = [n for n in (*dir(type(self)), *dir(self._data), *_DATA_NAMES) if not n.startswith("_")]
             hint = did_you_mean(name, known) or f"its attributes: {listing(known, 60)}"
-            raise AttributeError(f"the data of an asset have no '{name}'; {hint}") from None
+            raise AttributeError(f"asset.data has no '{name}'; {hint}") from None
 
     def _gains(self, column: int) -> Tensor:
         """Return stiffness (column 1) or damping (2) of the joints, as the model and the actuators have it."""
