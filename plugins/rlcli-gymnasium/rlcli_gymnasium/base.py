@@ -39,7 +39,7 @@ class GymnasiumTask(DirectTask):
             scene.spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
 
     def post_reset(self) -> None:
-        """Find the fields, and create the buffers that the hooks fill."""
+        """Look up the engine's fields, such as `qpos`, and create the buffers that the hooks fill."""
         engine = self.env.engine
         self.model = engine.model
         self.field = SimpleNamespace(**{name: engine.field(name) for name in ("qpos", "qvel", "ctrl", *self.reads)})

@@ -89,7 +89,7 @@ class JointPositionAction(JointAction):
             self._offset = self._asset.data.default_joint_pos[:, self._joint_ids].clone()
 
     def apply_actions(self) -> None:
-        """Write the targets."""
+        """Write the targets of the joints."""
         self._asset.set_joint_position_target(self.processed_actions, joint_ids=self._joint_ids)
 
 
@@ -102,7 +102,7 @@ class RelativeJointPositionAction(JointAction):
             self._offset = torch.zeros_like(self._offset)
 
     def apply_actions(self) -> None:
-        """Write the targets."""
+        """Write the targets of the joints."""
         targets = self.processed_actions + self._asset.data.joint_pos[:, self._joint_ids]
         self._asset.set_joint_position_target(targets, joint_ids=self._joint_ids)
 
@@ -116,7 +116,7 @@ class JointVelocityAction(JointAction):
             self._offset = self._asset.data.default_joint_vel[:, self._joint_ids].clone()
 
     def apply_actions(self) -> None:
-        """Write the targets."""
+        """Write the targets of the joints."""
         self._asset.set_joint_velocity_target(self.processed_actions, joint_ids=self._joint_ids)
 
 
@@ -124,7 +124,7 @@ class JointEffortAction(JointAction):
     """Efforts of joints [N or N m]."""
 
     def apply_actions(self) -> None:
-        """Write the efforts."""
+        """Write the efforts of the joints."""
         self._asset.set_joint_effort_target(self.processed_actions, joint_ids=self._joint_ids)
 
 

@@ -161,7 +161,7 @@ def _read_skrl(top: Node) -> dict[str, Any]:
 
 
 def _skrl_network(model: Node) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the MLP and the CNN of a model: a chain of containers, the last of which is the MLP."""
+    """Return the settings of the MLP and of the CNN (empty without one) of one of skrl's models."""
     hidden: list[int] = []
     convolutions: list[tuple[int, int, int]] = []
     activation = "elu"

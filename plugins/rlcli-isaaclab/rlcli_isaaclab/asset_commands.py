@@ -218,7 +218,7 @@ class PhysxView:
         return torch.stack([friction, friction, torch.zeros_like(friction)], dim=-1)
 
     def set_material_properties(self, materials: Tensor, indices: Any) -> None:
-        """Set the dynamic friction of the geoms of some environments. (num_envs, geoms, 3)"""
+        """Set the dynamic friction (column 1) of the geoms of some environments. materials (num_envs, geoms, 3)"""
         if bool(materials[..., 2].any()) or not torch.equal(materials[..., 0], materials[..., 1]):
             report_once("root_physx_view.set_material_properties: MuJoCo has one friction, the dynamic one, and no"
                         " restitution")  # fmt: skip
@@ -265,7 +265,7 @@ class PhysxView:
     def _motion(self) -> Tensor:
         """Return MuJoCo's motion axes of the joints (`cdof`), angular before linear. (num_envs, joints, 6)"""
         if self._entity.is_floating:
-            raise TaskError("root_physx_view has no joint inertia for a floating base", hint="fix the base")
+            raise TaskError("root_physx_view cannot compute joint inertias of a floating base", hint="fix the base")
         update_state(self._env)
         self._dofs = self._entity.dof_columns.cpu().numpy()
         return self._env.sim.derived_field("cdof")[:, self._dofs]

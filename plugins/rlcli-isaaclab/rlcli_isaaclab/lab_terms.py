@@ -57,7 +57,7 @@ def command_resample(env: Any, command_name: str, num_resamples: int = 1) -> Ten
 
 
 class reset_joints_within_limits_range(ManagerTermBase):  # noqa: N801  (Isaac Lab's name)
-    """Event: joint positions and velocities from a range of each joint, or from a fraction of its soft limits."""
+    """Event that samples joint positions and velocities from a range of each joint, or within its soft limits."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)

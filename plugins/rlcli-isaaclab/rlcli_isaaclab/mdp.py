@@ -266,11 +266,11 @@ NullCommandCfg = config_subclass(
 
 @configclass
 class UniformVelocityCommandCfg(CommandTermCfg):
-    """A velocity of the root, sampled from uniform distributions."""
+    """Configuration of a command: a velocity of the root, sampled from uniform distributions."""
 
     @configclass
     class Ranges:
-        """[low, high] of each [m/s, rad/s, rad]."""
+        """[low, high] of each component: velocities [m/s, rad/s] and heading [rad]."""
 
         lin_vel_x: Any = MISSING
         lin_vel_y: Any = MISSING
@@ -290,7 +290,7 @@ class UniformVelocityCommandCfg(CommandTermCfg):
 
 @configclass
 class NormalVelocityCommandCfg(UniformVelocityCommandCfg):
-    """A velocity of the root, sampled from normal distributions."""
+    """Configuration of a command: a velocity of the root, sampled from normal distributions."""
 
     @configclass
     class Ranges:
@@ -305,11 +305,11 @@ class NormalVelocityCommandCfg(UniformVelocityCommandCfg):
 
 @configclass
 class UniformPoseCommandCfg(CommandTermCfg):
-    """A pose of a body in the root's frame."""
+    """Configuration of a command: a pose of a body in the root's frame."""
 
     @configclass
     class Ranges:
-        """[low, high] of each [m, rad]."""
+        """[low, high] of each component: positions [m] and angles [rad]."""
 
         pos_x: Any = MISSING
         pos_y: Any = MISSING
@@ -329,11 +329,11 @@ class UniformPoseCommandCfg(CommandTermCfg):
 
 @configclass
 class UniformPose2dCommandCfg(CommandTermCfg):
-    """A position and heading on the ground."""
+    """Configuration of a command: a position and heading on the ground."""
 
     @configclass
     class Ranges:
-        """[low, high] of each [m, rad]."""
+        """[low, high] of each component: positions [m] and angles [rad]."""
 
         pos_x: Any = MISSING
         pos_y: Any = MISSING

@@ -41,7 +41,7 @@ class ObjectReader:
                         self.driven_joints.setdefault(entity, {})[joint] = command
 
     def read_action(self, node: Node) -> dict[str, Any]:
-        """Return an action term."""
+        """Return the settings of an action term of rlcli."""
         kind = kind_of(node.get("class_type"))
         action = find_action(node.data.get("class_type"))
         name = ACTIONS.get(kind)

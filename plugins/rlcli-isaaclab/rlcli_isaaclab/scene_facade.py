@@ -23,14 +23,14 @@ from rlcli_isaaclab.setup_scene import current_setup
 
 
 class Asset:
-    """A robot or an object."""
+    """A robot or object of the scene, with the attributes and methods of Isaac Lab's assets."""
 
     def __init__(self, cfg: Any) -> None:
         current_setup().add(self, cfg)
 
     @classmethod
     def of(cls, env: VecEnv, entity: Entity) -> Asset:
-        """Return the asset of an entity."""
+        """Create the asset of an entity of the simulation."""
         asset = cls.__new__(cls)
         asset.cfg = entity.config
         asset.bind(env, entity)

@@ -179,7 +179,7 @@ def read_filters(item: Node, sensor: Mapping[str, Any], prims: Mapping[str, str]
 
 
 def filter_name(sensor: str, index: int) -> str:
-    """Return the name of a sensor from `read_filters`: of entry `index` in the filters of a contact sensor."""
+    """Return the name of the sensor for the entry `index` of a contact sensor's `filter_prim_paths_expr`."""
     return f"{sensor}_filter_{index}"
 
 

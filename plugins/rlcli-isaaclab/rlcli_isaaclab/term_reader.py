@@ -63,7 +63,7 @@ class TermReader(ObjectReader):
         """Functions whose code is not in the imported files: name -> (section, parameters)."""
 
     def read_command(self, node: Node) -> dict[str, Any]:
-        """Return a command term."""
+        """Return the settings of a command term of rlcli."""
         class_type = node.get("class_type")
         kind = kind_of(class_type)
         entry = COMMANDS.get(kind)
@@ -160,7 +160,7 @@ class TermReader(ObjectReader):
         return self.scene.is_fixed(name) and not any(any(pair) for values in ranges for pair in values.values())
 
     def read_term(self, section: str, node: Node) -> dict[str, Any]:
-        """Return a term with its function and parameters."""
+        """Return the settings of a term of rlcli: `func` and its parameters."""
         function, params = node.require("func"), node.node("params")
         if isinstance(function, AbsentValue) or (isinstance(function, type) and hasattr(function, "absent_name")):
             reason, hint = reason_of(function.absent_name)
@@ -236,7 +236,7 @@ class TermReader(ObjectReader):
                 yield f"{section}.{name}", config
 
     def _find_builtin(self, section: str, name: str | None) -> tuple[str | None, Entry]:
-        """Return rlcli's name of one of Isaac Lab's terms (None if there is none), and its row of the table."""
+        """Return rlcli's name of one of Isaac Lab's terms (None if there is none), and its entry in `table.py`."""
         if name is None:
             return None, Entry()
         entry = TERMS.get(section, {}).get(name, Entry())

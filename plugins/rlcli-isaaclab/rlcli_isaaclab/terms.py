@@ -151,7 +151,7 @@ class UserObject:
         return self
 
     def __call__(self, *args: Any) -> Any:
-        """Create an object of the class."""
+        """Create an object of the user's class."""
         return self.function(*args)
 
     def __rlcli_term__(self, name: str) -> Signature:
@@ -190,7 +190,7 @@ class SettingTerm:
         return self
 
     def __call__(self, *args: Any) -> Any:
-        """Create an object of the class."""
+        """Create an object of the user's class."""
         return self.function(*args)
 
     def __rlcli_term__(self, name: str) -> Signature:

@@ -49,10 +49,10 @@ class GeomPrim(Prim):
         return "Mesh" if self.geom >= 0 else "Xform"
 
     def GetAttribute(self, name: str) -> None:  # noqa: N802
-        """Return None: a MuJoCo model has no scale of its own."""
+        """Return None: a geom has no USD attributes, such as a scale."""
 
     def in_root(self) -> NDArray[np.float64]:
-        """Return the pose in the root's frame, as a matrix that multiplies columns."""
+        """Return the geom's pose in the root's frame, as a matrix that multiplies columns."""
         pose = np.eye(4)
         if self.geom < 0:
             return pose

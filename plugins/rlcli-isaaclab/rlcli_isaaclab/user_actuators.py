@@ -83,7 +83,7 @@ class _BoundActuator:
         """Do nothing: the actuator is installed when the term is bound."""
 
     def compute_efforts(self, targets: Tensor, position: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
-        """Return efforts before and after limits."""
+        """Return (efforts of the user's actuator before its limits, efforts after them)."""
         wanted = ArticulationActions(*(row.clone() for row in targets.unbind(1)))
         self._actuator.compute(wanted, position, velocity)
         return self._actuator.computed_effort, self._actuator.applied_effort

@@ -16,7 +16,7 @@ from rlcli.sim.device_names import on_cpu
 
 
 def file_text(function: Any) -> str:
-    """Return the text of the file that defines a function."""
+    """Return the text of the file that defines a function; empty if the file does not belong to the user."""
     file = getattr(sys.modules.get(function.__module__), "__file__", None)
     return _text(file) if file and file.endswith(".py") and not is_framework(function.__module__) else ""
 
@@ -69,7 +69,7 @@ def placed(target: Any, device: Any) -> Any:
 
 
 def source_text(function: Any) -> str:
-    """Return the text of a function; empty if it is unknown."""
+    """Return the source code of a function; empty if it is not known."""
     try:
         return inspect.getsource(function)
     except (OSError, TypeError):

@@ -202,7 +202,7 @@ def get_basis_vector(q: Tensor, v: Tensor) -> Tensor:
 
 
 def get_axis_params(value, axis_idx: int, x_value=0.0, dtype=float, n_dims: int = 3) -> list:
-    """Return a vector with `value` at one axis and `x_value` at x."""
+    """Return a list of `n_dims` numbers: `value` at the index `axis_idx`, else `x_value` at 0, and 0 elsewhere."""
     params = [dtype(0.0)] * n_dims
     params[0] = dtype(x_value)
     params[axis_idx] = dtype(value)

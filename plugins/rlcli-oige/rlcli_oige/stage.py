@@ -224,7 +224,7 @@ class Stage(Counterpart):
         self.prims.pop(str(path), None)
 
     def define(self, path: str, pos: Any, quat: Any) -> Prim:
-        """Add a prim, or place the one that is there: below a reference, the pose is that of the reference's model."""
+        """Add a prim, or place an existing one. A path inside of a referenced USD file places its whole model."""
         reference = next((ref for ref in self.references if path == ref or path.startswith(f"{ref}/")), None)
         if reference is not None and reference not in self.prims and reference != path:
             self.define(reference, None, None)

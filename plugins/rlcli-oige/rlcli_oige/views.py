@@ -213,7 +213,7 @@ class XFormPrimView(Counterpart):
         self.set_velocities(torch.cat([kept, self._tensor(velocities)], dim=1), indices)
 
     def get_default_state(self) -> Any:
-        """Return the current poses."""
+        """Return the current poses as `positions` and `orientations`; rlcli stores no other default state."""
         return self.get_world_poses()
 
     def set_visibilities(self, visibilities: Any, indices: Any = None) -> None:
