@@ -98,7 +98,7 @@ class LocomotionTask(DirectTask):
         raise NotImplementedError
 
     def set_up_scene(self, scene) -> None:
-        """Register the view of the robots."""
+        """Register a view of the robots: their state in all environments, as tensors."""
         self.robots = scene.add(ArticulationView("robot"))
 
     def post_reset(self) -> None:

@@ -1,4 +1,4 @@
-"""Terms that rlcli does not have: height of the arm's tip, and whether the tip is below a height."""
+"""Terms of the example task that rlcli does not have: height of the arm's tip, and whether the tip is below a height."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reacher and pusher: an arm reaches a point, or pushes a puck to one."""
+"""Gymnasium's reacher and pusher: an arm reaches a point, or pushes a puck to a point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Humanoid and humanoid stand-up: walk, and get up from the ground."""
+"""Gymnasium's humanoid and humanoid stand-up: walk, and get up from the ground."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Inverted pendulum and inverted double pendulum: balance on a cart."""
+"""Gymnasium's inverted pendulum and inverted double pendulum: balance one pole or two on a cart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ant, half cheetah, hopper, walker and swimmer: move along x."""
+"""Gymnasium's ant, half cheetah, hopper, walker and swimmer: move along x."""
 
 from __future__ import annotations
 

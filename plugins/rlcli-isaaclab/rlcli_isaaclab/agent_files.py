@@ -1,4 +1,4 @@
-"""Agents in YAML files of rl_games, skrl and Stable-Baselines3, as settings of the trainer `ppo`."""
+"""Reader of agents in YAML files of rl_games, skrl and Stable-Baselines3: returns settings of the trainer `ppo`."""
 
 from __future__ import annotations
 

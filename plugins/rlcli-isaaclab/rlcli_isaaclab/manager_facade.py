@@ -1,4 +1,4 @@
-"""Managers under Isaac Lab's names: `env.command_manager.get_command("base_velocity")`."""
+"""rlcli's managers with Isaac Lab's interface: `env.command_manager.get_command("base_velocity")` in the user's terms."""
 
 from __future__ import annotations
 

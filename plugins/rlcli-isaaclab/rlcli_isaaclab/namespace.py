@@ -1,4 +1,4 @@
-"""Modules of Isaac Lab and Isaac Sim as task files import them.
+"""Import of `isaaclab` and `isaacsim` in task files: the modules of this package that replace theirs.
 
 The table `names.json` lists the public names of each module of Isaac Lab; `tools/names.py` writes it. A name that this
 package defines is imported from this package. Any other name of the table is a stand-in, which raises an error when the

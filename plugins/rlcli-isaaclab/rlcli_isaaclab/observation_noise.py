@@ -12,10 +12,10 @@ from rlcli_isaaclab.settings import kind_of
 
 
 class NoNoise:
-    """No noise."""
+    """No noise, and base of the noise models."""
 
     def __call__(self, data: Tensor) -> Tensor:
-        """Return the data with noise."""
+        """Return the data unchanged; a noise model returns the data with noise."""
         return data
 
     def reset(self, env_ids: Any) -> None:

@@ -1,4 +1,4 @@
-"""Isaac Lab's environment class around an environment of rlcli."""
+"""Isaac Lab's `ManagerBasedRLEnv` around an environment of rlcli: the `env` that the user's terms receive."""
 
 from __future__ import annotations
 

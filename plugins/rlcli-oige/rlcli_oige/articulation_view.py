@@ -1,4 +1,4 @@
-"""Views of robots: joints, their drives, and measured forces, under OmniIsaacGymEnvs' names."""
+"""`ArticulationView`: joints, drives and measured forces of the robots of all environments, as tensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Environment that runs a task in OmniIsaacGymEnvs' form."""
+"""`OigeEnv`: the environment of rlcli that runs a task class written for OmniIsaacGymEnvs."""
 
 from __future__ import annotations
 

@@ -172,7 +172,7 @@ class SceneRegistry(Counterpart):
         return found[name]
 
     def remove_object(self, name: str, registry_only: bool = False) -> None:
-        """Remove a name."""
+        """Remove the view or object with a name from the registry."""
         self.views.pop(name, None)
         self.objects.pop(name, None)
 

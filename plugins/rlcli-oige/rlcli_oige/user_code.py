@@ -1,4 +1,4 @@
-"""Place of the user's code that calls into this package, and errors for what this package lacks."""
+"""Search for the line of the user's code that calls this package, and errors for what this package lacks."""
 
 from __future__ import annotations
 

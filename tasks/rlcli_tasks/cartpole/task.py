@@ -40,7 +40,7 @@ class CartpoleTask(DirectTask):
     params: Params
 
     def set_up_scene(self, scene) -> None:
-        """Register the view of the robots."""
+        """Register a view of the robots: their state in all environments, as tensors."""
         self.cartpoles = scene.add(ArticulationView("robot", name="cartpole_view"))
 
     def post_reset(self) -> None:

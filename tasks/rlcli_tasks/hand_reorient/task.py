@@ -110,7 +110,7 @@ class HandTask(DirectTask):
     params: Params
 
     def set_up_scene(self, scene) -> None:
-        """Register the view of the hands."""
+        """Register a view of the hands: their state in all environments, as tensors."""
         self.hands = scene.add(ArticulationView("robot", name="hand_view"))
 
     def post_reset(self) -> None:
