@@ -1,4 +1,4 @@
-"""Terms of the example task that rlcli does not have: height of the arm's tip, and whether the tip is below a height."""
+"""Terms that the example task adds to those of rlcli: the tip's height, and whether the tip is below a height."""
 
 from __future__ import annotations
 

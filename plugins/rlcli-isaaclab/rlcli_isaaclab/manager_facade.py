@@ -1,4 +1,4 @@
-"""rlcli's managers with Isaac Lab's interface: `env.command_manager.get_command("base_velocity")` in the user's terms."""
+"""rlcli's managers with Isaac Lab's interface, for the user's terms: `env.command_manager.get_command("pose")`."""
 
 from __future__ import annotations
 

@@ -362,7 +362,7 @@ def _add_joint(scene: Scene, prim: Prim) -> None:
     if known is not None:
         site = scene.spec.site(f"{name}.anchor")
         if not np.allclose(site.pos, anchor, atol=1e-4):
-            raise TaskError(f"the joint '{prim.prim_path}' is not at the same place as in the first environment")
+            raise TaskError(f"the joint '{prim.prim_path}' must be at the same place as in the first environment")
         return
     body = scene.spec.body(f"{target.owner.entity}/{target.GetName()}")
     body.add_site(name=f"{name}.point", pos=np.asarray(values.get("LocalPos1", (0.0, 0.0, 0.0))), group=5)

@@ -223,7 +223,7 @@ class HandTask(DirectTask):
         self.shown.write_root_pose(selection, selection.read(self.shown_pos), quat)
 
     def _goal(self) -> Tensor:
-        """Return the goal's orientation, and the rotation from it to the cube. (num_envs, 8)"""
+        """Return two quaternions: the goal's orientation, and the rotation from it to the cube. (num_envs, 8)"""
         turn = multiply(self.cube.data.root_quat_w, conjugate(self.goal_quat))
         return torch.cat([self.goal_quat, unique(turn)], dim=1)
 
