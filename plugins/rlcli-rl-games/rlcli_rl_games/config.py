@@ -342,7 +342,7 @@ def _require(named: Named, key: str, name: str, algorithm: str) -> None:
 
 
 class RlGamesConfig(AgentConfig):
-    """Settings of both algorithms.
+    """Settings of an agent of rl_games, PPO or SAC.
 
     `max_epochs` and `save_frequency` of `params.config` set rlcli's `max_iterations` and `save_interval`.
     """
