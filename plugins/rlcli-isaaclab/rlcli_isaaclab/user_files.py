@@ -32,7 +32,7 @@ def reads_body_forces(text: str) -> bool:
 
 
 def term_reads_body_forces(function: Any) -> bool:
-    """Return whether a function or class, or a function of the user's that it names, reads such values."""
+    """Return whether a user's function or class, or one that it names, passes `reads_body_forces`."""
     found: dict[Any, str] = {}
     waiting = [function]
     while waiting:
@@ -55,7 +55,7 @@ _BODY_FORCES = (
 
 
 def placed(target: Any, device: Any) -> Any:
-    """Return a function or class of the user's that runs on a device.
+    """Return a function or class of the user's, changed if that is needed to run on a device.
 
     If the device is the CPU and the file names the device `cuda`, the code takes `cuda` for the CPU.
     """
