@@ -309,7 +309,7 @@ def _registered_agents(kwargs: Mapping[str, Any]) -> dict[str, Any]:
     return {
         key.removesuffix(ending).replace("_", "-"): _agent_object(value)
         for key, value in kwargs.items()
-        if key.endswith(ending) and key != CONFIGURATION
+        if key.endswith(ending) and not key.endswith(CONFIGURATION)  # `play_env_cfg_entry_point` is no agent either
     }
 
 

@@ -161,6 +161,11 @@ class CommandManager(TensorState):
         term: CommandTerm = self._by_name[name].instance
         return term
 
+    def time_left(self, name: str) -> Tensor:
+        """Return the time until a command is drawn again, at the latest at its end. (num_envs,) [s]"""
+        number = list(self._by_name).index(name)
+        return self._steps_left[number] * self._step_dt
+
     def measure(self) -> None:
         """Add the terms' metrics of this step to their sums over the episode, before commands are resampled."""
         if not self._measured:

@@ -10,6 +10,7 @@ import builtins
 import contextlib
 import functools
 import importlib
+import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.abc import MetaPathFinder
@@ -20,6 +21,8 @@ from typing import Any
 
 from rlcli.registry.formats import Format, aliasing_formats
 
+_COMMON = ("gym", "numpy")
+"""Libraries that files of all formats mention."""
 _MOST_FILES = 200
 """Most files of a task in which names of formats are counted."""
 _python_import = builtins.__import__
@@ -27,6 +30,8 @@ _trees: dict[str, str] = {}
 """Module name of an imported package or folder -> name under which its own files import it."""
 _roots: list[Path] = []
 """Folders whose modules are executed as files of a task."""
+_known_paths: list[frozenset[str]] = []
+"""`sys.path` before the task file that is being executed; empty if none is."""
 
 
 class TaskFileLoader(SourceFileLoader):
@@ -35,7 +40,15 @@ class TaskFileLoader(SourceFileLoader):
     def exec_module(self, module: ModuleType) -> None:
         """Execute the file with the `__import__` of task files."""
         vars(module)["__builtins__"] = {**vars(builtins), "__import__": _import}
-        super().exec_module(module)
+        outermost = not _known_paths
+        if outermost:
+            _known_paths.append(frozenset(sys.path))
+        try:
+            super().exec_module(module)
+        finally:
+            if outermost:
+                _add_own_paths()
+                _known_paths.clear()
 
 
 def register_package(module: str, folder: Path, own_name: str) -> None:
@@ -85,17 +98,34 @@ class _TaskFinder(MetaPathFinder):
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, target: Any = None) -> ModuleSpec | None:
         """Return the spec of a file in a registered folder; None for any other module."""
-        if path is None and not _roots:
-            return None
+        if path is None:
+            _add_own_paths()
         if path is not None and name.partition(".")[0] not in _trees:
             return None
         spec = PathFinder.find_spec(name, path)
         if spec is None or not isinstance(spec.loader, SourceFileLoader) or spec.origin is None:
             return None
-        if not any(Path(spec.origin).is_relative_to(root) for root in _roots):
+        if not any(Path(spec.origin).is_relative_to(root) for root in (*_roots, *_folders_above())):
             return None
+        if path is None:
+            _trees.setdefault(name, name)  # its modules are files of the task, too
         spec.loader = TaskFileLoader(spec.loader.name, spec.loader.path)
         return spec
+
+
+def _folders_above() -> list[Path]:
+    """Return the folders of PYTHONPATH that contain a task: a repository's root, from which its files import."""
+    given = (Path(entry).resolve() for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry)
+    return [folder for folder in given if any(root.is_relative_to(folder) for root in _roots)]
+
+
+def _add_own_paths() -> None:
+    """Treat folders that files of a task have added to `sys.path` as folders of the task, but not those of packages."""
+    for entry in sys.path if _known_paths else ():
+        folder = Path(entry).resolve()
+        installed = {"site-packages", "dist-packages"} & set(folder.parts) or Path(sys.prefix).is_relative_to(folder)
+        if entry and entry not in _known_paths[0] and folder not in _roots and not installed:
+            _roots.append(folder)
 
 
 def _import(
@@ -215,7 +245,7 @@ def _formats_for(first: str, file: str) -> tuple[Format, ...]:
     ]
     if len(forms) < 2 or not file.endswith(".py"):
         return tuple(forms)
-    shared = set.intersection(*(set(form.spec.aliases) for form in forms))
+    shared = {*_COMMON, *set.intersection(*(set(form.spec.aliases) for form in forms))}
     own = {form.name: tuple(set(form.spec.aliases) - shared) for form in forms}
     counts = {name: _mentions(file, aliases) for name, aliases in own.items()}
     if len(set(counts.values())) == 1:

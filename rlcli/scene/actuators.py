@@ -5,7 +5,7 @@ MuJoCo's own actuators do not use this module: the engine computes them within o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -21,6 +21,8 @@ from rlcli.sim.selection import Selection
 
 POSITION, VELOCITY, EFFORT = range(3)
 """Rows of `ActuatorModel.targets`."""
+Controller = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Returns the efforts before and after limits, (num_envs, k) each, for targets, joint positions and velocities."""
 _ROW = {"position": POSITION, "velocity": VELOCITY, "motor": EFFORT}
 
 
@@ -60,6 +62,8 @@ class ActuatorModel(TensorState):
         """Effort limit of each joint. (num_envs, k) [N or N m]"""
         self._saturation_effort, speed = config.saturation_effort, config.velocity_limit
         self._velocity_limit = values_by_joint(speed, names).to(device) if isinstance(speed, Mapping) else speed
+        self.controller: Controller | None = None
+        """Replacement of the PD controller and of its limits."""
         self.targets = torch.zeros(n, 3, k, device=device)
         """Position, velocity and effort targets of each joint. (num_envs, 3, k)"""
         self.computed_effort = torch.zeros(n, k, device=device)
@@ -80,6 +84,16 @@ class ActuatorModel(TensorState):
         """Compute the efforts for the next physics step and write them to the motors' controls."""
         position, velocity = self._qpos[:, self._qpos_columns].float(), self._qvel[:, self._dof_columns].float()
         target = self.targets if self._target_history is None else self._delayed_targets(self._target_history)
+        if self.controller is None:
+            self._compute_pd(target, position, velocity)
+        else:
+            computed, applied = self.controller(target, position, velocity)
+            self.computed_effort.copy_(computed)
+            self.applied_effort.copy_(applied)
+        self._ctrl[:, self._controls] = (self.applied_effort / self._gear).to(self._ctrl.dtype)
+
+    def _compute_pd(self, target: Tensor, position: Tensor, velocity: Tensor) -> None:
+        """Compute the efforts of the PD controller. target (num_envs, 3, k), position and velocity (num_envs, k)"""
         torch.mul(self.stiffness, target[:, POSITION] - position, out=self.computed_effort)
         self.computed_effort.addcmul_(self.damping, target[:, VELOCITY] - velocity).add_(target[:, EFFORT])
         low, high = -self.effort_limit, self.effort_limit
@@ -90,7 +104,6 @@ class ActuatorModel(TensorState):
             low = torch.maximum(low, -self._saturation_effort - drop)
             high = torch.minimum(high, self._saturation_effort - drop)
         self.applied_effort.copy_(self.computed_effort.clamp(low, high))
-        self._ctrl[:, self._controls] = (self.applied_effort / self._gear).to(self._ctrl.dtype)
 
     def reset(self, selection: Selection) -> None:
         """At the start of episodes in the selected environments, set the default pose as target and draw the delays."""

@@ -26,7 +26,7 @@ from rlcli.sim.engine import Engine, ReplayableEngine
 from rlcli.sim.gl import open_context
 from rlcli.sim.selection import Selection, ids_of
 
-_CHANNELS = {"rgb": 3, "depth": 1, "distance": 1}
+_CHANNELS = {"rgb": 3, "depth": 1, "distance": 1, "segmentation": 1}
 _DISABLED_EFFECTS = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_HAZE", "mjRND_FOG")
 _VISIBLE_CATEGORIES = int(mujoco.mjtCatBit.mjCAT_STATIC | mujoco.mjtCatBit.mjCAT_DYNAMIC)
 _INTEGRATION_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -60,8 +60,9 @@ class CameraSensor(LazySensor):
 
     @property
     def image(self) -> Tensor:
-        """Images, the top row first. rgb: (num_envs, h, w, 3) uint8; else (num_envs, h, w, 1) float32 [m].
+        """Images, the top row first. rgb: (num_envs, h, w, 3) uint8; else (num_envs, h, w, 1) float32 [m] or ids.
 
+        Segmentation has the ids of the visible bodies, 0 for the world's own geoms, and -1 where nothing is visible.
         A distance of 0 m means that nothing is within `clip`. Where a pixel is the mean of several samples, samples
         without a hit count as 0 m.
         """
@@ -147,20 +148,31 @@ class CameraRenderer:
         mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._view, _VISIBLE_CATEGORIES, scene)
         for view in scene.camera:
             _set_clip_planes(view, *config.clip)
-        is_rgb = config.data == "rgb"
+        is_rgb, is_ids = config.data == "rgb", config.data == "segmentation"
         for flag in (flags.mjRND_SEGMENT, flags.mjRND_IDCOLOR):  # without light and textures, depth is exact
             scene.flags[flag] = not is_rgb
         rect = mujoco.MjrRect(0, 0, config.width * config.samples, config.height * config.samples)
         mujoco.mjr_render(rect, scene, self._mjr)
-        if is_rgb:
+        if is_rgb or is_ids:
             pixels = np.empty((rect.height, rect.width, 3), np.uint8)
             mujoco.mjr_readPixels(pixels, None, rect, self._mjr)
-            out[:] = np.rint(_downsample(pixels, config.samples))
+            values = self._bodies(pixels) if is_ids else np.rint(_downsample(pixels, config.samples))
+            out[:] = values[::-1] if is_ids else values
             return
         nearness = np.empty((rect.height, rect.width), np.float32)
         mujoco.mjr_readPixels(None, nearness, rect, self._mjr)
         depths = _depths(nearness, scene.camera[0], along_ray=config.data == "distance")
         out[:] = _downsample(depths[..., None], config.samples)
+
+    def _bodies(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Return the body of each pixel, whose colour is the number of a geom of the scene, plus 1. (h, w, 1)"""
+        numbers = pixels.astype(np.int64) @ np.array([1, 1 << 8, 1 << 16])
+        body_of = np.full(self._scene.ngeom + 2, -1.0, np.float32)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.segid >= 0 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+                body_of[geom.segid + 1] = self._model.geom_bodyid[geom.objid]
+        bodies: NDArray[np.float32] = body_of[np.minimum(numbers, len(body_of) - 1)][..., None]
+        return bodies
 
     def free(self) -> None:
         """Free the OpenGL context and its buffers."""

@@ -183,7 +183,10 @@ class Entity:
             TaskError: if the root is fixed to the world.
         """
         if self.root_qpos is None or self.root_dof is None:
-            raise TaskError(f"entity '{self.name}' is fixed to the world; add a <freejoint/> (a shape: free: true)")
+            raise TaskError(
+                f"entity '{self.name}' is fixed to the world",
+                hint='add <freejoint/> to its body, or mocap="true" if only a reset moves it (a shape: free: true)',
+            )
         return self.root_qpos, self.root_dof
 
     def _index(self, positions: Sequence[int]) -> Columns:

@@ -38,9 +38,10 @@ def observation_names(joints: tuple[str, ...], feet: tuple[str, ...]) -> tuple[s
 
 
 def observation_units(joints: int, feet: int, *, rate: str, joint_rate: str, force: str) -> tuple[str, ...]:
-    """Return the units of the observation's columns.
+    """Return the units of the observation's columns, of which some are scaled.
 
-    A torso rate of `rate`, a joint velocity of `joint_rate` and a force of `force` (without unit) are observed as 1.
+    `rate` and `joint_rate` are units of the torso's and the joints' angular velocity, such as `4 rad/s`; `force` is
+    the number of N or N m that is observed as 1.
     """
     return (
         *("m", "m/s", "m/s", "m/s", rate, rate, rate, "rad", "rad", "rad", "", ""),
@@ -52,7 +53,7 @@ def observation_units(joints: int, feet: int, *, rate: str, joint_rate: str, for
 
 
 class LocomotionTask(DirectTask):
-    """Run towards the target.
+    """Base of tasks in which a robot runs towards a target.
 
     A subclass defines the joints, their torques and the scales of observations. Its `Params` add
     `termination_height`, `death_reward`, `alive_weight`, `action_cost`, `energy_cost`, `limit_cost` and
@@ -100,7 +101,7 @@ class LocomotionTask(DirectTask):
         raise NotImplementedError
 
     def set_up_scene(self, scene) -> None:
-        """Register the view of the robots."""
+        """Register a view of the robots: their state in all environments, as tensors."""
         self.robots = scene.add(ArticulationView("robot"))
 
     def post_reset(self) -> None:
@@ -180,7 +181,7 @@ class LocomotionTask(DirectTask):
         )
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the observations as terms of a manager-based task."""
+        """Return the observations and actions as terms of a manager-based task, by section."""
         target = (*self.params.target, 0.0)
         scale = dict(zip(self.joints, self.efforts(), strict=True))
         return {

@@ -121,6 +121,18 @@ def test_distance_image_equals_ray_casts(boxes):
     torch.testing.assert_close(seen[plain], rays[plain], rtol=1e-3, atol=1e-3)
 
 
+def test_segmentation_has_the_ids_of_bodies(boxes):
+    env = boxes({"eye": {**FRONT, "data": "segmentation"}})
+    env.reset()
+    seen = env.sensors["eye"].image[..., 0]
+    depth = boxes({"eye": FRONT})
+    depth.reset()
+    ids = {name: env.engine.model.body(f"robot/{name}").id for name in ("slab", "up", "left")}
+    assert set(seen.unique().tolist()) <= {-1.0, *map(float, ids.values())}
+    assert bool((seen[:, 15, 20] == ids["slab"]).all())  # the middle of the image
+    assert torch.equal(seen == -1.0, depth.sensors["eye"].image[..., 0] == 0.0)
+
+
 def test_image_has_top_row_and_left_column_first(boxes):
     colours = read_image(boxes({"camera": {**FRONT, "data": "rgb", "fov": 80.0}}))[0].int()
     assert colours.shape == (31, 41, 3)

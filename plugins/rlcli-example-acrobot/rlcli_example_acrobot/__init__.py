@@ -1,4 +1,4 @@
-"""An arm of two links with a motor only at its elbow, which must balance upright."""
+"""Example plugin with the task acrobot: an arm with a motor only at its elbow must balance upright."""
 
 from rlcli.task import TaskSpec
 

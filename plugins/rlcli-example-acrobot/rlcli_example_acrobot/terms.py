@@ -1,4 +1,4 @@
-"""Terms that rlcli does not have: height of the arm's tip, and a threshold of it."""
+"""Terms that the example task adds to those of rlcli: the tip's height, and whether the tip is below a height."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reacher and pusher: an arm reaches a point, or pushes a puck to one."""
+"""Gymnasium's reacher and pusher: an arm reaches a point, or pushes a puck to a point."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class _Arm(GymnasiumTask):
         return self.field.xpos[:, self.bodies[body]]
 
     def post_reset(self) -> None:
-        """Find the bodies."""
+        """Find the bodies that the task observes."""
         model = self.env.engine.model
         self.bodies = {model.body(b).name.removeprefix("robot/"): b for b in range(model.nbody)}
         super().post_reset()
 
     def velocities(self, selection: Selection, still: int) -> Tensor:
-        """Return small velocities for the arm, and 0 for the last `still` joints, which have no actuator. (rows, nv)"""
+        """Sample small joint velocities, with 0 for the last `still` joints, which have no actuator. (rows, nv)"""
         noise = self.noise(selection, 0.005, self.model.nv)
         noise[:, -still:] = 0.0
         return noise
@@ -60,7 +60,7 @@ class Reacher(_Arm):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return the state of the arm, the target, and the vector between them."""
+        """Return the parts of the observation: state of the arm, target, and the vector between them."""
         qpos, angles = self.field.qpos, self.field.qpos[:, :2]
         return [angles.cos(), angles.sin(), qpos[:, 2:], self.field.qvel[:, :2], self.gap()[:, :2]]
 
@@ -103,7 +103,7 @@ class Pusher(_Arm):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return the state of the arm, its tip, the puck and the goal."""
+        """Return the parts of the observation: state of the arm, its tip, the puck and the goal."""
         places = [self.body_position(body) for body in ("tips_arm", "object", "goal")]
         return [self.field.qpos[:, :7], self.field.qvel[:, :7], *places]
 

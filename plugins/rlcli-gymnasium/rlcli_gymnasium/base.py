@@ -39,7 +39,7 @@ class GymnasiumTask(DirectTask):
             scene.spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
 
     def post_reset(self) -> None:
-        """Find the fields, and create the buffers that the hooks fill."""
+        """Look up the engine's fields, such as `qpos`, and create the buffers that the hooks fill."""
         engine = self.env.engine
         self.model = engine.model
         self.field = SimpleNamespace(**{name: engine.field(name) for name in ("qpos", "qvel", "ctrl", *self.reads)})
@@ -95,7 +95,7 @@ class GymnasiumTask(DirectTask):
         """Fill `ended` where the task terminates the episode. By default it never does."""
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Return initial joint positions and velocities. (rows, nq), (rows, nv)"""
+        """Return initial positions and velocities, one row per environment that resets. (rows, nq), (rows, nv)"""
         raise NotImplementedError
 
     def progress(self) -> Tensor:
@@ -105,7 +105,7 @@ class GymnasiumTask(DirectTask):
     # --- shared by several tasks ---
 
     def speed(self) -> Tensor:
-        """Return the change of `progress` over the step, for a task that `moves`. (num_envs,) [m/s]"""
+        """Return the change of `progress` over the step, for a task with `moves = True`. (num_envs,) [m/s]"""
         assert self.moves
         return (self.progress() - self.before) / self.step_dt
 
@@ -125,7 +125,7 @@ class GymnasiumTask(DirectTask):
         return qpos, selection.normal(0.0, scale, (self.model.nv,))
 
     def noise(self, selection: Selection, scale: float, size: int) -> Tensor:
-        """Sample uniformly in +-scale. (rows, size)"""
+        """Sample uniformly in +-scale, one row per environment that resets. (rows, size)"""
         return selection.uniform(-scale, scale, (size,))
 
 
@@ -147,7 +147,7 @@ def square_sum(values: Tensor) -> Tensor:
 
 
 def within(values: Tensor, low: float, high: float) -> Tensor:
-    """Return whether values are strictly between two bounds."""
+    """Return whether values are strictly between two bounds, element by element."""
     return (values > low) & (values < high)
 
 

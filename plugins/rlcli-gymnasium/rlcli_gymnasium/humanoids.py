@@ -1,4 +1,4 @@
-"""Humanoid and humanoid stand-up: walk, and get up from the ground."""
+"""Gymnasium's humanoid and humanoid stand-up: walk, and get up from the ground."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _Humanoid(GymnasiumTask):
     reads = ("xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 
     def columns(self) -> list[Tensor]:
-        """Return qpos without x and y; qvel; inertia and velocity of each body; actuator forces; contact forces."""
+        """Return the parts of the observation: qpos without x and y; qvel; inertia, velocity, forces of bodies."""
         field = self.field
         return [
             field.qpos[:, 2:],

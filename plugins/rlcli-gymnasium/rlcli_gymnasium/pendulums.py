@@ -1,4 +1,4 @@
-"""Inverted pendulum and inverted double pendulum: balance on a cart."""
+"""Gymnasium's inverted pendulum and inverted double pendulum: balance one pole or two on a cart."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class InvertedPendulum(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return joint positions and velocities."""
+        """Return the parts of the observation: joint positions and velocities."""
         return [self.field.qpos, self.field.qvel]
 
     def compute_reward(self) -> Tensor:
@@ -69,7 +69,7 @@ class InvertedDoublePendulum(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return the cart, sines and cosines of the angles, clipped velocities, and the force on the cart."""
+        """Return the parts of the observation: cart, sines and cosines of angles, velocities, force on the cart."""
         qpos, force = self.field.qpos, self.field.qfrc_constraint[:, :1]
         angles = qpos[:, 1:]
         return [qpos[:, :1], angles.sin(), angles.cos(), self.field.qvel.clamp(-10.0, 10.0), force.clamp(-10.0, 10.0)]

@@ -1,4 +1,4 @@
-"""Ant, half cheetah, hopper, walker and swimmer: move along x."""
+"""Gymnasium's ant, half cheetah, hopper, walker and swimmer: move along x."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Ant(GymnasiumTask):
         return self.field.cfrc_ext.clamp(*self.params.contact_force_range)
 
     def columns(self) -> list[Tensor]:
-        """Return pose without x and y, velocity, and contact forces."""
+        """Return the parts of the observation: pose without x and y, velocity, and contact forces."""
         return [self.field.qpos[:, 2:], self.field.qvel, self.contact_forces()[:, 1:].flatten(1)]
 
     def healthy(self) -> Tensor:
@@ -101,7 +101,7 @@ class HalfCheetah(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return joint positions without x, and velocities."""
+        """Return the parts of the observation: joint positions without x, and velocities."""
         return [self.field.qpos[:, 1:], self.field.qvel]
 
     def compute_reward(self) -> Tensor:
@@ -133,7 +133,7 @@ class Swimmer(HalfCheetah):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return joint positions without x and y, and velocities."""
+        """Return the parts of the observation: joint positions without x and y, and velocities."""
         return [self.field.qpos[:, 2:], self.field.qvel]
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
@@ -166,7 +166,7 @@ class Walker2d(GymnasiumTask):
     params: Params
 
     def columns(self) -> list[Tensor]:
-        """Return joint positions without x, and velocities clipped to +-10."""
+        """Return the parts of the observation: joint positions without x, and velocities clipped to +-10."""
         return [self.field.qpos[:, 1:], self.field.qvel.clamp(-10.0, 10.0)]
 
     def healthy(self) -> Tensor:

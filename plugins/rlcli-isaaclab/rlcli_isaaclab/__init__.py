@@ -1,6 +1,6 @@
-"""Isaac Lab's vocabulary for rlcli: configuration classes, and the environment that Isaac Lab's terms expect.
+"""Replacement of the package `isaaclab` for tasks that rlcli runs: configuration classes, environments and terms.
 
-Every name is available here and in the submodule that has its name in Isaac Lab:
+Every name can be imported from here, and from a submodule with the same name as in Isaac Lab:
 `from rlcli_isaaclab import configclass` or `from rlcli_isaaclab.utils import configclass`.
 A submodule is imported when one of its names is first used.
 """

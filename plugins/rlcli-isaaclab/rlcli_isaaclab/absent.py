@@ -8,6 +8,7 @@ from types import ModuleType
 from typing import Any
 
 from rlcli.errors import TaskError
+from rlcli_isaaclab.format import LIBRARIES
 
 _REASONS = {
     "pink": ("Pink inverse kinematics needs Pinocchio", "use DifferentialInverseKinematicsActionCfg"),
@@ -29,7 +30,6 @@ _REASONS = {
     ),
     "read_file": ("it reads files of NVIDIA's server, and rlcli downloads nothing", "open a local file in the task"),
     "output[": ("rlcli's cameras have no such images", "use rgb, depth, distance_to_image_plane or distance_to_camera"),
-    "torchvision": ("the library is not installed", "pip install torchvision"),
     "nodal": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
     "deformable": ("rlcli simulates rigid bodies only", "replace the soft body by a rigid one"),
     "omni": ("it belongs to Isaac Sim's USD stage", "change the model (MJCF) instead"),
@@ -42,7 +42,10 @@ _REASONS = {
 
 
 def reason_of(name: str) -> tuple[str, str]:
-    """Return why rlcli does not have a name of Isaac Lab or Isaac Sim, and what to do."""
+    """Return (why rlcli does not have a name of Isaac Lab or Isaac Sim, what to do instead)."""
+    library = LIBRARIES.get(name.partition(".")[0])
+    if library is not None:
+        return "the library is not installed", f"pip install {library}"
     words = name.lower()
     return next(
         (texts for part, texts in _REASONS.items() if part in words),
@@ -51,13 +54,13 @@ def reason_of(name: str) -> tuple[str, str]:
 
 
 def absence(name: str, hint: str | None = None) -> TaskError:
-    """Return the error that a name of Isaac Lab or Isaac Sim cannot be used."""
+    """Return the error for the use of a name that rlcli does not have; `hint` replaces the usual hint."""
     reason, usual = reason_of(name)
-    return TaskError(f"{_user_place()}{name} cannot be used: {reason}", hint=hint or usual)
+    return TaskError(f"{user_place()}{name} cannot be used: {reason}", hint=hint or usual)
 
 
-def _user_place() -> str:
-    """Return `file:line: ` of the task's code that runs; empty if none does."""
+def user_place() -> str:
+    """Return `file:line: ` of the innermost line of the task's code that is running; empty if none is."""
     from rlcli.registry import is_framework
 
     frame = sys._getframe(2)
@@ -118,7 +121,7 @@ class AbsentValue:
     __ror__ = __add__ = __radd__ = __or__
 
     def __call__(self, *args: Any, **settings: Any) -> Any:
-        """Raise the error that the name cannot be used."""
+        """Raise TaskError: rlcli does not have this name."""
         raise absence(self.absent_name)
 
     def __repr__(self) -> str:
@@ -146,7 +149,7 @@ class AbsentModule(ModuleType):
         return module_of(f"{self.__name__}.{name}", "")
 
     def __call__(self, *args: Any, **settings: Any) -> Any:
-        """Raise the error that the name cannot be used."""
+        """Raise TaskError: rlcli does not have this name."""
         raise absence(self.__name__)
 
 
@@ -159,7 +162,7 @@ def absent_module(name: str) -> AbsentModule:
 
 
 def absent_class(name: str) -> type:
-    """Return the stand-in of a class. It can be subclassed; an object of it is a stand-in, too."""
+    """Return the stand-in of a class. It can be subclassed; calling it returns an `AbsentValue`."""
     return _AbsentMeta(name.rpartition(".")[2], (), {"__doc__": name, "absent_name": name, "__module__": __name__})
 
 

@@ -1,4 +1,4 @@
-"""Actions in Isaac Lab's form: the base of the user's own, and those that the core of rlcli does not have."""
+"""Action classes with Isaac Lab's interface: bases of the user's own classes, and actions that `rlcli.mdp` lacks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _OWN = "rlcli_isaaclab"
 
 
 class AffineActionTerm(ActionTerm):
-    """Base of actions raw x scale + offset, clipped; each setting is a number or a mapping by name."""
+    """Base of actions clip(raw x scale + offset). Scale and offset are numbers, or mappings from regexes of names."""
 
     def __init__(self, cfg: Any, env: Any, names: list[str]) -> None:
         super().__init__(cfg, env)
@@ -33,7 +33,10 @@ class AffineActionTerm(ActionTerm):
         self._clip = torch.stack([low, high], dim=-1)
 
     def _by_name(self, value: Any, default: float) -> Tensor:
-        """Return a setting of each column. (num_envs, k)"""
+        """Return a number, or a mapping from regexes of names, as one value per column of the action. (num_envs, k)
+
+        `default` is the value of names that no regex matches.
+        """
         if isinstance(value, Mapping):
             found = match_values(value, self._names, "element") if value else [None] * len(self._names)
             row = torch.tensor([default if v is None else float(v) for v in found], device=self.device)
@@ -68,7 +71,7 @@ class AffineActionTerm(ActionTerm):
 
 
 class JointAction(AffineActionTerm):
-    """Base of actions on joints, for the user's subclasses; rlcli runs Isaac Lab's own classes by its core."""
+    """Base of actions on joints, for the user's subclasses. Isaac Lab's own classes become rlcli's built-in actions."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         asset = env.scene[cfg.asset_name]
@@ -86,7 +89,7 @@ class JointPositionAction(JointAction):
             self._offset = self._asset.data.default_joint_pos[:, self._joint_ids].clone()
 
     def apply_actions(self) -> None:
-        """Write the targets."""
+        """Write the targets of the joints."""
         self._asset.set_joint_position_target(self.processed_actions, joint_ids=self._joint_ids)
 
 
@@ -99,7 +102,7 @@ class RelativeJointPositionAction(JointAction):
             self._offset = torch.zeros_like(self._offset)
 
     def apply_actions(self) -> None:
-        """Write the targets."""
+        """Write the targets of the joints."""
         targets = self.processed_actions + self._asset.data.joint_pos[:, self._joint_ids]
         self._asset.set_joint_position_target(targets, joint_ids=self._joint_ids)
 
@@ -113,7 +116,7 @@ class JointVelocityAction(JointAction):
             self._offset = self._asset.data.default_joint_vel[:, self._joint_ids].clone()
 
     def apply_actions(self) -> None:
-        """Write the targets."""
+        """Write the targets of the joints."""
         self._asset.set_joint_velocity_target(self.processed_actions, joint_ids=self._joint_ids)
 
 
@@ -121,7 +124,7 @@ class JointEffortAction(JointAction):
     """Efforts of joints [N or N m]."""
 
     def apply_actions(self) -> None:
-        """Write the efforts."""
+        """Write the efforts of the joints."""
         self._asset.set_joint_effort_target(self.processed_actions, joint_ids=self._joint_ids)
 
 
@@ -149,7 +152,7 @@ _LAB_ACTIONS: dict[str, type[ActionTerm]] = {
 
 
 def find_action(class_type: Any) -> type[ActionTerm] | None:
-    """Return the class that runs as an action: the user's own, or one of this package; None for one of the core."""
+    """Return the class to create for an action: the user's or this package's; None: look for a built-in action."""
     name = class_type.rpartition(":")[2].rpartition(".")[2] if isinstance(class_type, str) else ""
     if name in _LAB_ACTIONS:
         return _LAB_ACTIONS[name]
@@ -160,7 +163,7 @@ def find_action(class_type: Any) -> type[ActionTerm] | None:
 
 
 def driven_by(action: type[ActionTerm] | None) -> str | None:
-    """Return what a class of an action commands: motor (it writes efforts), velocity, or None."""
+    """Return what an action class commands to the joints: motor (it sets efforts), velocity, or None (neither)."""
     if action is None:
         return None
     kinds = [kind for kind in action.__mro__ if issubclass(kind, ActionTerm) and kind is not ActionTerm]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rlcli_isaaclab.settings import Node, Report, as_float, kind_of, to_plain
+from rlcli_isaaclab.user_actuators import is_user_actuator
 
 _EXPLICIT = ("IdealPDActuator", "DCMotor", "DelayedPDActuator", "RemotizedPDActuator")
 _NETWORKS = ("ActuatorNetLSTM", "ActuatorNetMLP")
@@ -20,6 +21,7 @@ def read_actuators(
     order_joints: Callable[[list[str], Node], Any],
     entity: str,
     replaced: Mapping[str, Mapping[str, float]],
+    own: dict[tuple[str, str], Mapping[str, Any]],
 ) -> tuple[JointSettings, dict[str, Any]]:
     """Return the settings of the joints, and the explicit actuator models by group.
 
@@ -27,7 +29,8 @@ def read_actuators(
         actuators: groups of actuators.
         order_joints: returns the names or regexes of a group's joints in the model's order.
         entity: name of the entity, for messages.
-        replaced: group -> gains that replace its actuator network.
+        replaced: group -> gains of the PD controller that replaces its actuator network.
+        own: filled with (entity, group) -> settings, for each group whose actuator class is the user's own.
     """
     joints: JointSettings = []
     models: dict[str, Any] = {}
@@ -44,10 +47,16 @@ def read_actuators(
             "viscous_friction": item.get("viscous_friction"),
         }
         if item.get("dynamic_friction") != item.get("friction"):
-            item.note("ignored", "dynamic_friction", "MuJoCo has one dry friction: that of `friction`")
+            item.note("ignored", "dynamic_friction", "MuJoCo has one dry friction; `friction` sets it")
         gains = {"stiffness": item.get("stiffness"), "damping": item.get("damping")}
         if kind == "ImplicitActuator":
             settings = {**gains, **passive, **_read_implicit_limits(item)}
+        elif is_user_actuator(item.data.get("class_type")):
+            own[entity, group] = item.data
+            item.skip(*item.data)
+            config = {"joints": order_joints(patterns, item), "kind": "pd"}
+            models[group] = to_plain(config | {key: value for key, value in gains.items() if value is not None})
+            settings = {**passive, "velocity_limit": item.get("velocity_limit")}
         elif kind in _NETWORKS and group not in replaced:
             what = f"the actuator network of '{kind}' is a TorchScript file, which rlcli does not load"
             gains_key = f"{group}: {{stiffness: S, damping: D}}"
@@ -60,13 +69,13 @@ def read_actuators(
             effort_limit = item.get("effort_limit")
             if kind in _NETWORKS:
                 gains = {key: replaced[group].get(key, 0.0) for key in gains}
-                item.note("approximated", "network_file", "replaced by the gains that are given with the model")
+                item.note("approximated", "network_file", "replaced by a PD controller with the gains of models.yaml")
                 item.skip("pos_scale", "vel_scale", "torque_scale", "input_order", "input_idx")
                 kind = "DCMotor"
             elif kind == "RemotizedPDActuator":
                 table = item.get("joint_parameter_lookup")
                 effort_limit = max(row[2] for row in table) if table and effort_limit is None else effort_limit
-                item.note("approximated", "joint_parameter_lookup", "the effort limit is the largest of the table")
+                item.note("approximated", "joint_parameter_lookup", "the effort limit is the largest in the table")
                 kind = "DelayedPDActuator"
             models[group] = _read_explicit_actuator(item, kind, order_joints(patterns, item), gains, effort_limit)
             speed = None if kind == "DCMotor" else _speed_limit(item)  # terms read that of a DC motor by themselves
@@ -122,11 +131,11 @@ def _read_explicit_actuator(
     for key, value in {**gains, "effort_limit": effort_limit}.items():
         if value is None:
             value = "no limit" if key == "effort_limit" else "0"
-            item.report.entries[(*item.key, key)] = ("approximated", f"{value}: that of the USD is not known")
+            item.report.entries[(*item.key, key)] = ("approximated", f"{value}: the value in the USD file is not known")
     if effort_limit is not None:
         config["effort_limit"] = effort_limit
     if of_solver is not None and of_solver != effort_limit:
-        item.note("ignored", "effort_limit_sim", "an explicit actuator has one limit, effort_limit")
+        item.note("ignored", "effort_limit_sim", "rlcli limits an explicit actuator by effort_limit only")
     if kind == "DCMotor":
         config["saturation_effort"] = item.require("saturation_effort")
         config["velocity_limit"] = _speed_limit(item) or item.require("velocity_limit")
@@ -137,7 +146,10 @@ def _read_explicit_actuator(
 
 
 def settings_of(joint: str, settings: JointSettings) -> dict[str, Any]:
-    """Return the settings of one joint. A regex counts only for the joints of its group."""
+    """Return the settings of one joint, where later entries override earlier ones.
+
+    A regex counts only for the joints of its group.
+    """
     found: dict[str, Any] = {}
     for pattern, values, group in settings:
         if re.fullmatch(pattern, joint) and any(re.fullmatch(other, joint) for other in group):
@@ -148,7 +160,7 @@ def settings_of(joint: str, settings: JointSettings) -> dict[str, Any]:
 def merge_joint_settings(
     settings: JointSettings, model: Mapping[str, Any], driven: Mapping[str, str], name: str, report: Report
 ) -> dict[str, Any]:
-    """Return `joints` of one entity, without the settings that the MJCF has already.
+    """Return the key `joints` of one entity in rlcli's scene, without values that its MJCF already has.
 
     Args:
         settings: settings of the joints, from `read_actuators`.
@@ -184,7 +196,7 @@ def _joint_config(
     """Return rlcli's settings of a joint.
 
     Args:
-        values: settings of its implicit actuator, or the passive ones of an explicit actuator.
+        values: settings of its implicit actuator, or the passive ones (armature, friction) of an explicit one.
         command: what an action commands: effort, motor (an effort by the task's own code), velocity, position or,
             without an action, nothing.
         has_actuator: whether an action or an actuator of the MJCF drives the joint.

@@ -1,4 +1,4 @@
-"""Agents in YAML files of rl_games, skrl and Stable-Baselines3, as settings of the trainer `ppo`."""
+"""Reader of agents in YAML files of rl_games, skrl and Stable-Baselines3: returns settings of the trainer `ppo`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import yaml
 
 from rlcli.config.strict_yaml import MAX_BYTES
 from rlcli.errors import ConfigError, Problem
-from rlcli.formats import Note
+from rlcli.formats import Note, Status
 from rlcli.machine import read_plain
+from rlcli.rl.ppo.rl_games_file import WITHOUT_EFFECT, RlGamesReader
 from rlcli_isaaclab.settings import Node, Report
 
 
@@ -59,109 +60,44 @@ def _numbers(value: Any) -> Any:
     return value
 
 
-_RL_GAMES_SCHEDULES = {
-    "adaptive": "adaptive", "linear": "linear", **dict.fromkeys(("constant", "identity", "fixed", "None"), "constant")
-}  # fmt: skip
+_WITHOUT_EFFECT = {*WITHOUT_EFFECT, "load_checkpoint", "load_path", "regularizer", "initializer", "d2rl"}
+
+
+class _ReportSink:
+    """Receiver of what `RlGamesReader` finds: `data` has the agent's settings, `report` notes and mistakes."""
+
+    def __init__(self, report: Report) -> None:
+        self.report = report
+        self.data: dict[str, Any] = {}
+
+    def put(self, target: tuple[str | int, ...], value: Any, source: tuple[str | int, ...]) -> None:
+        """Store a setting of the agent under its key, the first element of `target`."""
+        self.data[str(target[0])] = value
+
+    def note(self, path: tuple[str | int, ...], status: Status, text: str = "") -> None:
+        """Record how a key was translated. Keys that change nothing are not reported to the user."""
+        status = "default" if status == "ignored" and path[-1] in _WITHOUT_EFFECT else status
+        self.report.entries[tuple(map(str, path))] = (status, text)
+
+    def problem(self, path: tuple[str | int, ...], message: str, hint: str | None = None) -> None:
+        """Record a mistake."""
+        self.report.problem(tuple(map(str, path)), message, hint)
 
 
 def _read_rl_games(top: Node) -> dict[str, Any]:
-    params = top.node("params")
-    network, config, space = params.node("network"), params.node("config"), params.node("network").node("space")
-    for key, wanted in (("algo", "a2c_continuous"), ("model", "continuous_a2c_logstd")):
-        name = params.node(key).get("name")
-        if name != wanted:
-            top.report.problem(("params", key), f"'{name}' has no counterpart in rlcli", f"rlcli reads '{wanted}'")
-    mlp = network.node("mlp")
-    mlp.skip("d2rl", "initializer", "regularizer")
-    if mlp.data.get("d2rl"):
-        top.report.problem(mlp.key, "d2rl networks have no counterpart in rlcli", "write d2rl: False")
-    shape = {"hidden": mlp.require("units"), "activation": mlp.get("activation", "elu")}
-    continuous = space.node("continuous")
-    std = continuous.node("sigma_init").get("val", 0.0)
-    space.skip("continuous")
-    if continuous.data.get("fixed_sigma") is False:
-        continuous.note("approximated", "fixed_sigma", "the standard deviation never depends on the state")
-    schedule = config.get("lr_schedule") or "constant"
-    if schedule not in _RL_GAMES_SCHEDULES:
-        top.report.problem((*config.key, "lr_schedule"), f"unknown schedule '{schedule}'", "write adaptive or linear")
-    kl = schedule == "adaptive"
-    clip = config.get("clip_value", False)
-    found: dict[str, Any] = {
-        "dialect": "rl_games",
-        "num_steps": config.require("horizon_length"),
-        "max_iterations": config.require("max_epochs"),
-        "minibatch_size": config.require("minibatch_size"),
-        "num_epochs": config.require("mini_epochs"),
-        "gamma": config.require("gamma"),
-        "lam": config.require("tau"),
-        "learning_rate": config.require("learning_rate"),
-        "clip_range": config.require("e_clip"),
-        "entropy_coef": config.get("entropy_coef", 0.0),
-        "bounds_coef": config.get("bounds_loss_coef", 0.0),
-        "normalize_observations": bool(config.get("normalize_input", False)),
-        "normalize_value": bool(config.get("normalize_value", False)),
-        "normalize_advantage": "batch" if config.get("normalize_advantage", False) else None,
-        "value_coef": 0.5 * config.get("critic_coef", 2.0),
-        "clip_value": "larger" if clip else None,
-        "reward_scale": config.node("reward_shaper").get("scale_value", 1.0),
-        "max_grad_norm": config.get("grad_norm", 1.0) if config.get("truncate_grads", False) else None,
-        "schedule": _RL_GAMES_SCHEDULES.get(schedule, "constant"),
-        "desired_kl": config.get("kl_threshold", 0.008) if kl else None,
-        "kl_grain": {"standard": "epoch", "standard_epoch": "iteration"}.get(config.get("schedule_type"), "minibatch"),
-        "actor": shape,
-        "critic": dict(shape),
-        "init_std": math.exp(std),
-    }
-    if config.get("save_frequency"):
-        found["save_interval"] = config.get("save_frequency")
-    _rl_games_parts(network, config, found)
-    bound = params.node("env").get("clip_actions")
-    found["action_bound"] = float(bound) if bound is not None and math.isfinite(bound) else None
-    if found["action_bound"] not in (None, 1.0) and config.get("clip_actions", True):
-        params.node("env").note("approximated", "clip_actions", "actions are clipped to the bound, not scaled by it")
-    params.node("env").note("ignored", "clip_observations", "observations are not clipped")
-    config.skip("name", "env_name", "device", "device_name", "ppo", "print_stats", "score_to_win", "save_best_after")
-    config.skip("num_actors", "multi_gpu", "player", "full_experiment_name", "seq_len", "seq_length", "grad_norm")
-    config.skip(
-        "kl_threshold", "value_bootstrap", "use_diagnostics", "games_to_track", "mixed_precision", "clip_actions"
-    )
-    params.skip("seed", "load_checkpoint", "load_path", "algo", "model", "player")
-    network.skip("name", "separate")
-    _mark_false(config, "value_bootstrap", "rlcli always bootstraps at a time-out")
-    _mark_false(network, "separate", _SEPARATE)
+    sink = _ReportSink(top.report)
+    RlGamesReader(sink, is_strict=False).read(top.data.get("params"))
     top.skip("pbt")
-    return found
+    return sink.data
 
 
 _SEPARATE = "actor and critic are always separate networks"
 
 
 def _mark_false(node: Node, key: str, why: str) -> None:
-    """Report a setting that rlcli does not have if it is false."""
+    """Report a key as approximated if its value is false: rlcli always behaves as if it were true."""
     if node.data.get(key) is False:
         node.report.entries[(*node.key, key)] = ("approximated", why)
-
-
-def _rl_games_parts(network: Node, config: Node, found: dict[str, Any]) -> None:
-    """Read the parts of a network besides its MLP, and the central value."""
-    if "rnn" in network:
-        rnn = network.node("rnn")
-        if rnn.get("name") != "lstm":
-            network.report.problem(rnn.key, f"'{rnn.get('name')}' has no counterpart in rlcli", "write name: lstm")
-        found["rnn"] = {"hidden": rnn.get("units", 64), "layers": rnn.get("layers", 1)}
-        rnn.skip("before_mlp")
-        _mark_false(rnn, "before_mlp", "the RNN is always before the MLP")
-        rnn.note("approximated", "concat_input", "the MLP receives only the RNN's output, not the observations")
-        rnn.note("approximated", "layer_norm", "rlcli has no layer normalization")
-    if "cnn" in network:
-        cnn = network.node("cnn")
-        layers = cnn.get("convs") or []
-        if any(layer.get("padding", 0) for layer in layers):
-            network.report.problem((*cnn.key, "convs"), "rlcli's convolutions have no padding", "write padding: 0")
-        found["cnn"] = _cnn([(c["filters"], c["kernel_size"], c["strides"]) for c in layers])
-        cnn.skip("type", "initializer", "regularizer", "activation")
-    if "central_value_config" in config:
-        config.note("approximated", "central_value_config", "the critic's network and schedule are those of the policy")
 
 
 def _cnn(layers: list[tuple[int, int, int]]) -> dict[str, Any]:
@@ -176,7 +112,7 @@ def _read_skrl(top: Node) -> dict[str, Any]:
     policy, value = models.node("policy"), models.node("value")
     if policy.get("class") != "GaussianMixin":
         what = f"'{policy.get('class')}' has no counterpart in rlcli, whose actions are continuous"
-        top.report.problem(policy.key, what, "rlcli reads GaussianMixin")
+        top.report.problem(policy.key, what, "write GaussianMixin")
     actor, cnn = _skrl_network(policy)
     critic, _ = _skrl_network(value)
     rollouts = agent.require("rollouts") or 1
@@ -225,13 +161,14 @@ def _read_skrl(top: Node) -> dict[str, Any]:
 
 
 def _skrl_network(model: Node) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the MLP and the CNN of a model: a chain of containers, the last of which is the MLP."""
+    """Return the settings of the MLP and of the CNN (empty without one) of one of skrl's models."""
     hidden: list[int] = []
     convolutions: list[tuple[int, int, int]] = []
     activation = "elu"
     for container in model.get("network") or []:
         if container.get("type") not in (None, "linear"):
-            model.report.problem(model.key, f"a {container['type']} has no counterpart in rlcli", "write an MLP")
+            what = f"a network part of type '{container['type']}' has no counterpart in rlcli"
+            model.report.problem(model.key, what, "write type: linear")
         for layer in container.get("layers") or []:
             if isinstance(layer, dict) and "conv2d" in layer:
                 conv = layer["conv2d"]
@@ -250,7 +187,7 @@ def _skrl_network(model: Node) -> tuple[dict[str, Any], dict[str, Any]]:
 def _read_sb3(top: Node) -> dict[str, Any]:
     policy = top.node("policy_kwargs")
     if top.get("policy") != "MlpPolicy":
-        top.report.problem(("policy",), f"'{top.get('policy')}' is not read", "rlcli reads MlpPolicy")
+        top.report.problem(("policy",), f"'{top.get('policy')}' has no counterpart in rlcli", "write MlpPolicy")
     arch = policy.get("net_arch", [64, 64])
     shapes = arch if isinstance(arch, dict) else {"pi": arch, "vf": arch}
     activation = str(policy.get("activation_fn", "nn.Tanh")).rpartition(".")[2].lower()
@@ -275,7 +212,7 @@ def _read_sb3(top: Node) -> dict[str, Any]:
     if isinstance(found["learning_rate"], str):  # `lin_3e-4`: it decreases over the training
         found["learning_rate"], found["schedule"] = float(found["learning_rate"].removeprefix("lin_")), "linear"
     for key in ("normalize_value", "clip_obs", "target_kl", "squash_output"):
-        top.note("ignored", key, "rlcli's PPO has no such setting here")
+        top.note("ignored", key, "PPO with dialect: sb3 has no such setting in rlcli")
     policy.note("ignored", "squash_output", "actions are not squashed")
     policy.skip("ortho_init")
     top.skip("seed", "device", "policy_kwargs")

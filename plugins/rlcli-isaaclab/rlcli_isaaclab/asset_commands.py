@@ -1,4 +1,4 @@
-"""Commands of a task to an asset, besides its state: targets of joints, forces on bodies, and PhysX's view."""
+"""What a task commands to a robot or object: targets of joints, forces on bodies, and calls of `root_physx_view`."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class JointDrive:
             self.target.copy_(entity.data.default_joint_pos)
 
     def set(self, target: Tensor, joint_ids: Any, env_ids: Any) -> None:
-        """Set targets of joints. Joints without gains ignore position targets; other targets must be 0 there.
+        """Set targets of joints. A joint without such an actuator ignores position targets.
 
         Raises:
-            TaskError: for a target that nothing drives.
+            TaskError: for a velocity or effort target other than 0 of a joint without such an actuator.
         """
         rows = torch.arange(len(self.target)) if env_ids is None else torch.as_tensor(env_ids)
         if joint_ids is None:
@@ -50,7 +50,7 @@ class JointDrive:
         if self._undriven and bool(self.target[:, self._undriven].any()):
             wrong = self.target[:, self._undriven].any(dim=0).nonzero()[:, 0].tolist()
             raise TaskError(
-                f"the task sets a {self._kind} target of joints of '{self._name}' without such an actuator:"
+                f"the task sets {self._kind} targets of joints of '{self._name}' that have no such actuator:"
                 f" {listing(self._joints[self._undriven[i]] for i in wrong)}",
                 hint="add actuators of this kind to the MJCF",
             )
@@ -59,7 +59,7 @@ class JointDrive:
 
 
 class BodyWrench:
-    """Forces and torques on bodies, in the frames of the bodies."""
+    """Forces and torques that a task applies to an entity's bodies, in the body frames or the world frame."""
 
     def __init__(self, env: VecEnv, entity: Entity) -> None:
         self._env, self._entity = env, entity
@@ -138,7 +138,7 @@ class _WrenchSteps(Substeps):
 
 
 class PhysxView:
-    """The values of PhysX's view of an asset that have a counterpart in MuJoCo."""
+    """`root_physx_view` of an asset: those methods of PhysX's view that have a counterpart in MuJoCo."""
 
     def __init__(self, env: VecEnv, entity: Entity) -> None:
         self._env, self._entity = env, entity
@@ -152,11 +152,11 @@ class PhysxView:
         raise TaskError(f"root_physx_view.{name} cannot be used: rlcli has no PhysX", hint=hint)
 
     def _model_values(self, field: str, kind: str = "Bodies") -> Tensor:
-        """Return a model field in every environment, on the CPU as PhysX does. (num_envs, elements, ...)"""
+        """Return a model field of the entity's Bodies or Geoms (`kind`), on the CPU. (num_envs, elements, ...)"""
         return self._env.engine.expand(field)[:, self._entity.ids[kind]].float().cpu()
 
     def _write_model(self, field: str, values: Tensor, indices: Any, kind: str = "Bodies") -> None:
-        """Write the rows `indices` of values of every environment to a model field. (num_envs, elements, ...)"""
+        """Write values to a model field in the environments `indices` only. values (num_envs, elements, ...)"""
         target = self._env.engine.expand(field)
         rows = torch.as_tensor(indices, dtype=torch.int64, device=target.device)
         ids = torch.as_tensor(self._entity.ids[kind], dtype=torch.int64, device=target.device)
@@ -185,7 +185,8 @@ class PhysxView:
         matrices = inertias.unflatten(-1, (3, 3))
         moments = matrices.diagonal(dim1=-2, dim2=-1)
         if not torch.equal(torch.diag_embed(moments), matrices):
-            raise TaskError("root_physx_view.set_inertias: rlcli sets only xx, yy and zz", hint="leave the others at 0")
+            what = "root_physx_view.set_inertias: rlcli sets only xx, yy and zz; found a product of inertia"
+            raise TaskError(what, hint="leave the products xy, xz and yz at 0")
         self._write_model("body_inertia", moments, indices)
 
     def get_coms(self) -> Tensor:
@@ -197,11 +198,12 @@ class PhysxView:
         """Set centres of mass and principal axes of some environments. (num_envs, bodies, 7)
 
         Raises:
-            TaskError: if the model was compiled without the products that a moved centre of mass needs.
+            TaskError: if the model was compiled for centres of mass that do not move.
         """
         if self._env.engine.model.body_simple[self._entity.body_ids].any():
-            hint = "write the call into the file of an event's function, where rlcli looks for the call"
-            raise TaskError("root_physx_view.set_coms cannot be used here", hint=hint)
+            hint = "call it in the file of an event's function: rlcli prepares the model if it finds the call there"
+            what = "root_physx_view.set_coms cannot be used here: the model has fixed centres of mass"
+            raise TaskError(what, hint=hint)
         self._write_model("body_ipos", coms[..., :3], indices)
         self._write_model("body_iquat", coms[..., 3:].roll(1, dims=-1), indices)
 
@@ -216,7 +218,7 @@ class PhysxView:
         return torch.stack([friction, friction, torch.zeros_like(friction)], dim=-1)
 
     def set_material_properties(self, materials: Tensor, indices: Any) -> None:
-        """Set the dynamic friction of the geoms of some environments. (num_envs, geoms, 3)"""
+        """Set the dynamic friction (column 1) of the geoms of some environments. materials (num_envs, geoms, 3)"""
         if bool(materials[..., 2].any()) or not torch.equal(materials[..., 0], materials[..., 1]):
             report_once("root_physx_view.set_material_properties: MuJoCo has one friction, the dynamic one, and no"
                         " restitution")  # fmt: skip
@@ -261,15 +263,15 @@ class PhysxView:
         return (motion * (inertia @ up)).sum(dim=-1)
 
     def _motion(self) -> Tensor:
-        """Return MuJoCo's motion axes of the joints, angular before linear. (num_envs, joints, 6)"""
+        """Return MuJoCo's motion axes of the joints (`cdof`), angular before linear. (num_envs, joints, 6)"""
         if self._entity.is_floating:
-            raise TaskError("root_physx_view has no joint inertia for a floating base", hint="fix the base")
+            raise TaskError("root_physx_view cannot compute joint inertias of a floating base", hint="fix the base")
         update_state(self._env)
         self._dofs = self._entity.dof_columns.cpu().numpy()
         return self._env.sim.derived_field("cdof")[:, self._dofs]
 
     def _composite_inertia(self) -> Tensor:
-        """Return the inertia of all bodies that each joint moves, as a matrix on a motion. (num_envs, joints, 6, 6)"""
+        """Return the spatial inertia of all bodies that each joint moves. (num_envs, joints, 6, 6)"""
         model = self._env.engine.model
         bodies = model.jnt_bodyid[self._entity.joint_ids]
         parents = [_ancestors(model, int(body)) for body in bodies]

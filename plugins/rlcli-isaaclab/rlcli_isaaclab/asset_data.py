@@ -1,4 +1,4 @@
-"""States of an asset as Isaac Lab's terms read them: `asset.data.joint_pos`."""
+"""State of a robot or object (asset) as Isaac Lab's terms read it: `asset.data.joint_pos`."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Data:
 
     @property
     def _data(self) -> EntityData:
-        """State of the entity, of the physics step that comes next."""
+        """State of the entity, updated if a physics step has run since it was computed."""
         update_state(self._env)
         return self._entity.data
 
@@ -68,7 +68,7 @@ class Data:
         except AttributeError:
             known = [n for n in (*dir(type(self)), *dir(self._data), *_DATA_NAMES) if not n.startswith("_")]
             hint = did_you_mean(name, known) or f"its attributes: {listing(known, 60)}"
-            raise AttributeError(f"data has no '{name}'; {hint}") from None
+            raise AttributeError(f"asset.data has no '{name}'; {hint}") from None
 
     def _gains(self, column: int) -> Tensor:
         """Return stiffness (column 1) or damping (2) of the joints, as the model and the actuators have it."""
@@ -297,7 +297,7 @@ class Data:
 
     @property
     def FORWARD_VEC_B(self) -> Tensor:  # noqa: N802
-        """Unit vector along the x axis. (num_envs, 3)"""
+        """Unit vector along the x axis, root frame. (num_envs, 3)"""
         return torch.eye(3, device=self._env.device)[:1].expand(self._env.num_envs, 3)
 
     @property

@@ -12,12 +12,12 @@ from rlcli_isaaclab.sensor_facade import find_elements
 
 
 def entity_name(collection: str, item: str) -> str:
-    """Return the name of the entity of an object."""
+    """Return the name in rlcli's scene of one object of a collection: COLLECTION_OBJECT."""
     return f"{collection}_{item}"
 
 
 class CollectionData:
-    """State of the objects: `object_X` is the root's `X` of each object. (num_envs, objects, ...)"""
+    """State of a collection: `object_X` is the attribute `root_X` of each object. (num_envs, objects, ...)"""
 
     def __init__(self, objects: list[Asset]) -> None:
         self._objects = objects
@@ -66,7 +66,7 @@ class RigidObjectCollection:
     )  # fmt: skip
 
     def _each(self, values: Tensor, object_ids: Any) -> list[tuple[Asset, Tensor]]:
-        """Return each object with its values; `values` may lack the dimension of environments."""
+        """Return (object, its values) of each object; `values` may lack the dimension of environments."""
         values = values if values.dim() == 3 else values[None]
         ids = list(range(self.num_objects))
         if object_ids is not None and not isinstance(object_ids, slice):

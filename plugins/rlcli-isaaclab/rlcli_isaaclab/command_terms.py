@@ -1,4 +1,7 @@
-"""Commands in Isaac Lab's form, for the user's subclasses; rlcli runs Isaac Lab's own classes by its core."""
+"""Command classes with Isaac Lab's interface, for the user's subclasses and for code that reads their attributes.
+
+Elsewhere Isaac Lab's own commands become rlcli's built-in commands.
+"""
 
 from __future__ import annotations
 

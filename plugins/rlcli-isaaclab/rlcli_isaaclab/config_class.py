@@ -47,7 +47,7 @@ def make_config_class(name: str, doc: str, bases: tuple[type, ...] = (), **membe
 
 
 def config_subclass(class_type: str, doc: str, base: type, **members: Any) -> Any:
-    """Return a subclass of a configuration class: `{class_type}Cfg`."""
+    """Return a configuration class named `{class_type}Cfg` that derives from `base`."""
     return make_config_class(f"{class_type}Cfg", doc, (base,), class_type=class_type, **members)
 
 

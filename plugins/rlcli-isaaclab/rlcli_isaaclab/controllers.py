@@ -1,4 +1,4 @@
-"""Controllers. Names as in `isaaclab.controllers`."""
+"""Configuration of differential inverse kinematics, and a stand-in for Pink's. Names as in `isaaclab.controllers`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class DifferentialIKControllerCfg:
 
 
 def convert_usd_to_urdf(usd_path: str, output_path: str, force_conversion: bool = True) -> tuple[str, str]:
-    """Return the files that Isaac Lab would write: only Pink reads them, and actions of Pink are refused."""
+    """Return the paths that Isaac Lab would write, and write nothing: only Pink reads them, which rlcli refuses."""
     return f"{output_path}/urdf", f"{output_path}/meshes"
 
 

@@ -13,6 +13,7 @@ from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.settings import Key, Node, Report, as_float
 from rlcli_isaaclab.term_reader import TermReader
+from rlcli_isaaclab.user_actuators import actuator_events
 
 
 def task(
@@ -54,6 +55,7 @@ def task(
     for section in ("events", "rewards", "terminations", "curriculum"):
         terms_of_section = (terms.read_terms(section, *member) for member in top.node(section).nodes())
         config[section] = {name: term for pairs in terms_of_section for name, term in pairs}
+    config["events"] |= actuator_events(scene.user_actuators)
     if not config["rewards"]:
         config["rewards"] = {"no_reward": {"func": "is_alive", "weight": 0.0}}
     config["commands"] = {name: terms.read_command(node) for name, node in top.node("commands").nodes()}
@@ -65,9 +67,9 @@ def task(
     if top.data.get("is_finite_horizon"):
         top.note("ignored", "is_finite_horizon", "rlcli always bootstraps at a time-out")
     top.skip("ui_window_class_type", "wait_for_textures", "rerender_on_reset", "export_io_descriptors", "log_dir")
-    top.skip("recorders", "teleop_devices", "xr", "is_finite_horizon")
+    top.skip("num_rerenders_on_reset", "recorders", "teleop_devices", "xr", "is_finite_horizon")
     if "seed" in top:
-        top.note("ignored", "seed", "give the seed on the command line: --seed")
+        top.note("ignored", "seed", "set the seed on the command line: --seed N")
     report.stubs = terms.stubs
     report.finish(data, defaults)
     return {key: value for key, value in config.items() if value is not None}
@@ -100,7 +102,7 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         ConfigError: if a setting is missing or wrong.
     """
     top = Node(data, (), report)
-    policy, algorithm = top.node("policy"), top.node("algorithm")
+    policy, algorithm = _policy(top), top.node("algorithm")
     bound = top.get("clip_actions")
     config: dict[str, Any] = {
         "trainer": "ppo",
@@ -117,7 +119,7 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
     }
     normalized = policy.get("actor_obs_normalization", top.get("empirical_normalization", False))
     if bool(policy.get("critic_obs_normalization", normalized)) != bool(normalized):
-        policy.note("approximated", "critic_obs_normalization", "actor and critic share one normalizer")
+        policy.note("approximated", "critic_obs_normalization", "actor and critic share one observation normalizer")
     config["normalize_observations"] = bool(normalized)
     if policy.get("class_name", "ActorCritic") == "ActorCriticRecurrent":
         config["rnn"] = {
@@ -167,9 +169,38 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         if top.data.get(name) == default:
             top.skip(name)
         elif top.data.get(name):
-            top.note("ignored", name, f"use {option}")
+            top.note("ignored", name, f"use the option {option} of rlcli")
     report.finish(data)
     return config
+
+
+def _policy(top: Node) -> Node:
+    """Return the settings of actor and critic with the keys of `policy`.
+
+    RSL-RL 5 has the keys `actor` and `critic` instead of `policy`; they are translated.
+    """
+    if "policy" in top or "actor" not in top:
+        return top.node("policy")
+    actor, critic = top.node("actor"), top.node("critic")
+    for model in (actor, critic):
+        if model.get("class_name", "MLPModel") != "MLPModel":
+            top.report.problem(model.key, f"'{model.get('class_name')}' has no counterpart in rlcli", "use MLPModel")
+    distribution = actor.node("distribution_cfg")
+    if distribution.get("class_name", "GaussianDistribution").rpartition(".")[2] != "GaussianDistribution":
+        top.report.problem(distribution.key, "it has no counterpart in rlcli", "use GaussianDistribution")
+    if critic.get("activation", "elu") != actor.get("activation", "elu"):
+        critic.note("approximated", "activation", "both networks have the activation of the actor")
+    data = {
+        "actor_hidden_dims": actor.get("hidden_dims"),
+        "critic_hidden_dims": critic.get("hidden_dims"),
+        "activation": actor.get("activation"),
+        "actor_obs_normalization": bool(actor.get("obs_normalization", False)),
+        "critic_obs_normalization": bool(critic.get("obs_normalization", False)),
+        "init_noise_std": distribution.get("init_std", 1.0),
+        "noise_std_type": distribution.get("std_type", "scalar"),
+    }
+    top.get("policy")
+    return Node(data, ("policy",), top.report)
 
 
 def _network(policy: Node, name: str) -> dict[str, Any]:
@@ -185,6 +216,7 @@ def _sim(node: Node) -> dict[str, Any]:
     if gravity != [0.0, 0.0, -9.81]:
         config["gravity"] = gravity
     node.skip("physics_prim_path", "use_fabric", "enable_scene_query_support", "render", "create_stage_in_memory")
+    node.skip("logging_level", "save_logs_to_file", "log_dir")
     if "device" in node:
         node.skip("device")
     material = node.data.get("physics_material")
@@ -210,5 +242,5 @@ def _viewer(node: Node) -> dict[str, Any]:
         config["width"], config["height"] = resolution
     node.skip("cam_prim_path", "env_index", "asset_name", "body_name")
     if node.get("origin_type", "world") not in ("world", "env"):
-        node.note("ignored", "origin_type", "the camera does not move")
+        node.note("ignored", "origin_type", "the camera does not follow an asset")
     return config

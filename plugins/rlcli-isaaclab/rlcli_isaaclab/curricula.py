@@ -1,4 +1,4 @@
-"""Curriculum terms that change a setting by its address. Names as in `isaaclab.envs.mdp`."""
+"""Curriculum terms that change the setting at an address in the configuration. Names as in `isaaclab.envs.mdp`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class modify_env_param(ManagerTermBase):  # noqa: N801  (Isaac Lab's name)
         self._value = torch.tensor(self._setting.start, dtype=torch.float64)
 
     def __call__(self, env: Any, env_ids: Any, modify_fn: Any, modify_params: Any = None, **opened: Tensor) -> None:
-        """Change the setting."""
+        """Change the setting. `opened` has the settings of rlcli that depend on it, which are written in place."""
         value = _in_form_of(self._setting.start, self._value.tolist())
         new = modify_fn(env, env_ids, value, **(modify_params or {}))
         if new is self.NO_CHANGE:
@@ -41,7 +41,7 @@ class modify_env_param(ManagerTermBase):  # noqa: N801  (Isaac Lab's name)
 
 
 class modify_term_cfg(modify_env_param):  # noqa: N801  (Isaac Lab's name)
-    """The same, with an address that starts with a section: `events.NAME.params.KEY`."""
+    """`modify_env_param` with an address that starts with a section: `events.NAME.params.KEY`."""
 
 
 class ChangedSetting:
@@ -49,11 +49,11 @@ class ChangedSetting:
 
     Args:
         data: settings of all sections, as nested dicts.
-        address: Isaac Lab's address.
-        read: returns the terms of rlcli, by path, for a section, the path of a term in it and its settings.
+        address: Isaac Lab's address of the setting, such as `event_manager.cfg.NAME.params.KEY`.
+        read: translates a term: (section, path of the term in it, its settings) -> (path, settings) of rlcli's terms.
 
     Raises:
-        KeyError: if the address names nothing, or no number.
+        KeyError: if nothing has the address, or its value is neither a number nor a list of numbers.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class ChangedSetting:
         """Parameter of the curriculum term -> address of a setting of rlcli that depends on the value."""
 
     def translate(self, value: Any) -> list[Any]:
-        """Return the settings of rlcli for a value, in the order of `addresses`."""
+        """Return the values of rlcli's settings for a value of Isaac Lab's setting, in the order of `addresses`."""
         found = self._numbers(value)
         return [found[name] for _, name in self.addresses]
 
@@ -97,7 +97,7 @@ class ChangedSetting:
             _set(call.term.cfg, self.path, value)
 
     def _numbers(self, value: Any) -> dict[str, Any]:
-        """Return the numbers of the terms of rlcli for a value, by address."""
+        """Translate the term with a value of the setting; return the numbers in rlcli's terms, by address."""
         settings = copy.deepcopy(self._settings)
         _set(settings, self.path, value)
         found: dict[str, Any] = {}
@@ -129,14 +129,14 @@ def _is_number(value: Any) -> bool:
 
 
 def _moved(value: Any) -> Any:
-    """Return a value in which every number is another one; pairs stay in order."""
+    """Return a value with 1 added to every number, to find the settings of rlcli that depend on it."""
     if isinstance(value, list | tuple):
         return type(value)(_moved(item) for item in value)
     return value + 1.0
 
 
 def _in_form_of(form: Any, value: Any) -> Any:
-    """Return nested lists with the types of another value."""
+    """Return a value with the types of `form`: lists or tuples, integers or floats."""
     if isinstance(form, list | tuple):
         return type(form)(_in_form_of(a, b) for a, b in zip(form, value, strict=True))
     return value if isinstance(form, float) or value != int(value) else type(form)(value)
@@ -153,7 +153,7 @@ def _member(value: Any, name: str) -> Any:
 
 
 def _set(target: Any, path: list[str], value: Any) -> None:
-    """Set a nested member; a tuple on the way is replaced."""
+    """Set the value at a path in nested objects, dicts and lists; a tuple on the path is replaced by a changed copy."""
     name = path[0]
     if len(path) > 1:
         inner = target[int(name)] if isinstance(target, list) else _member(target, name)

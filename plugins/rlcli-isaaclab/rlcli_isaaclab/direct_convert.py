@@ -1,4 +1,4 @@
-"""Conversion of a direct task to a task of rlcli whose terms call the hooks of the task."""
+"""Conversion of a direct task to a task of rlcli, whose terms call the task's hooks such as `_get_rewards`."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.sensor_facade import TerrainImporter
 from rlcli_isaaclab.settings import Node, Report
 from rlcli_isaaclab.term_reader import TermReader
+from rlcli_isaaclab.user_actuators import actuator_events
+from rlcli_isaaclab.user_files import reads_body_forces
 
 _KINDS = {"set_joint_effort_target": "motor", "set_joint_velocity_target": "velocity"}
-_BODY_FORCES = ("get_link_incoming_joint_force", "body_incoming_joint_wrench")
 
 
 def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]) -> PythonTask:
-    """Return the task of a configuration and its environment class, with the models that the user gives.
+    """Return the task of a configuration and its environment class. `models` are those of `--model`.
 
     Raises:
         ConfigError: if the task cannot be expressed in rlcli.
@@ -66,7 +67,8 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
     config["sim"] |= scene.integrator()
     terms = TermReader(scene, report, cfg)
     events = {name: term for member in top.node("events").nodes() for name, term in terms.read_terms("events", *member)}
-    hook = _Hooks(env_class, original, any(word in source for word in _BODY_FORCES))
+    events |= actuator_events(scene.user_actuators)
+    hook = _Hooks(env_class, original, reads_body_forces(source))
     config |= {
         "actions": {"action": {"func": hook("action", actions)}},
         "observations": {"policy": {"observation": {"func": hook("policy", observations)}}},
@@ -75,7 +77,11 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
             "terminated": {"func": hook("terminated")},
             "time_out": {"func": hook("time_out"), "time_out": True},
         },
-        "events": {**events, "reset": {"func": hook("reset"), "mode": "reset"}},
+        "events": {
+            **events,
+            **actuator_events(scene.user_actuators),
+            "reset": {"func": hook("reset"), "mode": "reset"},
+        },
     }
     if cfg.state_space:
         states = hook("critic", shape_of(cfg.state_space, "state_space"))
@@ -86,7 +92,7 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
 
 
 class _Hooks:
-    """Maker of the terms of one direct task."""
+    """Maker of the terms of one direct task: called with the name of a hook, it returns the term."""
 
     def __init__(self, env_class: type, cfg: Any, reads_body_forces: bool) -> None:
         self._env_class, self._cfg, self._forces = env_class, cfg, reads_body_forces
@@ -114,7 +120,7 @@ def _require_values(cfg: Any, *names: str) -> None:
 
 
 def _names(setup: Any, env: Any) -> list[str]:
-    """Return a name for each created object: its key in the scene, or the last part of its path."""
+    """Return a name for each object of `_setup_scene`: its key in the scene, or the last part of its prim path."""
     keys = {
         id(made): key
         for table in (env.scene.articulations, env.scene.rigid_objects, env.scene.sensors, env.scene.extras)
@@ -130,6 +136,6 @@ def _names(setup: Any, env: Any) -> list[str]:
 
 
 def _source_of(env_class: type) -> str:
-    """Return the text of a class and of its bases that belong to the task."""
+    """Return the source code of a class and of its bases that belong to the task."""
     bases = [base for base in env_class.__mro__ if not base.__module__.startswith(("rlcli_isaaclab", "gymnasium"))]
     return "\n".join(inspect.getsource(base) for base in bases if base is not object)

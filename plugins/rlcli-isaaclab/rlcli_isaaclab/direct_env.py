@@ -23,6 +23,7 @@ from rlcli.errors import ConfigError, Problem, TaskError
 from rlcli_isaaclab.config_class import MISSING, configclass
 from rlcli_isaaclab.setup_scene import Setup, running
 from rlcli_isaaclab.sim import SimulationCfg
+from rlcli_isaaclab.user_files import placed
 
 MANAGED: ContextVar[Any] = ContextVar("managed")
 """The environment of rlcli for which an object of the task is created."""
@@ -30,7 +31,7 @@ MANAGED: ContextVar[Any] = ContextVar("managed")
 
 @contextlib.contextmanager
 def building(managed: Any) -> Iterator[None]:
-    """Make an environment the one whose USD stage the task's code reads, inside the `with` block."""
+    """Set the environment whose USD stage the task's code reads, for the duration of the `with` block."""
     token = MANAGED.set(managed)
     try:
         yield
@@ -39,7 +40,7 @@ def building(managed: Any) -> Iterator[None]:
 
 
 class DirectRLEnv(gymnasium.Env):
-    """A direct task. rlcli creates the object; the hooks are Isaac Lab's."""
+    """Base class of direct tasks; a subclass implements hooks such as `_get_rewards`. rlcli creates the object."""
 
     metadata = {"render_modes": [None]}  # noqa: RUF012  (gymnasium's)
 
@@ -203,7 +204,7 @@ class DirectMARLEnv(gymnasium.Env):
 
 @configclass
 class DirectRLEnvCfg:
-    """A direct task."""
+    """Configuration of a direct task."""
 
     viewer: Any = None
     sim: Any = SimulationCfg()
@@ -229,11 +230,11 @@ class DirectRLEnvCfg:
     log_dir: Any = None
 
     def __rlcli_environment__(self, entry: Any) -> None:
-        """Store the class of the environment that a registration names."""
+        """Store the environment class that the task's Gymnasium registration names, as a class or `module:Class`."""
         self.rlcli_class = entry
 
     def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
-        """Return this configuration as a task of rlcli, with the models that the user gives."""
+        """Return this configuration as a task of rlcli. `models` are those of `--model`."""
         from rlcli_isaaclab.direct_convert import direct_task
 
         return direct_task(self, _environment_class(self), root, models)
@@ -241,10 +242,10 @@ class DirectRLEnvCfg:
 
 @configclass
 class DirectMARLEnvCfg:
-    """A multi-agent task, which rlcli does not support."""
+    """Configuration of a multi-agent task, which rlcli does not support."""
 
     def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
-        """Raise the error that it cannot be used."""
+        """Raise ConfigError: rlcli does not support multi-agent tasks."""
         raise ConfigError(
             [
                 Problem(
@@ -287,14 +288,14 @@ def record(env_class: type[DirectRLEnv], cfg: Any) -> tuple[Setup, Any]:
     setup = Setup()
     with running(setup), building(_Shell(cfg)):
         try:
-            env_class(cfg)
+            placed(env_class, "cpu")(cfg)
         except _Recorded as recorded:
             return setup, recorded.env
     raise TaskError(f"{env_class.__name__}.__init__ does not call super().__init__(cfg, ...)", hint="add the call")
 
 
 class _Recorded(BaseException):
-    """End of the part of `__init__` that needs no simulation. No `except Exception` of the task catches it."""
+    """Exception that leaves `__init__` after `_setup_scene`. No `except Exception` in the task catches it."""
 
     def __init__(self, env: DirectRLEnv) -> None:
         self.env = env

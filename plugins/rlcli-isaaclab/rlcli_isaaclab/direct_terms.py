@@ -1,4 +1,4 @@
-"""Terms that call the hooks of a `DirectRLEnv`, one object of which belongs to each environment of rlcli."""
+"""Terms of rlcli that call the hooks of a direct task. Each environment of rlcli has its own `DirectRLEnv`."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from rlcli.sim.selection import Selection
 from rlcli_isaaclab.direct_env import DirectRLEnv, building
 from rlcli_isaaclab.observation_noise import noise_model
 from rlcli_isaaclab.substeps import Substeps
+from rlcli_isaaclab.user_files import placed
 
 
 class HookTerm:
-    """A hook of a direct task as a term of one section."""
+    """One hook of a direct task, such as `_get_rewards`, as a term of rlcli."""
 
     def __init__(self, hook: str, env_class: type, cfg: Any, shape: tuple[int, ...], reads_body_forces: bool) -> None:
         self.hook, self.env_class, self.cfg, self.shape = hook, env_class, cfg, shape
@@ -34,10 +35,10 @@ class HookTerm:
 
     def __call__(self, *args: Any) -> Any:
         """Raise an error: only the bound term can be called."""
-        raise TypeError("bind the term first")
+        raise TypeError(f"the term {self.hook} cannot be called before it is bound to an environment")
 
     def __rlcli_term__(self, name: str) -> Signature:
-        """Return the signature of the term under a name."""
+        """Return the signature of the term; `name` is the term's key in the task."""
         file = Path(inspect.getsourcefile(self.env_class) or "?")
         return Signature(
             name, self.__name__, True, file, 1, f"Hook of {self.env_class.__name__}.", (), target=self.target
@@ -57,7 +58,7 @@ class DirectRunner:
         self.phase = "build"
         self._substeps = Substeps(managed, "direct task", self)
         with building(managed):
-            self.lab: DirectRLEnv = term.env_class(cfg)
+            self.lab: DirectRLEnv = placed(term.env_class, managed.device)(cfg)
         for asset in self.lab.scene.articulations.values():
             asset.start_wrenches(by_task=True)
         self.action_noise = noise_model(cfg.action_noise_model, managed)
@@ -86,7 +87,7 @@ class DirectRunner:
         self._substeps.start()
 
     def compute_dones(self) -> None:
-        """Call `_get_dones`, but not for the first value that managers compute before the first reset."""
+        """Call `_get_dones`, but not before the first reset, when managers only check the shapes of values."""
         if self.phase == "build":
             return
         lab = self.lab
@@ -152,14 +153,14 @@ def _image_first(value: Tensor) -> Tensor:
 
 
 def runner_of(managed: Any, term: HookTerm) -> DirectRunner:
-    """Return the runner of an environment; the same object for the same environment."""
+    """Return the `DirectRunner` of an environment of rlcli; the first call creates it."""
     if "_isaaclab_direct" not in vars(managed):
         vars(managed)["_isaaclab_direct"] = DirectRunner(managed, term)
     return vars(managed)["_isaaclab_direct"]
 
 
 class _Hook:
-    """A bound hook."""
+    """A hook of a direct task, bound to an environment."""
 
     def __init__(self, runner: DirectRunner, shape: tuple[int, ...]) -> None:
         self._runner, self._shape = runner, shape

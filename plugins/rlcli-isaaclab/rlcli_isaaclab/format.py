@@ -13,9 +13,15 @@ if TYPE_CHECKING:
 
 _RUNNER = b"RslRlOnPolicyRunnerCfg"
 
+LIBRARIES = {
+    **{name: name for name in ("torchvision", "prettytable", "einops", "transformers", "numba", "warp", "psutil")},
+    **{"hid": "hidapi", "sklearn": "scikit-learn", "cv2": "opencv-python", "PIL": "pillow", "warp": "warp-lang"},
+}
+"""Libraries that come with Isaac Lab -> their name for pip. A missing one raises an error when it is used."""
 FOREIGN = (
     *("isaaclab", "isaaclab_tasks", "isaaclab_assets", "isaaclab_rl", "isaaclab_contrib", "isaaclab_mimic"),
-    *("isaacsim", "omni", "pxr", "carb", "usdrt", "toml", "pink", "pinocchio", "torchvision", "trimesh"),
+    *("isaacsim", "omni", "pxr", "carb", "usdrt", "toml", "pink", "pinocchio", "trimesh"),
+    *LIBRARIES,
 )
 """Packages whose modules `namespace.py` replaces in task files."""
 

@@ -115,7 +115,7 @@ def _write(folder: Path, data: dict[str, Any], report: Report) -> list[str]:
 
 
 def _compiles_alone(model: Path, folder: Path) -> bool:
-    """Copy an MJCF into a folder, and remove it again if it does not compile there (models with meshes do not)."""
+    """Copy an MJCF into a folder, and return whether it compiles there; if not (it needs meshes), remove the copy."""
     from rlcli.scene.untrusted_mjcf import read_mjcf
 
     copy = folder / model.name
@@ -175,7 +175,8 @@ def _agent(file: Path, report: Report) -> dict[str, Any]:
     data = read(file)
     if "algorithm" not in data or "num_steps_per_env" not in data:
         hint = "agents of rl_games, skrl and Stable-Baselines3 cannot be imported: write the agent by hand"
-        raise ConfigError([Problem(str(file), "", "not an agent.yaml of RSL-RL", hint)])
+        what = "not an agent.yaml of RSL-RL: algorithm or num_steps_per_env is missing"
+        raise ConfigError([Problem(str(file), "", what, hint)])
     return agent(data, report)
 
 
@@ -210,7 +211,7 @@ def _slice(loader: _Loader, node: yaml.SequenceNode) -> slice:
 
 
 def _opaque(loader: _Loader, suffix: str, node: yaml.Node) -> Any:
-    """Return any other Python object as text: a name as its reference, anything else as None."""
+    """Return `module:name` for YAML's tag of a Python function or class; return None for the tag of another object."""
     kind, _, name = suffix.partition(":")
     return ":".join(name.rsplit(".", 1)) if kind == "name" else None
 

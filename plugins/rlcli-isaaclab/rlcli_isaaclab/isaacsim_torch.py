@@ -37,23 +37,23 @@ def normalize_angle(x: Tensor) -> Tensor:
 
 
 def tf_combine(q1: Tensor, t1: Tensor, q2: Tensor, t2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return rotation and position of the second pose, given in the frame of the first."""
+    """Return the pose (q2, t2), which is given in the frame of the pose (q1, t1), in the parent frame of (q1, t1)."""
     return quat_mul(q1, q2), quat_apply(q1, t2) + t1
 
 
 def tf_inverse(q: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the inverse of a pose."""
+    """Return the inverse of a pose: quaternion and position."""
     back = quat_conjugate(q)
     return back, -quat_apply(back, t)
 
 
 def tf_apply(q: Tensor, t: Tensor, v: Tensor) -> Tensor:
-    """Transform a point."""
+    """Return the point v rotated by q and moved by t. (..., 4), (..., 3), (..., 3) -> (..., 3)"""
     return quat_apply(q, v) + t
 
 
 def tf_vector(q: Tensor, v: Tensor) -> Tensor:
-    """Rotate a vector."""
+    """Return the vector v rotated by q; t is not used. (..., 4), (..., 3), (..., 3) -> (..., 3)"""
     return quat_apply(q, v)
 
 
@@ -88,7 +88,12 @@ def to_torch(x: Any, dtype: torch.dtype = torch.float, device: Any = "cpu", requ
 def compute_heading_and_up(
     torso_rotation: Tensor, inv_start_rot: Tensor, to_target: Tensor, vec0: Tensor, vec1: Tensor, up_idx: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return torso rotation, projections of up and heading, and the vectors of heading and up."""
+    """Return how upright a torso is, and how well it faces a target.
+
+    Returns:
+        Orientation since the start (n, 4); the up vector's component `up_idx` (n,); the cosine between heading and
+        target (n,); the heading vector (n, 3); the up vector (n, 3).
+    """
     rotation = quat_mul(torso_rotation, inv_start_rot)
     up, heading = quat_apply(rotation, vec1), quat_apply(rotation, vec0)
     target = to_target / to_target.norm(p=2, dim=-1, keepdim=True).clamp(min=1e-9)
@@ -103,7 +108,12 @@ def compute_rot(
     torso_positions: Tensor,
     extrinsic: bool = True,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return velocities in the torso's frame, roll, pitch, yaw and the angle to the target [rad]."""
+    """Return a torso's velocities and angles, and the angle to a target.
+
+    Returns:
+        Linear and angular velocity in the torso's frame (n, 3) each; roll, pitch and yaw in [0, 2 pi) [rad] (n,) each;
+        the direction to the target minus the yaw [rad] (n,).
+    """
     roll, pitch, yaw = get_euler_xyz(torso_quat)
     walk = torch.atan2(targets[:, 2] - torso_positions[:, 2], targets[:, 0] - torso_positions[:, 0])
     return rotate_inverse(torso_quat, velocity), rotate_inverse(torso_quat, ang_velocity), roll, pitch, yaw, walk - yaw

@@ -15,7 +15,7 @@ from rlcli_isaaclab.utils.math import quat_apply_inverse, sample_uniform
 
 @dataclass(frozen=True, slots=True)
 class LabTerm:
-    """A term in Isaac Lab's form."""
+    """A term of Isaac Lab that is run by a function of this module."""
 
     function: Any
     needed: Callable[[Mapping[str, Any]], bool]
@@ -39,7 +39,10 @@ def action_rate_l2_clamped(env: Any) -> Tensor:
 
 
 def fingers_contact_force_b(env: Any, contact_sensor_names: list[str], asset_cfg: Any = None) -> Tensor:
-    """Return forces on the sensors' bodies, of filtered objects or of everything, root frame. (num_envs, 3 k) [N]"""
+    """Return the contact forces that the named sensors measure, robot's root frame. (num_envs, 3 k) [N]
+
+    A sensor with filters counts only contacts with the filtered objects.
+    """
     robot = env.scene["robot" if asset_cfg is None else asset_cfg.name]
     data = [env.scene.sensors[name].data for name in contact_sensor_names]
     forces = [d.net_forces_w if d.force_matrix_w is None else d.force_matrix_w.sum(dim=2) for d in data]
@@ -47,8 +50,14 @@ def fingers_contact_force_b(env: Any, contact_sensor_names: list[str], asset_cfg
     return quat_apply_inverse(robot.data.root_link_quat_w[:, None].expand(-1, force.shape[1], -1), force).flatten(1)
 
 
+def command_resample(env: Any, command_name: str, num_resamples: int = 1) -> Tensor:
+    """Whether a command that was sampled `num_resamples` times in the episode is about to be resampled. (num_envs,)"""
+    command = env.command_manager.get_term(command_name)
+    return (command.time_left < 1.5 * env.step_dt) & (command.command_counter == num_resamples)
+
+
 class reset_joints_within_limits_range(ManagerTermBase):  # noqa: N801  (Isaac Lab's name)
-    """Event: joint positions and velocities from a range of each joint, or from a fraction of its soft limits."""
+    """Event that samples joint positions and velocities from a range of each joint, or within its soft limits."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -95,6 +104,7 @@ def _always(params: Mapping[str, Any]) -> bool:
 LAB_TERMS: dict[str, LabTerm] = {
     "last_action": LabTerm(last_action_of_term, lambda params: params.get("action_name") is not None),
     "reset_joints_within_limits_range": LabTerm(reset_joints_within_limits_range, _always),
+    "command_resample": LabTerm(command_resample, _always),
     "fingers_contact_force_b": LabTerm(fingers_contact_force_b, _always),
     "action_l2_clamped": LabTerm(action_l2_clamped, _always),
     "action_rate_l2_clamped": LabTerm(action_rate_l2_clamped, _always),

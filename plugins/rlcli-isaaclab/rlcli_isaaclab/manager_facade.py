@@ -1,4 +1,4 @@
-"""Managers under Isaac Lab's names: `env.command_manager.get_command("base_velocity")`."""
+"""rlcli's managers with Isaac Lab's interface, for the user's terms: `env.command_manager.get_command("pose")`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rlcli.errors import did_you_mean, listing
 from rlcli.scene.names import NameProblem
-from rlcli_isaaclab.absent import absence
+from rlcli_isaaclab.absent import absence, user_place
 
 
 class ManagerFacade:
@@ -55,6 +55,10 @@ class ActionManagerFacade(ManagerFacade):
         return ActionTermFacade(_find_term(self._manager.terms, name, "action"), self._manager)
 
 
+_ACTION_NAMES = {"_joint_ids": "joints", "_joint_names": "elements", "action_dim": "size"}
+"""Attribute of Isaac Lab's joint actions -> attribute of rlcli's."""
+
+
 class ActionTermFacade:
     """An action term with Isaac Lab's attributes."""
 
@@ -64,7 +68,15 @@ class ActionTermFacade:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        return getattr(self._term, name)
+        holders = (self._term, getattr(self._term, "term", None))  # the second one is the user's object
+        for holder in holders:
+            found = getattr(holder, _ACTION_NAMES.get(name, name), None)
+            found = getattr(holder, name, None) if found is None else found
+            if found is not None:
+                return found
+        known = sorted({n for holder in holders for n in dir(holder) if not n.startswith("_")} | set(_ACTION_NAMES))
+        hint = did_you_mean(name, known) or f"its attributes: {listing(known, 40)}"
+        raise AttributeError(f"{user_place()}an action of rlcli has no '{name}'; {hint}")
 
     @property
     def raw_actions(self) -> Tensor:
@@ -74,7 +86,7 @@ class ActionTermFacade:
             if bound.instance is self._term:
                 return self._manager.action[:, start : start + bound.instance.size]
             start += bound.instance.size
-        raise LookupError("the term does not belong to this environment")
+        raise LookupError("the action term does not belong to this environment")
 
 
 class ObservationManagerFacade(ManagerFacade):
@@ -150,7 +162,7 @@ class RewardManagerFacade(ManagerFacade):
         return {term.name: row for term, row in zip(self._manager.terms, self._manager._sums, strict=True)}
 
     def set_term_cfg(self, name: str, cfg: Any) -> None:
-        """Set the weight of a term to that of the settings."""
+        """Set the weight of a term to `cfg.weight`."""
         self.get_term_cfg(name).weight = cfg.weight
 
 

@@ -36,7 +36,7 @@ class SceneEntityCfg:
 
 @configclass
 class ManagerTermBaseCfg:
-    """Settings of all terms."""
+    """Base of the configuration classes of all terms."""
 
     func: Any = MISSING
     params: dict[str, Any] = {}  # noqa: RUF012  (configclass copies it for each object)
@@ -146,7 +146,7 @@ class ManagerTermBase:
 
 
 class ActionTerm(ManagerTermBase):
-    """An action of the user's own: `process_actions` once per step, `apply_actions` before each physics step."""
+    """Base of the user's own actions: `process_actions` runs once per step, `apply_actions` in each physics step."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -155,25 +155,25 @@ class ActionTerm(ManagerTermBase):
     @property
     def action_dim(self) -> int:
         """Number of columns of the policy's action."""
-        raise NotImplementedError(f"write {type(self).__name__}.action_dim")
+        raise NotImplementedError(f"class {type(self).__name__} has no property action_dim; implement it")
 
     @property
     def raw_actions(self) -> Tensor:
         """The policy's action for this term. (num_envs, k)"""
-        raise NotImplementedError(f"write {type(self).__name__}.raw_actions")
+        raise NotImplementedError(f"class {type(self).__name__} has no property raw_actions; implement it")
 
     @property
     def processed_actions(self) -> Tensor:
         """The action after scale, offset and clip. (num_envs, k)"""
-        raise NotImplementedError(f"write {type(self).__name__}.processed_actions")
+        raise NotImplementedError(f"class {type(self).__name__} has no property processed_actions; implement it")
 
     def process_actions(self, actions: Tensor) -> None:
         """Store or process the action, once per step. (num_envs, k)"""
-        raise NotImplementedError(f"write {type(self).__name__}.process_actions")
+        raise NotImplementedError(f"class {type(self).__name__} has no method process_actions; implement it")
 
     def apply_actions(self) -> None:
         """Write targets to the assets, before each physics step."""
-        raise NotImplementedError(f"write {type(self).__name__}.apply_actions")
+        raise NotImplementedError(f"class {type(self).__name__} has no method apply_actions; implement it")
 
     def set_debug_vis(self, debug_vis: bool) -> bool:
         """Do nothing: actions are not shown. Returns False."""
@@ -181,17 +181,26 @@ class ActionTerm(ManagerTermBase):
 
 
 class CommandTerm(ManagerTermBase):
-    """A command of the user's own. The environment decides when to resample it."""
+    """Base of the user's own commands. The environment decides when to resample them."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
         self.metrics: dict[str, Tensor] = {}
         self.command_counter = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
 
+    rlcli_name: str
+    """Name of the term."""
+
     @property
     def command(self) -> Tensor:
         """Current command. (num_envs, k)"""
         raise NotImplementedError
+
+    @property
+    def time_left(self) -> Tensor:
+        """Time until the next resampling. (num_envs,) [s]"""
+        left: Tensor = self._env.managed.command_manager.time_left(self.rlcli_name)
+        return left
 
     def reset(self, env_ids: Any = None) -> dict[str, float]:
         """Reset the counter and the metrics. The environment samples the first command of an episode afterwards."""

@@ -15,8 +15,10 @@ from torch import Tensor
 
 from rlcli.config.term_signatures import SECTIONS, Parameter, builtin_terms
 from rlcli.errors import did_you_mean
+from rlcli_isaaclab.absent import absent_value
 from rlcli_isaaclab.config_class import MISSING, config_subclass, configclass
 from rlcli_isaaclab.curricula import modify_env_param, modify_term_cfg
+from rlcli_isaaclab.lab_terms import LAB_TERMS
 from rlcli_isaaclab.managers import ActionTermCfg, CommandTermCfg, SceneEntityCfg
 from rlcli_isaaclab.table import TERMS, Entry
 from rlcli_isaaclab.utils.math import sample_gaussian, sample_log_uniform, sample_uniform
@@ -76,7 +78,7 @@ def _default(env: Any, parameter: Parameter) -> Any:
 def _elements(
     env: Any, name: str, value: SceneEntityCfg, by_name: dict[str, Any], by_alias: dict[str, str]
 ) -> dict[str, Any]:
-    """Return the parameters of a built-in term for the elements that a `SceneEntityCfg` selects."""
+    """Return the parameters of a built-in term for the joints, bodies, ... that a `SceneEntityCfg` selects."""
     sensor = next((by_alias[kind] for kind in ("ContactSensor", "RaySensor") if kind in by_alias), None)
     if sensor is not None and value.name not in env.entities:
         whole = env.managed.sensors[value.name]
@@ -119,14 +121,15 @@ def find_term(name: str) -> tuple[str, str]:
 def _randomize_prop_by_op(
     data: Tensor, distribution_parameters: Any, dim_0_ids: Any, dim_1_ids: Any, operation: str, distribution: str
 ) -> Tensor:
-    """Draw new values of some rows and columns, in place. Isaac Lab's name for a function that user's events call."""
+    """Sample new values for some rows and columns of `data`, in place. Events of the user's own call this function."""
     samplers: dict[str, Any] = {
         "uniform": sample_uniform,
         "log_uniform": sample_log_uniform,
         "gaussian": sample_gaussian,
     }
     if operation not in ("add", "scale", "abs") or distribution not in samplers:
-        raise NotImplementedError(f"unknown operation '{operation}' or distribution '{distribution}'")
+        what = f"unknown operation '{operation}' or distribution '{distribution}'"
+        raise NotImplementedError(f"{what}; use add, scale or abs, and uniform, log_uniform or gaussian")
     rows = torch.arange(len(data), device=data.device) if dim_0_ids is None else torch.as_tensor(dim_0_ids)
     columns = torch.arange(data.shape[1], device=data.device)[dim_1_ids]
     drawn = samplers[distribution](*distribution_parameters, (len(rows), len(columns)), device=data.device)
@@ -160,6 +163,8 @@ def _has_counterpart(name: str) -> bool:
 def __getattr__(name: str) -> Any:
     if name.startswith("_"):
         raise AttributeError(name)
+    if not _has_counterpart(name) and name in LAB_TERMS:
+        return LAB_TERMS[name].function
     if not _has_counterpart(name):
         raise _UnknownTermError(name)
     return _function(name)
@@ -261,11 +266,11 @@ NullCommandCfg = config_subclass(
 
 @configclass
 class UniformVelocityCommandCfg(CommandTermCfg):
-    """A velocity of the root, sampled from uniform distributions."""
+    """Configuration of a command: a velocity of the root, sampled from uniform distributions."""
 
     @configclass
     class Ranges:
-        """[low, high] of each [m/s, rad/s, rad]."""
+        """[low, high] of each component: velocities [m/s, rad/s] and heading [rad]."""
 
         lin_vel_x: Any = MISSING
         lin_vel_y: Any = MISSING
@@ -273,6 +278,8 @@ class UniformVelocityCommandCfg(CommandTermCfg):
         heading: Any = None
 
     class_type: Any = "UniformVelocityCommand"
+    goal_vel_visualizer_cfg: Any = absent_value("isaaclab.markers.config.GREEN_ARROW_X_MARKER_CFG")
+    current_vel_visualizer_cfg: Any = absent_value("isaaclab.markers.config.BLUE_ARROW_X_MARKER_CFG")
     asset_name: str = MISSING
     heading_command: bool = False
     heading_control_stiffness: float = 1.0
@@ -283,7 +290,7 @@ class UniformVelocityCommandCfg(CommandTermCfg):
 
 @configclass
 class NormalVelocityCommandCfg(UniformVelocityCommandCfg):
-    """A velocity of the root, sampled from normal distributions."""
+    """Configuration of a command: a velocity of the root, sampled from normal distributions."""
 
     @configclass
     class Ranges:
@@ -298,11 +305,11 @@ class NormalVelocityCommandCfg(UniformVelocityCommandCfg):
 
 @configclass
 class UniformPoseCommandCfg(CommandTermCfg):
-    """A pose of a body in the root's frame."""
+    """Configuration of a command: a pose of a body in the root's frame."""
 
     @configclass
     class Ranges:
-        """[low, high] of each [m, rad]."""
+        """[low, high] of each component: positions [m] and angles [rad]."""
 
         pos_x: Any = MISSING
         pos_y: Any = MISSING
@@ -312,6 +319,8 @@ class UniformPoseCommandCfg(CommandTermCfg):
         yaw: Any = MISSING
 
     class_type: Any = "UniformPoseCommand"
+    goal_pose_visualizer_cfg: Any = absent_value("isaaclab.markers.config.FRAME_MARKER_CFG")
+    current_pose_visualizer_cfg: Any = absent_value("isaaclab.markers.config.FRAME_MARKER_CFG")
     asset_name: str = MISSING
     body_name: str = MISSING
     make_quat_unique: bool = False
@@ -320,17 +329,18 @@ class UniformPoseCommandCfg(CommandTermCfg):
 
 @configclass
 class UniformPose2dCommandCfg(CommandTermCfg):
-    """A position and heading on the ground."""
+    """Configuration of a command: a position and heading on the ground."""
 
     @configclass
     class Ranges:
-        """[low, high] of each [m, rad]."""
+        """[low, high] of each component: positions [m] and angles [rad]."""
 
         pos_x: Any = MISSING
         pos_y: Any = MISSING
         heading: Any = MISSING
 
     class_type: Any = "UniformPose2dCommand"
+    goal_pose_visualizer_cfg: Any = absent_value("isaaclab.markers.config.GREEN_ARROW_X_MARKER_CFG")
     asset_name: str = MISSING
     simple_heading: bool = MISSING
     ranges: Any = MISSING

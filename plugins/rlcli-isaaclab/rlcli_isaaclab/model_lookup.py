@@ -34,7 +34,7 @@ def map_usd(usd: str, mjcf: str) -> None:
 
 @dataclass(slots=True)
 class GivenModels:
-    """Content of the files `models.yaml` of a task."""
+    """Models that the user gives with `--model` and in files `models.yaml`."""
 
     files: dict[str, str] = field(default_factory=dict)
     """Entity, or end of a USD path -> MJCF."""
@@ -43,10 +43,10 @@ class GivenModels:
 
 
 def given_models(root: Path, asked: Mapping[str, Any]) -> GivenModels:
-    """Return the models of entities, or of ends of paths: those of `--model`, then those of every `models.yaml`.
+    """Return the models that the user gives: `asked`, the values of `--model`, and then every `models.yaml`.
 
-    The files are those in the task's folder, in the folders above it that belong to its package, and in the folders of
-    RLCLI_MODELS. Earlier ones win.
+    These files are searched for in the task's folder, in the folders above it that belong to its package, and in the
+    folders of RLCLI_MODELS. Earlier ones win.
 
     Raises:
         TaskError: if a file is not a mapping of text, or names a file that does not exist.
@@ -64,11 +64,11 @@ def given_models(root: Path, asked: Mapping[str, Any]) -> GivenModels:
         except (OSError, yaml.YAMLError, RecursionError) as error:
             raise TaskError(f"{file}: not YAML: {' '.join(str(error).split())}", hint="write NAME: FILE.xml") from None
         if not isinstance(content, Mapping):
-            raise TaskError(f"{file}: expected lines NAME: FILE", hint="for example robot: robot.xml")
+            raise TaskError(f"{file}: expected lines NAME: FILE.xml", hint="for example robot: robot.xml")
         for name, value in content.items():
             model = value.get("model") if isinstance(value, Mapping) else value
             if not isinstance(model, str):
-                raise TaskError(f"{file}: {name}: expected a file", hint="for example robot: robot.xml")
+                raise TaskError(f"{file}: {name}: expected an MJCF file", hint="for example robot: robot.xml")
             if ":" not in model and not (folder / model).is_file():
                 raise TaskError(f"{file}: {name}: there is no file '{model}' in {folder}", hint="correct the path")
             _add(found, str(name), value, prefix)
@@ -76,7 +76,7 @@ def given_models(root: Path, asked: Mapping[str, Any]) -> GivenModels:
 
 
 def _add(found: GivenModels, name: str, value: Any, prefix: str) -> None:
-    """Add a model, and the gains that are given with it."""
+    """Add the model of a name, and the gains that are given with the model, unless the name is known."""
     model = value["model"] if isinstance(value, Mapping) else value
     if isinstance(value, Mapping):
         found.gains.setdefault(name, value.get("gains") or {})
@@ -84,7 +84,7 @@ def _add(found: GivenModels, name: str, value: Any, prefix: str) -> None:
 
 
 def model_hint(entity: str) -> str:
-    """Return how the user gives a model."""
+    """Return a hint for the user: how to give the model of an entity."""
     return f"give a model: --model {entity}=FILE.xml, or --model {MODEL_MAP} with lines {entity}: FILE.xml"
 
 

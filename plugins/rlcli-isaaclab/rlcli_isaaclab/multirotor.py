@@ -34,7 +34,7 @@ class Thruster:
         self.reset(slice(None))
 
     def reset(self, env_ids: Any) -> None:
-        """Draw the constants of the rotors, and start them at their first speed."""
+        """Draw the constants of the rotors, and set the rotors to their initial speed."""
         cfg = self.cfg
         shape = self.tau_inc_s[env_ids].shape
         for target, ends in (
@@ -59,7 +59,7 @@ class Thruster:
         return self.applied_thrust
 
     def _change(self, error: Tensor, mixing: Tensor) -> Tensor:
-        """Return the change of speed in one physics step."""
+        """Return the change of speed in one physics step, from `error` = target - speed and `mixing` [1/s]."""
         dt, most = self.cfg.dt, self.cfg.max_thrust_rate
 
         def rate(wanted: Tensor) -> Tensor:
@@ -79,7 +79,7 @@ class Multirotor(Asset):
     """A robot that thrusters drive; their forces act on its first body, in its frame."""
 
     def start(self) -> None:
-        """Create the thrusters; `cfg` and the entity are known."""
+        """Create the thrusters. Call this after `cfg` and the entity are set."""
         self.actuators: dict[str, Thruster] = {}
         groups = {group: self.find_bodies(cfg.thruster_names_expr)[1] for group, cfg in self.cfg.actuators.items()}
         self.thruster_names = [name for names in groups.values() for name in names]
@@ -105,7 +105,7 @@ class Multirotor(Asset):
         self.data.thrust_target[rows[:, None], columns] = target
 
     def reset(self, env_ids: Any = None) -> None:
-        """Start the thrusters of new episodes again."""
+        """Reset the thrusters of some environments."""
         super().reset(env_ids)
         rows = slice(None) if env_ids is None else env_ids
         # as in Isaac Lab, the first target is the speed

@@ -1,4 +1,4 @@
-"""Modules of Isaac Lab and Isaac Sim as task files import them.
+"""Import of `isaaclab` and `isaacsim` in task files: the modules of this package that replace theirs.
 
 The table `names.json` lists the public names of each module of Isaac Lab; `tools/names.py` writes it. A name that this
 package defines is imported from this package. Any other name of the table is a stand-in, which raises an error when the
@@ -21,6 +21,7 @@ from rlcli.errors import did_you_mean
 from rlcli.registry.task_imports import import_from
 from rlcli_isaaclab.absent import absent_class, absent_function, absent_module, absent_value
 from rlcli_isaaclab.config_class import configclass
+from rlcli_isaaclab.format import LIBRARIES
 
 _OWN = "rlcli_isaaclab"
 _EXTRA = {
@@ -30,12 +31,12 @@ _EXTRA = {
     "isaaclab_contrib": ("multirotor", "action_terms"),
     "isaaclab.envs.mdp": ("mdp", "action_terms", "command_terms"),
     "isaaclab.sim": ("usd_stage", "usd_geometry"),
+    "isaaclab.utils.math": ("utils.poses",),
+    "isaaclab.actuators": ("actuator_classes",),
 }
 """Module of Isaac Lab -> modules of this package that define further names of it."""
 _SOURCE_PACKAGES = ("isaaclab_tasks", "isaaclab_assets")
 """Packages whose original files are imported if they are found: they only use other modules of Isaac Lab."""
-_LIBRARIES = ("toml", "torchvision", "trimesh")
-"""Libraries that come with Isaac Lab: an installed one is imported, a missing one raises an error when it is used."""
 _SIM = {"isaacsim.core.utils.torch": "isaacsim_torch", "isaacsim.core.utils.torch.rotations": "isaacsim_torch",
         "isaacsim.core.utils.torch.maths": "isaacsim_torch",
     "isaacsim.core.utils.torch.transformations": "isaacsim_torch"}  # fmt: skip
@@ -62,17 +63,16 @@ SOURCE = "RLCLI_ISAACLAB"
 def module_of(name: str, file: str) -> ModuleType | None:
     """Return the module that replaces a module of Isaac Lab or Isaac Sim; None to import an installed one.
 
-    The files of `isaaclab_tasks` and `isaaclab_assets` are searched for in the folders above the importing file, in the
-    folder RLCLI_ISAACLAB and in an installed wheel of Isaac Lab.
+    The files of `isaaclab_tasks` and `isaaclab_assets` are searched for in the folders above `file`, which has the
+    import statement, in the folder RLCLI_ISAACLAB and in an installed wheel of Isaac Lab.
     """
     top, _, inner = name.partition(".")
     # `isaaclab_tasks.utils` is replaced by this package's `task_utils`
     if top in _SOURCE_PACKAGES and not inner.startswith("utils"):
         folder = _source_folder(top, Path(file).parent)
         if folder is not None:
-            # the __init__.py of isaaclab_tasks imports every task, so that file is not run
-            return import_from(folder, inner, run_start=top != "isaaclab_tasks")
-    if top in _LIBRARIES and importlib.util.find_spec(top) is not None:
+            return _of_source(name, folder, inner)
+    if top in ("toml", "trimesh", *LIBRARIES) and importlib.util.find_spec(top) is not None:
         return None
     if top in ("toml", "trimesh"):
         return importlib.import_module(f"{_OWN}.{top}_reader" if top == "toml" else f"{_OWN}.triangle_mesh")
@@ -90,6 +90,22 @@ def module_of(name: str, file: str) -> ModuleType | None:
         what = f"Isaac Lab 2.3.2 has no module '{name}'"
         raise ModuleNotFoundError(f"{what}; {near}" if near else what, name=name)
     return _lab_module(name)
+
+
+def _of_source(name: str, folder: Path, inner: str) -> ModuleType:
+    """Import a module of `isaaclab_tasks` or `isaaclab_assets` from the original files in a folder.
+
+    Raises:
+        ModuleNotFoundError: if the package has no such module.
+    """
+    top = name.partition(".")[0]
+    try:
+        # the __init__.py of isaaclab_tasks imports every task, so that file is not run
+        return import_from(folder, inner, run_start=top != "isaaclab_tasks")
+    except ModuleNotFoundError as error:
+        if not str(error.name).endswith(f".{inner}"):
+            raise
+        raise ModuleNotFoundError(f"Isaac Lab's package '{top}' has no module '{name}' ({folder})", name=name) from None
 
 
 @functools.cache
@@ -159,7 +175,7 @@ def lab_name(name: str) -> Any:
 
 
 def _settings_class(name: str, kind: Mapping[str, Any], full: str, qualified: str | None = None) -> Any:
-    """Return a configuration class of the table. Settings that rlcli cannot use are reported where they are read."""
+    """Return the configuration class that `names.json` describes. Readers report the settings that rlcli cannot use."""
     bases = tuple(base for base in map(_base, kind["bases"]) if isinstance(base, type)) or (object,)
     members: dict[str, Any] = {"__doc__": f"Settings of Isaac Lab's `{full}`.", "__module__": f"{_OWN}.namespace"}
     qualified = full.rpartition(".")[2] if qualified is None else qualified
@@ -181,7 +197,7 @@ def _settings_class(name: str, kind: Mapping[str, Any], full: str, qualified: st
 
 
 def _base(written: str) -> Any:
-    """Return a base class by its text in the table: `Name`, `module.Name` or `Name.Nested`."""
+    """Return a base class by its text in `names.json`: `Name`, `module.Name` or `Name.Nested`."""
     parts = written.split(".")
     while len(parts) > 1 and parts[0] not in _definitions():
         parts = parts[1:]
@@ -226,7 +242,7 @@ def _modules() -> frozenset[str]:
 
 @functools.cache
 def _definitions() -> dict[str, tuple[str, Any]]:
-    """Return name -> module that defines it, and its kind. Names of isaaclab itself win over others."""
+    """Return name -> (module that defines it, its entry in `names.json`). Names of isaaclab itself win over others."""
     found: dict[str, tuple[str, Any]] = {}
     for module, names in sorted(_table().items(), key=lambda item: item[0].split(".")[0] != "isaaclab"):
         for name, kind in names.items():

@@ -27,7 +27,7 @@ class ObjectReader:
         self.driven_joints = scene.driven_joints
 
     def record_driven_joints(self, actions: Node) -> None:
-        """Record which joints the actions drive, and how."""
+        """Record which joints the actions drive, and by what: effort, motor, velocity or position."""
         for _, item in actions.nodes():
             wanted = item.data.get("joint_names")
             entity = str(item.data.get("asset_name"))
@@ -41,7 +41,7 @@ class ObjectReader:
                         self.driven_joints.setdefault(entity, {})[joint] = command
 
     def read_action(self, node: Node) -> dict[str, Any]:
-        """Return an action term."""
+        """Return the settings of an action term of rlcli."""
         kind = kind_of(node.get("class_type"))
         action = find_action(node.data.get("class_type"))
         name = ACTIONS.get(kind)
@@ -88,7 +88,7 @@ class ObjectReader:
             elif has_no_effect(key, value):
                 continue
             else:
-                node.note("ignored", key, f"'{name}' has no such setting")
+                node.note("ignored", key, f"rlcli's action '{name}' has no such setting")
         return config
 
     def _read_ik_controller(self, node: Node) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from rlcli_isaaclab.settings import kind_of
 
 
 class NoNoise:
-    """No noise."""
+    """No noise, and base of the noise models."""
 
     def __call__(self, data: Tensor) -> Tensor:
-        """Return the data with noise."""
+        """Return the data unchanged; a noise model returns the data with noise."""
         return data
 
     def reset(self, env_ids: Any) -> None:
@@ -62,7 +62,10 @@ def noise_model(cfg: Any, managed: Any) -> NoNoise:
     if isinstance(cfg.class_type, type):
         return cfg.class_type(cfg, managed.num_envs, str(managed.device))
     if kind not in models:
-        raise TaskError(f"the noise model '{kind}' has no counterpart in rlcli", hint="use NoiseModelCfg")
+        raise TaskError(
+            f"the noise model '{kind}' has no counterpart in rlcli",
+            hint="use NoiseModelCfg or NoiseModelWithAdditiveBiasCfg",
+        )
     return models[kind](cfg, managed)
 
 

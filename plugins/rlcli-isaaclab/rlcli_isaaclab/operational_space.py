@@ -54,7 +54,7 @@ class OperationalSpaceController:
         self.desired_ee_wrench_b: Tensor | None = None
 
     def _row(self, value: Any) -> Tensor:
-        """Return six values for each environment. (num_envs, 6)"""
+        """Return a number, or six numbers, as one row for each environment. (num_envs, 6)"""
         row = torch.as_tensor(value, dtype=torch.float32, device=self._device).expand(6)
         return row.expand(self.num_envs, 6).clone()
 
@@ -73,7 +73,7 @@ class OperationalSpaceController:
         current_ee_pose_b: Tensor | None = None,
         current_task_frame_pose_b: Tensor | None = None,
     ) -> None:
-        """Set targets and gains. (num_envs, action_dim); poses (num_envs, 7)"""
+        """Set targets and gains from a command (num_envs, action_dim). Poses are (num_envs, 7)."""
         if command.shape != (self.num_envs, self.action_dim):
             raise ValueError(f"a command has shape {tuple(command.shape)}; pass {(self.num_envs, self.action_dim)}")
         if self.cfg.impedance_mode != "fixed":

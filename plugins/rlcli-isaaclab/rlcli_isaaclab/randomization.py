@@ -45,7 +45,7 @@ class EventParameters:
         self.key = (*params.key, "asset_cfg")
 
     def require(self, name: str) -> Any:
-        """Return a value.
+        """Return the value of a parameter.
 
         Raises:
             ParameterError: if it is missing.
@@ -56,12 +56,16 @@ class EventParameters:
         return value
 
     def range(self, name: str) -> Any:
-        """Return a pair of numbers, or None if it is not set."""
+        """Return a parameter that is a pair of numbers, or None if it is not set."""
         value = self.params.get(name)
-        return None if value is None else _pair(name, value)
+        if value is None:
+            return None
+        pair = _pair(name, value)
+        # as in Isaac Lab, the ends of a uniform distribution may be written from high to low
+        return pair if self.params.data.get("distribution") == "gaussian" else sorted(pair)
 
     def entity(self) -> TermConfig:
-        """Return `entity`, unless it is the robot, which is the default of rlcli's terms."""
+        """Return the parameter `entity` of rlcli's term; empty for the robot, which is the default."""
         return {} if self.name == "robot" else {"entity": self.name}
 
     def selected(self, kind: str) -> list[str] | None:
@@ -79,7 +83,7 @@ class EventParameters:
         return {} if names is None else {parameter: names}
 
     def sampling(self, operation: str, distribution: str = "uniform") -> TermConfig:
-        """Return how values are sampled and applied. The arguments are the defaults of Isaac Lab's event."""
+        """Return `operation` and `distribution` of rlcli's term. The arguments are Isaac Lab's defaults."""
         operation = self.params.get("operation", operation)
         distribution = self.params.get("distribution", distribution)
         return {
@@ -96,7 +100,7 @@ class EventParameters:
             self.params.skip(name)
 
     def approximate(self, name: str, why: str) -> None:
-        """Report that a parameter has nearly the same meaning."""
+        """Report that rlcli's parameter has nearly the same meaning; `why` tells the difference."""
         self.params.note("approximated", name, why)
 
 

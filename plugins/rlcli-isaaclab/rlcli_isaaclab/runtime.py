@@ -1,4 +1,4 @@
-"""Isaac Lab's environment class around an environment of rlcli."""
+"""Isaac Lab's `ManagerBasedRLEnv` around an environment of rlcli: the `env` that the user's terms receive."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
         self.managed.close()
 
     def use(self, context: Any) -> None:
-        """Take over the parts of the user's configuration that terms read."""
+        """Take over the parts of the user's configuration that terms read: `cfg`, frame transformers and lights."""
         self.scene.add_frames(context.frames)
         if context.cfg is not None and self._context is not context:
             self._context, self.cfg = context, copy.deepcopy(context.cfg)
@@ -247,7 +247,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
 
 def facade_of(managed: VecEnv) -> ManagerBasedRLEnv:
-    """Return the facade of an environment; the same object for the same environment."""
+    """Return the `ManagerBasedRLEnv` around an environment of rlcli; the first call creates it."""
     if "_isaaclab" not in vars(managed):
         vars(managed)["_isaaclab"] = ManagerBasedRLEnv._of(managed)
     return vars(managed)["_isaaclab"]

@@ -23,14 +23,14 @@ from rlcli_isaaclab.setup_scene import current_setup
 
 
 class Asset:
-    """A robot or an object."""
+    """A robot or object of the scene, with the attributes and methods of Isaac Lab's assets."""
 
     def __init__(self, cfg: Any) -> None:
         current_setup().add(self, cfg)
 
     @classmethod
     def of(cls, env: VecEnv, entity: Entity) -> Asset:
-        """Return the asset of an entity."""
+        """Create the asset of an entity of the simulation."""
         asset = cls.__new__(cls)
         asset.cfg = entity.config
         asset.bind(env, entity)
@@ -158,6 +158,11 @@ class Asset:
 
     def write_root_pose_to_sim(self, root_pose: Tensor, env_ids: Any = None) -> None:
         """Set the root's position [m] and quaternion (w, x, y, z). (rows, 7)"""
+        if self._entity.mocap >= 0:
+            mocap = torch.tensor([self._entity.mocap], device=self._env.device)
+            self._write("mocap_pos", mocap, root_pose[:, None, :3], None, env_ids)
+            self._write("mocap_quat", mocap, root_pose[:, None, 3:], None, env_ids)
+            return
         if not self._entity.is_floating:
             self._require_same_base(root_pose, env_ids)
             return
@@ -171,7 +176,7 @@ class Asset:
         Set the pose first.
         """
         if not self._entity.is_floating:
-            return  # a fixed base does not move
+            return  # a fixed base does not move, and MuJoCo's mocap bodies (kinematic ones) have no velocity
         root, _ = self._entity.floating()
         rows = slice(None) if env_ids is None else env_ids
         quat = self._env.engine.field("qpos")[:, root + 3 : root + 7].float()
@@ -226,7 +231,7 @@ class Asset:
         if not torch.allclose(root_pose[:, :3], now, atol=1e-4):
             raise TaskError(
                 f"the base of '{self._entity.name}' is fixed in its MJCF, and the task moves it",
-                hint="add a <freejoint/> to the MJCF, or remove the change of the root's position",
+                hint='add <freejoint/> to its body in the MJCF, or mocap="true" if only a reset moves it',
             )
 
     def _write(self, field: str, columns: Tensor, values: Tensor, joint_ids: Any, env_ids: Any) -> None:

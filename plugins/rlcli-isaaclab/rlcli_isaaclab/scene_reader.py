@@ -29,6 +29,8 @@ class SceneReader:
         self.prims: dict[str, str] = {}
         """Entity -> the last part of its prim path."""
         self.sensors: dict[str, dict[str, Any]] = {}
+        self.user_actuators: dict[tuple[str, str], Mapping[str, Any]] = {}
+        """(entity, group) -> settings of the actuators with a class of the user's."""
         self.has_terrain = False
         self.frames: dict[str, dict[str, Any] | None] = {}
         """Frame transformers, and lights (None), which only the user's terms read."""
@@ -112,15 +114,15 @@ class SceneReader:
                 entity["joints"] = joints
 
     def integrator(self) -> dict[str, str]:
-        """Return the `integrator` of joints with a drive: PhysX integrates their damping implicitly.
+        """Return the setting `integrator` that a model with drives needs; empty without drives.
 
-        MuJoCo's method of Euler does so only with the damping of joints, and a drive's damping can diverge.
+        PhysX integrates the damping of drives implicitly. MuJoCo's Euler method would diverge with a large damping.
         """
         joints = [settings for entity in self.entities.values() for settings in entity.get("joints", {}).values()]
         return {"integrator": "implicitfast"} if any(settings.get("kv") for settings in joints) else {}
 
     def names(self, entity: str, kind: str) -> list[str] | None:
-        """Return the joints or bodies of an entity in its model's order; None if there is no model."""
+        """Return the names of an entity's joints or bodies (`kind`) in the model's order; None without a model."""
         model = self._models.get(entity)
         return None if model is None else model[kind]
 
@@ -145,7 +147,7 @@ class SceneReader:
             return wanted
 
     def geoms_of_bodies(self, entity: str, bodies: list[str], key: Key) -> list[str]:
-        """Return the geoms of bodies, which are given by names or regexes."""
+        """Return the names of the geoms of bodies, which are given by names or regexes."""
         from rlcli.scene.names import NameProblem, match
 
         model = self._models.get(entity)
@@ -159,7 +161,7 @@ class SceneReader:
         return [geom for geom, body in model["geoms"] if body in chosen]
 
     def gains_of_joints(self, entity: str, joints: list[str] | None) -> dict[str, Any]:
-        """Return where the gains of the joints (None: all) are.
+        """Return the names of the elements that have the gains of the joints (None: all), by kind.
 
         `kp` and `kv` are MuJoCo's actuators with that gain, `damping` the joints whose damping is their own, and
         `explicit` the joints with an explicit actuator model.
@@ -200,7 +202,7 @@ class SceneReader:
         return [n for n in passive if driven.get(n) != "velocity"]
 
     def sensor_of_bodies(self, name: str, bodies: Any, preserve: bool, key: Key) -> str:
-        """Return the name of a sensor for some bodies of a contact sensor; adds one unless these are all its bodies."""
+        """Return the name of a contact sensor with only these bodies of the sensor `name`; add one if there is none."""
         sensor = self.sensors.get(name)
         if sensor is None or sensor["kind"] != "contact" or bodies is None:
             return name  # a missing sensor is reported when the environment is built
@@ -283,6 +285,7 @@ class SceneReader:
             lambda patterns, group: self.order_names(name, "joint", patterns, False, group.key),
             name,
             self._given.gains.get(name, {}),
+            self.user_actuators,
         )
         if explicit:
             entity["actuators"] = explicit

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
+from rlcli.errors import did_you_mean, listing
 from rlcli.scene.names import match
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
-from rlcli_isaaclab.absent import absence
+from rlcli_isaaclab.absent import absence, user_place
 from rlcli_isaaclab.setup_scene import current_setup
 
 
@@ -109,7 +110,7 @@ class CameraView:
 
 
 class _Images(dict[str, Tensor]):
-    """Images by type of data."""
+    """Images by type of data, such as `rgb`; another type raises an error."""
 
     def __missing__(self, name: str) -> Tensor:
         raise absence(f"Camera.data.output[{name!r}]")
@@ -141,12 +142,12 @@ class TerrainImporter:
 
     @property
     def terrain_levels(self) -> Tensor:
-        """Level of each environment. (num_envs,) int64"""
+        """Terrain level (row of the terrain) of each environment. (num_envs,) int64"""
         return self._terrain.levels
 
     @property
     def terrain_types(self) -> Tensor:
-        """Column of each environment. (num_envs,) int64"""
+        """Column of the terrain on which each environment is. (num_envs,) int64"""
         return self._terrain.types
 
     @property
@@ -168,13 +169,13 @@ class TerrainImporter:
 
 
 def camera_or_sensor(sensor: Any) -> Any:
-    """Return the facade of a sensor."""
+    """Return a `CameraView` of a camera, or a `Sensor` of another sensor."""
     is_camera = getattr(getattr(sensor, "config", None), "kind", "") == "camera"
     return bound(CameraView if is_camera else Sensor, sensor)
 
 
 def bound(kind: Any, *parts: Any) -> Any:
-    """Return an object of a class that is connected with parts of the simulation."""
+    """Create an object of a class without `__init__`, and connect it by `bind` with parts of the simulation."""
     made = kind.__new__(kind)
     made.bind(*parts)
     return made
@@ -214,7 +215,28 @@ class Sensor:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        return getattr(self._sensor, self._NAMES.get(name, name))
+        try:
+            return getattr(self._sensor, self._NAMES.get(name, name))
+        except AttributeError:
+            known = sorted({n for n in (*dir(self._sensor), *self._NAMES) if not n.startswith("_")})
+            hint = did_you_mean(name, known) or f"its attributes: {listing(known, 40)}"
+            raise AttributeError(f"{user_place()}a sensor of rlcli has no '{name}'; {hint}") from None
+
+    @property
+    def num_rays(self) -> int:
+        """Number of rays."""
+        return len(self._sensor._starts)
+
+    @property
+    def ray_starts(self) -> Tensor:
+        """Starts of the rays in the sensor's body frame. (num_envs, rays, 3) [m]"""
+        starts = self._sensor._starts + self._sensor._offset
+        return starts.expand(len(self._sensor._position), -1, -1)
+
+    @property
+    def ray_directions(self) -> Tensor:
+        """Directions of the rays in the sensor's body frame. (num_envs, rays, 3)"""
+        return self._sensor._directions.expand(len(self._sensor._position), -1, -1)
 
     def find_bodies(self, name_keys: Any, preserve_order: bool = False) -> Any:
         """Return indices and names of the sensor's bodies that names or regexes match."""

@@ -28,7 +28,7 @@ def read_sensor(kind: str, item: Node, prims: Mapping[str, str], frames: dict[st
         return read_camera(item, entity, parts[parts.index(prims[entity]) + 1 : -1] if entity else [])
     if entity is None:
         hint = f"prims: {listing(prims)}"
-        item.report.problem((*item.key, "prim_path"), f"'{prim}' is not inside an entity", hint)
+        item.report.problem((*item.key, "prim_path"), f"'{prim}' is not a prim of a robot or object", hint)
         return None
     inside = parts[parts.index(prims[entity]) + 1 :]
     body = inside[-1] if inside else None
@@ -163,7 +163,7 @@ def _read_contact_sensor(item: Node, entity: str, body: str | None) -> dict[str,
 
 
 def read_filters(item: Node, sensor: Mapping[str, Any], prims: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return one sensor for each body that a contact sensor filters by: `force_matrix_w` has their forces."""
+    """Return a contact sensor for each entry of `filter_prim_paths_expr`; `force_matrix_w` has their forces."""
     found = []
     for path in item.get("filter_prim_paths_expr") or ():
         parts = [part for part in str(path).split("/") if part]
@@ -179,7 +179,7 @@ def read_filters(item: Node, sensor: Mapping[str, Any], prims: Mapping[str, str]
 
 
 def filter_name(sensor: str, index: int) -> str:
-    """Return the name of the sensor of one filter."""
+    """Return the name of the sensor for the entry `index` of a contact sensor's `filter_prim_paths_expr`."""
     return f"{sensor}_filter_{index}"
 
 

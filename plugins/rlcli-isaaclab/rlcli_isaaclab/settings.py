@@ -97,13 +97,13 @@ class Node:
         return Node(value, (*self.key, name), self.report)
 
     def nodes(self) -> Iterator[tuple[str, Node]]:
-        """Yield every member that has settings of its own."""
+        """Yield (name, settings) of every member that is a mapping."""
         for name, value in self.data.items():
             if isinstance(value, Mapping):
                 yield name, Node(value, (*self.key, name), self.report)
 
     def note(self, status: Status, name: str, why: str = "") -> None:
-        """Record a status for a member, unless it is empty."""
+        """Record how a member was translated, unless its value is empty."""
         if name in self and not is_empty(self.data[name]):
             self.report.entries[(*self.key, name)] = (status, why)
 

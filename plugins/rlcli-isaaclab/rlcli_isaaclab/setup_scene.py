@@ -39,7 +39,7 @@ _CURRENT: ContextVar[Setup | None] = ContextVar("setup", default=None)
 
 
 def current_setup() -> Setup:
-    """Return the setup that runs.
+    """Return the `Setup` of the `_setup_scene` that is running.
 
     Raises:
         TaskError: outside of `_setup_scene`.

@@ -93,6 +93,9 @@ class SimulationCfg:
     physics_material: Any = RigidBodyMaterialCfg()
     render: Any = RenderCfg()
     create_stage_in_memory: bool = False
+    logging_level: str = "WARNING"
+    save_logs_to_file: bool = True
+    log_dir: Any = None
 
 
 __all__ = [name for name in dict(globals()) if name.endswith("Cfg")]

@@ -53,7 +53,7 @@ def _names(value: Any) -> dict[str, Any]:
 
 
 def _unwrap_single(value: Any) -> dict[str, Any]:
-    """Unwrap a single-element list. The check of the term rejects longer lists."""
+    """Return the only element of a list as `sensor`. The check of the term rejects longer lists."""
     return {"sensor": value[0] if len(value) == 1 else list(value)}
 
 

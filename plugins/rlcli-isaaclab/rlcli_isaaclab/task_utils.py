@@ -25,7 +25,7 @@ def import_packages(package_name: str, blacklist_pkgs: list[str] | None = None) 
 
 
 def load_cfg_from_registry(task_name: str, entry_point_key: str) -> Any:
-    """Return a configuration that a registered task names."""
+    """Return the configuration that a registered task names under a key such as `env_cfg_entry_point`."""
     from rlcli.registry.task_imports import load_object, registrations
 
     entry = registrations[task_name][entry_point_key]

@@ -14,7 +14,7 @@ from rlcli_isaaclab import command_terms
 from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.curricula import ChangedSetting, modify_env_param
-from rlcli_isaaclab.lab_terms import LAB_TERMS
+from rlcli_isaaclab.lab_terms import LAB_TERMS, command_resample
 from rlcli_isaaclab.managers import CommandTerm
 from rlcli_isaaclab.mdp import MdpFunction
 from rlcli_isaaclab.object_reader import OBJECT_KEYS, ObjectReader
@@ -30,7 +30,7 @@ from rlcli_isaaclab.table import (
     Entry,
     finite_times,
 )
-from rlcli_isaaclab.term_values import builtin_name, is_entity, is_plain, triple
+from rlcli_isaaclab.term_values import builtin_name, is_entity, is_plain, order_ranges, triple
 
 _READS_COMMAND = "command_manager.get_term("
 _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
@@ -55,13 +55,15 @@ class TermReader(ObjectReader):
         super().__init__(scene, report, TermContext(cfg, scene.frames))
         self.data = data
         self._user_terms: dict[Any, Any] = {}
-        self.reads_commands = any(_READS_COMMAND in file_text(function) for function in _functions(data))
+        self.reads_commands = any(
+            function is command_resample or _READS_COMMAND in file_text(function) for function in _functions(data)
+        )
         """Whether the user's code reads or changes the object of a command, which must then be Isaac Lab's class."""
         self.stubs: dict[str, tuple[str, dict[str, Any]]] = {}
         """Functions whose code is not in the imported files: name -> (section, parameters)."""
 
     def read_command(self, node: Node) -> dict[str, Any]:
-        """Return a command term."""
+        """Return the settings of a command term of rlcli."""
         class_type = node.get("class_type")
         kind = kind_of(class_type)
         entry = COMMANDS.get(kind)
@@ -90,13 +92,14 @@ class TermReader(ObjectReader):
         if node.data.get("heading_command") is False:
             for key in ("heading", "heading_stiffness", "rel_heading"):
                 config.pop(key, None)
+        order_ranges(signature, config)
         if kind == "NormalVelocityCommand":
             config |= {"mean": triple(ranges, "mean_vel"), "std": triple(ranges, "std_vel")}
             config["zero_prob"] = triple(ranges, "zero_prob")
         return config
 
     def _read_user_command(self, kind: str, node: Node) -> dict[str, Any]:
-        """Return a command term for the user's own class. A YAML file has only its name: then write a stub."""
+        """Return a command term for the user's class. A YAML file has only its name: then record a stub to fill in."""
         config: dict[str, Any] = {"resampling_time_s": finite_times(node.require("resampling_time_range"))}
         class_type = node.data.get("class_type")
         node.skip("debug_vis")
@@ -114,7 +117,7 @@ class TermReader(ObjectReader):
         return config | self._read_user_object(class_type, node)
 
     def read_group(self, node: Node) -> dict[str, Any]:
-        """Return a group of observations."""
+        """Return the settings of an observation group."""
         config: dict[str, Any] = {}
         noisy = any("noise" in item for _, item in node.nodes())
         corrupt = node.get("enable_corruption", False)
@@ -149,7 +152,7 @@ class TermReader(ObjectReader):
             yield name if len(parts) == 1 else f"{name}_{suffix}", {"func": config["func"], **common, **config}
 
     def _moves_nothing(self, node: Node) -> bool:
-        """Return whether a reset of the root has a fixed base and only ranges of zero."""
+        """Return whether an event that resets the root changes nothing: a fixed base, and only ranges of zero."""
         params = node.data.get("params") or {}
         asset = params.get("asset_cfg") or {"name": "robot"}
         name = asset["name"] if isinstance(asset, Mapping) else asset.name
@@ -157,7 +160,7 @@ class TermReader(ObjectReader):
         return self.scene.is_fixed(name) and not any(any(pair) for values in ranges for pair in values.values())
 
     def read_term(self, section: str, node: Node) -> dict[str, Any]:
-        """Return a term with its function and parameters."""
+        """Return the settings of a term of rlcli: `func` and its parameters."""
         function, params = node.require("func"), node.node("params")
         if isinstance(function, AbsentValue) or (isinstance(function, type) and hasattr(function, "absent_name")):
             reason, hint = reason_of(function.absent_name)
@@ -186,6 +189,7 @@ class TermReader(ObjectReader):
             signature = builtin_terms(section)[ours]
             config = {"func": ours} | self._read_common(section, node)
             config |= self._read_params(signature, entry, params)
+            order_ranges(signature, config)
             if entry.note:
                 self.report.entries[(*node.key, "func")] = ("approximated", entry.note)
             if name in HEIGHT_TERMS and self.scene.has_terrain:
@@ -218,7 +222,7 @@ class TermReader(ObjectReader):
     def _read_again(
         self, section: str, term: list[str], settings: Mapping[str, Any]
     ) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield the address and the settings of the terms that one term of Isaac Lab becomes with other settings."""
+        """Translate one term of Isaac Lab with changed settings; yield (address, settings) of each term of rlcli."""
         reader = copy.copy(self)
         reader.report, reader.stubs = Report(), {}
         node = Node(settings, (section, *term), reader.report)
@@ -232,7 +236,7 @@ class TermReader(ObjectReader):
                 yield f"{section}.{name}", config
 
     def _find_builtin(self, section: str, name: str | None) -> tuple[str | None, Entry]:
-        """Return rlcli's name of one of Isaac Lab's terms (None if there is none), and its row of the table."""
+        """Return rlcli's name of one of Isaac Lab's terms (None if there is none), and its entry in `table.py`."""
         if name is None:
             return None, Entry()
         entry = TERMS.get(section, {}).get(name, Entry())
@@ -312,7 +316,7 @@ class TermReader(ObjectReader):
     def _read_selection(
         self, key: str, value: Any, by_alias: Mapping[str, Any], known: Mapping[str, Any], at: Key
     ) -> dict[str, Any]:
-        """Return the parameters for the elements that a `SceneEntityCfg` selects."""
+        """Return the parameters of a built-in term for the joints, bodies, ... that a `SceneEntityCfg` selects."""
         settings = value if isinstance(value, Mapping) else vars(value)
         stem = key.removesuffix("_cfg")
         config: dict[str, Any] = {}
@@ -342,13 +346,13 @@ class TermReader(ObjectReader):
     def _read_user_term(
         self, section: str, function: Any, name: str | None, node: Node, params: Node
     ) -> dict[str, Any]:
-        """Return a term for the user's own function. A YAML file has only its name: then write a stub."""
+        """Return a term for the user's function. A YAML file has only its name: then record a stub to fill in."""
         from rlcli_isaaclab.terms import entity_data, key_of
 
         common = self._read_common(section, node)
         if isinstance(function, MdpFunction) or (name is not None and name.split(".")[0] == "isaaclab"):
             near = did_you_mean(str(name), builtin_terms(section))
-            self.report.problem((*node.key, "func"), f"no {section.rstrip('s')} term '{name}'", near)
+            self.report.problem((*node.key, "func"), f"rlcli has no {section.rstrip('s')} term '{name}'", near)
             return {"func": str(name), **common}
         values = {key: params.get(key) for key in params.data}
         objects = {key: value for key, value in values.items() if not is_entity(value) and not is_plain(value)}
@@ -381,7 +385,7 @@ class TermReader(ObjectReader):
     def _user_term(
         self, function: Any, section: str, entities: frozenset[str], names: tuple[str, ...], objects: dict[str, Any]
     ) -> Any:
-        """Return the term of a function; the same object for the same arguments."""
+        """Return the `UserTerm` of a function; the same object for the same arguments."""
         from rlcli_isaaclab.terms import UserTerm
 
         key = (function, section, entities, names)
@@ -418,5 +422,7 @@ _LOOKS = ("randomize_visual_color", "randomize_visual_texture_material")
 
 def _find_signature(terms: Mapping[str, Signature], name: str) -> Signature:
     if name not in terms:
-        raise ConfigError([Problem("configuration", "commands", f"no term '{name}'", f"terms: {listing(terms)}")])
+        raise ConfigError(
+            [Problem("configuration", "commands", f"rlcli has no command term '{name}'", f"terms: {listing(terms)}")]
+        )
     return terms[name]

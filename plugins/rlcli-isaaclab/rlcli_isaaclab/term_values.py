@@ -1,10 +1,12 @@
-"""Questions about the values in Isaac Lab's term settings."""
+"""Helpers that classify and convert values in Isaac Lab's term settings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, get_args
 
+from rlcli.config.schema.base import Range
+from rlcli.config.term_signatures import Signature
 from rlcli_isaaclab.managers import SceneEntityCfg
 from rlcli_isaaclab.mdp import MdpFunction
 from rlcli_isaaclab.settings import Node, as_float
@@ -35,8 +37,25 @@ def builtin_name(function: Any) -> str | None:
     return None
 
 
+def order_ranges(signature: Signature, config: dict[str, Any]) -> None:
+    """Swap the ends of ranges that are written from high to low: Isaac Lab draws from them as well."""
+    for parameter in signature.parameters:
+        if parameter.name in config and _has_range(parameter.type):
+            config[parameter.name] = _in_order(config[parameter.name])
+
+
+def _has_range(annotation: Any) -> bool:
+    return annotation == Range or any(map(_has_range, get_args(annotation)))
+
+
+def _in_order(value: Any) -> Any:
+    if isinstance(value, list) and len(value) == 2 and all(isinstance(end, int | float) for end in value):
+        return sorted(value)
+    return [_in_order(item) for item in value] if isinstance(value, list) else value
+
+
 def triple(ranges: Node, name: str) -> list[float]:
-    """Return three numbers, by default zeros."""
+    """Return a setting of three numbers; zeros if it is not set."""
     return [as_float(v) for v in ranges.get(name, (0.0, 0.0, 0.0))]
 
 

@@ -19,12 +19,13 @@ from torch import Tensor
 from rlcli.config.schema import Names, Number, StrictModel
 from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, SignatureError
 from rlcli.sim.selection import Selection
-from rlcli_isaaclab.config_class import to_dict
+from rlcli_isaaclab.config_class import is_missing, to_dict
 from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
 from rlcli_isaaclab.settings import to_plain
 from rlcli_isaaclab.substeps import Substeps
-from rlcli_isaaclab.user_files import file_text, source_text, unset_simple
+from rlcli_isaaclab.user_files import file_text, placed, source_text, term_reads_body_forces, unset_simple
+from rlcli_isaaclab.utils.buffers import set_tensors, tensors_of
 
 _RESERVED = {name for model in SECTIONS.values() for name in model.model_fields} | {"params"}
 _PLAIN: dict[Any, Any] = {float: Number, int: int, bool: bool, str: str}
@@ -81,6 +82,7 @@ class UserTerm:
         self.target = functools.partial(_bind_term, self)
         if section == "events" and "set_coms(" in file_text(function):
             self.target.prepare = unset_simple  # type: ignore[attr-defined]
+        self.target.reads_body_forces = term_reads_body_forces(function)  # type: ignore[attr-defined]
         call = function.__call__ if self.is_class else function
         declared = list(inspect.signature(call).parameters.values())
         takes_env_ids = section in ("events", "curriculum")
@@ -109,7 +111,7 @@ class UserTerm:
         return self.function(*args, **params)
 
     def __rlcli_term__(self, name: str) -> Signature:
-        """Return the signature of the term under a name."""
+        """Return the signature of the term; `name` is the term's key in the task."""
         code = getattr(self.function, "__code__", None)
         file = Path(inspect.getsourcefile(self.function) or "?")
         summary = (inspect.getdoc(self.function) or "").split("\n")[0]
@@ -129,7 +131,7 @@ class UserTerm:
 
 
 class UserObject:
-    """The user's class `Name(cfg, env)` of an action or a command, as the term of one name.
+    """The user's class `Name(cfg, env)` of an action or a command, as one term.
 
     Args:
         function: the user's class.
@@ -149,11 +151,11 @@ class UserObject:
         return self
 
     def __call__(self, *args: Any) -> Any:
-        """Create an object of the class."""
+        """Create an object of the user's class."""
         return self.function(*args)
 
     def __rlcli_term__(self, name: str) -> Signature:
-        """Return the term's signature with this name; the parameters are the keys of its configuration class."""
+        """Return the signature of the term, whose key is `name`; its parameters are the keys of its configuration."""
         file = Path(inspect.getsourcefile(self.function) or "?")
         summary = (inspect.getdoc(self.function) or "").split("\n")[0]
         parameters = tuple(Parameter(key, Any, None, True, None) for key in self.original)
@@ -188,11 +190,11 @@ class SettingTerm:
         return self
 
     def __call__(self, *args: Any) -> Any:
-        """Create an object of the class."""
+        """Create an object of the user's class."""
         return self.function(*args)
 
     def __rlcli_term__(self, name: str) -> Signature:
-        """Return the signature of the term under a name; its parameters are the addresses that it changes."""
+        """Return the signature of the term, whose key is `name`; its parameters are the addresses that it changes."""
         file = Path(inspect.getsourcefile(self.function) or "?")
         addresses = tuple(Parameter(key, str, None, True, "Address") for key, _ in self.setting.addresses)
         return Signature(name, self.__name__, True, file, 1, "Changes a setting.", addresses, target=self.target)
@@ -214,6 +216,8 @@ def entity_data(settings: Any) -> dict[str, Any]:
             raise ValueError(f"{key} is not supported by rlcli; remove it")
     data = {"name": settings["name"]}
     for key in ("joint_names", "body_names"):
+        if is_missing(settings.get(key)):
+            raise ValueError(f"missing '{key}'; give it a value")
         if settings.get(key) is not None:
             value = settings[key]
             data[key] = value if isinstance(value, str) else list(value)
@@ -271,12 +275,11 @@ class _BoundObject:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of the object's tensors."""
-        return {name: value.clone() for name, value in vars(self.term).items() if isinstance(value, Tensor)}
+        return {name: value.clone() for name, value in tensors_of(self.term).items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore the tensors returned by `state_dict`."""
-        for name, value in state.items():
-            setattr(self.term, name, value.clone())
+        set_tensors(self.term, state)
 
 
 class _BoundClass(_Bound, _BoundObject):
@@ -364,7 +367,8 @@ def _bind_object(term: UserObject, env: Any, **params: Any) -> _BoundObject:
     if term.section == "commands":
         cfg.resampling_time_range = tuple(env.config.commands[term.name].resampling_time_s)
     with building(env):
-        made = term.function(cfg, facade)
+        made = placed(term.function, env.device)(cfg, facade)
+    made.rlcli_name = term.name
     return _BoundAction(made, env, term.name) if term.section == "actions" else _BoundCommand(made)
 
 
@@ -378,7 +382,7 @@ def _bind_setting(term: SettingTerm, env: Any, **opened: Tensor) -> _BoundClass:
 
 
 def _set_members(target: Any, values: Mapping[str, Any]) -> None:
-    """Set members of a configuration object that differ from the values; a list replaces an equal tuple only then."""
+    """Set the members of a configuration object that differ from `values`; a list equals a tuple of equal items."""
     for name, value in values.items():
         now = getattr(target, name, None)
         if isinstance(value, Mapping) and hasattr(now, "__dataclass_fields__"):
@@ -430,9 +434,10 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
                 if isinstance(chosen, SceneEntityCfg) and isinstance(getattr(chosen, key), Tensor):
                     setattr(chosen, key, getattr(chosen, key).tolist())
     if not term.is_class:
-        return _Bound(term.function, term.section, facade, values)
+        return _Bound(placed(term.function, env.device), term.section, facade, values)
     with building(env):
-        instance = term.function(cfg=ManagerTermBaseCfg(func=term.function, params=values), env=facade)
+        cfg = ManagerTermBaseCfg(func=term.function, params=values)
+        instance = placed(term.function, env.device)(cfg=cfg, env=facade)
     return _BoundClass(instance, term.section, facade, values)
 
 

@@ -65,7 +65,7 @@ def read_friction(material: Node) -> dict[str, float]:
     static = material.get("static_friction", 0.5)
     dynamic = material.get("dynamic_friction", 0.5)
     if static != dynamic:
-        material.note("approximated", "static_friction", "MuJoCo has one friction, the dynamic one")
+        material.note("approximated", "static_friction", "MuJoCo has one friction; dynamic_friction sets it")
     if material.data.get("restitution"):
         material.note("ignored", "restitution", "in MuJoCo, solref of a geom sets how contacts bounce")
     else:

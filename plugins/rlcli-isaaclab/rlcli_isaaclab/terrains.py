@@ -53,24 +53,23 @@ class TerrainImporterCfg:
 def _sub_terrain(name: str, function: str, **settings: Any) -> Any:
     """Return the class of a sub-terrain. Its settings keep Isaac Lab's names."""
     common: dict[str, Any] = {"function": function, "proportion": 1.0, "size": None, "flat_patch_sampling": None}
+    if name.startswith("Hf"):
+        common |= {"border_width": 0.0, "horizontal_scale": 0.1, "vertical_scale": 0.005, "slope_threshold": None}
     return make_config_class(name, f"Sub-terrain `{function}`.", **common, **settings)
 
 
 HfRandomUniformTerrainCfg = _sub_terrain(
     "HfRandomUniformTerrainCfg", "random_uniform_terrain", noise_range=MISSING, noise_step=MISSING,
-    downsampled_scale=None, border_width=0.0,
+    downsampled_scale=None,
 )  # fmt: skip
 HfPyramidSlopedTerrainCfg = _sub_terrain(
     "HfPyramidSlopedTerrainCfg", "pyramid_sloped_terrain", slope_range=MISSING, platform_width=1.0, inverted=False,
-    border_width=0.0,
 )  # fmt: skip
 HfInvertedPyramidSlopedTerrainCfg = _sub_terrain(
     "HfInvertedPyramidSlopedTerrainCfg", "pyramid_sloped_terrain", slope_range=MISSING, platform_width=1.0,
-    inverted=True, border_width=0.0,
+    inverted=True,
 )  # fmt: skip
-HfWaveTerrainCfg = _sub_terrain(
-    "HfWaveTerrainCfg", "wave_terrain", amplitude_range=MISSING, num_waves=1, border_width=0.0
-)
+HfWaveTerrainCfg = _sub_terrain("HfWaveTerrainCfg", "wave_terrain", amplitude_range=MISSING, num_waves=1)
 HfDiscreteObstaclesTerrainCfg = _sub_terrain(
     "HfDiscreteObstaclesTerrainCfg", "discrete_obstacles_terrain", obstacle_height_mode="choice",
     obstacle_width_range=MISSING, obstacle_height_range=MISSING, num_obstacles=MISSING, platform_width=1.0,
@@ -95,8 +94,15 @@ MeshRandomGridTerrainCfg = _sub_terrain(
 
 MeshRepeatedBoxesTerrainCfg = _sub_terrain(
     "MeshRepeatedBoxesTerrainCfg", "repeated_boxes_terrain", object_params_start=MISSING, object_params_end=MISSING,
-    platform_width=1.0,
+    platform_width=1.0, object_type=None, max_height_noise=None, abs_height_noise=(0.0, 0.0),
+    rel_height_noise=(1.0, 1.0), platform_height=-1.0,
 )  # fmt: skip
+
+
+def height_field_to_mesh(function: Any) -> Any:
+    """Return a terrain function of the task's own. rlcli does not call it: flat ground replaces the sub-terrain."""
+    return function
+
 
 ROUGH_TERRAINS_CFG = TerrainGeneratorCfg(
     size=(8.0, 8.0),

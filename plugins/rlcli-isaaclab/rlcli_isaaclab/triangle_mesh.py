@@ -1,4 +1,4 @@
-"""The part of the library trimesh that tasks need to sample points on surfaces, for where it is not installed."""
+"""Replacement of the library trimesh, if it is not installed, for tasks that sample points on surfaces."""
 
 from __future__ import annotations
 

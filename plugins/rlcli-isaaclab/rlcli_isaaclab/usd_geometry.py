@@ -45,14 +45,14 @@ class GeomPrim(Prim):
         self.model, self.body, self.geom = model, body, geom
 
     def GetTypeName(self) -> str:  # noqa: N802
-        """Return Mesh."""
+        """Return the text "Mesh"."""
         return "Mesh" if self.geom >= 0 else "Xform"
 
     def GetAttribute(self, name: str) -> None:  # noqa: N802
-        """Return None: a MuJoCo model has no scale of its own."""
+        """Return None: a geom has no USD attributes, such as a scale."""
 
     def in_root(self) -> NDArray[np.float64]:
-        """Return the pose in the root's frame, as a matrix that multiplies columns."""
+        """Return the geom's pose in the root's frame, as a matrix that multiplies columns."""
         pose = np.eye(4)
         if self.geom < 0:
             return pose

@@ -35,7 +35,7 @@ class Prim:
 
 
 class Stage:
-    """The stage: its prims are bodies."""
+    """Replacement of the USD stage: its prims are the bodies of the first environment."""
 
     def GetPrimAtPath(self, path: Any) -> Any:  # noqa: N802
         """Return the prim of a path: the root of an entity, or else a body."""
@@ -63,5 +63,5 @@ UsdGeom = SimpleNamespace(Xformable=_Xformable)
 
 
 def get_current_stage(fabric: bool = False) -> Stage:
-    """Return the stage."""
+    """Return the replacement of the USD stage."""
     return Stage()

@@ -1,4 +1,4 @@
-"""Texts of the user's files, and what a model needs for the calls in them."""
+"""Source code of the user's functions, which is searched for calls that a model must be prepared for."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from typing import Any
 import mujoco
 
 from rlcli.registry import is_framework
+from rlcli.sim.device_names import on_cpu
 
 
 def file_text(function: Any) -> str:
-    """Return the text of the file that defines a function."""
+    """Return the text of the file that defines a function; empty if the file does not belong to the user."""
     file = getattr(sys.modules.get(function.__module__), "__file__", None)
     return _text(file) if file and file.endswith(".py") and not is_framework(function.__module__) else ""
 
@@ -25,8 +26,50 @@ def _text(file: str) -> str:
     return Path(file).read_text(encoding="utf-8", errors="replace")
 
 
+def reads_body_forces(text: str) -> bool:
+    """Return whether code reads accelerations or joint forces of bodies, which MuJoCo computes only on demand."""
+    return any(word in text for word in _BODY_FORCES)
+
+
+def term_reads_body_forces(function: Any) -> bool:
+    """Return whether a user's function or class, or one that it names, passes `reads_body_forces`."""
+    found: dict[Any, str] = {}
+    waiting = [function]
+    while waiting:
+        item = waiting.pop()
+        if item in found or is_framework(str(getattr(item, "__module__", ""))):
+            continue
+        found[item] = source_text(item)
+        methods = [m for m in vars(item).values() if inspect.isfunction(m)] if inspect.isclass(item) else [item]
+        for method in methods:
+            used = (method.__globals__.get(name) for name in method.__code__.co_names)
+            waiting += [other for other in used if inspect.isfunction(other)]
+        waiting += item.__bases__ if inspect.isclass(item) else ()
+    return any(map(reads_body_forces, found.values()))
+
+
+_BODY_FORCES = (
+    *("get_link_incoming_joint_force", "body_incoming_joint_wrench", "body_acc_w", "body_com_acc_w"),
+    *("body_lin_acc_w", "body_ang_acc_w", "body_com_lin_acc_w", "body_com_ang_acc_w", "body_link_acc_w"),
+)
+
+
+def placed(target: Any, device: Any) -> Any:
+    """Return a function or class of the user's, changed if that is needed to run on a device.
+
+    If the device is the CPU and the file names the device `cuda`, the code takes `cuda` for the CPU.
+    """
+    kinds = [kind for kind in reversed(getattr(target, "__mro__", (target,))) if not is_framework(kind.__module__)]
+    if str(device) != "cpu" or not any("cuda" in file_text(kind) for kind in kinds):
+        return target
+    if not inspect.isclass(target):
+        return on_cpu(target)
+    members = {name: on_cpu(f) for kind in kinds for name, f in vars(kind).items() if inspect.isfunction(f)}
+    return type(target.__name__, (target,), {**members, "__module__": target.__module__})
+
+
 def source_text(function: Any) -> str:
-    """Return the text of a function; empty if it is unknown."""
+    """Return the source code of a function; empty if it is not known."""
     try:
         return inspect.getsource(function)
     except (OSError, TypeError):

@@ -1,5 +1,5 @@
 # ruff: noqa: F401
-"""All names of Isaac Lab's vocabulary in one module."""
+"""All names of this package that task files import, in one module. `rlcli_isaaclab` reads its names from here."""
 
 from rlcli_isaaclab import actuators, assets, envs, managers, mdp, rsl_rl, scene, sensors, sim, terrains, utils
 from rlcli_isaaclab import sim as sim_utils

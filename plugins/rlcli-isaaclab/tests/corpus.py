@@ -2,6 +2,7 @@
 
 Usage: python corpus.py [--only WORD] [--stage NAME] [--out FILE.json], with the environment variable ISAACLAB_SOURCE at
 the folder `source` of Isaac Lab 2.3.2, or of its unpacked wheel. Each robot gets a stand-in model (`standins.py`).
+With `--package FOLDER` it runs the tasks that another package registers.
 """
 
 from __future__ import annotations
@@ -29,11 +30,10 @@ OUTSIDE = ("pick_place",)
 """Packages that Isaac Lab does not import by default."""
 
 
-def tasks(source: Path) -> dict[str, dict[str, Any]]:
-    """Return ID -> arguments of every registered task."""
+def tasks(package: Path) -> dict[str, dict[str, Any]]:
+    """Return ID -> arguments of every task that a package registers."""
     from rlcli.registry.task_imports import import_file, registrations
 
-    package = source / "isaaclab_tasks" / "isaaclab_tasks"
     import_file(package / "__init__.py")
     for file in sorted(package.rglob("__init__.py")):
         if any(word in str(file) for word in OUTSIDE):
@@ -166,14 +166,16 @@ def isolated(limit_s: float, function: Any, *arguments: Any) -> Any:
 
 
 def write_page(rows: dict[str, Any], page: Path) -> None:
-    """Write the table of the documentation from the results."""
+    """Write the table of the documentation from the results. Rows of tasks that were not run stay."""
     text = page.read_text(encoding="utf-8")
     start, end = "<!-- table -->\n", "<!-- end of table -->"
-    lines = [
+    head = [
         "| task | imports | validates | steps | trains | what is lost, or why it stops |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
-    for name, row in sorted(rows.items()):
+    table = text.partition(start)[2].partition(end)[0].splitlines()[len(head) :]
+    lines = {line.split("`")[1]: line for line in table}
+    for name, row in rows.items():
         marks = ["yes" if row["stage"] > i else "no" for i in range(len(STAGES))]
         if row["stage"] == row["last"] < len(STAGES):
             marks[row["last"] :] = ["not run"] * (len(STAGES) - row["last"])
@@ -181,9 +183,10 @@ def write_page(rows: dict[str, Any], page: Path) -> None:
             marks[-1] = "no agent"
         stops = row["stage"] < (row["last"] if row["agent"] else min(row["last"], STAGES.index("trains")))
         reason = re.sub(r"/\S*/", "", row["reason"]).replace("|", ";")[:300] if stops else lost(row.get("lost", ()))
-        lines.append(f"| `{name}` | {' | '.join(marks)} | {reason} |")
+        lines[name] = f"| `{name}` | {' | '.join(marks)} | {reason} |"
     before, after = text.partition(start)[0], text.partition(end)[2]
-    page.write_text(before + start + "\n".join(lines) + "\n" + end + after, encoding="utf-8")
+    ordered = [*head, *(lines[name] for name in sorted(lines))]
+    page.write_text(before + start + "\n".join(ordered) + "\n" + end + after, encoding="utf-8")
 
 
 USUAL = ("physx", "rigid_props", "articulation_props", "collision_props", "experiment_name", "run_name", "num_envs")
@@ -214,6 +217,7 @@ def main_() -> None:
     parser.add_argument("--page", type=Path, help="page whose table is written from the results")
     parser.add_argument("--merge", type=Path, nargs="*", help="write the page from files of --out, and run nothing")
     parser.add_argument("--part", default="0/1", help="i/n: every n-th task")
+    parser.add_argument("--package", type=Path, help="folder of another package that registers tasks")
     options = parser.parse_args()
     rows: dict[str, Any]
     if options.merge:
@@ -226,7 +230,9 @@ def main_() -> None:
 
     import rlcli.envs.managed  # noqa: F401
 
-    found = tasks(source)
+    os.environ.setdefault("RLCLI_ISAACLAB", str(source))
+    package = (options.package or source / "isaaclab_tasks" / "isaaclab_tasks").resolve()
+    found = tasks(package)
     part, parts = map(int, options.part.split("/"))
     rows = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -235,7 +241,6 @@ def main_() -> None:
             direct = is_direct(found[name]["entry_point"])
             if number % parts != part or options.kind == ("manager" if direct else "direct"):
                 continue
-            package = source / "isaaclab_tasks" / "isaaclab_tasks"
             stage, reason, facts = isolated(
                 LIMIT_S, run, name, found[name], package, Path(folder) / name, options.stage, options.steps
             )

@@ -138,7 +138,7 @@ def collect(data: Any) -> dict[str, dict[str, list[str]]]:
 
     def add(entity: Any, kind: str, value: Any) -> None:
         entity = owner.get(str(entity), str(entity))
-        if entity in found and value is not None:
+        if entity in found and isinstance(value, str | list | tuple):
             values = [value] if isinstance(value, str) else list(value)
             found[entity][kind] += [v for v in values if isinstance(v, str)]
 
@@ -207,14 +207,31 @@ def collect(data: Any) -> dict[str, dict[str, list[str]]]:
     return found
 
 
-def mjcf(name: str, path: str, joints: list[str], bodies: list[str], articulated: bool, driven: bool = False) -> str:
-    """Return an MJCF with these joints and bodies: a chain on a fixed base, or legs on a floating one."""
+def moved_by_resets(data: Any) -> set[str]:
+    """Return the entities whose root a reset moves."""
+    found = set()
+    for event in (data.get("events") or {}).values():
+        params = (event.get("params") or {}) if isinstance(event, Mapping) else {}
+        asset, ranges = params.get("asset_cfg"), params.get("pose_range") or {}
+        if asset is not None and any(any(pair) for pair in ranges.values()):
+            found.add(asset["name"] if isinstance(asset, Mapping) else asset.name)
+    return found
+
+
+def mjcf(
+    name: str, path: str, joints: list[str], bodies: list[str], articulated: bool, driven: bool = False,
+    moved: bool = False, walks: bool = False,
+) -> str:  # fmt: skip
+    """Return an MJCF with these joints and bodies: a chain on a fixed base, or legs on a floating one.
+
+    `moved`: a reset moves the base. `walks`: a velocity is commanded to the base.
+    """
     if not articulated:
         parts = "".join(
             f'<body name="{b}" pos="0 0 {0.05 * i}"><geom size="0.02"/></body>' for i, b in enumerate(bodies)
         )
         return f'<mujoco><worldbody><body name="{name}"><freejoint/><geom type="box" size=".03 .03 .03"/>{parts}</body></worldbody></mujoco>'
-    floating = any(word in path.lower() for word in FLOATING)
+    floating = walks or any(word in path.lower() for word in FLOATING)
     root_words = ("base", "trunk", "torso", "pelvis", "body", "root", "link0", "base_link", "torso_link")
     root = next((b for word in root_words for b in bodies if b == word), None)
     root = (
@@ -244,10 +261,11 @@ def mjcf(name: str, path: str, joints: list[str], bodies: list[str], articulated
     drives = "".join(f'<position name="{joint}" joint="{joint}" kp="30" kv="1"/>' for joint in joints if driven)
     motors = f"<actuator>{drives}</actuator>" if driven else ""
     free = "<freejoint/>" if floating else ""
+    mocap = ' mocap="true"' if moved and not floating else ""
     if "shadow" in path.lower():
         motors += f'<tendon><fixed name="tendon"><joint joint="{joints[0]}" coef="1"/><joint joint="{joints[1]}" coef="-1"/></fixed></tendon>'
     return (
-        f'<mujoco model="{name}"><compiler angle="radian"/><worldbody><body name="{root}">{free}'
+        f'<mujoco model="{name}"><compiler angle="radian"/><worldbody><body name="{root}"{mocap}>{free}'
         f'<geom type="box" size=".15 .1 .05" mass="20"/>{inner}{fixed}</body></worldbody>{motors}</mujoco>'
     )
 
@@ -278,7 +296,13 @@ def write(data: Any, folder: Path) -> None:
             for word, names in table.items():
                 if word in path.lower():
                     target[:] = names
-        text = mjcf(name, path, joints, bodies, bool(item.get("actuators")) or bool(wanted["joint"]), driven)
+        articulated = bool(item.get("actuators")) or bool(wanted["joint"])
+        walks = any(
+            "ang_vel_z" in (command.get("ranges") or {}) and command.get("asset_name") == name
+            for command in (data.get("commands") or {}).values()
+            if isinstance(command, Mapping)
+        )
+        text = mjcf(name, path, joints, bodies, articulated, driven, name in moved_by_resets(data), walks)
         (folder / f"{name}.xml").write_text(text)
         networks = [g for g, a in groups.items() if "network_file" in a] if isinstance(groups, Mapping) else []
         gains = ", ".join(f"{group}: {{stiffness: 40.0, damping: 2.0}}" for group in networks)

@@ -75,8 +75,8 @@ mass="1"/></body><body name="round"><joint name="wheel" axis="0 1 0"/><geom name
 """
 
 
-def rover(folder, functions="", **sections):
-    """Return the task of a file with the user's functions, and terms as texts by section."""
+def rover(folder, functions="", replaced=(), **sections):
+    """Return the task of a file with the user's functions, terms as texts by section, and replaced parts."""
     folder.mkdir()
     text = HEAD
     for section in ("events", "rewards", "commands", "curriculum"):
@@ -88,7 +88,11 @@ def rover(folder, functions="", **sections):
         made = f"    @configclass\n    class {name}:\n{lines}\n    {section}: {name} = {name}()"
         text = text.replace(f"    {section}: {section.upper()}", made)
     file = folder / "rover_env.py"
-    file.write_text(text.replace("@configclass\nclass SceneCfg", f"{functions}\n@configclass\nclass SceneCfg", 1))
+    text = text.replace("@configclass\nclass SceneCfg", f"{functions}\n@configclass\nclass SceneCfg", 1)
+    for old, new in replaced:
+        assert old in text
+        text = text.replace(old, new, 1)
+    file.write_text(text)
     (folder / "rover.xml").write_text(ROVER)
     (folder / "models.yaml").write_text("robot: rover.xml\n")
     return resolve(find_task(f"{file}:RoverEnvCfg"))

@@ -351,7 +351,7 @@ def test_rl_games_settings_without_counterpart_are_reported(direct):
     found = {problem.path: problem.message for problem in caught.value.problems}
     assert found == {
         "params.config.lr_schedule": "unknown schedule 'cosine'",
-        "params.network.cnn.convs": "rlcli's convolutions have no padding",
+        "params.network.cnn.convs.0.padding": "rlcli's convolutions have no padding",
     }
 
 

@@ -1,4 +1,4 @@
-"""OmniIsaacGymEnvs' vocabulary in one flat package: change a task's import lines to `from rlcli_oige import ...`.
+"""All names that OmniIsaacGymEnvs' tasks import, in one package: import them by `from rlcli_oige import ...`.
 
 A name that this package does not have is searched in the Python files beside the importing file, and below the folder
 of the task's YAML. So a task's shared modules and view classes are imported from here too. Nothing is imported before

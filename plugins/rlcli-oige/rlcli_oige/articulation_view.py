@@ -1,4 +1,4 @@
-"""Views of robots: joints, their drives, and measured forces, under OmniIsaacGymEnvs' names."""
+"""`ArticulationView`: joints, drives and measured forces of the robots of all environments, as tensors."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ class ArticulationView(XFormPrimView):
     def get_measured_joint_forces(self, indices: Any = None, joint_indices: Any = None, clone: bool = True) -> Tensor:
         """Return force and torque between each body and its parent, body frame. (n, bodies, 6) [N, N m]
 
-        The second dimension is bodies, breadth first, as in `_body_indices`. All are 0 before an episode's first step.
+        The second dimension is bodies, breadth first, as in `body_names`. All are 0 before an episode's first step.
         """
         if self._wrench_columns is None:
             self._wrench_columns = self._find_force_sensors()
@@ -282,7 +282,7 @@ class ArticulationView(XFormPrimView):
     # --- helpers ---
 
     def _actuators(self, kind: str, joints: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the columns of joints with an actuator of this kind, their actuators, and factors value -> control."""
+        """Return (columns of the joints with an actuator of a kind, ids of the actuators, factors value -> control)."""
         model, device = self.env.engine.model, self.env.device
         found = {joint: actuator for joint, actuator in self.entity.actuators_of(kind)}
         columns = [column for column, joint in enumerate(joints) if joint in found]
@@ -350,7 +350,7 @@ class ArticulationView(XFormPrimView):
         return torch.arange(self.env.num_envs, device=self.env.device) if index is None else index
 
     def _broadcast(self, values: Any, indices: Any, joint_indices: Any) -> tuple[Tensor, Tensor, Tensor]:
-        """Return environments, joint columns, and the values as a table (environments, columns)."""
+        """Return (ids of environments, columns of joints, the values as a tensor (environments, columns))."""
         rows = self._env_rows(indices)
         columns = self._index(joint_indices)
         columns = torch.arange(self.num_dof, device=self.env.device) if columns is None else columns

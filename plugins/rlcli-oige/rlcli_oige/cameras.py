@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from rlcli.config.schema import CameraSensorConfig
@@ -14,6 +16,8 @@ from rlcli.errors import TaskError
 from rlcli.scene.camera import CameraSensor
 from rlcli.scene.scene import Scene
 from rlcli.scene.sensor_builder import SensorBuilder
+from rlcli_oige.prim_paths import BASE
+from rlcli_oige.stage import get_current_stage, note_ignored
 from rlcli_oige.task_yaml import relative
 from rlcli_oige.user_code import Counterpart, user_location
 
@@ -21,8 +25,10 @@ if TYPE_CHECKING:
     from rlcli_oige.env import OigeEnv
     from rlcli_oige.stage import Prim
 
-SENSOR = "oige_camera"
-"""Name of the camera sensor in the scene."""
+SENSOR, SEGMENTATION = "oige_camera", "oige_segmentation"
+"""Names of the camera sensors in the scene: colours, and ids of bodies."""
+_BACKGROUND, _UNLABELLED, _FIRST_LABELLED = range(3)
+"""Ids of an image of instance segmentation."""
 _APERTURE = 20.955
 """Width of a USD camera's film, if the task does not set it [mm]."""
 _FOCAL_LENGTH = 50.0
@@ -36,6 +42,7 @@ class Replicator:
         self._env = env
         self._path = ""
         self._resolution = (0, 0)
+        self._has_segmentation = False
         self.orchestrator = SimpleNamespace(_orchestrator=SimpleNamespace(_is_started=False))
         self.create = SimpleNamespace(render_product=self._render_product)
         self.WriterRegistry = SimpleNamespace(get=lambda name: Writer())
@@ -48,13 +55,16 @@ class Replicator:
     def _render_product(self, camera: Any, resolution: tuple[int, int], **kwargs: Any) -> str:
         path, size = relative(str(camera)), (int(resolution[0]), int(resolution[1]))
         if self._path and (path, size) != (self._path, self._resolution):
-            raise TaskError(f"{user_location()}a task has one camera, and this is a second one: '{path}'")
+            raise TaskError(f"{user_location()}'{path}' is a second camera; rlcli has one per task: remove it")
         self._path, self._resolution = path, size
         return str(camera)
 
     def _annotator(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        hint = "rlcli's cameras render rgb, depth and distance, for tasks in its own format"
-        raise TaskError(f"{user_location()}the annotator '{name}' has no counterpart", hint=hint)
+        if name != "instance_segmentation":
+            hint = "use rgb images or instance_segmentation; tasks in rlcli's own format also have depth"
+            raise TaskError(f"{user_location()}the annotator '{name}' has no counterpart in rlcli", hint=hint)
+        self._has_segmentation = True
+        return Annotator(self._env)
 
     def add_to(self, scene: Scene) -> None:
         """Add the camera to the scene, if the task has created a render product.
@@ -64,25 +74,118 @@ class Replicator:
         """
         if not self._path:
             return
-        width, height = self._resolution
         prim = self._env.stage.GetPrimAtPath(f"/World/envs/env_0/{self._path}")
-        if prim.kind != "Camera":
-            raise TaskError(f"the task has no camera at '{prim.prim_path}'", hint="define it with stage.DefinePrim")
-        pos, rotation = _pose(prim)
-        if rotation[2, 1] <= 0.0 or abs(rotation[2, 0]) > 1e-3:
-            prim.stage.note_ignored(
-                f"roll of {prim.prim_path}", "up in the image is the z axis of the world", lost=True
-            )
-        focal, aperture = (
-            _number(prim, n, d) for n, d in (("focalLength", _FOCAL_LENGTH), ("horizontalAperture", _APERTURE))
-        )
+        placed = _of_stage(prim, *self._resolution) if prim.kind == "Camera" else _of_model(prim)
         near, far = _value(prim, "clippingRange", (0.01, 1e3))
-        eye, lookat = pos, pos - rotation[:, 2]  # a USD camera looks along its -z axis
-        config = CameraSensorConfig(
-            kind="camera", width=width, height=height, eye=tuple(eye.tolist()), lookat=tuple(lookat.tolist()),
-            fov=math.degrees(2.0 * math.atan(0.5 * aperture * height / width / focal)), clip=(float(near), float(far)),
-        )  # fmt: skip
-        scene.sensors[SENSOR] = SensorBuilder(scene.spec, scene.config.entities, scene.ground).add(SENSOR, config)
+        kinds: dict[str, Any] = {SENSOR: "rgb", **({SEGMENTATION: "segmentation"} if self._has_segmentation else {})}
+        width, height = self._resolution
+        for name, kind in kinds.items():
+            config = CameraSensorConfig(
+                kind="camera", data=kind, width=width, height=height, clip=(float(near), float(far)), **placed
+            )
+            scene.sensors[name] = SensorBuilder(scene.spec, scene.config.entities, scene.ground).add(name, config)
+
+
+def _of_model(prim: Prim) -> dict[str, Any]:
+    """Return the settings (entity and camera) of a camera that is in a robot's MJCF.
+
+    Raises:
+        TaskError: if the model has no camera of the name.
+    """
+    name = prim.GetName()
+    model = prim.owner.child
+    if model is None or name not in [camera.name for camera in model.cameras]:
+        hint = f'add <camera name="{name}"/> to the MJCF of the robot, or define it with stage.DefinePrim'
+        raise TaskError(f"the task has no camera at '{prim.prim_path}'", hint=hint)
+    return {"entity": prim.owner.entity, "camera": name}
+
+
+def _of_stage(prim: Prim, width: int, height: int) -> dict[str, Any]:
+    """Return the settings (eye, lookat and fov) of a camera that the task has defined on the stage."""
+    pos, rotation = _pose(prim)
+    if rotation[2, 1] <= 0.0 or abs(rotation[2, 0]) > 1e-3:
+        prim.stage.note_ignored(f"roll of {prim.prim_path}", "up in the image is the z axis of the world", lost=True)
+    focal, aperture = (
+        _number(prim, n, d) for n, d in (("focalLength", _FOCAL_LENGTH), ("horizontalAperture", _APERTURE))
+    )
+    eye, lookat = pos, pos - rotation[:, 2]  # a USD camera looks along its -z axis
+    fov = math.degrees(2.0 * math.atan(0.5 * aperture * height / width / focal))
+    return {"eye": tuple(eye.tolist()), "lookat": tuple(lookat.tolist()), "fov": fov}
+
+
+def add_update_semantics(prim: Any, semantic_label: str, type_label: str = "class", suffix: str = "") -> None:
+    """Give a prim a semantic label: images of instance segmentation tell it from other prims."""
+    get_current_stage().labelled.add(relative(prim.GetPath()))
+
+
+class Camera(Counterpart):
+    """`omni.isaac.sensor.Camera`: settings of a camera of a robot's model."""
+
+    def __init__(self, prim_path: str, *args: Any, **kwargs: Any) -> None:
+        self.prim_path = prim_path
+        self._prim = get_current_stage().GetPrimAtPath(prim_path)
+        self._focal_length = _FOCAL_LENGTH / 10.0
+
+    def set_clipping_range(self, near_distance: float | None = None, far_distance: float | None = None) -> None:
+        """Set the distances between which the camera sees [m]."""
+        near, far = self.get_clipping_range()
+        given = (near if near_distance is None else near_distance, far if far_distance is None else far_distance)
+        self._prim.GetAttribute("clippingRange").value = given
+
+    def get_clipping_range(self) -> tuple[float, float]:
+        """Return the distances between which the camera sees [m]."""
+        near, far = _value(self._prim, "clippingRange", (0.01, 1e3))
+        return float(near), float(far)
+
+    def set_focal_length(self, value: float) -> None:
+        """Record the call: the MJCF's camera has the field of view."""
+        self._focal_length = value
+        note_ignored("Camera.set_focal_length", "the MJCF's camera has the field of view", lost=True)
+
+    def get_focal_length(self) -> float:
+        """Return the focal length [cm]."""
+        return self._focal_length
+
+
+class Annotator(Counterpart):
+    """Replicator's annotator of instance segmentation, of the camera of one environment."""
+
+    def __init__(self, env: OigeEnv) -> None:
+        self._env = env
+        self._row = 0
+        self._id_of: Tensor | None = None
+
+    def attach(self, render_products: Any, **kwargs: Any) -> None:
+        """Choose the environment whose camera is read."""
+        found = re.search(r"/env_(\d+)/", str(render_products[0]))
+        self._row = int(found[1]) if found else 0
+
+    def get_data(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        """Return the ids of the visible objects, (height, width) int32, and the paths of the ids."""
+        env = self._env
+        labelled = {n: p for n, p in enumerate(sorted(env.stage.labelled), _FIRST_LABELLED)}
+        if self._id_of is None:  # by body + 1; the first entry: nothing is visible
+            self._id_of = torch.full((env.engine.model.nbody + 1,), _UNLABELLED, dtype=torch.int32)
+            self._id_of[:2] = _BACKGROUND
+            for number, path in labelled.items():
+                bodies = env.entities[path.replace("/", "_")].body_ids
+                self._id_of[torch.as_tensor(bodies, dtype=torch.int64) + 1] = number
+        camera = env.sensors[SEGMENTATION]
+        assert isinstance(camera, CameraSensor)
+        data = self._id_of[camera.image[self._row, ..., 0].long() + 1]
+        visible = set(data.unique().tolist())
+        names = {_BACKGROUND: "BACKGROUND", _UNLABELLED: "UNLABELLED"}
+        names |= {number: f"{BASE}/env_{self._row}/{path}" for number, path in labelled.items()}
+        labels = {str(number): path for number, path in names.items() if number in visible}
+        return {"data": data.to(env.device), "info": {"idToLabels": labels}}
+
+
+warp_int32 = torch.int32
+
+
+def warp_to_torch(array: Tensor) -> Tensor:
+    """Return the data unchanged: an annotator's data are already a torch tensor."""
+    return array
 
 
 class Writer(Counterpart):

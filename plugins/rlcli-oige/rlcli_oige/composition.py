@@ -17,7 +17,7 @@ _SELF = "_self_"
 
 @dataclass(slots=True)
 class Composed(Document):
-    """A document that is merged from several files."""
+    """A parsed YAML document that is merged from several files."""
 
     labels: dict[Path, str] = field(default_factory=dict)
     """Path of a key -> name of the file that has it."""
@@ -80,7 +80,7 @@ def _parts(
 
 
 def _file(entry: Any, file: FilePath) -> FilePath | None:
-    """Return the YAML file of an entry; None if there is none."""
+    """Return the YAML file that an entry of a `defaults:` list names; None if there is none."""
     if not isinstance(entry, str) or not entry.strip("/"):
         return None
     folder = file.parent.parent if entry.startswith("/") else file.parent

@@ -1,8 +1,9 @@
-"""Environment that runs a task in OmniIsaacGymEnvs' form."""
+"""`OigeEnv`: the environment of rlcli that runs a task class written for OmniIsaacGymEnvs."""
 
 from __future__ import annotations
 
 import copy
+import inspect
 import logging
 import math
 from collections.abc import Mapping
@@ -20,6 +21,7 @@ from rlcli.envs.layout import Layout
 from rlcli.errors import DependencyError, TaskError
 from rlcli.registry import import_file, is_framework
 from rlcli.scene.scene import Scene
+from rlcli.sim.device_names import on_cpu
 from rlcli.sim.selection import Selection
 from rlcli_oige.articulation_view import ArticulationView
 from rlcli_oige.cameras import Replicator
@@ -38,6 +40,19 @@ _IMAGE_DIMS = 4
 _TINY_GRAVITY_COMPENSATION = 1e-30
 
 
+_HOOKS = (
+    *("__init__", "set_up_scene", "post_reset", "pre_physics_step", "post_physics_step", "get_observations"),
+    *("get_states", "calculate_metrics", "is_done", "reset_idx", "get_extras"),
+)
+
+
+def _on_cpu(task_class: type) -> type:
+    """Return a subclass of a task class in whose hooks the device `cuda` means the CPU."""
+    own = [hook for hook in _HOOKS if getattr(task_class, hook) is not getattr(RLTask, hook, None)]
+    members = {hook: on_cpu(getattr(task_class, hook)) for hook in own}
+    return type(task_class.__name__, (task_class,), {**members, "__module__": task_class.__module__})
+
+
 class OigeEnv(DirectEnv):
     """Direct workflow for `RLTask`: it splits the reset flag, clips after rewards, and applies forces for one step."""
 
@@ -47,6 +62,8 @@ class OigeEnv(DirectEnv):
     def _prepare_scene(self, scene: Scene) -> None:
         source, config = self.resolved.source, self.config
         task_class = self._task_class()
+        if self.device.type == "cpu" and "cuda" in Path(inspect.getfile(task_class)).read_text(encoding="utf-8"):
+            task_class = _on_cpu(task_class)
         if not issubclass(task_class, RLTask):
             hint = "its YAML has OmniIsaacGymEnvs' form: derive the class from rlcli_oige.RLTask"
             raise TaskError(f"task '{source.name}' is broken: {source.task} is not an RLTask", hint=hint)

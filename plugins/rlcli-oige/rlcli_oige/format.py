@@ -35,6 +35,7 @@ SPEC = FormatSpec(
                 "omni",
                 "pxr",
                 "carb",
+                "warp",
             ),
             "rlcli_oige.modules:find",
         ),
@@ -73,7 +74,7 @@ def read(document: Document, source: TaskSource) -> Translation | None:
 
 
 def check(block: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str, str]]:
-    """Yield every key of the block `oige` that a task file has under another name."""
+    """Yield (key, message, hint) for each key of the block `oige` that is in the wrong place in a task file."""
     from rlcli_oige.task_keys import MOVED_KEYS
 
     for path, target in MOVED_KEYS.items():

@@ -156,7 +156,7 @@ def _closing(path: Path, text: str, start: int) -> int:
 
 
 def _split(text: str) -> list[str]:
-    """Split at commas outside of brackets and quotes."""
+    """Split the arguments of a resolver at commas outside of brackets and quotes."""
     parts, depth, quote = [""], 0, ""
     for letter in text:
         if quote:

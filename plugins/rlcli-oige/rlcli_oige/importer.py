@@ -1,4 +1,4 @@
-"""`rlcli import oige`: writes a task of OmniIsaacGymEnvs as a folder of rlcli. The task's class stays a class."""
+"""`rlcli import oige`: writes a task of OmniIsaacGymEnvs as a folder of rlcli. The task's Python class is kept."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _copy_code(class_file: Path, home: Path, folder: Path) -> list[Path]:
 
 
 def _used_files(start: Path, home: Path) -> list[Path]:
-    """Return a file and all files of its package that it imports, directly or not, without names of `rlcli_oige`."""
+    """Return a file and all files of its package that it imports, directly or not, but no names of `rlcli_oige`."""
     words = [node for file in _VOCABULARY for node in ast.walk(parse_file(file))]
     own = {getattr(node, "name", getattr(node, "value", None)) for node in words if isinstance(node, _WORDS)}
     deepest_first = sorted(home.rglob("*.py"), key=lambda file: (-len(file.parts), file))[-500:]

@@ -74,7 +74,7 @@ def torch_rand_float(lower: float, upper: float, shape: tuple[int, int], device:
 
 
 def torch_random_dir_2(shape: tuple[int, int], device: str) -> Tensor:
-    """Sample directions in the plane. (*shape, 2), without the last 1 of the shape"""
+    """Sample unit vectors in the plane uniformly. shape (n, 1) -> (n, 2)"""
     angle = torch_rand_float(-math.pi, math.pi, shape, device).squeeze(-1)
     return torch.stack([torch.cos(angle), torch.sin(angle)], dim=-1)
 

@@ -1,6 +1,6 @@
 """Modules that the unchanged import lines of task files get: `omni.*`, `pxr`, `carb`, `gym`, `omniisaacgymenvs.*`.
 
-Names that rlcli has are those of the flat vocabulary, whatever the module is. Names whose calls have no effect in
+A name that `rlcli_oige` has is imported from there, whatever module the task names. Names whose calls have no effect in
 MuJoCo are recorded when they are called; all others can be imported and raise an error when they are used.
 """
 
@@ -21,7 +21,6 @@ _modules: dict[str, ModuleType] = {}
 
 _IGNORED = {
     "enable_extension": "rlcli has no extensions",
-    "add_update_semantics": "there are no semantic labels",
     "PreviewSurface": "the model has the materials",
     "VisualMaterial": "the model has the materials",
     "OmniPBR": "the model has the materials",
@@ -45,8 +44,6 @@ _REFUSED = {
     " body of MJCF has not; there is no counterpart of Factory's tasks",
     "omniisaacgymenvs.tasks.franka_deformable": "PhysX simulates deformable bodies on its GPU; rlcli simulates rigid"
     " bodies",
-    "omniisaacgymenvs.tasks.target_following": "its reward reads images of instance segmentation, which rlcli's cameras"
-    " do not render",
     "omniisaacgymenvs.tasks.warp": "tasks with Warp arrays are not supported; use the task's torch version",
 }
 """Module of the user's package -> why a task that imports it cannot run."""
@@ -107,6 +104,8 @@ class _Module(ModuleType):
         full = f"{self.__name__}.{name}"
         if full == "omni.usd.get_context":
             return UsdContext
+        if full in ("warp.to_torch", "warp.int32"):  # arrays of annotators are tensors
+            return getattr(importlib.import_module("rlcli_oige.cameras"), f"warp_{name}")
         if name in _IGNORED:
             return Ignored(name, _IGNORED[name])
         reason = next((text for module, text in _REASONS.items() if f"{full}.".startswith(f"{module}.")), None)

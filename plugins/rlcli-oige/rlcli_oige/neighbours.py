@@ -43,7 +43,10 @@ def used_names(known: Iterable[str]) -> list[str]:
 
 
 def _neighbours(importer: Path) -> Iterator[Path]:
-    """Yield the other Python files in the folders of `_search_folders`, subfolders included."""
+    """Yield the task's other Python files: those in the folders of `_search_folders` and below them.
+
+    `importer` is the file whose import statement is running.
+    """
     seen = {importer}
     for folder in _search_folders(importer.parent):
         for file in sorted(folder.rglob("*.py"))[:500]:
@@ -53,7 +56,7 @@ def _neighbours(importer: Path) -> Iterator[Path]:
 
 
 def _search_folders(folder: Path) -> list[Path]:
-    """Return the folder of a file, and its parents up to the folder of the task's YAML."""
+    """Return the folders of a task's Python files: a folder and its parents up to the folder of the task's YAML."""
     above = [folder, *list(folder.parents)[:3]]
     home = next((depth for depth, parent in enumerate(above) if any(map(_is_task, _yamls(parent)))), None)
     if home is not None:

@@ -1,4 +1,4 @@
-"""Paths of prims, and the regular expressions of paths that views have."""
+"""Paths of USD prims (objects of a scene), and the expressions by which views select prims."""
 
 from __future__ import annotations
 

@@ -62,15 +62,15 @@ class Randomizer:
         """Do nothing: the environment randomizes in each step."""
 
     def get_initial_dr_distribution_parameters(self, *path: str) -> np.ndarray:
-        """Return the parameters of a distribution as in the YAML."""
+        """Return the `distribution_parameters` of the YAML; `path` has the keys that lead to them."""
         return np.array(self.active_domain_randomizations[self._check_path(path)])
 
     def get_dr_distribution_parameters(self, *path: str) -> Any:
-        """Return the current parameters of a distribution."""
+        """Return the current `distribution_parameters`; `path` has the YAML's keys that lead to them."""
         return self._parameters[self._check_path(path)]
 
     def set_dr_distribution_parameters(self, distribution_parameters: Any, *path: str) -> None:
-        """Replace the parameters of a distribution, for a schedule of the task's own."""
+        """Replace `distribution_parameters` during the training; `path` has the YAML's keys that lead to them."""
         self._parameters[self._check_path(path)] = np.asarray(distribution_parameters).tolist()
 
     # --- called by the environment ---
@@ -192,14 +192,14 @@ class Randomizer:
         return path
 
     def _acts_on_state(self, gate: Gate) -> bool:
-        """Return whether a gate acts on the state, which the task's reset overwrites."""
+        """Return whether a randomization acts on the state, which the task's reset overwrites, and not on the model."""
         return gate.path[-1] in VIEW_STATE
 
     def _sample(self, gate: Gate, ids: Tensor, step: int | None, size: int, shape: tuple[int, ...]) -> Tensor:
-        """Sample the values of a gate, one row per environment.
+        """Sample the values of one randomization, one row per environment.
 
         Args:
-            gate: what to sample.
+            gate: attribute and distribution.
             ids: environments.
             step: environment step that keys the samples of `on_interval`; None: the episode index keys them.
             size: number of values per environment.

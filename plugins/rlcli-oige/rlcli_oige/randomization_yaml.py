@@ -1,4 +1,4 @@
-"""Reader of OmniIsaacGymEnvs' `domain_randomization:`: it becomes a list of gates."""
+"""Reader of OmniIsaacGymEnvs' `domain_randomization:`: each of its entries becomes a `Gate`."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ ATTRIBUTES: Mapping[str, Mapping[str, tuple[Status, str]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """One randomization: its attribute, its time (startup, reset or interval) and its distribution."""
+    """One randomization: its attribute, its key (`on_startup`, `on_reset` or `on_interval`) and its distribution."""
 
     path: tuple[str, ...]
     """(observations,), (actions,), (simulation, gravity) or (kind of view, view, attribute)"""
@@ -97,11 +97,11 @@ class Gate:
 
     @property
     def name(self) -> str:
-        """Unique name of the gate in its task."""
+        """Name of the randomization, unique in its task, such as `simulation.gravity.on_reset`."""
         return ".".join((*self.path, self.gate))
 
     def strength(self, step: int) -> float:
-        """Return the strength in [0, 1] at a training step, from the schedule."""
+        """Return the factor in [0, 1] that the schedule gives the randomization at a training step."""
         if self.schedule is None or self.schedule_steps <= 0:
             return 1.0
         if self.schedule == "constant":
@@ -110,7 +110,7 @@ class Gate:
 
 
 def gates(block: Mapping[str, Any]) -> list[Gate]:
-    """Return the gates (`on_startup`, `on_reset`, `on_interval`) of a checked block, without the ignored ones."""
+    """Return the randomizations of a block that `check` has accepted, without those that rlcli ignores."""
     found = []
     for at, params in _entries(block):
         path = at[1:-1]
@@ -134,7 +134,7 @@ def gates(block: Mapping[str, Any]) -> list[Gate]:
 def check(
     block: Any, problem: Callable[[Path, str, str | None], None], note: Callable[[Path, Status, str], None]
 ) -> None:
-    """Report every key of a `domain_randomization:` block, as a mistake or as a note."""
+    """Check a `domain_randomization:` block: call `problem` for each mistake, and `note` for each translated key."""
     base: Path = ("domain_randomization",)
     if not isinstance(block, dict):
         problem(base, "expected a mapping", "write {randomize: true, randomization_params: {...}}")
@@ -181,7 +181,7 @@ def _check_gate(
     if target and target[0] in VIEWS and (len(target) < 3 or target[2] not in ATTRIBUTES[target[0]]):
         return  # _check_views has reported it
     if gate not in GATES:
-        problem(at, f"unknown key '{gate}'", did_you_mean(gate, GATES) or f"gates: {listing(GATES)}")
+        problem(at, f"unknown key '{gate}'", did_you_mean(gate, GATES) or f"keys: {listing(GATES)}")
         return
     if gate == "on_startup" and target[0] not in VIEWS:
         problem(at, f"{target[0]} cannot be randomized on_startup", "use on_reset or on_interval")
@@ -236,7 +236,7 @@ def _check_numbers(at: Path, entry: Mapping[str, Any], problem: Callable[[Path, 
 
 
 def _entries(block: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield (path below the block, content) of everything at the level of a gate."""
+    """Yield (path in the block, value) of every key at the level of `on_reset`, such as `on_startup`."""
     params = block.get("randomization_params")
     for key, content in params.items() if isinstance(params, dict) else ():
         base: tuple[str, ...] = ("randomization_params", key)

@@ -228,7 +228,7 @@ def _mass_field(bodies: Tensor, mass: bool, env: OigeEnv) -> RandomizedField:
 
 
 def _friction_field(bodies: list[int], env: OigeEnv) -> RandomizedField:
-    """Return static friction, dynamic friction and restitution of geoms. MuJoCo has only one friction."""
+    """Return the field of static friction, dynamic friction and restitution of bodies. MuJoCo has one friction."""
     model = env.engine.model
     geoms = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in bodies]
     columns, friction = torch.tensor(geoms, device=env.device), env.engine.expand("geom_friction")

@@ -1,4 +1,4 @@
-"""Rotations under the names of Isaac Sim's torch utilities. Quaternions are (w, x, y, z). TorchScript compiles all."""
+"""Rotations (w, x, y, z) under the names of Isaac Sim's torch utilities. TorchScript can compile all functions."""
 
 import math
 
@@ -176,18 +176,18 @@ def slerp(q0: Tensor, q1: Tensor, fraction: Tensor) -> Tensor:
 
 
 def tf_inverse(q: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the inverse of a rotation and translation."""
+    """Return the inverse of a pose, rotation q and translation t. (..., 4), (..., 3)"""
     inverse = quat_conjugate(q)
     return inverse, -quat_rotate(inverse, t)
 
 
 def tf_apply(q: Tensor, t: Tensor, v: Tensor) -> Tensor:
-    """Rotate and translate a point."""
+    """Return the point v rotated by q and moved by t. (..., 3)"""
     return quat_rotate(q, v) + t
 
 
 def tf_vector(q: Tensor, v: Tensor) -> Tensor:
-    """Rotate a direction."""
+    """Return the direction v rotated by q; t is not used. (..., 3)"""
     return quat_rotate(q, v)
 
 
@@ -202,7 +202,7 @@ def get_basis_vector(q: Tensor, v: Tensor) -> Tensor:
 
 
 def get_axis_params(value, axis_idx: int, x_value=0.0, dtype=float, n_dims: int = 3) -> list:
-    """Return a vector with `value` at one axis and `x_value` at x."""
+    """Return a list of `n_dims` numbers: `value` at the index `axis_idx`, else `x_value` at 0, and 0 elsewhere."""
     params = [dtype(0.0)] * n_dims
     params[0] = dtype(x_value)
     params[axis_idx] = dtype(value)

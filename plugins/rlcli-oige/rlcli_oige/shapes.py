@@ -14,7 +14,7 @@ from rlcli_oige.user_code import Counterpart, user_location
 
 
 class XFormPrim(Counterpart):
-    """A frame."""
+    """A frame (coordinate system) on the stage, into which a model can be loaded."""
 
     def __init__(
         self,

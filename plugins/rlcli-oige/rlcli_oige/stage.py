@@ -178,6 +178,8 @@ class Stage(Counterpart):
         self.parts: dict[str, dict[str, Prim]] = {}
         self.references: dict[str, str] = {}
         """Path of a prim -> USD file that the task refers to."""
+        self.labelled: set[str] = set()
+        """Paths of the prims with a semantic label, relative to their environment."""
         self.ignored: dict[str, str] = {}
         """Call of the task that has no effect -> where it is, and the reason."""
         self.lost: dict[str, str] = {}
@@ -222,7 +224,7 @@ class Stage(Counterpart):
         self.prims.pop(str(path), None)
 
     def define(self, path: str, pos: Any, quat: Any) -> Prim:
-        """Add a prim, or place the one that is there: below a reference, the pose is that of the reference's model."""
+        """Add a prim, or place an existing one. A path inside of a referenced USD file places its whole model."""
         reference = next((ref for ref in self.references if path == ref or path.startswith(f"{ref}/")), None)
         if reference is not None and reference not in self.prims and reference != path:
             self.define(reference, None, None)
@@ -268,7 +270,7 @@ class Stage(Counterpart):
         if not file.is_file():
             have = listing(sorted(str(p.relative_to(self.root)) for p in self.root.rglob("*.xml")))
             hint = f"MJCF files of the task: {have}" if have else f"--model {name}=FILE.xml"
-            raise ConfigError([Problem(where, "", f"no file '{file}'", hint)])
+            raise ConfigError([Problem(where, "", f"there is no file '{file}'", hint)])
         try:
             beside = [file.parent] if entry and Path(entry["model"]).is_absolute() else []
             roots = [*package_roots(self.root), home(self.root / "task.yaml"), MODELS, *beside]
@@ -313,7 +315,7 @@ class Stage(Counterpart):
             _add_joint(scene, joint)
 
     def note_ignored(self, what: str, reason: str, lost: bool = False) -> None:
-        """Record a call of the task that has no effect in MuJoCo."""
+        """Record a call of the task without effect in MuJoCo, for one message; `lost`: it is logged as a warning."""
         (self.lost if lost else self.ignored).setdefault(what, f"{user_location()}{reason}")
 
     def _rename_elements(self, prim: Prim, where: str) -> None:
@@ -325,7 +327,7 @@ class Stage(Counterpart):
             for new, old in names.items():
                 if old not in known:
                     near = did_you_mean(old, known) or f"{kind}: {listing(known)}"
-                    raise ConfigError([Problem(f"{where}.{kind}.{new}", "", f"no '{old}' in {prim.label}", near)])
+                    raise ConfigError([Problem(f"{where}.{kind}.{new}", "", f"{prim.label} has no '{old}'", near)])
             for old, element in known.items():
                 new_names = [new for new, was in names.items() if was == old]
                 if new_names:
@@ -360,7 +362,7 @@ def _add_joint(scene: Scene, prim: Prim) -> None:
     if known is not None:
         site = scene.spec.site(f"{name}.anchor")
         if not np.allclose(site.pos, anchor, atol=1e-4):
-            raise TaskError(f"the joint '{prim.prim_path}' is at another place than the one of the first environment")
+            raise TaskError(f"the joint '{prim.prim_path}' must be at the same place as in the first environment")
         return
     body = scene.spec.body(f"{target.owner.entity}/{target.GetName()}")
     body.add_site(name=f"{name}.point", pos=np.asarray(values.get("LocalPos1", (0.0, 0.0, 0.0))), group=5)
@@ -397,7 +399,7 @@ def get_current_stage(fabric: bool = False) -> Stage:
 
 
 def note_ignored(what: str, reason: str, lost: bool = False) -> None:
-    """Record a call of the task that has no effect in MuJoCo, if a task is being built."""
+    """Record a call of the task without effect in MuJoCo, like `Stage.note_ignored`, if a task is being built."""
     if _CURRENT_STAGES:
         _CURRENT_STAGES[-1].note_ignored(what, reason, lost)
 

@@ -172,7 +172,7 @@ class SceneRegistry(Counterpart):
         return found[name]
 
     def remove_object(self, name: str, registry_only: bool = False) -> None:
-        """Remove a name."""
+        """Remove the view or object with a name from the registry."""
         self.views.pop(name, None)
         self.objects.pop(name, None)
 
@@ -411,7 +411,7 @@ class RLTask(DirectTask):
         """Do nothing: the YAML's `viewport:` sets the camera."""
 
     def set_is_extension(self, is_extension: bool) -> None:
-        """Store the flag."""
+        """Store whether the task runs as an extension of Isaac Sim; rlcli does not use the flag."""
         self.is_extension = is_extension
 
     def get_states(self) -> Any:
@@ -419,7 +419,7 @@ class RLTask(DirectTask):
         return self.states_buf
 
     def get_extras(self) -> Any:
-        """Fill extras."""
+        """Fill `extras`, the values that the trainer logs."""
 
     def reset(self, selection: Any = None) -> None:
         """Set all reset flags."""

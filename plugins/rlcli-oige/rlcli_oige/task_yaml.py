@@ -229,7 +229,7 @@ class _Translator(YamlTranslator):
         randomization_yaml.check(block, self.problem, self.note)
 
     def _models(self, block: Any) -> dict[str, Any]:
-        """Return robot, by its path in an environment -> model file, and the task's names -> the model's names."""
+        """Return the key `mjcf` with each robot named by its path in an environment; report mistakes."""
         models: dict[str, Any] = {}
         for path, value in _mapping(block).items():
             at = ("mjcf", path)

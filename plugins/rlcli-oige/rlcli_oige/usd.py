@@ -32,7 +32,7 @@ class ArticulationAction:
 
 
 class Missing(type):
-    """Class of names without a counterpart. They can be imported; their use raises an error with the user's line.
+    """Class of names that rlcli does not have. They can be imported; their use raises an error with the user's line.
 
     A new name is created as `Missing(name, (), {"reason": ...})`.
     """

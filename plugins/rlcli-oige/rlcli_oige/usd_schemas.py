@@ -57,7 +57,7 @@ class Attribute:
         return self.value
 
     def Set(self, value: Any, time: Any = None) -> bool:  # noqa: N802
-        """Set the value. One that the model cannot have is recorded."""
+        """Set the value. Record a call whose value has no effect in MuJoCo."""
         self.value = value
         if self.schema and not self.schema.endswith("Joint") and self.name not in _APPLIED.get(self.schema, ()):
             lost = self.name in _LOST and value not in (0, 0.0)
@@ -86,7 +86,7 @@ class _SchemaClass(type):
 
 
 class Schema(metaclass=_SchemaClass):
-    """A schema, applied to a prim."""
+    """A USD schema (a group of attributes, such as `MassAPI`), applied to a prim."""
 
     def __init__(self, prim: Any, instance: str = "") -> None:
         self._prim, self._instance = getattr(prim, "_prim", prim), instance
@@ -193,7 +193,7 @@ class Xform(Xformable):
 
 
 class SchemaModule:
-    """A module of schemas. A schema class is created when its name is used."""
+    """A module of USD's schemas, such as `UsdPhysics`. A schema class is created when its name is used."""
 
     _classes: ClassVar[dict[str, Any]] = {"Xformable": Xformable, "Xform": Xform}
 

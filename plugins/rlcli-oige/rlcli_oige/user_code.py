@@ -1,4 +1,4 @@
-"""Place of the user's code that calls into this package, and errors for what this package lacks."""
+"""Search for the line of the user's code that calls this package, and errors for what this package lacks."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def error_location(error: BaseException) -> str:
 
 
 class MissingAttributeError(TaskError, AttributeError):
-    """Use of an attribute that the original class has, or may have, and its counterpart has not."""
+    """Error of a task that uses an attribute of Isaac Sim's class that rlcli's class does not have."""
 
 
 class Counterpart:

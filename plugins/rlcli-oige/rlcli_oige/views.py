@@ -213,7 +213,7 @@ class XFormPrimView(Counterpart):
         self.set_velocities(torch.cat([kept, self._tensor(velocities)], dim=1), indices)
 
     def get_default_state(self) -> Any:
-        """Return the current poses."""
+        """Return the current poses as `positions` and `orientations`; rlcli stores no other default state."""
         return self.get_world_poses()
 
     def set_visibilities(self, visibilities: Any, indices: Any = None) -> None:
@@ -246,7 +246,10 @@ class XFormPrimView(Counterpart):
         return torch.as_tensor(indices, device=self.env.device).long().reshape(-1)
 
     def _rows_of(self, which: int, indices: Any) -> tuple[Tensor, Any]:
-        """Return the environments of the selected rows of one body, and which of the caller's values belong to it."""
+        """Return (the environments of one body's rows among `indices`, the positions of these rows in `indices`).
+
+        `which` is the number of the body among the view's bodies in an environment.
+        """
         index = self._index(indices)
         if index is None:
             return torch.arange(self.env.num_envs, device=self.env.device), slice(which, None, self._per_env)
@@ -389,5 +392,5 @@ def _interleave(rows: list[Tensor]) -> Tensor:
 
 
 def select_rows(values: Tensor, index: Tensor | None) -> Tensor:
-    """Return selected rows as a new tensor; None: all."""
+    """Return the rows `index` of values as a new tensor; None: all rows."""
     return values.clone() if index is None else values[index]

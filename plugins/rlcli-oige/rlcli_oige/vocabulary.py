@@ -1,7 +1,8 @@
 # ruff: noqa: F401
-"""All names of OmniIsaacGymEnvs' vocabulary that `rlcli_oige` defines."""
+"""All names that `rlcli_oige` defines, in one module. `rlcli_oige` imports it when a name is first used."""
 
 from rlcli_oige.articulation_view import ArticulationView
+from rlcli_oige.cameras import Camera, add_update_semantics
 from rlcli_oige.maths import *  # noqa: F403
 from rlcli_oige.maths import TENSOR_NAMES
 from rlcli_oige.randomization import Randomizer
@@ -48,12 +49,13 @@ MATHS = [*TENSOR_NAMES, *ROTATION_NAMES]
 
 NAMES = [
     *MATHS,
-    "Ant", "ArticulationAction", "ArticulationView", "Cartpole", "Cloner", "Crazyflie", "DynamicCuboid",
+    "Ant", "ArticulationAction", "ArticulationView", "Camera", "Cartpole", "Cloner", "Crazyflie", "DynamicCuboid",
     "DynamicCylinder", "DynamicSphere", "FixedCuboid", "FixedCylinder", "FixedSphere", "Gf", "GridCloner",
     "GroundPlane",
     "Humanoid", "Ingenuity", "PhysxSchema", "Quadcopter", "RLTask", "Randomizer", "RigidPrim", "RigidPrimView", "Robot",
     "Sdf", "SimConfig", "SimulationContext", "Usd", "UsdGeom", "UsdLux", "UsdPhysics", "UsdShade", "VisualCuboid",
-    "VisualSphere", "WheeledRobot", "World", "XFormPrim", "XFormPrimView", "add_reference_to_stage", "carb",
+    "VisualSphere", "WheeledRobot", "World", "XFormPrim", "XFormPrimView", "add_reference_to_stage",
+    "add_update_semantics", "carb",
     "define_prim", "find_matching_prim_paths", "get_assets_root_path", "get_current_stage", "get_prim_at_path",
     "is_prim_path_valid", "torch_utils",
 ]  # fmt: skip

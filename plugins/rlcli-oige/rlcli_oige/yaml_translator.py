@@ -14,7 +14,7 @@ from rlcli_oige.composition import label_at
 
 @dataclass(slots=True)
 class YamlTranslator:
-    """State of one translation."""
+    """Base of a translator of one file: the settings found so far, their keys in the file, notes and mistakes."""
 
     document: Document
     label: str

@@ -257,7 +257,7 @@ def test_restored_state_continues_bit_for_bit(env):
             "'/World/envs/env_0/Arm' has no model",
         ),
         ("yaml", "arm.xml", "leg.xml", ConfigError, "no file"),
-        ("yaml", "Arm: arm.xml", "Arm: {model: arm.xml, joints: {x: knee}}", ConfigError, "no 'knee' in arm.xml"),
+        ("yaml", "Arm: arm.xml", "Arm: {model: arm.xml, joints: {x: knee}}", ConfigError, "arm.xml has no 'knee'"),
     ],
 )
 def test_invalid_task_is_reported_when_env_is_built(tmp_path, where, old, new, error, message):

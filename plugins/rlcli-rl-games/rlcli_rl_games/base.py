@@ -80,7 +80,7 @@ class RlGamesTrainer(BaseTrainer):
 
     @abstractmethod
     def _make(self, parameters: dict[str, Any]) -> Any:
-        """Return rl_games' agent."""
+        """Create rl_games' agent from `params`."""
 
     @abstractmethod
     def _policy_spec(self) -> PolicySpec:
@@ -169,7 +169,7 @@ class RlGamesTrainer(BaseTrainer):
         return config.params.config.model_dump(exclude_none=True)
 
     def _parameters(self, settings: dict[str, Any], device: str, folder: str) -> dict[str, Any]:
-        """Return all of `params`, as rl_games' runner passes them to an agent."""
+        """Return all of `params`, as rl_games' runner passes them to an agent; `folder` is for its files."""
         config: Any = self.config
         shaper = DefaultRewardsShaper(**settings["reward_shaper"])
         if self.config.max_iterations is not None:

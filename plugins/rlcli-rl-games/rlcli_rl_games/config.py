@@ -44,7 +44,7 @@ IGNORED: Mapping[str, str] = {
 
 
 class _Settings(StrictModel):
-    """Settings whose ignored keys are dropped before validation."""
+    """Base of settings: keys of rl_games without effect in rlcli (`IGNORED`) are dropped before validation."""
 
     @model_validator(mode="before")
     @classmethod
@@ -342,7 +342,7 @@ def _require(named: Named, key: str, name: str, algorithm: str) -> None:
 
 
 class RlGamesConfig(AgentConfig):
-    """Settings of both algorithms.
+    """Settings of an agent of rl_games, PPO or SAC.
 
     `max_epochs` and `save_frequency` of `params.config` set rlcli's `max_iterations` and `save_interval`.
     """

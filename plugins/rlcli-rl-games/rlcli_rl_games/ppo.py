@@ -119,7 +119,7 @@ class PpoTrainer(RlGamesTrainer):
         return optimizers
 
     def _names(self) -> dict[str, str]:
-        """Return the name in a saved policy of each weight of the actor, by rl_games' name."""
+        """Return rl_games' name of each weight of the actor -> its name in a saved policy."""
         last = 2 * len(self.spec.hidden)
         names = {f"mu.{kind}": f"actor.{last}.{kind}" for kind in ("weight", "bias")}
         for name in self.agent.model.a2c_network.state_dict():

@@ -105,7 +105,7 @@ class WeightScheduleConfig(StrictModel):
         names = needed.get(self.mode, ("initial_step", "final_step", "final_value"))
         missing = [name for name in names if getattr(self, name) is None]
         if missing:
-            raise ValueError(f"mode {self.mode} needs {' and '.join(missing)}")
+            raise ValueError(f"mode {self.mode} needs {' and '.join(missing)}; set each of them")
         return self
 
 

@@ -213,7 +213,7 @@ class RslRlTrainer(BaseTrainer):
         return getattr(normalizer, "disc_avg", None)
 
     def _names(self) -> dict[str, str]:
-        """Return the name in a saved policy of each weight of the actor, by RSL-RL's name."""
+        """Return RSL-RL's name of each weight of the actor -> its name in a saved policy."""
         names = {}
         for name in self.alg.get_policy().state_dict():
             if name.startswith("mlp."):
@@ -301,7 +301,7 @@ def _require_batch(env: Environment, config: RunnerConfig) -> None:
 
 
 def _settings(env: Environment, config: RunnerConfig, groups: dict[str, list[str]]) -> dict[str, Any]:
-    """Return the settings in the form of RSL-RL 5."""
+    """Return the settings of RSL-RL's PPO (networks, algorithm, groups) as the dict that RSL-RL 5 reads."""
     algorithm: dict[str, Any] = config.algorithm.model_dump(exclude={"class_name", "rnd_cfg", "symmetry_cfg"})
     algorithm["class_name"] = PPO
     if config.algorithm.rnd_cfg is not None:
@@ -334,7 +334,7 @@ def _network(config: Any) -> dict[str, Any]:
 
 
 def _mirror(env: Environment, reference: str) -> Any:
-    """Load the function that mirrors observations and actions."""
+    """Load the function `module:name` that mirrors observations and actions."""
     module, _, name = reference.rpartition(":")
     if not module:
         module, _, name = reference.rpartition(".")

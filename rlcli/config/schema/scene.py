@@ -190,8 +190,9 @@ class EntityConfig(StrictModel):
     """Name -> actuator model. Joints without an actuator model keep the actuators of the MJCF."""
     init: InitialStateConfig = InitialStateConfig()
     """Default state. A joint that is not listed starts at the MJCF's qpos0 with velocity 0."""
-    soft_joint_pos_limit_factor: Annotated[float, Field(gt=0, le=1), _FractionString()] = 1.0
-    """Part of the joint range, around its middle, that is inside the soft limits, in (0, 1]."""
+    soft_joint_pos_limit_factor: Annotated[float, Field(gt=0, le=100), _FractionString()] = 1.0
+    """Part of the joint range, around its middle, that is inside the soft limits; above 1, the soft limits are wider
+    than the joint range."""
 
     @model_validator(mode="after")
     def _one_kind(self, info: ValidationInfo) -> Self:

@@ -97,9 +97,9 @@ class CameraSensorConfig(StrictModel):
 
     kind: Literal["camera"]
     """Kind of sensor: always camera."""
-    data: Literal["rgb", "depth", "distance"] = "rgb"
+    data: Literal["rgb", "depth", "distance", "segmentation"] = "rgb"
     """rgb: red, green and blue in 0 to 255; depth: distance along the camera's axis [m]; distance: distance from the
-    camera's position [m]."""
+    camera's position [m]; segmentation: id of the visible body in MuJoCo's model."""
     width: Annotated[int, Field(ge=1, le=4096)]
     """Image width [pixels]."""
     height: Annotated[int, Field(ge=1, le=4096)]
@@ -131,6 +131,8 @@ class CameraSensorConfig(StrictModel):
         if self.camera is not None and placed:
             keys = ", ".join(placed)
             raise ValueError(f"a camera of the MJCF has its own position and field of view: remove {keys}")
+        if self.data == "segmentation" and self.samples > 1:
+            raise ValueError("ids of bodies have no mean: remove samples")
         if self.clip[0] >= self.clip[1]:
             raise ValueError(
                 f"clip must be [nearest, farthest] in metres; {self.clip[0]:g} is not below {self.clip[1]:g}"

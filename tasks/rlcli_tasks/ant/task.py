@@ -51,9 +51,9 @@ class AntTask(LocomotionTask):
     params: Params
 
     def efforts(self) -> tuple[float, ...]:
-        """Return the same torque for every joint."""
+        """Return the torque of each joint at action 1, which is the same for all joints [N m]."""
         return (self.params.effort,) * len(JOINTS)
 
     def at_limits(self, position: Tensor) -> Tensor:
-        """Return 1 for each joint at a limit."""
+        """Return whether each joint is at a limit; positions are in half ranges, from -1 to 1. (n, joints) bool"""
         return position.abs() > 0.99

@@ -74,7 +74,7 @@ class BallBalanceTask(DirectTask):
     params: Params
 
     def set_up_scene(self, scene) -> None:
-        """Register the view of the tables."""
+        """Register a view of the tables: their state in all environments, as tensors."""
         self.tables = scene.add(ArticulationView("robot", name="table_view"))
 
     def post_reset(self) -> None:

@@ -62,7 +62,7 @@ class CartDoublePendulumTask(DirectTask):
     params: Params
 
     def set_up_scene(self, scene) -> None:
-        """Register the view of the robots."""
+        """Register a view of the robots: their state in all environments, as tensors."""
         self.carts = scene.add(ArticulationView("robot", name="cart_view"))
 
     def post_reset(self) -> None:
@@ -97,7 +97,7 @@ class CartDoublePendulumTask(DirectTask):
         )
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the observations as terms of a manager-based task."""
+        """Return the observations and actions as terms of a manager-based task, by section."""
         params = self.params
         return {
             "observations": [

@@ -40,7 +40,7 @@ class CartpoleTask(DirectTask):
     params: Params
 
     def set_up_scene(self, scene) -> None:
-        """Register the view of the robots."""
+        """Register a view of the robots: their state in all environments, as tensors."""
         self.cartpoles = scene.add(ArticulationView("robot", name="cartpole_view"))
 
     def post_reset(self) -> None:
@@ -76,7 +76,7 @@ class CartpoleTask(DirectTask):
         return {self.cartpoles.name: {"obs_buf": self.obs_buf}}
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the observations as terms of a manager-based task."""
+        """Return the observations and actions as terms of a manager-based task, by section."""
         cart, pole = ["slider_to_cart"], ["cart_to_pole"]
         observed = [{"func": func, "joints": joints} for joints in (cart, pole) for func in ("joint_pos", "joint_vel")]
         return {

@@ -110,7 +110,7 @@ class HandTask(DirectTask):
     params: Params
 
     def set_up_scene(self, scene) -> None:
-        """Register the view of the hands."""
+        """Register a view of the hands: their state in all environments, as tensors."""
         self.hands = scene.add(ArticulationView("robot", name="hand_view"))
 
     def post_reset(self) -> None:
@@ -223,7 +223,7 @@ class HandTask(DirectTask):
         self.shown.write_root_pose(selection, selection.read(self.shown_pos), quat)
 
     def _goal(self) -> Tensor:
-        """Return the goal's orientation, and the rotation from it to the cube. (num_envs, 8)"""
+        """Return two quaternions: the goal's orientation, and the rotation from it to the cube. (num_envs, 8)"""
         turn = multiply(self.cube.data.root_quat_w, conjugate(self.goal_quat))
         return torch.cat([self.goal_quat, unique(turn)], dim=1)
 

@@ -19,7 +19,7 @@ JOINTS = tuple(EFFORTS)
 
 
 class HumanoidTask(LocomotionTask):
-    """Run towards the target on two legs."""
+    """Run towards the target on two legs. Observations: docs/reference/zoo/humanoid-direct.md lists the columns."""
 
     num_observations = 87
     num_actions = 21
@@ -72,9 +72,9 @@ class HumanoidTask(LocomotionTask):
         self.start_high[[JOINTS.index("hip_roll_l"), JOINTS.index("hip_roll_r")]] = 0.0
 
     def efforts(self) -> tuple[float, ...]:
-        """Return the torque of each motor."""
+        """Return the torque of each joint at action 1 [N m]."""
         return tuple(self.params.power * effort for effort in EFFORTS.values())
 
     def at_limits(self, position: Tensor) -> Tensor:
-        """Return 0 at 98 % of the half range, and at the limit 1 times the motor's weight."""
+        """Return costs that rise from 0 at 98 % of the half range to the motor's weight at the limit. (n, joints)"""
         return (position.abs() - 0.98).clamp_(min=0.0).mul_(self.share / 0.02)

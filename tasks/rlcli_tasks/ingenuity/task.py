@@ -86,7 +86,7 @@ class IngenuityTask(FlightTask):
         ).div_(self.units)
 
     def calculate_metrics(self) -> None:
-        """Reward nearness, and near the target an upright pose, no spin, and `steadiness`."""
+        """Reward nearness, and near the target an upright pose, no spin, and (`steadiness`) a low speed."""
         data = self.robot.data
         self.distance.copy_(length(self.to_target))
         _, x, y, _ = data.root_quat_w.unbind(dim=1)

@@ -104,7 +104,7 @@ class DrawerTask(DirectTask):
     params: Params
 
     def set_up_scene(self, scene) -> None:
-        """Register the view of the arms."""
+        """Register a view of the arms: their state in all environments, as tensors."""
         self.arms = scene.add(ArticulationView("robot", name="arm_view"))
 
     def post_reset(self) -> None:

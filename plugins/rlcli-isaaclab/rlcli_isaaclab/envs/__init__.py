@@ -30,7 +30,7 @@ class ViewerCfg:
 
 @configclass
 class ManagerBasedEnvCfg:
-    """An environment without rewards."""
+    """Configuration of a manager-based environment without rewards."""
 
     viewer: Any = ViewerCfg()
     sim: Any = SimulationCfg()
@@ -43,6 +43,7 @@ class ManagerBasedEnvCfg:
     actions: Any = MISSING
     events: Any = None
     rerender_on_reset: bool = False
+    num_rerenders_on_reset: int = 0
     wait_for_textures: bool = True
     xr: Any = None
     teleop_devices: Any = None
@@ -50,11 +51,11 @@ class ManagerBasedEnvCfg:
     log_dir: Any = None
 
     def __rlcli_environment__(self, entry: Any) -> None:
-        """Store the class of the environment that a registration names."""
+        """Store the environment class that the task's Gymnasium registration names, as a class or `module:Class`."""
         self._rlcli_class = entry
 
     def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
-        """Return this configuration as a task of rlcli, with the models that the user gives."""
+        """Return this configuration as a task of rlcli. `models` are those of `--model`."""
         from rlcli.config.python_task import PythonTask
         from rlcli_isaaclab.convert import task
         from rlcli_isaaclab.settings import Report
@@ -70,7 +71,7 @@ class ManagerBasedEnvCfg:
 
 @configclass
 class ManagerBasedRLEnvCfg(ManagerBasedEnvCfg):
-    """A manager-based task."""
+    """Configuration of a manager-based task."""
 
     is_finite_horizon: bool = False
     episode_length_s: float = MISSING

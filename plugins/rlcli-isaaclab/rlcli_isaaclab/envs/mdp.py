@@ -1,4 +1,4 @@
-"""Names as in `isaaclab.envs.mdp`; the same as in `rlcli_isaaclab.mdp`."""
+"""Replacement of the module `isaaclab.envs.mdp`, with the names of `rlcli_isaaclab.mdp`."""
 
 from typing import Any
 

@@ -65,6 +65,8 @@ class ImuCfg(SensorBaseCfg):
 
     class_type: Any = "Imu"
     offset: Any = None
+    visualizer_cfg: Any = None
+    gravity_bias: Any = (0.0, 0.0, 9.81)
 
 
 __all__ = [

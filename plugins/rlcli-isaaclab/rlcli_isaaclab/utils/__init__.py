@@ -1,4 +1,4 @@
-"""Names as in `isaaclab.utils`."""
+"""Utilities that tasks import from `isaaclab.utils`, under the same names."""
 
 from rlcli_isaaclab.config_class import MISSING, configclass
 

@@ -212,7 +212,7 @@ def skew_symmetric_matrix(vec: Tensor) -> Tensor:
 
 
 def default_orientation(num: int, device: Any) -> Tensor:
-    """Return rotations by nothing. (num, 4)"""
+    """Return identity quaternions (1, 0, 0, 0). (num, 4)"""
     return torch.eye(1, 4, device=device).repeat(num, 1)
 
 
@@ -240,7 +240,7 @@ def sample_cylinder(radius: float, h_range: Any, size: Any, device: Any) -> Tens
 
 
 def orthogonalize_perspective_depth(depth: Tensor, intrinsics: Tensor) -> Tensor:
-    """Return the distance along the optical axis from the distance to the camera. (n, h, w[, 1]), (n or none, 3, 3)"""
+    """Convert distances to the camera into distances along its optical axis. (n, h, w[, 1]), (3, 3) or (n, 3, 3)"""
     flat = depth.squeeze(-1) if depth.shape[-1] == 1 else depth
     height, width = flat.shape[-2:]
     inverse = intrinsics.reshape(-1, 3, 3)

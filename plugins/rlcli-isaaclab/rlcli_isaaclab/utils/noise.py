@@ -46,6 +46,7 @@ class NoiseModelCfg:
     """Noise that is sampled in every step."""
 
     class_type: Any = "NoiseModel"
+    func: Any = None
     noise_cfg: Any = MISSING
 
 

@@ -1,4 +1,4 @@
-"""Names and regexes. Names as in `isaaclab.utils.string`."""
+"""Functions for names and regexes of names. They are named as in `isaaclab.utils.string`."""
 
 from __future__ import annotations
 

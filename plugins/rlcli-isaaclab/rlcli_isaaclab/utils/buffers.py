@@ -1,0 +1,126 @@
+"""Histories of tensors. Names as in `isaaclab.utils.buffers`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class CircularBuffer:
+    """The last values of every environment. The first value of an episode fills the whole history."""
+
+    def __init__(self, max_len: int, batch_size: int, device: Any) -> None:
+        if max_len < 1:
+            raise ValueError(f"the length of a buffer must be at least 1, found {max_len}")
+        self.max_length, self.batch_size, self.device = max_len, batch_size, device
+        self.current_length = torch.zeros(batch_size, dtype=torch.int64, device=device)
+        """Number of values since the last reset, at most `max_length`. (batch,)"""
+        self._values: Tensor | None = None
+
+    @property
+    def buffer(self) -> Tensor:
+        """Stored values, the oldest first. (batch, max_length, ...)"""
+        return self._stored().clone()
+
+    def reset(self, batch_ids: Any = None) -> None:
+        """Forget the values of some environments."""
+        rows = slice(None) if batch_ids is None else batch_ids
+        self.current_length[rows] = 0
+        if self._values is not None:
+            self._values[rows] = 0
+
+    def append(self, data: Tensor) -> None:
+        """Add a value for every environment. (batch, ...)"""
+        if len(data) != self.batch_size:
+            raise ValueError(
+                f"the buffer has {self.batch_size} environments, found {len(data)} rows; pass one row for each"
+            )
+        data = data.to(self.device)
+        if self._values is None:
+            self._values = data.unsqueeze(1).repeat_interleave(self.max_length, dim=1)
+        else:
+            moved = torch.cat([self._values[:, 1:], data.unsqueeze(1)], dim=1)
+            is_first = (self.current_length == 0).view(-1, *[1] * (moved.dim() - 1))
+            self._values = torch.where(is_first, data.unsqueeze(1), moved)
+        self.current_length = (self.current_length + 1).clamp(max=self.max_length)
+
+    def __getitem__(self, key: Tensor) -> Tensor:
+        """Return the value of `key` steps ago in each environment, at most the oldest one. (batch,) -> (batch, ...)"""
+        values = self._stored()
+        if bool((self.current_length == 0).any()):
+            raise RuntimeError("the buffer is empty: append a value first")
+        lag = torch.minimum(torch.as_tensor(key, device=self.device).long(), self.current_length - 1)
+        return values[torch.arange(self.batch_size, device=self.device), self.max_length - 1 - lag]
+
+    def _stored(self) -> Tensor:
+        if self._values is None:
+            raise RuntimeError("the buffer is empty: append a value first")
+        return self._values
+
+
+class DelayBuffer:
+    """A buffer that returns values some steps late; each environment has its own lag."""
+
+    def __init__(self, history_length: int, batch_size: int, device: Any) -> None:
+        self.history_length, self.batch_size, self.device = max(0, history_length), batch_size, device
+        self.time_lags = torch.zeros(batch_size, dtype=torch.int64, device=device)
+        self._history = CircularBuffer(self.history_length + 1, batch_size, device)
+
+    @property
+    def min_time_lag(self) -> int:
+        """The shortest lag [steps]."""
+        return int(self.time_lags.min())
+
+    @property
+    def max_time_lag(self) -> int:
+        """The longest lag [steps]."""
+        return int(self.time_lags.max())
+
+    def set_time_lag(self, time_lag: Any, batch_ids: Any = None) -> None:
+        """Set the lags of some environments [steps]."""
+        lags = torch.as_tensor(time_lag, device=self.device).long()
+        if int(lags.min()) < 0 or int(lags.max()) > self.history_length:
+            raise ValueError(f"a lag must be between 0 and {self.history_length}, found {time_lag}")
+        self.time_lags[slice(None) if batch_ids is None else batch_ids] = lags
+
+    def reset(self, batch_ids: Any = None) -> None:
+        """Forget the values of some environments."""
+        self._history.reset(batch_ids)
+
+    def compute(self, data: Tensor) -> Tensor:
+        """Add a value for every environment, and return the delayed ones. (batch, ...)"""
+        self._history.append(data)
+        return self._history[self.time_lags].clone()
+
+
+@dataclass
+class TimestampedBuffer:
+    """A value and the time of its last update [s]."""
+
+    data: Any = None
+    timestamp: float = -1.0
+
+
+def tensors_of(holder: object) -> dict[str, Tensor]:
+    """Return the tensors in the attributes of an object and of its buffers, by their path."""
+    found: dict[str, Tensor] = {}
+    for name, value in vars(holder).items():
+        if isinstance(value, Tensor):
+            found[name] = value
+        elif isinstance(value, CircularBuffer | DelayBuffer):
+            found |= {f"{name}.{inner}": tensor for inner, tensor in tensors_of(value).items()}
+    return found
+
+
+def set_tensors(holder: object, tensors: Mapping[str, Tensor]) -> None:
+    """Restore tensors returned by `tensors_of`."""
+    for path, value in tensors.items():
+        name, _, inner = path.partition(".")
+        if inner:
+            set_tensors(getattr(holder, name), {inner: value})
+        else:
+            setattr(holder, name, value.clone())

@@ -1,0 +1,18 @@
+"""Types of Isaac Lab's utilities. Names as in `isaaclab.utils.types`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+
+@dataclass
+class ArticulationActions:
+    """Position and velocity targets and efforts of joints. (num_envs, joints) each"""
+
+    joint_positions: Tensor | None = None
+    joint_velocities: Tensor | None = None
+    joint_efforts: Tensor | None = None
+    joint_indices: Any = None

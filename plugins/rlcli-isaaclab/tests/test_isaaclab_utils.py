@@ -1,0 +1,77 @@
+"""Utilities of Isaac Lab that a task's own code calls: buffers, poses, interpolation."""
+
+import math
+
+import pytest
+import torch
+
+from rlcli_isaaclab.namespace import module_of
+from rlcli_isaaclab.sim import SimulationCfg
+from rlcli_isaaclab.utils.math import matrix_from_quat, quat_from_euler_xyz, random_orientation
+
+
+def lab(name):
+    return module_of(name, "")
+
+
+def test_circular_buffer_starts_with_its_first_value():
+    buffer = lab("isaaclab.utils.buffers.circular_buffer").CircularBuffer(3, 2, "cpu")
+    with pytest.raises(RuntimeError, match="empty"):
+        buffer[torch.zeros(2)]
+    for value in range(1, 5):
+        buffer.append(torch.tensor([[value], [10 * value]]))
+    assert buffer.buffer[..., 0].tolist() == [[2, 3, 4], [20, 30, 40]]
+    assert buffer[torch.tensor([0, 2])][:, 0].tolist() == [4, 20]
+    buffer.reset([1])
+    buffer.append(torch.tensor([[5], [50]]))
+    assert buffer.buffer[..., 0].tolist() == [[3, 4, 5], [50, 50, 50]]
+    assert buffer[torch.tensor([2, 2])][:, 0].tolist() == [3, 50]
+    assert buffer.current_length.tolist() == [3, 1]
+
+
+def test_delay_buffer_delays_each_environment_by_its_lag():
+    buffer = lab("isaaclab.utils.buffers").DelayBuffer(2, 3, "cpu")
+    buffer.set_time_lag(torch.tensor([0, 1, 2]))
+    values = [buffer.compute(torch.full((3, 1), float(step)))[:, 0].tolist() for step in range(4)]
+    assert values == [[0, 0, 0], [1, 0, 0], [2, 1, 0], [3, 2, 1]]
+    assert (buffer.min_time_lag, buffer.max_time_lag) == (0, 2)
+    with pytest.raises(ValueError, match="between 0 and 2"):
+        buffer.set_time_lag(3)
+
+
+def test_poses():
+    maths = lab("isaaclab.utils.math")
+    torch.manual_seed(0)
+    rotation, position = matrix_from_quat(random_orientation(5, "cpu")), torch.rand(5, 3)
+    pose = maths.make_pose(position, rotation)
+    assert torch.allclose(maths.pose_inv(pose) @ pose, torch.eye(4).expand(5, 4, 4), atol=1e-5)
+    assert all(torch.equal(a, b) for a, b in zip(maths.unmake_pose(pose), (position, rotation), strict=True))
+    assert torch.allclose(maths.pose_in_A_to_pose_in_B(maths.pose_inv(pose), pose), torch.eye(4), atol=1e-5)
+    assert maths.is_identity_pose(torch.zeros(3), torch.tensor([1.0, 0, 0, 0]))
+    assert not maths.is_identity_pose(torch.ones(3), torch.tensor([1.0, 0, 0, 0]))
+
+
+def test_euler_angles_are_intrinsic():
+    angles = torch.tensor([[0.3, -0.5, 0.9]])
+    # turns about the fixed axes x, y, z are those about the moving axes z, y, x
+    expected = matrix_from_quat(quat_from_euler_xyz(*angles.unbind(1)))
+    found = lab("isaaclab.utils.math").matrix_from_euler(angles.flip(1), "ZYX")
+    assert torch.allclose(found, expected, atol=1e-6)
+
+
+def test_interpolation_of_quaternions_takes_the_short_way():
+    start, end = torch.tensor([1.0, 0, 0, 0]), -torch.tensor([math.cos(0.4), 0, 0, math.sin(0.4)])
+    found = lab("isaaclab.utils.math").quat_slerp(start, end, 0.25)
+    assert found.tolist() == pytest.approx([math.cos(0.1), 0, 0, math.sin(0.1)], abs=1e-6)
+
+
+def test_velocities_in_another_frame():
+    turned = torch.tensor([[math.sqrt(0.5), 0, 0, math.sqrt(0.5)]])  # 90 degrees about z
+    velocity, spin = torch.tensor([[1.0, 0, 0]]), torch.tensor([[0, 0, 2.0]])
+    found = lab("isaaclab.utils.math").rigid_body_twist_transform(velocity, spin, torch.tensor([[0, 1.0, 0]]), turned)
+    assert found[0][0].tolist() == pytest.approx([0.0, 1.0, 0.0], abs=1e-6)
+    assert found[1][0].tolist() == pytest.approx([0.0, 0.0, 2.0])
+
+
+def test_settings_of_the_log_have_no_effect():
+    assert SimulationCfg().logging_level == "WARNING"
