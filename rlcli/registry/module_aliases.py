@@ -236,7 +236,7 @@ def _alias_module(form: Format, name: str, file: str, below_top: bool = False) -
 
 @functools.cache
 def _formats_for(first: str, file: str) -> tuple[Format, ...]:
-    """Return the formats that replace modules of the package `first`, the one that fits the importing file best first.
+    """Return the formats that replace modules of the package `first`; of several the one that fits the importing file.
 
     It is the one whose other modules the file mentions most often; if it mentions none, all files of its task count.
     """
