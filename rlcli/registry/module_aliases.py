@@ -236,7 +236,7 @@ def _alias_module(form: Format, name: str, file: str, below_top: bool = False) -
 
 @functools.cache
 def _formats_for(first: str, file: str) -> tuple[Format, ...]:
-    """Return the formats that replace modules of the package `first`, the one that fits the importing file best first.
+    """Return the formats that replace modules of the package `first`; of several the one that fits the importing file.
 
     It is the one whose other modules the file mentions most often; if it mentions none, all files of its task count.
     """
@@ -252,7 +252,8 @@ def _formats_for(first: str, file: str) -> tuple[Format, ...]:
         root = next((root for root in _roots if Path(file).is_relative_to(root)), Path(file).parent)
         files = sorted(root.rglob("*.py"))[:_MOST_FILES]
         counts = {name: sum(_mentions(str(path), aliases) for path in files) for name, aliases in own.items()}
-    return tuple(sorted(forms, key=lambda form: -counts[form.name]))
+    most = max(counts.values())  # other formats have no part in the task
+    return tuple(form for form in forms if counts[form.name] == most)
 
 
 @functools.cache

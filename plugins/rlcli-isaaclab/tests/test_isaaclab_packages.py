@@ -386,10 +386,12 @@ def test_soft_limits_may_be_wider_than_the_joint_range(tmp_path):
     assert env.config.scene.entities["robot"].soft_joint_pos_limit_factor == 1.8
 
 
-def test_file_without_names_of_a_format_belongs_to_the_format_of_its_task(tmp_path):
+def test_file_without_names_of_a_format_belongs_to_the_format_of_its_task(tmp_path, monkeypatch):
     folder = tmp_path / "rover"
     kernels = "import numpy as np\nimport warp as wp\n\nONE = np.ones(1)\n\n\n@wp.func\ndef f(x):\n    return x\n"
     (tmp_path / "kernels_of_test.py").write_text(kernels)
     added = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nimport kernels_of_test\n"
+    find = namespace.importlib.util.find_spec
+    monkeypatch.setattr(namespace.importlib.util, "find_spec", lambda name: None if name == "warp" else find(name))
     with pytest.raises(TaskError, match=r"kernels_of_test.py:7: warp.func cannot be used: .* not installed"):
         rover(folder, added)
