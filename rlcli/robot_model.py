@@ -242,17 +242,15 @@ def _home(spec: mujoco.MjSpec) -> np.ndarray | None:
 
 
 def _clean(spec: mujoco.MjSpec) -> None:
-        """Return the kind of task that fits the robot.
+    """Remove ground, lights and keyframes from a model, because the task's scene has its own; name every element.
 
-        It is velocity (walk as commanded), reach (move the last body to a goal) or balance (keep the default pose).
-        """
-        legged = self.free and self.gravity > 0.0 and self.feet()
-        if legged and len(self.driven) >= max(4, len(self.passive) + 1):
+    Welds to mocap bodies are removed, too: a task does not move them, so that they would hold the robot.
+    """
     for key in list(spec.keys):
         spec.delete(key)
     mocap = {body.name for body in spec.bodies if body.mocap}
     mocap |= {site.name for site in spec.sites if site.parent.mocap}
-    for tie in list(spec.equalities):  # nothing moves a mocap body in a task, so that the tie would hold the robot
+    for tie in list(spec.equalities):
         if tie.type in (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT) and {tie.name1, tie.name2} & mocap:
             spec.delete(tie)
     world = spec.worldbody
