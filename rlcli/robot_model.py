@@ -15,6 +15,8 @@ from rlcli.errors import listing
 
 _CONTROL_DT = 0.02
 """Control period of the new task [s]."""
+_MAX_DECIMATION = 20
+"""Largest number of physics steps in a control period. A small robot with a short time step moves faster."""
 SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 """Joint types with one position: hinge and slide."""
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -42,7 +44,11 @@ class Robot:
         self.xml = ElementTree.tostring(tree, encoding="unicode")
         self.model = model = _compile_copy(self.xml, self.assets)
         self.dt = model.opt.timestep if model.opt.timestep <= 0.01 else 0.005
-        self.decimation = max(1, round(_CONTROL_DT / self.dt))
+        self.decimation = min(max(1, round(_CONTROL_DT / self.dt)), _MAX_DECIMATION)
+        self.tempo = short(min(1.0, _MAX_DECIMATION * self.dt / _CONTROL_DT))
+        """Factor of all times of the task: less than 1 if the decimation would be too large."""
+        self.gravity = float(np.linalg.norm(model.opt.gravity))
+        """Gravity of the file, in the units of the file [m/s^2]."""
         balls = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_BALL)]
         if balls:
             raise ValueError(f"ball joints are not supported: {listing(balls)}; use three hinges")
@@ -51,9 +57,6 @@ class Robot:
         self.joints = [j for j in range(model.njnt) if model.jnt_type[j] in SCALAR]
         joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
         self.actuator = {int(model.actuator_trnid[a, 0]): a for a in range(model.nu) if joint_actuator[a]}
-        # without any actuator in the file, the task drives every joint
-        self.driven = [j for j in self.joints if j in self.actuator or not model.nu]
-        self.passive = [j for j in self.joints if j not in self.driven]
         self.data = mujoco.MjData(model)
         for joint in self.joints:
             if home is not None and len(home) == model.nq:
@@ -63,7 +66,13 @@ class Robot:
                 self.data.qpos[address] = np.clip(self.data.qpos[address], *model.jnt_range[joint])
         self.height = self._stand() if self.free else 0.0
         """Height of the root above the ground in the default pose [m]."""
+        locked = {j for j in self.joints if j not in self.actuator and self._is_locked(j)}
+        # without any actuator in the file, the task drives every joint that can move
+        self.driven = [j for j in self.joints if j in self.actuator or not (model.nu or j in locked)]
+        self.passive = [j for j in self.joints if j not in locked.union(self.driven)]
         mujoco.mj_forward(model, self.data)
+        self.com_height = float(self.data.subtree_com[_ROOT, 2]) if self.free else 0.0
+        """Height of a floating robot's centre of mass above the ground in the default pose [m]."""
         self.inertia = self._inertia()
 
     def kind(self) -> str:
@@ -71,7 +80,8 @@ class Robot:
 
         It is velocity (walk as commanded), reach (move the last body to a goal) or balance (keep the default pose).
         """
-        if self.free and len(self.driven) >= max(4, len(self.passive) + 1) and self.feet():
+        legged = self.free and self.gravity > 0.0 and self.feet()
+        if legged and len(self.driven) >= max(4, len(self.passive) + 1):
             return "velocity"
         if self.free or self.passive or len(self.driven) < 2:
             return "balance"
@@ -101,8 +111,17 @@ class Robot:
         carried, lever = model.jnt_bodyid[joint], 0.6
         if self.free and model.body_rootid[carried] == _ROOT:
             carried, lever = _ROOT, 0.5 * max(self.height, 0.05)
-        weight = 9.81 * float(model.body_subtreemass[carried])
+        weight = (self.gravity or 9.81) * float(model.body_subtreemass[carried])
         return max(0.05, weight * (2.0 if model.jnt_type[joint] == SCALAR[1] else lever))
+
+    def _is_locked(self, joint: int) -> bool:
+        """Return whether friction and damping stop a joint; some files lock joints with a damping of 1e11 for example.
+
+        The largest effort of such a joint moves it at less than 1 cm/s or 0.01 rad/s.
+        """
+        dof = self.model.jnt_dofadr[joint]
+        resistance = 0.01 * self.model.dof_damping[dof] + self.model.dof_frictionloss[dof]
+        return bool(resistance > abs(self.effort(joint)))
 
     def settings(self) -> dict[str, dict[str, float]]:
         """Return joint name -> kp, kv and effort_limit, for joints without a position actuator in the file.
@@ -118,6 +137,12 @@ class Robot:
             kv = 2.0 * 0.5 * math.sqrt(kp * self.inertia[joint])  # damping ratio 0.5
             settings[self.name(joint)] = {"kp": short(kp), "kv": short(kv), "effort_limit": short(effort)}
         return settings
+
+    def sim(self) -> dict[str, Any]:
+        """Return the physics settings of the task as data of its YAML."""
+        settings: dict[str, Any] = {"dt": self.dt, "integrator": "implicitfast"}  # stable with the damping of servos
+        gravity = [float(value) for value in self.model.opt.gravity]
+        return settings if gravity == [0.0, 0.0, -9.81] else settings | {"gravity": gravity}
 
     def scene(self) -> dict[str, Any]:
         """Return the key `scene` of the task for this robot, as data for its YAML."""
@@ -217,9 +242,17 @@ def _home(spec: mujoco.MjSpec) -> np.ndarray | None:
 
 
 def _clean(spec: mujoco.MjSpec) -> None:
-    """Remove ground, lights and keyframes from a model, because the task's scene has its own; name every element."""
+    """Remove ground, lights and keyframes from a model, because the task's scene has its own; name every element.
+
+    Welds to mocap bodies are removed, too: a task does not move them, so that they would hold the robot.
+    """
     for key in list(spec.keys):
         spec.delete(key)
+    mocap = {body.name for body in spec.bodies if body.mocap}
+    mocap |= {site.name for site in spec.sites if site.parent.mocap}
+    for tie in list(spec.equalities):
+        if tie.type in (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT) and {tie.name1, tie.name2} & mocap:
+            spec.delete(tie)
     world = spec.worldbody
     for geom in list(world.geoms):
         if geom.type in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD):

@@ -7,6 +7,7 @@ two or more joints, all driven, brings its last body to goals. balance: any othe
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,8 +68,8 @@ def read_robot(file: Path, name: str) -> RobotTask:
     task = {
         "summary": f"{_SUMMARIES[kind]} ({name}).",
         "decimation": robot.decimation,
-        "episode_length_s": 20.0 if kind == "velocity" else 8.0,
-        "sim": {"dt": robot.dt, "integrator": "implicitfast"},  # stable with the damping of position servos
+        "episode_length_s": short(robot.tempo * (20.0 if kind == "velocity" else 8.0)),
+        "sim": robot.sim(),
         "scene": robot.scene() | {"sensors": sensors},
         **parts,
         "play": {"scene": {"num_envs": 16}},
@@ -90,11 +91,14 @@ _SUMMARIES = {
 
 def _velocity(robot: Robot) -> dict[str, Any]:
     joints, feet = [robot.name(j) for j in robot.driven], robot.feet()
+    speed = short(math.sqrt(robot.gravity * robot.com_height / 15.0))  # a slow walk for every size: Froude number 1/15
+    yaw_rate, period = short(0.6 / robot.tempo), short(10.0 * robot.tempo)
     return {
         "commands": {
             "velocity": {
-                **{"func": "uniform_velocity", "resampling_time_s": [10.0, 10.0], "lin_vel_x": [-0.6, 0.6]},
-                **{"lin_vel_y": [-0.3, 0.3], "ang_vel_z": [-0.6, 0.6], "rel_standing": 0.05},
+                **{"func": "uniform_velocity", "resampling_time_s": [period, period], "lin_vel_x": [-speed, speed]},
+                "lin_vel_y": [short(-0.5 * speed), short(0.5 * speed)],
+                **{"ang_vel_z": [-yaw_rate, yaw_rate], "rel_standing": 0.05},
             }
         },
         "actions": {"joint_position": {"func": "joint_position", "joints": joints, "scale": 0.25}},
@@ -121,8 +125,14 @@ def _velocity(robot: Robot) -> dict[str, Any]:
             "joints": {"func": "reset_joints_by_offset", "mode": "reset", "joints": joints, "position": [-0.1, 0.1]},
         },
         "rewards": {
-            "track_lin_vel": {"func": "track_lin_vel_xy_exp", "weight": 1.5, "command": "velocity", "std": 0.5},
-            "track_ang_vel": {"func": "track_ang_vel_z_exp", "weight": 0.75, "command": "velocity", "std": 0.5},
+            "track_lin_vel": {
+                **{"func": "track_lin_vel_xy_exp", "weight": 1.5, "command": "velocity"},
+                "std": short(0.5 * speed),  # a robot that stands still earns a third of this reward
+            },
+            "track_ang_vel": {
+                **{"func": "track_ang_vel_z_exp", "weight": 0.75, "command": "velocity"},
+                "std": short(0.5 * yaw_rate),
+            },
             "lin_vel_z": {"func": "lin_vel_z_l2", "weight": -2.0},
             "ang_vel_xy": {"func": "ang_vel_xy_l2", "weight": -0.05},
             "flat_orientation": {"func": "flat_orientation_l2", "weight": -2.5},
@@ -134,7 +144,7 @@ def _velocity(robot: Robot) -> dict[str, Any]:
                 "weight": 0.5,
                 "sensor": "feet",
                 "command": "velocity",
-                "threshold": 0.2,
+                "threshold": short(0.2 * robot.tempo),
             },
             "fall": {"func": "is_terminated", "weight": -100.0},
         },
@@ -144,8 +154,8 @@ def _velocity(robot: Robot) -> dict[str, Any]:
             "tilted": {"func": "bad_orientation", "limit_angle": 1.0},
         },
         "success": {
-            "velocity": {"func": "mean_velocity_error", "command": "velocity", "at_most": 0.25},
-            "yaw_rate": {"func": "mean_yaw_rate_error", "command": "velocity", "at_most": 0.3},
+            "velocity": {"func": "mean_velocity_error", "command": "velocity", "at_most": short(0.42 * speed)},
+            "yaw_rate": {"func": "mean_yaw_rate_error", "command": "velocity", "at_most": short(0.5 * yaw_rate)},
         },
         "_sensors": {
             "feet": {"kind": "contact", "bodies": feet, "against": "ground"},
@@ -162,7 +172,7 @@ def _reach(robot: Robot) -> dict[str, Any]:
             "goal": {
                 "func": "uniform_pose",
                 "bodies": hand,
-                "resampling_time_s": [8.0, 8.0],
+                "resampling_time_s": [short(8.0 * robot.tempo)] * 2,
                 **dict(zip("xyz", box, strict=True)),
             }
         },
@@ -188,7 +198,9 @@ def _reach(robot: Robot) -> dict[str, Any]:
             "joint_vel": {"func": "joint_vel_l2", "weight": -0.001, "joints": joints},
         },
         "terminations": {"time_out": {"func": "time_out", "time_out": True}},
-        "success": {"position": {"func": "body_goal_distance", **goal, "at_most": 0.05, "hold_s": 0.5}},
+        "success": {
+            "position": {"func": "body_goal_distance", **goal, "at_most": 0.05, "hold_s": short(0.5 * robot.tempo)}
+        },
     }
 
 
@@ -198,17 +210,18 @@ def _balance(robot: Robot) -> dict[str, Any]:
     held: dict[float, list[str]] = {}
     for joint in hinges:
         held.setdefault(round(float(robot.data.qpos[robot.model.jnt_qposadr[joint]]), 4), []).append(robot.name(joint))
-    every = [robot.name(j) for j in robot.joints]
+    every = [robot.name(j) for j in sorted([*robot.driven, *robot.passive])]
     scale = {robot.name(j): short(abs(robot.effort(j))) for j in robot.driven}
     floating: dict[str, Any] = {"projected_gravity": {"func": "projected_gravity"}} if robot.free else {}
     start = {"root": {"func": "reset_root_state_uniform", "mode": "reset"}} if robot.free else {}
-    success: dict[str, Any] = {"upright": {"func": "root_tilt", "at_most": 0.2, "hold_s": 1.0}}
+    hold = {"at_most": 0.2, "hold_s": robot.tempo}
+    success: dict[str, Any] = {"upright": {"func": "root_tilt", **hold}}
     ends: dict[str, Any] = {"fallen": {"func": "bad_orientation", "limit_angle": 1.0}}
     if not robot.free:
         success, ends = {}, {}
         for number, (target, joints) in enumerate(held.items()):
             name = "pose" if len(held) == 1 else f"pose_{number}"
-            success[name] = {"func": "joint_error", "joints": joints, "target": target, "at_most": 0.2, "hold_s": 1.0}
+            success[name] = {"func": "joint_error", "joints": joints, "target": target, **hold}
             bounds = [target - 1.0, target + 1.0]
             ends[f"{name}_lost"] = {"func": "joint_pos_out_of_manual_limit", "joints": joints, "bounds": bounds}
     return {
@@ -219,6 +232,7 @@ def _balance(robot: Robot) -> dict[str, Any]:
             "joints": {
                 "func": "reset_joints_by_offset",
                 "mode": "reset",
+                "joints": every,
                 "position": [-0.1, 0.1],
                 "velocity": [-0.1, 0.1],
             },

@@ -36,8 +36,7 @@ _MAX_ASSET = 256 * 1024 * 1024
 _MAX_FILES = 1000
 _MAX_DEPTH = 200
 """Largest depth of nested elements."""
-_MAX_LEVELS = 50
-"""Largest depth of nested includes."""
+_MAX_LEVELS = 50  # of nested includes
 _MAX_MEMORY = 2 * 1024**3
 """Limit of the memory that a model may ask for, and of the compiling subprocess [bytes]."""
 SUBPROCESS_COST, _MAX_COST = 5_000, 1_000_000
@@ -45,6 +44,8 @@ SUBPROCESS_COST, _MAX_COST = 5_000, 1_000_000
 TIME_S = 10
 """Limit of the CPU time of the compiling subprocess [s]; it is killed after twice this time at the latest."""
 _MAX_ITERATIONS = 100_000
+_compiled: set[tuple[tuple[Path, tuple[int, int]], ...]] = set()
+"""Files of each model that a subprocess has compiled, with their versions; the same files are not compiled again."""
 _TEXT = (".xml", ".mjcf", ".urdf")
 _NOT_FINITE = re.compile(r"[-+]?(nan|inf)|[eE]\+?\d{3}", re.IGNORECASE)
 """Parts of numbers that may not be finite: nan, inf, an exponent of three digits."""
@@ -86,8 +87,9 @@ def read_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False, com
             f"{file}: the model is too large: its cost is {cost:,.0f}, at most {_MAX_COST:,} is allowed (one element"
             f" costs 1); the most expensive part is {scan.costliest}; make this part smaller"
         )
-    if not installed and cost > SUBPROCESS_COST:
+    if not installed and cost > SUBPROCESS_COST and (versions := tuple(scan.versions.items())) not in _compiled:
         _compile_in_subprocess(file)
+        _compiled.add(versions)
     try:
         quiet_mujoco()
         spec = mujoco.MjSpec.from_file(str(file))
@@ -166,6 +168,8 @@ class _MjcfScan:
     """Whether MuJoCo may look for assets without their folders (`strippath`)."""
     _assets: list[tuple[Path, int, str, str]] = field(default_factory=list)
     """File, line, element and file name of each asset to load."""
+    versions: dict[Path, tuple[int, int]] = field(default_factory=dict)
+    """Modification time [ns] and size [bytes] of each file."""
 
     def read(self, file: Path) -> float:
         """Parse a model and the files that it refers to, and check the assets that it loads; return its cost.
@@ -250,7 +254,8 @@ class _MjcfScan:
             raise BadModel(f"{file}: is included more than {_MAX_LEVELS} levels deep; use fewer levels")
         text = self._texts[file.resolve()] = _Text()
         try:
-            data = read_plain(file, _MAX_TEXT)
+            data, status = read_plain(file, _MAX_TEXT), file.stat()
+            self.versions[file.resolve()] = (status.st_mtime_ns, status.st_size)
         except OSError as error:
             raise BadModel(f"{file}: {error.strerror or error}") from None
         files: list[tuple[int, str, str, str, float]] = []
@@ -349,7 +354,8 @@ class _MjcfScan:
     def _asset_cost(self, path: Path, file: Path, line: int) -> float:
         if not path.is_file():
             raise BadModel(f"{file}:{line}: '{path}' is not a regular file; name a mesh or image file")
-        size = path.stat().st_size
+        size = (status := path.stat()).st_size
+        self.versions[path] = (status.st_mtime_ns, size)
         if size > _MAX_ASSET:
             raise BadModel(f"{file}:{line}: '{path}' is too large; allowed are {_MAX_ASSET:,} bytes")
         cost = size / 20_000

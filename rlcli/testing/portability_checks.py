@@ -254,7 +254,7 @@ CLOSE = 1e-3
 
 def engines(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the task runs on the GPU engine, and that reset and step agree with the CPU engine within rounding."""
-    warp = _warp_env(subject)
+    warp = _warp_env(subject, subject.resolved.task.decimation)
     env = subject.env(episode_steps=EPISODE, flags={"scene.num_envs": FEW_WORLDS})
     hint = "use only the selection's methods and the engine's fields; or set sim.engine: batch, if it is for CPUs only"
     action = next(random_actions(env, subject.bound))
@@ -289,7 +289,8 @@ def captured(subject: TaskUnderTest) -> Iterator[Finding]:
             raise NotRunError(
                 "reset_idx takes ids, which a CUDA graph cannot record; write `reset(selection)` to run on a GPU"
             )
-    env = _warp_env(subject)
+    # one physics step for each environment step: only the task's own code is checked here, and the physics is slow
+    env = _warp_env(subject, decimation=1)
     action = torch.zeros(FEW_WORLDS, env.layout.action_size)
     env.reset(seed=env.seed)
     env.step(action)
@@ -303,17 +304,20 @@ def captured(subject: TaskUnderTest) -> Iterator[Finding]:
         yield warning_at(subject.location(error), f"{error}, in a step", hint)
 
 
-def _warp_env(subject: TaskUnderTest) -> VecEnv:
+def _warp_env(subject: TaskUnderTest, decimation: int) -> VecEnv:
     """Return an environment with a few worlds on MuJoCo Warp's CPU device.
 
     Raises:
         NotRunError: if MuJoCo Warp is not installed, or cannot run this model.
     """
-    if subject.resolved.task.sim.engine == "batch":
+    sim = subject.resolved.task.sim
+    if sim.engine == "batch":
         raise NotRunError("the task sets sim.engine: batch, so it never runs on a GPU")
     if find_spec("mujoco_warp") is None:
         raise NotRunError(f"MuJoCo Warp is not installed; {pip_install('rlcli[gpu]')}")
     try:
-        return subject.env(episode_steps=EPISODE, flags={"scene.num_envs": FEW_WORLDS, "sim.engine": "warp"})
+        episode_s = EPISODE * decimation * sim.dt
+        flags = {"decimation": decimation, "episode_length_s": episode_s}
+        return subject.env(flags=flags | {"scene.num_envs": FEW_WORLDS, "sim.engine": "warp"})
     except (ConfigError, DeviceError) as error:
         raise NotRunError(f"MuJoCo Warp cannot run the model: {' '.join(error.message.split())}") from None

@@ -24,7 +24,9 @@ TITLE = "Options"
 """Title of the window that MuJoCo's viewer docks to the left."""
 _SPEEDS = ["1/8 x", "1/4 x", "1/2 x", "real time", "2 x", "4 x", "8 x"]
 _WIDTH = 310.0
-"""Width of the panel [pixels]; on a narrow page less."""
+"""Width of the docked panel [pixels]."""
+_NARROW = 2.0 * _WIDTH
+"""Width of a page below which the panel covers the lower part of the page, as on a phone [pixels]."""
 _LAST = 0
 """Priority of event handlers that run after those of MuJoCo."""
 
@@ -100,8 +102,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
                     self.viewer.dispatch(messages.ExitEvent())
                 imgui.EndMenu()
             imgui.EndMainMenuBar()
-        imgui.Begin(TITLE)
-        self._widen()
+        self._begin()
         imgui.TextWrapped(self._title)
         for label, request in (("Resume" if view.paused else "Pause", "pause"), ("Step", "step"), ("Reset", "reset")):
             if imgui.Button(label):
@@ -128,12 +129,19 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         imgui.End()
         ux.view_gizmo_gui(self.viewer.model, self.viewer.data, self.viewer.camera, self._ux, area)
 
-    def _widen(self) -> None:
-        """Set the width of the docked panel when the page has opened or changed its width."""
-        node, page = imgui.GetWindowDockID(), imgui.GetIO().DisplaySize
-        if node and page.x != self._page_width:
+    def _begin(self) -> None:
+        """Begin the panel: docked to the left, or on a narrow page below the middle of the scene."""
+        page = imgui.GetIO().DisplaySize
+        if page.x < _NARROW:
+            imgui.SetNextWindowPos(imgui.Vec2(0.0, 0.55 * page.y))
+            imgui.SetNextWindowSize(imgui.Vec2(page.x, 0.45 * page.y))
+            imgui.Begin(f"{TITLE}###narrow", flags=_FIXED)  # another window than the one that the layout docks
+            return
+        imgui.Begin(TITLE)
+        node = imgui.GetWindowDockID()
+        if node and page.x != self._page_width:  # the page has opened or changed its width
             self._page_width = page.x
-            imgui.DockBuilderSetNodeSize(node, imgui.Vec2(min(_WIDTH, 0.5 * page.x), page.y))
+            imgui.DockBuilderSetNodeSize(node, imgui.Vec2(_WIDTH, page.y))
 
     def _checkpoints(self, view: View) -> None:
         if not view.checkpoints:
@@ -253,6 +261,7 @@ def _legend(markers: Sequence[Marker]) -> list[tuple[str, Sequence[float] | None
     return list(dict.fromkeys(entries))
 
 
+_FIXED = int(imgui.WindowFlags.NoDocking) | int(imgui.WindowFlags.NoDecoration) & ~int(imgui.WindowFlags.NoScrollbar)
 _SWATCH = int(imgui.ColorEditFlags.NoTooltip)
 KEYS = (
     "Space: pause, resume. Right: one step. Backspace: new episodes. - and =: speed. Up, Down: environment."

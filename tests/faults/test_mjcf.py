@@ -314,6 +314,21 @@ def test_system_without_limits_reads_models(tmp_path, monkeypatch):
     assert len(read_mjcf(file, [tmp_path]).geoms) == 1
 
 
+def test_same_files_are_compiled_in_one_subprocess(tmp_path, monkeypatch):
+    file, mesh, log = tmp_path / "model.xml", tmp_path / "part.obj", tmp_path / "log"
+    mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n")
+    file.write_text(model(asset='<mesh name="part" file="part.obj"/>', body='<geom type="mesh" mesh="part"/>'))
+    note = f"open({str(log)!r}, 'a').write('x')\n"
+    monkeypatch.setattr(untrusted_mjcf, "SUBPROCESS_COST", 0)
+    monkeypatch.setattr(untrusted_mjcf, "_SUBPROCESS_CODE", note + untrusted_mjcf._SUBPROCESS_CODE)
+    for _ in range(3):
+        read_mjcf(file, [tmp_path])
+    assert log.read_text() == "x"
+    mesh.write_text(mesh.read_text().replace("v 0 0 1", "v 0 0 1.5"))
+    read_mjcf(file, [tmp_path])
+    assert log.read_text() == "xx"
+
+
 # --- mutants ---
 
 

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import tomllib
+from importlib import metadata
 
 import pytest
 from packaging.markers import default_environment
@@ -49,6 +50,18 @@ def test_trainer_plugin_dependencies_are_pinned(name):
     assert len(library) == 1
     assert library[0].specifier.contains(pinned()[canonicalize_name(library[0].name)])
     assert "<" in str(library[0].specifier)
+
+
+@pytest.mark.parametrize("library", ["rsl-rl-lib", "rl-games"])
+def test_pins_fulfil_requirements_of_trainer_libraries(library):
+    try:
+        lines = metadata.requires(library) or []
+    except metadata.PackageNotFoundError:
+        pytest.skip(f"{library} is not installed")
+    needed = [each for each in map(Requirement, lines) if each.marker is None or each.marker.evaluate({"extra": ""})]
+    pins = pinned()
+    both = [each for each in needed if canonicalize_name(each.name) in pins]
+    assert [str(each) for each in both if not each.specifier.contains(pins[canonicalize_name(each.name)])] == []
 
 
 @pytest.mark.slow

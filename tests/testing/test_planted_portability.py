@@ -367,6 +367,18 @@ def test_captured_finds_host_sync_with_its_line(managed):
 
 
 @needs_warp
+def test_captured_simulates_one_physics_step_for_each_environment_step(managed):
+    managed.terms = (
+        "def substeps(env, selection) -> None:\n"
+        "    if env.engine.asynchronous and env.config.decimation > 1:\n"
+        "        raise ValueError('slow')\n"
+    )
+    managed.config["decimation"] = 4
+    managed.config["events"]["substeps"] = {"func": "substeps", "mode": "reset"}
+    assert only(managed, "captured") == ([], {})
+
+
+@needs_warp
 def test_captured_is_not_run_for_reset_idx(direct):
     found, notes = only(direct, "engines", "captured")
     assert found == []

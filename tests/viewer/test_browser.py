@@ -22,13 +22,13 @@ PATIENCE = 240.0
 
 
 @contextmanager
-def page_of(url):
+def page_of(url, width=640, height=400):
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         try:
-            page = browser.new_page(viewport={"width": 640, "height": 400})
+            page = browser.new_page(viewport={"width": width, "height": height})
             page.requested = []
             page.on("request", lambda request: page.requested.append(request.url))
             page.goto(url)
@@ -37,10 +37,10 @@ def page_of(url):
             browser.close()
 
 
-def picture(page):
+def picture(page, part=SCENE):
     from PIL import Image
 
-    shot = page.screenshot(clip=SCENE, timeout=120_000)
+    shot = page.screenshot(clip=part, timeout=120_000)
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
 
 
@@ -104,3 +104,17 @@ def test_browser_shows_pauses_and_switches_policy(cartpole_run):
     assert playing.out == ""
     assert "Traceback" not in playing.err
     assert not playing.answers()
+
+
+def test_panel_is_below_the_scene_on_a_narrow_page(cartpole_run):
+    left = {"x": 0, "y": 60, "width": 190, "height": 300}
+    below = {"x": 0, "y": 700, "width": 390, "height": 100}
+
+    def panel_is_below():
+        return np.median(picture(page, left)) < 200 < np.median(picture(page, below))  # the panel is light
+
+    with (
+        Playing("--checkpoint", cartpole_run, "--viewer", "web", "--port", 0) as playing,
+        page_of(playing.url, 390, 844) as page,
+    ):
+        until("the panel below the scene", panel_is_below)

@@ -108,6 +108,44 @@ def test_root_whose_z_axis_is_not_up_gets_a_level_parent(cli, tmp_path):
     assert task["scene"]["sensors"]["trunk"]["bodies"] == ["trunk"]
 
 
+def test_mocap_body_does_not_hold_the_robot(cli, tmp_path):
+    mocap = '<body name="target" mocap="true"/></worldbody><equality><weld body1="target" body2="hand"/></equality>'
+    written(cli, tmp_path, ARM.replace("</worldbody>", mocap))
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "my-robot" / "my_robot" / "model.xml"))
+    assert (model.nmocap, model.neq) == (1, 0)
+
+
+def test_joint_locked_by_its_damping_is_not_driven(cli, tmp_path):
+    text = ARM[: ARM.index("<actuator>")].replace('name="a"', 'name="a" damping="1e11"') + "</mujoco>"
+    result, task = written(cli, tmp_path, text)
+    assert result.json["flavour"] == "reach"
+    assert task["actions"]["joint_position"]["joints"] == ["b", "c"]
+    assert list(task["scene"]["entities"]["robot"]["joints"]) == ["b", "c"]
+
+
+def test_gravity_of_the_file_is_kept(cli, tmp_path):
+    _, task = written(cli, tmp_path, ARM.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'))
+    assert task["sim"]["gravity"] == [0.0, 0.0, 0.0]
+
+
+def test_velocities_fit_the_size_of_the_robot(cli, tmp_path):
+    _, task = written(cli, tmp_path, DOG)
+    fast = task["commands"]["velocity"]["lin_vel_x"][1]
+    assert fast == pytest.approx((9.81 * 0.2 / 15.0) ** 0.5, rel=0.05)  # the centre of mass is at 0.2 m
+    assert task["rewards"]["track_lin_vel"]["std"] == pytest.approx(0.5 * fast, rel=0.01)
+    assert task["success"]["velocity"]["at_most"] == pytest.approx(0.42 * fast, rel=0.01)
+
+
+def test_short_time_step_makes_the_control_period_short(cli, tmp_path):
+    _, usual = written(cli, tmp_path, DOG)
+    shutil.rmtree(tmp_path / "my-robot")
+    _, task = written(cli, tmp_path, DOG.replace("<worldbody>", '<option timestep="0.0001"/><worldbody>'))
+    assert (usual["decimation"], usual["episode_length_s"]) == (10, 20.0)
+    assert (task["decimation"], task["episode_length_s"]) == (20, 2.0)
+    assert task["commands"]["velocity"]["resampling_time_s"] == [1.0, 1.0]
+    assert task["commands"]["velocity"]["ang_vel_z"] == [-6.0, 6.0]
+
+
 def write_assets(folder):
     """Write a mesh in two sizes, an image, a height field and a skin; the meshes have the same file name."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
