@@ -15,7 +15,8 @@ from typing import Any
 
 from rlcli.errors import TaskError, UsageError
 from rlcli.robot_model import SCALAR, Robot, short
-from rlcli.scene.untrusted_mjcf import BadModel, read_mjcf
+from rlcli.scene.mjcf_scan import BadModel
+from rlcli.scene.untrusted_mjcf import read_mjcf
 
 _AGENT = {
     **{"trainer": "ppo", "algorithm": "ppo", "num_steps": 24, "num_epochs": 5, "num_minibatches": 4},

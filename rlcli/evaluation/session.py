@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.config.layers import flags
 from rlcli.errors import CheckpointError, MachineError, TaskError, UsageError, require_known
+from rlcli.registry import path_of
 from rlcli.runs.atomic_io import require_regular
 from rlcli.runs.run import RECORD, Run
 from rlcli.runs.run_ref import default_runs_dir, find_run, list_runs
@@ -211,10 +212,11 @@ def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
 def is_run_name(word: str, runs_dir: Path | None) -> bool:
     """Return whether a word names a run or a checkpoint and not a task."""
     runs = runs_dir or default_runs_dir()
-    name = word if Path(word).exists() else word.partition("@")[0]
-    if name == "latest" or (Path(word) / "manifest.json").is_file():
+    path = path_of(word)
+    name = word if path.exists() else word.partition("@")[0]
+    if name == "latest" or (path / "manifest.json").is_file():
         return True
-    if any((folder / RECORD).is_file() for folder in (Path(name), runs / name)):
+    if any((folder / RECORD).is_file() for folder in (path_of(name), runs / name)):
         return True
     return any(run.folder.name == name for run in list_runs(runs, None))
 

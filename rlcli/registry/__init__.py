@@ -17,7 +17,7 @@ from rlcli.registry.entries import (
     unknown_wanted,
     unreadable_distributions,
 )
-from rlcli.registry.find import find_task, task_source
+from rlcli.registry.find import find_task, path_of, task_source
 from rlcli.registry.folders import folder_task, python_config, python_place, python_task
 from rlcli.registry.formats import is_framework
 from rlcli.registry.imports import exit_refused, load_entry
@@ -51,6 +51,7 @@ __all__ = [
     "model_file",
     "package_folder",
     "packaged_task",
+    "path_of",
     "plugins_chosen_by",
     "python_config",
     "python_place",

@@ -11,11 +11,23 @@ from rlcli.registry.formats import find_in_formats, require_format
 from rlcli.registry.packages import installed_task, task_of_file
 from rlcli.registry.task_location import TaskSource
 
+KEYWORDS = ("latest", "shipped")
+"""Words of a command line that name the newest run and the policy of a task, never a folder."""
+
+
+def path_of(word: str) -> Path:
+    """Return the path that a word of the command line names.
+
+    A keyword, or a keyword before an @, names no file: the returned path never exists. The folder needs `./latest`.
+    """
+    return Path(os.devnull, word) if word.partition("@")[0] in KEYWORDS else Path(word)
+
 
 def find_task(name: str) -> TaskSource:
     """Return a task by name, by `distribution:name`, by the path of its folder, or as `file.py:attribute`.
 
-    Installed tasks are searched first: a folder with the name of an installed task needs a slash, `./cartpole`.
+    Installed tasks are searched first: a folder with the name of an installed task needs a slash, `./cartpole`. So
+    does a folder with the name of a keyword, `./latest`.
 
     Raises:
         TaskError: if the task is unknown, ambiguous, broken, or needs a newer rlcli.
@@ -34,8 +46,10 @@ def find_task(name: str) -> TaskSource:
     try:
         entry = find_entry(TASKS, name, what="task")
     except TaskError:
-        if name and Path(name).is_dir() and all(entry.name != name for entry in catalog()[0]):
+        if name and path_of(name).is_dir() and all(entry.name != name for entry in catalog()[0]):
             return folder_task(Path(name))
+        if name in KEYWORDS and Path(name).is_dir():
+            raise TaskError(f"no task '{name}'", hint=f"write ./{name} for the folder") from None
         if "=" in name:
             raise TaskError(f"no task '{name}'", hint="overrides come after the task: TASK key.path=value") from None
         raise

@@ -6,6 +6,7 @@ The steps are stored as engine calls: each one simulates one or more physics ste
 
 import itertools
 import logging
+import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -155,9 +156,14 @@ def write_dump(env: Environment, found: list[Divergence], pending: bool, folder:
         folder: folder of the file; created if it does not exist.
         parents: whether missing folders above it are created, too.
 
+    Returns:
+        The file. Its name is new: an older dump of the same step stays.
+
     Raises:
-        MachineError: if the disk reports an error.
+        MachineError: if the disk reports an error, or the folder is a link.
     """
+    if folder.is_symlink():  # it may come with an unpacked archive and lead anywhere
+        raise MachineError(f"{folder} is a link, through which rlcli does not write; remove it")
     engine = env.engine.replayable
     assert engine is not None
     traces = [trace_calls(env, divergence, pending) for divergence in found[:MAX_DESCRIBED]]
@@ -166,6 +172,10 @@ def write_dump(env: Environment, found: list[Divergence], pending: bool, folder:
     constants = engine.own_constants
     worlds, tensors = describe_traces(traces, engine.model, env.resolved, constants, diverged=True)
     header = Header.of(env).model_copy(update={"kind": "crash", "worlds": worlds, "follows_constants": constants})
-    file = folder / f"step-{env.common_step:012d}.safetensors"
+    names = (f"step-{env.common_step:012d}{end}" for end in ("", *(f"-{number}" for number in range(2, 10_000))))
+    files = (folder / f"{name}.safetensors" for name in names)
+    file = next((file for file in files if not os.path.lexists(file)), None)
+    if file is None:
+        raise MachineError(f"{folder} has 10,000 dumps of step {env.common_step}; remove some")
     write_trajectory(file, header, tensors, parents=parents)
     return file

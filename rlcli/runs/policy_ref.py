@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rlcli.errors import CheckpointError, UsageError
-from rlcli.registry import TaskSource
+from rlcli.registry import TaskSource, path_of
 from rlcli.runs.bundle import is_bundle, open_bundle
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.restore import recorded_task, source_of
@@ -78,7 +78,7 @@ def choose(
     name = None if named is None or any_task else named.name
     if reference == SHIPPED or (reference is None and _has_only_shipped(named, runs_dir)):
         return _shipped(named)
-    if reference is not None and is_bundle(Path(reference)):
+    if reference is not None and is_bundle(path_of(reference)):
         found = open_bundle(Path(reference))
         owner = found.manifest["task"]["name"]
         if name is not None and owner != name:

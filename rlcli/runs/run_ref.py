@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from rlcli.errors import CheckpointError, UsageError, did_you_mean, listing
+from rlcli.registry import path_of
 from rlcli.runs.run import RECORD, STUDY, Run, open_run, run_folders, runs_below, seconds_since
 from rlcli.settings import setting
 
@@ -34,7 +35,8 @@ def find_run(reference: str, runs_dir: Path, task: str | None = None) -> tuple[R
 
 def is_checkpoint_ref(reference: str) -> bool:
     """Return whether a reference names one checkpoint (its folder, or RUN@...) and not a run."""
-    return (Path(reference) / "manifest.json").is_file() or ("@" in reference and not Path(reference).exists())
+    path = path_of(reference)
+    return (path / "manifest.json").is_file() or ("@" in reference and not path.exists())
 
 
 def find_runs(references: list[str], runs_dir: Path) -> list[Run]:
@@ -58,11 +60,11 @@ def find_runs(references: list[str], runs_dir: Path) -> list[Run]:
 
 def _runs_of_task(reference: str, runs_dir: Path) -> list[Run]:
     """Return the runs of a task or of a folder of runs; an empty list if the reference names one run."""
-    if (Path(reference) / RECORD).is_file() or reference == "latest":
+    if reference == "latest" or (path_of(reference) / RECORD).is_file():
         return []
     found, refused = _list_runs(runs_dir, reference.rpartition(":")[2])
     studies = [] if os.sep in reference else sorted(runs_dir.glob(f"*/{glob.escape(reference)}"))
-    for folder in (Path(reference), runs_dir / reference, *studies):
+    for folder in (path_of(reference), runs_dir / reference, *studies):
         if not found and os.path.isdir(folder) and not (folder / RECORD).is_file():
             found, broken = _opened(runs_below(folder))
             refused = list(broken.values())
@@ -130,7 +132,7 @@ def find_checkpoint(
     """
     from rlcli.runs.checkpoint_reader import steps
 
-    folder = Path(reference)
+    folder = path_of(reference)
     if os.path.isfile(folder / "manifest.json"):  # Path.is_file raises an error for a name that is too long
         return open_run(folder.resolve().parent.parent), folder, "as named"
     name, _, which = (reference, "", "") if os.path.exists(folder) else reference.partition("@")
@@ -216,7 +218,7 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
             )
         _warn_of_skipped(refused)
         return runs[-1], f"newest run of {task}" if task else f"newest run in {runs_dir}"
-    for candidate in (Path(reference), runs_dir / reference, *([runs_dir / task / reference] if task else [])):
+    for candidate in (path_of(reference), runs_dir / reference, *([runs_dir / task / reference] if task else [])):
         if os.path.isfile(candidate / RECORD):
             return open_run(candidate), "as named"
         if os.path.isfile(candidate / STUDY):

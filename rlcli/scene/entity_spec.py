@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,31 +14,75 @@ from numpy.typing import NDArray
 from rlcli.config.schema import EntityConfig
 from rlcli.errors import MissingModelError, TaskError, one_line
 from rlcli.registry import model_file
+from rlcli.scene.mjcf_scan import BadModel
 from rlcli.scene.names import SceneProblem
-from rlcli.scene.untrusted_mjcf import BadModel, model_roots, read_mjcf
+from rlcli.scene.untrusted_mjcf import CheckedModel, ModelsTogether, check_mjcf, model_roots, open_mjcf
 
 FloatArray = NDArray[np.float64]
 
 
+def checked_models(
+    entities: Mapping[str, EntityConfig], root: Path, *, installed: bool
+) -> tuple[dict[str, CheckedModel], list[SceneProblem]]:
+    """Check the MJCFs of a scene's entities, each by itself and together, before MuJoCo opens one of them.
+
+    Args:
+        entities: the configurations of the entities.
+        root: the task's folder.
+        installed: whether the task is installed: the files of an installed task are trusted.
+
+    Returns:
+        The models by entity, without those of shapes and of entities with a problem; and the problems.
+
+    Raises:
+        MissingModelError: if the user has to provide a model.
+    """
+    found: dict[str, CheckedModel] = {}
+    problems: list[SceneProblem] = []
+    of_model: dict[str, CheckedModel] = {}
+    together = ModelsTogether()
+    for name, entity in entities.items():
+        if (model := entity.model) is None:
+            continue
+        path = ("scene", "entities", name, "model")
+        try:
+            if model not in of_model:
+                of_model[model] = _check_model(model, path, root, installed)
+            together.add(of_model[model])
+        except SceneProblem as problem:
+            problems.append(problem)
+        except BadModel as error:
+            return {}, [*problems, _not_valid(path, model, error)]
+        else:
+            found[name] = of_model[model]
+    try:
+        together.compile_expensive()
+    except BadModel as error:
+        name = max(found, key=lambda name: found[name].cost.total)
+        return {}, [*problems, _not_valid(("scene", "entities", name, "model"), entities[name].model, error)]
+    return found, problems
+
+
 def entity_spec(
-    name: str, entity: EntityConfig, root: Path, *, installed: bool, compiled: bool = False
+    name: str, entity: EntityConfig, checked: CheckedModel | None, *, compiled: bool = False
 ) -> mujoco.MjSpec:
     """Return the model of an entity: its MJCF, or a body with one geom.
 
     Args:
         name: name of the entity.
         entity: configuration of the entity.
-        root: the task's folder.
-        installed: whether the task is installed: the files of an installed task are trusted.
+        checked: its MJCF; None for a shape.
         compiled: whether to check by compiling that MuJoCo accepts the model.
 
     Raises:
         SceneProblem: if the MJCF cannot be read.
-        MissingModelError: if the user has to provide the model.
     """
-    if entity.model is None:
+    if checked is None:
         return _shape_model(entity)
-    return _load_mjcf(entity, ("scene", "entities", name, "model"), root, installed, compiled)
+    try:
+        return open_mjcf(checked, compiled=compiled)
+    except BadModel as error:
+        raise _not_valid(("scene", "entities", name, "model"), entity.model, error) from None
 
 
 def name_all(child: mujoco.MjSpec) -> None:
@@ -99,30 +144,30 @@ def _product(pos: FloatArray, quat: FloatArray, pos2: FloatArray, quat2: FloatAr
     return product
 
 
-def _load_mjcf(
-    entity: EntityConfig, path: tuple[str, ...], root: Path, installed: bool, compiled: bool
-) -> mujoco.MjSpec:
-    """Read the MJCF of an entity. `path` is the key of the model in the configuration, for messages."""
-    assert entity.model is not None
+def _check_model(model: str, path: tuple[str, ...], root: Path, installed: bool) -> CheckedModel:
+    """Find and check the MJCF of an entity. `path` is the key of the model in the configuration, for messages."""
     try:
-        file = model_file(root, entity.model).resolve()
+        file = model_file(root, model).resolve()
     except MissingModelError:
         raise
     except TaskError as error:
         raise SceneProblem(path, error.message, error.hint) from None
-    if ":" not in entity.model and not file.is_relative_to(root):
-        raise SceneProblem(path, f"'{entity.model}' lies outside the task's folder {root}; move it inside")
+    if ":" not in model and not file.is_relative_to(root):
+        raise SceneProblem(path, f"'{model}' lies outside the task's folder {root}; move it inside")
     if file.exists() and not file.is_file():
-        raise SceneProblem(path, f"'{entity.model}' in {root} is not a regular file; put an MJCF in its place")
+        raise SceneProblem(path, f"'{model}' in {root} is not a regular file; put an MJCF in its place")
     if not file.exists():
         files = sorted(str(p.relative_to(root)) for p in root.rglob("*.xml") if p.is_file())
         hint = f"MJCF files there: {', '.join(files) or 'none'}"
-        raise SceneProblem(path, f"no file '{entity.model}' in {root}", hint)
+        raise SceneProblem(path, f"no file '{model}' in {root}", hint)
     try:
-        installed = installed or ":" in entity.model
-        return read_mjcf(file, model_roots(root, entity.model), installed=installed, compiled=compiled)
+        return check_mjcf(file, model_roots(root, model), installed=installed or ":" in model)
     except BadModel as error:
-        raise SceneProblem(path, f"'{entity.model}' is not a valid MJCF: {one_line(error)}") from None
+        raise _not_valid(path, model, error) from None
+
+
+def _not_valid(path: tuple[str, ...], model: str | None, error: BadModel) -> SceneProblem:
+    return SceneProblem(path, f"'{model}' is not a valid MJCF: {one_line(error)}")
 
 
 def _shape_model(entity: EntityConfig) -> mujoco.MjSpec:

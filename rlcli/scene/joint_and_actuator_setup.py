@@ -70,6 +70,8 @@ class SceneJoints:
             entity: configuration of the entity.
             degrees: whether its MJCF has angles in degrees instead of radians.
         """
+        if not entity.joints:
+            return  # looking through the joints of the whole scene would take long in a scene of many entities
         joints, names = self._scalar_joints(name), self._joint_names(name)
         for pattern, change in entity.joints.items():
             for position in self._match(("scene", "entities", name, "joints", pattern), pattern, names):
@@ -80,6 +82,8 @@ class SceneJoints:
 
     def add_motors_of_actuator_models(self, name: str, entity: EntityConfig) -> None:
         """Replace the actuators of every joint that an actuator model drives by one motor without limits."""
+        if not entity.actuators:
+            return
         names = self._joint_names(name)
         owner: dict[str, str] = {}
         for key, config in entity.actuators.items():

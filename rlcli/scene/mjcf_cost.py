@@ -3,9 +3,71 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 
 ENDLESS = 1e18
 """Upper bound of counts of copies and of costs, so that products of a few of them stay finite."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModelCost:
+    """Cost of a model, in ordinary elements; a cost of nothing by default."""
+
+    size: float = 0.0
+    """Cost of the model's elements, with those that it attaches."""
+    loads: float = 0.0
+    """Cost of the models that MuJoCo reads to attach them, each before it is copied."""
+    elements: float = 0.0
+    """Number of elements."""
+    stored: dict[str, float] = field(default_factory=dict)
+    """Name -> size of arrays that MuJoCo stores with each element: `nuser_geom` and the like."""
+    keys: float = 0.0
+    """Number of keyframes."""
+    assets: float = 0.0
+    """Cost of the files of meshes and images, which MuJoCo loads when it compiles the model."""
+
+    @property
+    def total(self) -> float:
+        """Cost to load and compile the model."""
+        per_element = sum(self.stored.values()) + self.keys
+        return min(self.size + self.assets + self.loads + self.elements * per_element / 1_000, ENDLESS)
+
+    def beside(self, other: ModelCost) -> ModelCost:
+        """Return the cost of a model that has the elements of both."""
+        names = self.stored.keys() | other.stored.keys()
+        return ModelCost(
+            min(self.size + other.size, ENDLESS),
+            min(self.loads + other.loads, ENDLESS),
+            min(self.elements + other.elements, ENDLESS),
+            {name: max(self.stored.get(name, 0.0), other.stored.get(name, 0.0)) for name in names},
+            min(self.keys + other.keys, ENDLESS),
+            min(self.assets + other.assets, ENDLESS),
+        )
+
+    def loading(self, other: ModelCost) -> ModelCost:
+        """Return the cost of a model that also reads the other one, to attach it."""
+        return replace(self, loads=min(self.loads + other.size + other.loads, ENDLESS))
+
+    def times(self, copies: float, *, loaded: bool = True) -> ModelCost:
+        """Return the cost of several copies of the model.
+
+        Args:
+            copies: their number.
+            loaded: whether the models that it attaches are read for the copies.
+        """
+        scaled = {name: min(getattr(self, name) * copies, ENDLESS) for name in ("size", "elements", "keys", "assets")}
+        return replace(self, loads=self.loads if loaded else 0.0, **scaled)
+
+
+def stored_arrays(name: str, attributes: dict[str, str]) -> Iterator[tuple[str, float]]:
+    """Yield name and size of the arrays of numbers that MuJoCo stores with every element because of this element."""
+    if name == "size":
+        for key in attributes:
+            if key.startswith(("nuser_", "nkey")):
+                yield key, number_of(attributes[key])
+    elif "user" in attributes:  # MuJoCo stores as many numbers with all other elements of this kind
+        yield name, float(len(attributes["user"].split()))
 
 
 def element_cost(name: str, attributes: dict[str, str]) -> float:

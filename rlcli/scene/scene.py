@@ -12,7 +12,7 @@ import mujoco
 from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig, TerrainConfig
 from rlcli.errors import ConfigError, Problem, one_line
 from rlcli.machine import memory_error
-from rlcli.scene.entity_spec import entity_spec, frame_of_start_pose, name_all, write_masses
+from rlcli.scene.entity_spec import checked_models, entity_spec, frame_of_start_pose, name_all, write_masses
 from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_materials
 from rlcli.scene.joint_and_actuator_setup import SceneJoints
 from rlcli.scene.names import SceneProblem
@@ -52,8 +52,11 @@ class Scene:
         self.sensors: dict[str, SensorSpec] = {}
         self.ground: Ground | None = None
         self.joints = SceneJoints(self.spec, self.config.entities, self.problems)
+        self._models, problems = checked_models(config.entities, self.root, installed=installed)
+        self.problems += problems
         for name, entity in config.entities.items():
-            self._attach(name, entity)
+            if entity.model is None or name in self._models:
+                self._attach(name, entity)
         self._set_options()
         if config.terrain is not None:
             self._add_terrain(config.terrain)
@@ -88,22 +91,24 @@ class Scene:
 
     def broken_models(self) -> Iterator[SceneProblem]:
         """Compile the model of each entity by itself, and yield a problem, with the file, for each broken one."""
-        for name, entity in self.config.entities.items():
+        for name, checked in self._models.items():
             try:
-                entity_spec(name, entity, self.root, installed=self.installed, compiled=True)
+                entity_spec(name, self.config.entities[name], checked, compiled=True)
             except SceneProblem as problem:
                 yield problem
 
     def _attach(self, name: str, entity: EntityConfig) -> None:
         try:
-            child = entity_spec(name, entity, self.root, installed=self.installed)
+            self.attach(name, entity, entity_spec(name, entity, self._models.get(name)))
         except SceneProblem as problem:
             self.problems.append(problem)
-        else:
-            self.attach(name, entity, child)
 
     def attach(self, name: str, entity: EntityConfig, child: mujoco.MjSpec) -> None:
-        """Add an entity with the model `child` to the scene; `entity.model` is not read."""
+        """Add an entity with the model `child` to the scene; `entity.model` is not read.
+
+        Raises:
+            SceneProblem: if MuJoCo cannot attach the model.
+        """
         self.config.entities[name] = entity
         name_all(child)
         if child.compiler.settotalmass > 0:
@@ -118,8 +123,14 @@ class Scene:
         self.spec.memory = max(self.spec.memory, child.memory)
         pos, quat = frame_of_start_pose(child, entity)
         frame = self.spec.worldbody.add_frame(pos=pos, quat=quat)
-        with warnings.catch_warnings(action="ignore"):
-            self.spec.attach(child, prefix=f"{name}/", frame=frame)
+        try:
+            with warnings.catch_warnings(action="ignore"):
+                self.spec.attach(child, prefix=f"{name}/", frame=frame)
+        except MUJOCO_ERRORS as error:
+            if too_little := memory_error(error):
+                raise too_little from None
+            message = f"MuJoCo cannot attach the model: {one_line(error)}"
+            raise SceneProblem(("scene", "entities", name, "model"), message) from None
         self.joints.override(name, entity, degrees=bool(child.compiler.degree))
         self.joints.add_motors_of_actuator_models(name, entity)
 

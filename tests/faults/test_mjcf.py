@@ -17,7 +17,8 @@ from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
 from rlcli.registry import folder_task
 from rlcli.scene import untrusted_mjcf
-from rlcli.scene.untrusted_mjcf import BadModel, read_mjcf
+from rlcli.scene.mjcf_scan import BadModel, MjcfScan
+from rlcli.scene.untrusted_mjcf import check_mjcf, read_mjcf
 
 TASK = """
 summary: A block.
@@ -211,6 +212,35 @@ NAMED = {
         ),
         "the plugin has no name",
     ),
+    "numbers that one element stores for all others": (
+        model(
+            body='<replicate count="4000"><geom size="1"/></replicate><geom size="1" user="' + "0 " * 300_000 + '"/>'
+        ),
+        "the model is too large: its cost is",
+    ),
+    "a mesh file of every copy": (
+        model(
+            body='<replicate count="1000"><body><flexcomp name="f" type="mesh" file="large.obj" mass="1"/></body>'
+            "</replicate>"
+        ),
+        "the model is too large: its cost is",
+    ),
+    "an element of 1,000 attributes": (
+        model("<option " + " ".join(f'a{i}="1"' for i in range(1000)) + "/>"),
+        "model.xml:1: the element has over 200 attributes",
+    ),
+    "asset folders times assets": (
+        model(
+            "".join(f'<compiler meshdir="d{i}"/>' for i in range(1000)),
+            asset="".join(f'<mesh name="m{i}" file="m{i}.obj"/>' for i in range(900)),
+        ),
+        "names 1001 folders of assets",
+    ),
+    "a million includes of one file": (model('<include file="parts/eye.xml"/>' * 400_000), "includes more than"),
+    "fewer copies than none": (
+        model(body='<replicate count="-4"><geom size="1"/></replicate>'),
+        "replicate count is below 0",
+    ),
     "a mass that is no number": (model(body='<geom size="1" mass="nan"/>'), 'geom mass="nan" is not finite'),
     "a place that is no number": (model(body='<geom size="1" pos="0 nan 0"/>'), 'geom pos="0 nan 0" is not finite'),
     "a damping without end": (model(body='<body><joint damping="inf"/></body>'), 'joint damping="inf" is not finite'),
@@ -232,6 +262,8 @@ def task(tmp_path):
     (folder / "notes.txt").write_text("<mujoco/>")
     (folder / "bin.mjb").write_bytes(b"\0" * 100)
     (folder / "huge.png").write_bytes(png(2_000_000, 2_000_000))
+    with (folder / "large.obj").open("wb") as large:
+        large.truncate(30 << 20)
     (folder / "folder.xml").mkdir()
     for name, text in PARTS.items():
         (folder / "parts" / f"{name}.xml").write_text(text)
@@ -357,3 +389,92 @@ def test_large_model_leaves_no_log_in_its_folder(tmp_path, monkeypatch):
     (tmp_path / "model.xml").write_text(f"<mujoco>{odd}<worldbody>{geoms}</worldbody></mujoco>")
     read_mjcf(tmp_path / "model.xml", [tmp_path])
     assert [file.name for file in tmp_path.iterdir()] == ["model.xml"]
+
+
+# --- several entities ---
+
+
+def several(task, count, text, name="o.xml"):
+    """Let the task have `count` more entities with one model."""
+    (task / "model.xml").write_text(model())
+    (task / name).write_text(text)
+    entities = "".join(f", r{i}: {{model: {name}}}" for i in range(count))
+    (task / "task.yaml").write_text(TASK.replace("model.xml}", "model.xml}" + entities))
+    return resolve(folder_task(task))
+
+
+BODY = '<worldbody><body name="b"><geom size="0.1"/></body></worldbody>'
+HFIELD = f'<mujoco><asset><hfield name="t" nrow="2100" ncol="2100" size="1 1 1 1"/></asset>{BODY}</mujoco>'
+COPIES = model(body='<replicate count="4000"><geom size="0.1"/></replicate>')
+
+
+@pytest.mark.parametrize("text", [HFIELD, COPIES], ids=["height fields", "copies"])
+def test_models_of_many_entities_are_too_large_together(task, text):
+    begin = time.process_time()
+    with pytest.raises(
+        ConfigError, match=r"o\.xml: the first \d+ models of the scene are too large together: their cost"
+    ):
+        make_env(several(task, 300, text))
+    assert time.process_time() - begin < 10
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="the limits of a process are the system's")
+def test_models_of_many_entities_are_first_compiled_under_limits(task):
+    with pytest.raises(ConfigError, match=r"o\.xml \(81 models together\): compiling takes more than"):
+        make_env(several(task, 80, HFIELD))
+
+
+def test_numbers_that_one_entity_stores_for_all_others_count(task):
+    (task / "user.xml").write_text(
+        f'<mujoco><worldbody><body><geom size="1" user="{"0 " * 300_000}"/></body></worldbody></mujoco>'
+    )
+    resolved = several(task, 1, COPIES)
+    text = (task / "task.yaml").read_text()
+    (task / "task.yaml").write_text(text.replace("r0: {", "u: {model: user.xml}, r0: {"))
+    with pytest.raises(ConfigError, match="too large together"):
+        make_env(resolve(resolved.source))
+
+
+def test_small_models_of_many_entities_are_compiled_at_once(task, monkeypatch):
+    monkeypatch.setattr(untrusted_mjcf, "_compile_in_subprocess", lambda files: pytest.fail("a subprocess"))
+    small = f"<mujoco>{BODY}</mujoco>"
+    assert make_env(several(task, 40, small)).engine.model.nbody == 42
+
+
+def test_file_of_many_entities_is_parsed_once(task, monkeypatch):
+    parsed = []
+    read = MjcfScan.read
+    monkeypatch.setattr(MjcfScan, "read", lambda scan: (parsed.append(scan.main.name), read(scan))[1])
+    make_env(several(task, 40, f"<mujoco>{BODY}</mujoco>"))
+    assert sorted(parsed) == ["model.xml", "o.xml"]
+
+
+def test_many_shapes_are_refused(task):
+    with pytest.raises(ConfigError, match="601 entities are too many; at most 500"):
+        several(task, 600, f"<mujoco>{BODY}</mujoco>")
+
+
+def test_chain_of_attached_models_costs_its_elements(tmp_path):
+    """Each of 30 files attaches the next one once: about 90 bodies."""
+    for i in range(30):
+        asset = f'<asset><model name="m" file="a{i + 1}.xml"/></asset>' if i < 29 else ""
+        attach = '<attach model="m" body="r" prefix="p"/>' if i < 29 else ""
+        text = f'{asset}<worldbody><body name="r"><body><geom size=".1"/>{attach}</body></body></worldbody>'
+        (tmp_path / f"a{i}.xml").write_text(f"<mujoco>{text}</mujoco>")
+    checked = check_mjcf(tmp_path / "a0.xml", [tmp_path])
+    assert checked.cost.elements < 300
+    assert checked.cost.total < 5_000
+    assert len(read_mjcf(tmp_path / "a0.xml", [tmp_path]).bodies) > 50
+
+
+def test_models_that_are_attached_twice_double_at_every_level(tmp_path):
+    for i in range(30):
+        asset = f'<asset><model name="m" file="a{i + 1}.xml"/></asset>' if i < 29 else ""
+        attach = (
+            '<body><attach model="m" body="r" prefix="p"/></body><body><attach model="m" body="r" prefix="q"/></body>'
+        )
+        text = f'{asset}<worldbody><body name="r"><geom size=".1"/>{attach if i < 29 else ""}</body></worldbody>'
+        (tmp_path / f"a{i}.xml").write_text(f"<mujoco>{text}</mujoco>")
+    with pytest.raises(BadModel, match="the model is too large: its cost is"):
+        read_mjcf(tmp_path / "a0.xml", [tmp_path])

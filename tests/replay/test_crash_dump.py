@@ -102,6 +102,23 @@ def test_eval_without_a_run_counts_divergences_and_dumps_one(diverging_task, cli
     assert cli("replay", file).code == 0
 
 
+def test_dump_replaces_no_other_one(dump, diverging_task, cli):
+    first = dump.read_bytes()
+    cli("eval", diverging_task, "--policy", "zero", "--episodes", "32", "--quiet")
+    assert dump.read_bytes() == first
+    assert sorted(file.name for file in Path("runs/dumps").iterdir()) == [f"{dump.stem}-2.safetensors", dump.name]
+
+
+def test_dump_is_not_written_through_a_link(diverging_task, cli, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    Path("runs").mkdir()
+    Path("runs/dumps").symlink_to(elsewhere)
+    message = cli("eval", diverging_task, "--policy", "zero", "--episodes", "32")
+    assert "there is no dump: runs/dumps is a link" in message.err
+    assert not list(elsewhere.iterdir())
+
+
 def test_replay_of_a_changed_state_exits_9(dump, cli):
     model = Path("coin/model.xml")
     model.write_text(model.read_text().replace('type="slide"', 'type="slide" stiffness="10" springref="1"'))

@@ -16,7 +16,8 @@ from xml.etree import ElementTree
 import mujoco
 
 from rlcli.errors import Problem, one_line
-from rlcli.scene.untrusted_mjcf import BadModel, read_mjcf
+from rlcli.scene.mjcf_scan import BadModel
+from rlcli.scene.untrusted_mjcf import read_mjcf
 
 RICH = """
 <mujoco model="rich">

@@ -14,6 +14,7 @@ import typer
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import RunRef, RunsDir, TaskFolder, choice, video_file
 from rlcli.errors import RlcliError, UsageError, require_known
+from rlcli.registry import path_of
 
 if TYPE_CHECKING:
     from rlcli.registry import TaskSource
@@ -69,7 +70,7 @@ def command(
     from rlcli.runs.trusted_tasks import named_task
 
     named = None if task is None else named_task(task)
-    if is_bundle(Path(run)):
+    if is_bundle(path_of(run)):
         _refuse_bundle(run, case)
         return
     found, why = find_run(run, runs_dir or default_runs_dir())

@@ -12,7 +12,7 @@ from rlcli.cli.ui.console import console
 from rlcli.cli.ui.difference_table import report_differences
 from rlcli.cli.ui.options import Agent, RunsDir, choice
 from rlcli.errors import CheckpointError, TaskError, UsageError, did_you_mean, listing, require_known
-from rlcli.registry import TASKS, catalog, task_source
+from rlcli.registry import TASKS, catalog, path_of, task_source
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
@@ -97,7 +97,7 @@ def _task(side: Side, agent: str | None) -> Resolved | None:
     from rlcli.runs.run import RECORD
 
     name, overrides = side
-    path = Path(name)
+    path = path_of(name)
     installed = any(name in (entry.name, entry.qualified) for entry in catalog(TASKS)[0])
     is_run = not installed and ("@" in name or (path / RECORD).is_file() or (path / "manifest.json").is_file())
     if not is_run:

@@ -10,6 +10,7 @@ import typer
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import CheckpointRef, RunsDir, TaskOfPolicy, choice
 from rlcli.errors import UsageError, listing
+from rlcli.registry import path_of
 
 if TYPE_CHECKING:
     from rlcli.deploy.closed_loop import ClosedLoopResult, ReferenceEnv
@@ -158,13 +159,13 @@ def _find(reference: str | None, runs_dir: Path, task: str | None) -> Choice:
     from rlcli.runs.run import RECORD, open_run
     from rlcli.runs.run_ref import find_checkpoint, list_runs
 
-    folder = Path(reference or "latest")
+    folder = path_of(reference or "latest")
     if (folder / "manifest.json").is_file() and not is_bundle(folder):
         run = folder.resolve().parent.parent
         return Choice(folder, "as named", open_run(run) if (run / RECORD).is_file() else None, None)
     name = None
     if task is not None:
-        name = Path(task).resolve().name if Path(task).is_dir() else task.rpartition(":")[2]
+        name = Path(task).resolve().name if path_of(task).is_dir() else task.rpartition(":")[2]
     without_run = task is not None and reference in (None, "latest") and not list_runs(runs_dir, name)
     if reference == SHIPPED or is_bundle(folder) or without_run:
         return choose(reference, runs_dir, None if task is None else named_task_or_run(task, runs_dir))

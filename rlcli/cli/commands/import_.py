@@ -51,7 +51,7 @@ def sb3(
     runs_dir: RunsDir = None,
     name: RunName = None,
 ) -> None:
-    """Import a policy of Stable-Baselines3 as a run. PPO, A2C, SAC, TD3 or DDPG; nothing is unpickled.
+    """Import a policy of Stable-Baselines3 (PPO, A2C, SAC, TD3, DDPG) as a run. Only plain data is unpickled.
 
     Options:
         file: File written by model.save of Stable-Baselines3.
@@ -80,7 +80,7 @@ def rsl_rl(
     runs_dir: RunsDir = None,
     name: RunName = None,
 ) -> None:
-    """Import a policy of RSL-RL as a run. Nothing is unpickled.
+    """Import a policy of RSL-RL as a run. Only plain data is unpickled.
 
     Options:
         file: Checkpoint model_N.pt of RSL-RL.

@@ -220,6 +220,9 @@ class EntityConfig(StrictModel):
             raise ValueError("a plane cannot move: remove free and mocap, or use `shape: box`")
 
 
+_MAX_ENTITIES = 500
+
+
 class SceneConfig(StrictModel):
     """The scene that each environment simulates."""
 
@@ -237,14 +240,16 @@ class SceneConfig(StrictModel):
     """Uneven ground. All environments share it and start at different positions on it."""
     lights: LightsConfig = LightsConfig(dome=DomeLightConfig())
     """Lights."""
-    entities: dict[str, EntityConfig] = Field(json_schema_extra={"minProperties": 1})
-    """Name -> robot or object."""
+    entities: dict[str, EntityConfig] = Field(json_schema_extra={"minProperties": 1, "maxProperties": _MAX_ENTITIES})
+    """Name -> robot or object; at most 500."""
     sensors: dict[str, SensorConfig] = {}
     """Name -> contact sensor, ray sensor or camera that terms use. Sensors of the MJCF need no entry."""
 
     @field_validator("entities")
     @classmethod
-    def _not_empty(cls, value: dict[str, EntityConfig], info: ValidationInfo) -> dict[str, EntityConfig]:
+    def _has_right_size(cls, value: dict[str, EntityConfig], info: ValidationInfo) -> dict[str, EntityConfig]:
         if not value and not (info.context or {}).get("open_scene"):
             raise PydanticKnownError("too_short", {"field_type": "Dictionary", "min_length": 1, "actual_length": 0})
+        if len(value) > _MAX_ENTITIES:  # the time to attach an entity grows with the square of their number
+            raise ValueError(f"{len(value)} entities are too many; at most {_MAX_ENTITIES} are allowed")
         return value
