@@ -26,7 +26,7 @@ from rlcli.config.schema import AutopsyConfig
 from rlcli.envs.environment import Environment
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.step import Episodes, StepRecord
-from rlcli.errors import CheckpointError, RlcliError
+from rlcli.errors import CheckpointError, MachineError, RlcliError
 from rlcli.managers.termination import DIVERGED
 from rlcli.replay.crash_dump import CallTrace, describe_traces, stop_observing_divergences, trace_calls
 from rlcli.replay.failure_cases import FILE_NAME, FOLDER
@@ -39,7 +39,7 @@ from rlcli.replay.trajectory import (
     read_trajectory,
     write_trajectory,
 )
-from rlcli.runs.atomic_io import write_atomic
+from rlcli.runs.atomic_io import disk_errors, write_atomic
 from rlcli.runs.safe_io import read_file
 from rlcli.sim.divergence_report import Divergence
 
@@ -189,7 +189,8 @@ class FailureRecorder(StepObserver):
                 header = self._header.model_copy(update={**parts, "follows_constants": kept.follows_constants})
                 write_trajectory(self._folder / name, header, tensors | kept.tensors, parents=False)
             if batch.returns:  # needed after a resumption, even if no episode is recorded yet
-                self._folder.mkdir(exist_ok=True)
+                with disk_errors(self._folder):
+                    self._folder.mkdir(exist_ok=True)
                 recent = _RecentReturns(step=batch.step, returns=batch.returns)
                 write_atomic(self._folder / _RETURNS_FILE, recent.model_dump_json(indent=2) + "\n")
         except (RlcliError, OSError) as error:
@@ -198,7 +199,7 @@ class FailureRecorder(StepObserver):
     def drop(self, batch: FailureBatch) -> None:
         """Remove the files that a batch lists, after its checkpoint is complete."""
         for name in batch.remove:
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(MachineError), disk_errors(self._folder / name):
                 (self._folder / name).unlink(missing_ok=True)
 
     @cached_property

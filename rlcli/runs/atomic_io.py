@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import MachineError, UsageError
+from rlcli.runs.run_lock import require_locks
 
 
 def write_atomic(file: Path, content: bytes | str) -> Path:
@@ -22,7 +23,8 @@ def write_atomic(file: Path, content: bytes | str) -> Path:
     The content goes to a temporary file in the same folder, which is synced to the disk and then renamed.
 
     Raises:
-        MachineError: if the disk reports an error; the old file is unchanged.
+        MachineError: if the disk reports an error, or the file is in a run whose lock this process has lost; the old
+            file is unchanged.
         UsageError: if the path is a folder, a pipe, a socket or a device.
     """
     require_regular(file)
@@ -32,6 +34,7 @@ def write_atomic(file: Path, content: bytes | str) -> Path:
         with disk_errors(file):
             temporary.unlink(missing_ok=True)  # open() would follow a link of this name
             write_synced(temporary, data)
+            require_lock(file)
             os.replace(temporary, file)
     finally:
         with contextlib.suppress(OSError):
@@ -123,6 +126,18 @@ def disk_error(path: Path, error: OSError) -> MachineError:
     return MachineError(f"cannot write {path}: {error.strerror or error}{missing}", hint=_HINTS.get(error.errno or 0))
 
 
+def require_lock(path: Path) -> None:
+    """Check that this process still holds the lock of the run in which it writes.
+
+    Raises:
+        MachineError: if the lock file was deleted or belongs to another folder, or the run was moved away.
+    """
+    try:
+        require_locks(path)
+    except OSError as error:
+        raise disk_error(path, error) from error
+
+
 @contextlib.contextmanager
 def disk_errors(path: Path, *, remove: bool = False) -> Iterator[None]:
     """Turn an OSError inside the block into a MachineError that names the path.
@@ -132,14 +147,16 @@ def disk_errors(path: Path, *, remove: bool = False) -> Iterator[None]:
         remove: after an error, delete the folder at this path.
 
     Raises:
-        MachineError: if the disk reports an error.
+        MachineError: if the disk reports an error, or the path is in a run whose lock this process has lost.
     """
+    require_lock(path)
     try:
         yield
     except (OSError, MachineError) as error:
         if remove:
             shutil.rmtree(path, ignore_errors=True)
         if isinstance(error, OSError):
+            require_lock(path)  # another process may have removed what is missing
             raise disk_error(path, error) from error
         raise
 

@@ -15,7 +15,8 @@ from typing import Any
 
 from rlcli.errors import CheckpointError
 from rlcli.runs.metric_rows import parse_row
-from rlcli.runs.run import CONFIG, RECORD, WAITING, Run, is_locked, open_run, run_folders, seconds_since
+from rlcli.runs.run import CONFIG, RECORD, WAITING, Run, open_run, run_folders, seconds_since
+from rlcli.runs.run_lock import is_locked
 from rlcli.runs.safe_io import read_tail
 
 ENDED = {"finished", "stopped", "diverged", "failed"}

@@ -16,12 +16,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from filelock import FileLock, Timeout
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from rlcli.config import strict_yaml
 from rlcli.errors import CheckpointError, MachineError, UsageError
-from rlcli.runs.atomic_io import disk_error, disk_errors, to_json, write_atomic
+from rlcli.runs.atomic_io import disk_errors, require_lock, to_json, write_atomic
+from rlcli.runs.run_lock import LOCK, RunLock
 from rlcli.runs.safe_io import FileModel, PrintableText, check_json, read_file, read_json, refuse_links, require_inside
 from rlcli.safe_text import MAX_SEED
 
@@ -32,13 +32,10 @@ STUDY = "study.json"
 """File that marks a study: a folder of runs with several seeds, or of the trials of a sweep."""
 WAITING = "waiting"
 """State of a run of a study that has not started yet."""
-LOCK = ".lock"
 MAX_NAME = 200
 """Longest `--name`; with the time of a run in front it is a part of a path, which has at most 255 bytes."""
 _TASK = re.compile(r"(?!\.{1,2}$)[^/\\:]{1,255}")
 _MAX_FILES = 100_000
-_LOCK_TIMEOUT_S = 0.3
-"""Time to wait for the lock [s]; `is_locked` of another process holds it for a shorter time."""
 _NAME = re.compile(r"[A-Za-z0-9][\w.-]*", re.ASCII)
 
 
@@ -48,7 +45,7 @@ class Run:
 
     folder: Path
     record: dict[str, Any] = field(default_factory=dict)
-    _lock: FileLock | None = None
+    _lock: RunLock | None = None
 
     @property
     def config(self) -> Path:
@@ -94,13 +91,10 @@ class Run:
         Raises:
             MachineError: if another process is writing to this run.
         """
-        self._lock = FileLock(self.folder / LOCK, timeout=_LOCK_TIMEOUT_S)
-        try:
-            self._lock.acquire()
-        except Timeout:
-            raise MachineError(f"another process writes to {self.folder}; wait for its end") from None
-        except OSError as error:
-            raise disk_error(self.folder / LOCK, error) from None
+        lock = RunLock(self.folder)
+        with disk_errors(self.folder / LOCK):
+            lock.acquire()
+        self._lock = lock
 
     def unlock(self) -> None:
         """Release the lock."""
@@ -108,9 +102,11 @@ class Run:
             self._lock.release()
 
     def discard(self) -> None:
-        """Delete a run that has not started."""
+        """Delete a run that has not started, unless another process may write to it."""
+        with contextlib.suppress(MachineError):
+            require_lock(self.folder)
+            shutil.rmtree(self.folder, ignore_errors=True)
         self.unlock()
-        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def create_run(runs_dir: Path, task: str, name: str | None, config: str, record: Mapping[str, Any]) -> Run:
@@ -168,10 +164,10 @@ def initialize_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
     """
     run = Run(folder)
     with disk_errors(folder, remove=True):
+        run.lock()
         run.checkpoints.mkdir()
         write_atomic(run.config, config)
         run.update(**{"started": datetime.now(UTC).isoformat(timespec="microseconds"), "state": "running", **record})
-        run.lock()
     return run
 
 
@@ -229,40 +225,6 @@ def _subfolders(folder: Path) -> list[Path]:
 def _warn_of_link(path: str) -> None:
     """Log one warning for a link, however often its folder is searched."""
     _log.warning("%s is a link; rlcli does not search it for runs", path)
-
-
-def is_locked(folder: Path) -> bool:
-    """Return whether a process has locked the run; no file is created or changed."""
-    try:
-        handle = os.open(folder / LOCK, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
-    except OSError:
-        return False
-    try:
-        return stat.S_ISREG(os.fstat(handle).st_mode) and not _can_share(handle)
-    finally:
-        os.close(handle)
-
-
-def _can_share(handle: int) -> bool:
-    """Return whether no process holds the lock of an opened lock file: then a shared lock on it is possible."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        import msvcrt
-
-        try:
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
-            msvcrt.locking(handle, msvcrt.LK_UNLCK, 1)  # type: ignore[attr-defined]
-        except OSError:
-            return False
-        return True
-    try:
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        return True
-    return True
 
 
 def require_own(run: Run, *parts: str) -> None:

@@ -21,11 +21,11 @@ import safetensors.torch
 from torch import Tensor
 
 from rlcli.envs.layout import Layout
-from rlcli.errors import CheckpointError
+from rlcli.errors import CheckpointError, MachineError
 from rlcli.replay.failure_cases import FOLDER
 from rlcli.replay.failure_recorder import FailureBatch, FailureRecorder
 from rlcli.rl.trainer import Rows, TrainerState
-from rlcli.runs.atomic_io import disk_errors, sync_folder, to_json, write_atomic, write_synced
+from rlcli.runs.atomic_io import disk_errors, require_lock, sync_folder, to_json, write_atomic, write_synced
 from rlcli.runs.checkpoint_reader import FORMAT, LOG_FOLDER, Checkpoint, Shard, open_checkpoint, sha256, steps
 from rlcli.runs.run import Run
 
@@ -119,7 +119,7 @@ class CheckpointWriter:
         """Block until everything is on the disk.
 
         Raises:
-            MachineError: if the checkpoint could not be written.
+            MachineError: if the checkpoint could not be written, or this process has lost the lock of the run.
         """
         if self._thread is not None:
             self._thread.join()
@@ -127,6 +127,7 @@ class CheckpointWriter:
         if self._failure is not None:
             failure, self._failure = self._failure, None
             raise failure
+        require_lock(self.checkpoints)
 
     def check(self) -> None:
         """Raise the error of the background thread, if it had one."""
@@ -230,6 +231,7 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
             manifest = {"format": FORMAT, "step": step, **extra, "files": files}
             write_synced(temporary / "manifest.json", to_json(manifest).encode())
             sync_folder(temporary)
+            require_lock(target)
             os.rename(temporary, target)
             sync_folder(checkpoints)
     finally:
@@ -296,7 +298,7 @@ def drop_rows(checkpoints: Path, aside: Path | None = None) -> None:
     except CheckpointError:
         return  # a damaged checkpoint: which rows it needs is unknown
     for file in files:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(MachineError), disk_errors(file):
             if aside is None:
                 file.unlink(missing_ok=True)
             else:
@@ -319,8 +321,9 @@ def _remove(folder: Path) -> None:
     """Rename a checkpoint to a temporary folder, then delete that folder."""
     temporary = _temporary_folder(folder.parent)
     try:
-        folder.rename(temporary)
-    except OSError:
+        with disk_errors(folder):
+            folder.rename(temporary)
+    except MachineError:
         return
     shutil.rmtree(temporary, ignore_errors=True)
 

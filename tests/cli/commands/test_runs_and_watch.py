@@ -18,7 +18,8 @@ import pytest
 from rlcli.cli.commands.runs import age, size
 from rlcli.runs.eval_store import write_evaluation
 from rlcli.runs.overview import overviews
-from rlcli.runs.run import create_run, is_locked, open_run
+from rlcli.runs.run import create_run, open_run
+from rlcli.runs.run_lock import is_locked
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
