@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rlcli.config.load import Resolved
     from rlcli.envs.vec_env import VecEnv
     from rlcli.registry import TaskSource
+    from rlcli.replay.episode_recorder import EpisodeRecorder
     from rlcli.rl.acting import Act
 
 _log = logging.getLogger(__name__)
@@ -286,27 +287,31 @@ def recording_files(file: Path, mode: str) -> dict[str, Path]:
 
 
 def run_episodes(
-    session: Session, episodes: int, record: Path | None = None, mode: str = "all"
-) -> tuple[dict[str, Any], list[str]]:
-    """Evaluate the policy of a session; return the summary and the files of recorded episodes.
-
-    Args:
-        session: the environment and the policy.
-        episodes: number of episodes.
-        record: file to which episodes are recorded; None: no recording.
-        mode: which episodes are recorded, as in `recording_files`.
-    """
+    session: Session, episodes: int, *, records: bool = False
+) -> tuple[dict[str, Any], EpisodeRecorder | None]:
+    """Evaluate the policy of a session; return the summary, and the recorder of the episodes if `records` is true."""
     from rlcli.evaluation.evaluate import evaluate
 
-    if record is None:
-        return evaluate(session.env, session.act, episodes).summary(), []
+    if not records:
+        return evaluate(session.env, session.act, episodes).summary(), None
     from rlcli.replay.episode_recorder import EpisodeRecorder
 
     with session.env.observers.added(EpisodeRecorder(session.env, episodes)) as recorder:
-        summary = evaluate(session.env, session.act, episodes).summary()
-    files = [str(file) for file in recorder.save(recording_files(record, mode))]
+        return evaluate(session.env, session.act, episodes).summary(), recorder
+
+
+def save_episodes(
+    recorder: EpisodeRecorder | None, record: Path | None, mode: str
+) -> tuple[list[str], MachineError | None]:
+    """Write recorded episodes; return the files, or the error to raise after the results have been printed."""
+    if recorder is None or record is None:
+        return [], None
+    try:
+        files = [str(file) for file in recorder.save(recording_files(record, mode))]
+    except MachineError as error:
+        return [], error
     _log.info(f"recorded {len(recorder.episodes)} episodes to {' and '.join(files)}")
-    return summary, files
+    return files, None
 
 
 def evaluation_record(session: Session, summary: dict[str, Any]) -> dict[str, Any]:

@@ -163,10 +163,11 @@ def disk_errors(path: Path, *, remove: bool = False) -> Iterator[None]:
 
 _HINTS = {
     2: "create the folder; if it was moved or deleted meanwhile, put it back",
+    27: "files are limited to the size that `ulimit -f` shows: raise this limit, or write less",
     28: "free some space",
     36: "a name in a path has at most 255 bytes: shorten it",
     13: "choose another folder with --runs-dir",
     30: "the disk is read-only: make it writable, copy the run, or choose another folder with --runs-dir",
     122: "the disk quota is used up: free some space",
 }
-"""errno -> hint: ENOENT, ENOSPC, ENAMETOOLONG, EACCES, EROFS, EDQUOT."""
+"""errno -> hint: ENOENT, EFBIG, ENOSPC, ENAMETOOLONG, EACCES, EROFS, EDQUOT."""

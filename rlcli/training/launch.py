@@ -181,14 +181,27 @@ def run_record(request: TrainingRequest, resolved: Resolved, device: str) -> dic
 
 
 def resume_run(request: TrainingRequest) -> Job | TrainingResult:
-    """Open and lock a run to continue it; if it is finished and has no new budget, return its result instead."""
+    """Open and lock a run to continue it; if it is finished and has no new budget, return its result instead.
+
+    A finished run that has lost its last checkpoints is continued, unless the reference names one checkpoint.
+    """
     from rlcli.runs.checkpoint_reader import open_checkpoint
     from rlcli.runs.restore import resolve_run
+    from rlcli.runs.run_ref import is_checkpoint_ref
 
     run, folder, why = _find_checkpoint(request)
     if run.record.get("state") == "finished" and not request.budget and folder is not None:
-        _log.info("%s (%s) is finished; --max-iterations N continues it", run.folder, why)
-        return TrainingResult(run.folder, folder, open_checkpoint(folder).step)
+        step, last = open_checkpoint(folder).step, run.record.get("step", 0)
+        if step >= last or is_checkpoint_ref(request.resume or ""):
+            _log.info("%s (%s) is finished; --max-iterations N continues it", run.folder, why)
+            return TrainingResult(run.folder, folder, step)
+        _log.warning(
+            "%s has lost its last checkpoint: it was finished at step %s, and its newest good checkpoint has step %s;"
+            " the training continues from there",
+            run.folder,
+            last,
+            step,
+        )
     _require_larger_budget(request, run, folder)
     resolved = resolve_run(run, play=False, flags=request.budget, named=request.source)
     _require_parallel(resolved)

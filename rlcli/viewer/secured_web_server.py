@@ -22,9 +22,10 @@ from unittest import mock
 
 import mujoco
 
-from rlcli.errors import DependencyError, MachineError
+from rlcli.errors import DependencyError, MachineError, one_line
 from rlcli.viewer.access import refusal_reason, response_headers
 
+_log = logging.getLogger(__name__)
 _REQUIRED_NAMES = {
     "web_viewer": ("WebViewer", "web_server", "_print_url_banner"),
     "web.web_server": ("serve", "bind_public_socket", "bind_loopback_socket", "WebServer", "Response", "Headers"),
@@ -42,6 +43,8 @@ _REQUIRED_NAMES = {
 }
 """Module of `mujoco.studio` -> the names that are used from it."""
 _MAX_MESSAGE_BYTES = 2**20
+_UNSUPPORTED_DATA = 1003
+"""Code of a closed WebSocket (RFC 6455): the type of data cannot be accepted."""
 _REQUEST_S = 10.0
 """Time after which the server closes a connection without a complete request [s]."""
 
@@ -149,7 +152,17 @@ def _serve_with_checks(server: Any, port: int) -> Any:
     """
     serve, own_headers = server.serve, response_headers(port)
 
-    def serve_checked(*arguments: Any, process_request: Any, process_response: Any, **settings: Any) -> Any:
+    def serve_checked(
+        handler: Any, *arguments: Any, process_request: Any, process_response: Any, **settings: Any
+    ) -> Any:
+        async def handle(connection: Any) -> None:
+            """Close the connection of a client whose messages the viewer cannot handle, and print nothing."""
+            try:
+                await handler(connection)
+            except Exception as error:
+                _log.debug("the browser's viewer closes a connection: %s", one_line(error, 200))
+                await connection.close(_UNSUPPORTED_DATA, "unexpected message")
+
         def check(connection: Any, request: Any) -> Any:
             headers: dict[str, list[str]] = {}
             for name, value in request.headers.raw_items():
@@ -173,7 +186,7 @@ def _serve_with_checks(server: Any, port: int) -> Any:
             return response
 
         settings |= {"max_size": _MAX_MESSAGE_BYTES, "open_timeout": _REQUEST_S, "close_timeout": _REQUEST_S}
-        return serve(*arguments, **settings, process_request=check, process_response=respond)
+        return serve(handle, *arguments, **settings, process_request=check, process_response=respond)
 
     return serve_checked
 

@@ -4,6 +4,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 import torch
@@ -12,6 +14,7 @@ from support.sharded_runs import both, differences, same, step_differences
 from rlcli.config.load import resolve
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.shard_range import split
+from rlcli.envs.sharding import workers
 from rlcli.envs.sharding.choice import number_of_workers
 from rlcli.envs.sharding.env import ShardedEnv
 from rlcli.envs.sharding.state import join_states, split_state
@@ -333,3 +336,47 @@ def test_state_of_all_environments_that_differs_is_refused(folder):
 
 def _count_a_step(env, row):
     env._counters.common_step += 1
+
+
+@pytest.fixture
+def three():
+    env = ShardedEnv(resolve(find_task("cartpole"), overrides=["scene.num_envs=6"]), workers=3)
+    yield env
+    env.close()
+
+
+def test_worker_that_does_not_answer_is_named_once(three, monkeypatch, caplog):
+    monkeypatch.setattr(workers, "_SILENT_S", 0.3)
+    pid = [process.pid for process in three._workers][1]
+    for _ in range(2):
+        os.kill(pid, signal.SIGSTOP)
+        threading.Timer(1.0, os.kill, (pid, signal.SIGCONT)).start()
+        three.step(torch.zeros(6, 1))
+    (message,) = [record.getMessage() for record in caplog.records if "has not answered" in record.getMessage()]
+    assert f"worker process 2 of the environment (pid {pid}) has not answered for 0.3 s" in message
+    assert f"kill -CONT {pid}" in message
+
+
+def test_stopped_workers_end_with_the_environment(three):
+    pids = [process.pid for process in three._workers]
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
+    begin = time.monotonic()
+    three.close()
+    assert time.monotonic() - begin < 4
+    assert not any(os.path.exists(f"/proc/{pid}") for pid in pids)
+
+
+@pytest.mark.parametrize("call", ["step", "state"])
+def test_signal_ends_the_wait_for_stopped_workers_at_once(three, call):
+    for process in three._workers:
+        os.kill(process.pid, signal.SIGSTOP)
+    previous = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 1.0)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            three.step(torch.zeros(6, 1)) if call == "step" else three.state_dict()
+    finally:
+        signal.signal(signal.SIGALRM, previous)
+    with pytest.raises(RuntimeError, match="interrupted"):
+        three.state_dict()

@@ -1,8 +1,10 @@
 """Server of `play --viewer web`: requests of other pages and programs, sent without a browser."""
 
+import contextlib
 import json
 import signal
 import socket
+import time
 from pathlib import Path
 
 import pytest
@@ -171,6 +173,29 @@ def test_stopped_server_frees_port_and_stdout_is_one_document(tmp_path, stop):
         assert json.loads(one.out)["error"]["kind"] == "stopped"
         assert "error: interrupted" in one.err
     assert "Traceback" not in one.err
+
+
+def frame(opcode, content):
+    """Return a masked WebSocket frame of a client."""
+    return bytes([0x80 | opcode, 0x80 | len(content), 0, 0, 0, 0]) + content
+
+
+@pytest.mark.parametrize("path", ["/ui?sid=a", "/state?sid=a"])
+@pytest.mark.parametrize(("opcode", "content"), [(1, b"hello"), (1, b""), (1, b'{"a": 1}'), (2, b""), (2, b"\0\1")])
+def test_unexpected_message_prints_nothing(playing, path, opcode, content):
+    own = (f"Host: {playing.host}", f"Origin: http://{playing.host}")
+    before, answer = playing.err, b""
+    with socket.create_connection(("127.0.0.1", playing.port), timeout=5) as connection:
+        connection.sendall("\r\n".join([f"GET {path} HTTP/1.1", *own, *UPGRADE, "", ""]).encode())
+        connection.sendall(frame(opcode, content))
+        deadline = time.monotonic() + 5
+        with contextlib.suppress(TimeoutError):  # a message that is expected leaves the connection open
+            while (part := connection.recv(65536)) and time.monotonic() < deadline:
+                answer += part
+    if path.startswith("/ui") and opcode == 1:
+        assert (1003).to_bytes(2, "big") + b"unexpected message" in answer
+    assert playing.err == before
+    assert status(ask(playing, "/", f"Host: 127.0.0.1:{playing.port}")) == 200
 
 
 @pytest.mark.slow

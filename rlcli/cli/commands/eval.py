@@ -68,12 +68,15 @@ def command(
         return
     sessions.check_record(record, record_mode)
     session = sessions.open_session(request, lambda resolved: require_success(resolved, [each.key for each in limits]))
-    summary, recorded = sessions.run_episodes(session, episodes, record, record_mode)
+    summary, recorder = sessions.run_episodes(session, episodes, records=record is not None)
     failed = failures(summary, limits)
     show_summary(summary)
+    recorded, unsaved = sessions.save_episodes(recorder, record, record_mode)
     document = sessions.evaluation_record(session, summary)
     sessions.save_evaluation(session, {"schema": SCHEMA_VERSION, "command": "eval", **document})
     console.document("eval", **document, passed=not failed, failures=failed, recorded=recorded)
+    if unsaved is not None:
+        raise unsaved
     options.exit_on_failures(failed)
 
 

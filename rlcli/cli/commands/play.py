@@ -148,9 +148,12 @@ def _video(session: Session, file: Path, drawn: int) -> None:
 
 def _statistics(session: Session, record: Path | None, record_mode: str) -> None:
     from rlcli.cli.ui.evaluation_tables import show_summary
-    from rlcli.evaluation.session import run_episodes
+    from rlcli.evaluation.session import run_episodes, save_episodes
 
     console.info("one episode per environment, as numbers (--video FILE.mp4 writes a video)")
-    summary, recorded = run_episodes(session, session.env.num_envs, record, record_mode)
+    summary, recorder = run_episodes(session, session.env.num_envs, records=record is not None)
     show_summary(summary)
+    recorded, unsaved = save_episodes(recorder, record, record_mode)
     console.document("play", **session.policy.record(), video=None, recorded=recorded, **summary)
+    if unsaved is not None:
+        raise unsaved

@@ -69,6 +69,7 @@ def play_episode(
         record: file to record the episode to.
         watch: opens a viewer at the start of the episode; returns whether one could be opened.
     """
+    from rlcli.evaluation.session import save_episodes
     from rlcli.replay.episode_recorder import EpisodeRecorder
     from rlcli.replay.rerun_episode import run_episode, start_episode
 
@@ -80,7 +81,7 @@ def play_episode(
         session.start = (env_id, start.obs)
         if watch():
             return
-    frames, recorded = 0, []
+    frames, recorder = 0, None
     if video is not None:
         with film(session, video, env_id) as filming:
             last = run_episode(session.env, filming.act, start.obs, env_id)
@@ -89,16 +90,17 @@ def play_episode(
     elif record is not None:
         with session.env.observers.added(EpisodeRecorder(session.env, 1, env_id=env_id)) as recorder:
             last = run_episode(session.env, session.act, start.obs, env_id)
-        recorded = [str(written) for written in recorder.save({"all": record})]
-        console.info(f"recorded to {recorded[0]}")
     else:
         last = run_episode(session.env, session.act, start.obs, env_id)
     outcome, origin = _outcome(last, env_id), _origin(session, start, env_id, episode)
     _print_outcome(outcome)
     if video is not None:
         console.data(str(video))
+    recorded, unsaved = save_episodes(recorder, record, "all")
     files = {"video": None if video is None else str(video), "frames": frames, "recorded": recorded}
     console.document("play", **origin, **outcome, **files)
+    if unsaved is not None:
+        raise unsaved
 
 
 def _print_origin(session: Session, start: EpisodeStart, env_id: int, episode: int) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import pickle
+import select
 import socket
 import struct
 import time
+from collections.abc import Callable
 from typing import Any
 
 _HEADER = struct.Struct("=2sq")
@@ -45,14 +47,18 @@ class Channel:
         except OSError as error:
             raise ChannelClosedError from error
 
-    def receive(self) -> tuple[bytes, Any]:
-        """Wait for a message; return its kind and content.
+    def receive(self, wait: Callable[[], None] = lambda: None) -> tuple[bytes, Any]:
+        """Wait for a message; return its kind and content. `wait` is called before this process sleeps.
 
         Raises:
             ChannelClosedError: if the other process has ended.
         """
-        kind, size = _HEADER.unpack(self._first_bytes(_HEADER.size))
+        kind, size = _HEADER.unpack(self._first_bytes(_HEADER.size, wait))
         return kind.rstrip(b"\0"), pickle.loads(self._read(size)) if size else None
+
+    def is_silent(self, seconds: float) -> bool:
+        """Wait for a message or the end of the other process; return whether there is none after so many seconds."""
+        return not select.select([self._socket], [], [], seconds)[0]
 
     def wait_until_closed(self) -> None:
         """Discard messages until the other process closes its end."""
@@ -63,7 +69,7 @@ class Channel:
         """Close this end of the connection."""
         self._socket.close()
 
-    def _first_bytes(self, size: int) -> bytes:
+    def _first_bytes(self, size: int, wait: Callable[[], None]) -> bytes:
         """Return the first bytes of a message; poll for a short time, then sleep."""
         end = time.perf_counter() + self._spin_s
         while time.perf_counter() < end:
@@ -74,6 +80,7 @@ class Channel:
             except OSError as error:
                 raise ChannelClosedError from error
             return data if len(data) == size else data + self._read(size - len(data), ended=not data)
+        wait()
         return self._read(size)
 
     def _read(self, size: int, ended: bool = False) -> bytes:

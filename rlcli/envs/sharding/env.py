@@ -251,9 +251,14 @@ class ShardedEnv(Environment):
         """
         self._require_whole()
         self._workers.request(worker.CALL, (function, arguments))
-        try:
-            own = function(self.local, *arguments)
-        finally:  # an unread reply would be taken for the next one
+        with self._unread_replies():
+            try:
+                own = function(self.local, *arguments)
+            except KeyboardInterrupt:
+                raise
+            except BaseException:  # an unread reply would be taken for the next one
+                self._workers.replies()
+                raise
             values = self._workers.replies()
         return [own, *(value for (value,) in values)]
 
@@ -266,7 +271,8 @@ class ShardedEnv(Environment):
             return function(self.local, row, *arguments)
         process = list(self._workers)[number - 1]
         process.send(worker.CALL, (function, (row, *arguments)))
-        return process.receive()[1][0]
+        with self._unread_replies():
+            return process.receive()[1][0]
 
     # --- a step in all processes ---
 
@@ -282,6 +288,15 @@ class ShardedEnv(Environment):
         self._is_broken = True
         yield
         self._is_broken = False
+
+    @contextlib.contextmanager
+    def _unread_replies(self) -> Iterator[None]:
+        """Mark the environment as broken if a signal interrupts the processes before their replies are read."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self._is_broken = True
+            raise
 
     def _require_whole(self) -> None:
         if self._is_broken and not self._stage:

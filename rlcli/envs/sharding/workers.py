@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import time
 import weakref
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -26,7 +28,10 @@ _CODE = (
 )
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _CLOSE_S = 5.0
-"""Time after which a worker that does not end is killed [s]."""
+"""Time after which workers that do not end are killed [s]."""
+_SILENT_S = 30.0
+"""Time after which a warning names a worker that does not answer [s]."""
+_log = logging.getLogger(__name__)
 
 
 class Worker:
@@ -50,6 +55,8 @@ class Worker:
                 env={**os.environ, **_ONE_THREAD},
             )
         self._channel = Channel(ours, SPIN_S)
+        self._was_named = False
+        """Whether a warning has named it because it did not answer."""
 
     def send(self, kind: bytes, content: Any = None) -> None:
         """Send a message.
@@ -70,7 +77,7 @@ class Worker:
             BaseException: an error of the worker.
         """
         try:
-            kind, content = self._channel.receive()
+            kind, content = self._channel.receive(self._warn_if_silent)
         except ChannelClosedError:
             raise self._ended() from None
         if kind == worker.ERROR:
@@ -87,16 +94,31 @@ class Worker:
         return self._process.poll() is not None
 
     def hang_up(self) -> None:
-        """Close the connection; the process then ends."""
+        """Close the connection; the process then ends, also if it was stopped."""
         self._channel.close()
+        if os.name == "posix" and not self.has_ended():
+            self._process.send_signal(signal.SIGCONT)
 
-    def wait(self) -> None:
-        """Wait for the end of the process; after `_CLOSE_S` kill it."""
+    def wait(self, seconds: float) -> None:
+        """Wait for the end of the process; after this time kill it."""
         try:
-            self._process.wait(_CLOSE_S)
+            self._process.wait(seconds)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+
+    def _warn_if_silent(self) -> None:
+        """Wait for a message; log a warning, once, if there is none for a long time."""
+        if not self._was_named and self._channel.is_silent(_SILENT_S):
+            self._was_named = True
+            _log.warning(
+                "worker process %s of the environment (pid %s) has not answered for %g s; if it was stopped,"
+                " `kill -CONT %s` continues it; else end this command and resume the run",
+                self.number,
+                self.pid,
+                _SILENT_S,
+                self.pid,
+            )
 
     def _ended(self) -> MachineError:
         """Return the error for a process that has ended."""
@@ -155,12 +177,15 @@ class Workers:
 
         Raises:
             MachineError: if a process has ended.
-            BaseException: the first error of a worker, after all have replied.
+            BaseException: the first error of a worker, after all have replied; a KeyboardInterrupt at once, and the
+                workers cannot be used any more.
         """
         contents, first_error = [], None
         for process in self._workers:
             try:
                 contents.append(process.receive()[1])
+            except KeyboardInterrupt:
+                raise
             except BaseException as error:
                 first_error = first_error or error
         if first_error is not None:
@@ -203,8 +228,9 @@ def _create_shared_file() -> int:
 def _close(workers: list[Worker], arrays: int) -> None:
     for process in workers:
         process.hang_up()
+    end = time.monotonic() + _CLOSE_S
     for process in workers:
-        process.wait()
+        process.wait(max(0.0, end - time.monotonic()))
     workers.clear()
     os.close(arrays)
 

@@ -1,6 +1,7 @@
 """Files that the user names for output: a pipe, a socket, a device or a folder is refused before any work."""
 
 import os
+import resource
 import socket
 import stat
 
@@ -50,3 +51,31 @@ def test_output_to_a_link_to_a_socket_is_refused(cli, tmp_path):
             "cannot write link.html: it is a socket" in expect_code(cli("report", "latest", "-o", "link.html"), 2).err
         )
     assert (tmp_path / "link.html").is_symlink()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("eval", "cartpole", "--policy", "zero", "--episodes", 8),
+        ("play", "cartpole", "--policy", "zero", "--viewer", "none", "--num-envs", 8),
+        ("play", "cartpole", "--policy", "zero", "--viewer", "none", "--num-envs", 8, "--env", 2, "--episode", 0),
+    ],
+    ids=["eval", "play", "one episode"],
+)
+def test_recording_that_cannot_be_written_does_not_take_the_results_with_it(cli, command):
+    whole = cli(*command)
+    assert whole.code == 0, whole.err
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        ended = [cli(*command, "--record", "rec.npz", *more) for more in ((), ("--json",))]
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    text, document = ended
+    assert text.code == document.code == 10
+    assert text.out == whole.out
+    assert "error: cannot write rec.npz: File too large" in text.err
+    assert "`ulimit -f`" in text.err
+    assert document.json["recorded"] == []
+    assert "error" not in document.json
+    assert os.listdir() == []

@@ -113,6 +113,28 @@ def test_resume_of_finished_run_changes_nothing(cli, only_run):
     assert {p: p.stat().st_mtime_ns for p in only_run().rglob("*")} == before
 
 
+@pytest.mark.parametrize("damage", ["deleted", "truncated", "both"])
+def test_finished_run_that_lost_its_last_checkpoints_is_continued(cli, only_run, damage):
+    cli("train", "cartpole", *SMALL, "--max-iterations", 4, "agent.save_interval=1")
+    run = only_run()
+    whole, rows = files_of(run, 512), metrics(run)
+    if damage != "truncated":
+        shutil.rmtree(run / "checkpoints/000000000512")
+    if damage != "deleted":
+        left = "000000000384" if damage == "both" else "000000000512"
+        os.truncate(run / "checkpoints" / left / "trainer.safetensors", 100)
+    os.truncate(run / "metrics.jsonl", (run / "metrics.jsonl").stat().st_size - 37)
+    named = cli("train", "--resume", f"{run.name}@step:256", "-q")
+    assert named.code == 0
+    assert not (run / "checkpoints/000000000512/manifest.json").exists() or damage == "truncated"
+    done = cli("train", "--resume", run)
+    assert done.code == 0, done.err
+    last = 256 if damage == "both" else 384
+    assert f"it was finished at step 512, and its newest good checkpoint has step {last}; the training" in done.err
+    assert files_of(run, 512) == whole
+    assert metrics(run) == rows
+
+
 def test_resume_of_earlier_step_drops_later_steps(cli, only_run):
     cli("train", "cartpole", *SMALL, "--max-iterations", 4, "agent.save_interval=1")
     run = only_run()
