@@ -313,7 +313,7 @@ def test_null_removes_a_term(tmp_path):
 
 def test_two_actions_on_one_actuator_are_rejected(tmp_path):
     twice = {"legs": {"func": "joint_position"}, "more": {"func": "joint_position", "joints": ["hip_fl"]}}
-    with pytest.raises(RlcliError, match=r"actions.more.*'hip_fl'.*legs"):
+    with pytest.raises(RlcliError, match=r"actions.more: the action 'legs' drives 'hip_fl' already"):
         build(critter(tmp_path, edited(CRITTER_TASK, actions=twice, rewards={"power": None})))
 
 

@@ -302,7 +302,7 @@ def test_hold_command_without_commands_is_usage_error(task):
     env = make_env(resolve(find_task(task), overrides=["scene.num_envs=1", "sim.engine_threads=1"]))
     with pytest.raises(UsageError) as caught:
         hold_command(env, "vx", 1.0)
-    assert caught.value.hint == "leave out --command"
+    assert caught.value.hint == "leave out --command: the task has no commands"
     assert Playback(env, zero_policy(env)).view.knobs == ()
 
 

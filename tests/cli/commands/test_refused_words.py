@@ -91,10 +91,8 @@ def test_config_file_is_read_up_to_its_limit(cli, monkeypatch):
     assert "larger than 262144 bytes" in cli("show", "cartpole", "--config", "sparse.yaml").err
     os.mkfifo("pipe.yaml")
     done = cli("show", "cartpole", "--config", "pipe.yaml")  # nobody writes to it
-    assert (done.code, "pipe.yaml: cannot be read: nothing was written to the pipe in 0.1 s" in done.err) == (
-        3,
-        True,
-    ), done.err
+    assert done.code == 3
+    assert "pipe.yaml: the file cannot be read: nothing was written to the pipe in 0.1 s" in done.err
     assert "it is not a regular file" in cli("show", "cartpole", "--config", "/dev/zero").err
 
 
