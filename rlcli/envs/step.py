@@ -36,7 +36,7 @@ class Episodes:
     mask: Tensor | None = None
     """Which rows are valid, on a GPU, whose tensors have a row for every environment; None: all. (num_envs,) bool
 
-    The tensors are overwritten by the next step.
+    The tensors are overwritten by the next step, earlier than those of `StepResult`.
     """
 
     def ended(self) -> Episodes:
@@ -54,7 +54,11 @@ class Episodes:
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """Result of one step. Its tensors are not overwritten before the step after the next one."""
+    """Result of one step.
+
+    Its tensors stay valid during the next step and are overwritten by the one after it. `final_obs` and `episodes` are
+    exceptions: the next step overwrites their tensors.
+    """
 
     obs: dict[str, Tensor]
     """Group -> observations; of the new episode where one has just begun. (num_envs, d) float32"""
@@ -67,8 +71,7 @@ class StepResult:
     final_obs: dict[str, Tensor] | None
     """Last observations of the episodes that end, for all environments; None if there is certainly no valid row.
 
-    A row is valid where an episode ended (with `final_obs_of = "truncated"`: where it timed out). The tensors
-    are overwritten by the next step.
+    A row is valid where an episode ended (with `final_obs_of = "truncated"`: where it timed out).
     """
     episodes: Episodes | None
     """Episodes that ended; None if certainly none did."""

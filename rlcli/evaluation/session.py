@@ -140,7 +140,11 @@ def split_overrides(task: str | None, overrides: Sequence[str]) -> tuple[str | N
 
 
 def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
-    """Find a task by its name.
+    """Return the task of a name that the user gave as a task; the name of a run is a common mistake.
+
+    Args:
+        task: name, file or folder of a task.
+        runs_dir: folder of the runs, to name the right option where `task` is a run; None: the default one.
 
     Raises:
         TaskError: if there is no such task. If a run has this name, the message says so.

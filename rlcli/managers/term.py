@@ -103,7 +103,7 @@ class EnvContext:
 
 
 class TermEnv(Protocol):
-    """Part of an environment that `Binder` uses. Terms get the whole environment as their argument `env`."""
+    """Attributes of an environment that `Binder` uses to connect terms with it; terms get the whole environment."""
 
     device: torch.device
 

@@ -311,7 +311,9 @@ def filled(policy: Policy, weights: Mapping[str, Tensor]) -> Policy:
     if expected != found:
         differs = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
         rows = [f"{n[:80]} is {found.get(n, 'missing')}, expected {expected.get(n, 'nothing')}" for n in differs[:4]]
-        raise CheckpointError(f"policy.safetensors and policy.json differ; export again: {', '.join(rows)}")
+        raise CheckpointError(
+            f"policy.safetensors does not fit policy.json: {', '.join(rows)}; export the policy again"
+        )
     for name, value in weights.items():
         if not bool(value.isfinite().all()):
             raise CheckpointError(f"policy.safetensors is corrupt: '{name}' is not finite; export it again")

@@ -316,7 +316,9 @@ def open_checkpoint(folder: Path) -> Checkpoint:
     step = check_json(_Manifest, manifest, file).step
     name = folder.name
     if name.isdecimal() and name.isascii() and len(name) >= 12 and int(name) != step:
-        raise CheckpointError(f"{file} is corrupt: it has step {step}, its folder is named {int(name)}; rename it")
+        raise CheckpointError(
+            f"{file} is corrupt: it has step {step}, its folder is named {name}; rename the folder to {step:012d}"
+        )
     return Checkpoint(folder, manifest)
 
 

@@ -236,7 +236,7 @@ class EntityData:
 
     @property
     def computed_effort(self) -> Tensor:
-        """Efforts of the actuators on the joints without force limits. (num_envs, k) [N or N m]
+        """Efforts that actuators would have on the joints if no force limit applied. (num_envs, k) [N or N m]
 
         Actuator models: efforts of the last substep. Motor, position and velocity actuators of MuJoCo (fixed gain, no
         bias or an affine one, no dynamics): computed from the present state and controls. Other actuators count as 0.

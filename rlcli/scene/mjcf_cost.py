@@ -29,7 +29,7 @@ class ModelCost:
 
     @property
     def total(self) -> float:
-        """Cost to load and compile the model."""
+        """Estimate of the work to load and compile the model, in ordinary elements, for the limits."""
         per_element = sum(self.stored.values()) + self.keys
         return min(self.size + self.assets + self.loads + self.elements * per_element / 1_000, ENDLESS)
 

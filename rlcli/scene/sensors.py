@@ -181,7 +181,7 @@ class RaySensor(LazySensor):
         if float(distances.max()) > 1e-4:
             ray, body = int(distances.argmax()), self._config.body
             message = f"ray {ray} of the ray sensor on body '{body}' has no mirror image"
-            raise TaskError(message, hint="make its pattern symmetric about the x-z plane")
+            raise TaskError(message, hint="make the pattern of this ray sensor symmetric about the x-z plane")
         found: list[int] = partners.tolist()
         return found
 

@@ -101,7 +101,7 @@ def _weighted_terms(evidence: RolloutEvidence) -> list[str]:
 
 
 def silent_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that no reward term with a weight other than 0 is 0 in every step of all fixed policies."""
+    """Check that no reward term with a weight other than 0 is 0 in every step of the fixed policies."""
     if evidence.steps < min(evidence.subject.resolved.task.max_episode_length, MAX_STEPS):
         return  # a term may be other than 0 only at the end of an episode, which a shorter rollout does not reach
     steps = sum(rollout.reward.numel() for rollout in evidence.rollouts)
@@ -146,7 +146,7 @@ def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     if not ends_early or value == 0.0:  # with terminations, any other constant rewards long or short episodes
         reason = "" if ends_early else ", and no episode ends early"
         where = "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf"
-        message = f"the reward is {value:g} in every step of all fixed policies{reason}: there is nothing to learn"
+        message = f"the reward is {value:g} in every step of every simple policy{reason}: there is nothing to learn"
         yield error_at(where, message, "compute the reward from the state or the action", {"value": value})
 
 

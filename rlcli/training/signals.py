@@ -1,4 +1,4 @@
-"""Signals (Ctrl-C, SIGTERM) that stop a training: the first one without loss of work, the second one at once."""
+"""Signals (Ctrl-C, SIGTERM) that stop a training: the first one keeps what is saved, the second one ends it at once."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _SIGNALS = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGHUP")
 
 
 class Interrupted(KeyboardInterrupt):
-    """Exception that ends an iteration after a signal. The work of this iteration is lost."""
+    """Exception that ends an iteration after a signal. A resumed run repeats this iteration; earlier ones are kept."""
 
 
 @dataclass(slots=True)
 class StopRequest(StepObserver):
-    """Context manager that stores the first signal and raises `Interrupted` where that loses no work.
+    """Context manager that stores the first signal and raises `Interrupted` where an iteration may be repeated.
 
     A second signal always raises KeyboardInterrupt. Signals that the process ignores from its start
     (nohup) stay ignored.
@@ -79,7 +79,7 @@ class StopRequest(StepObserver):
         """Check for a signal.
 
         Raises:
-            Interrupted: if a signal has arrived and stopping here loses no work.
+            Interrupted: if a signal has arrived and the work may be interrupted here.
         """
         if self._interruptible and self.signal is not None:
             raise Interrupted

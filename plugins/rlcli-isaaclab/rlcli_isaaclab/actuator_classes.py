@@ -51,7 +51,7 @@ class ActuatorBase:
         """Return a setting of every joint: a number, a mapping from regexes, or the default. (num_envs, joints)"""
         value = default_value if cfg_value is None else cfg_value
         if value is None:
-            raise ValueError("an actuator setting is None and has no default; give it a value")
+            raise ValueError("a setting of an actuator group (such as stiffness) is None and has no default; set it")
         found = torch.zeros(self._num_envs, self.num_joints, device=self._device)
         if isinstance(value, dict):
             columns, _, values = resolve_matching_names_values(value, self.joint_names)

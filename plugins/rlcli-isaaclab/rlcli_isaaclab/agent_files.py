@@ -168,7 +168,9 @@ def _skrl_network(model: Node) -> tuple[dict[str, Any], dict[str, Any]]:
     for container in model.get("network") or []:
         if container.get("type") not in (None, "linear"):
             what = f"a network part of type '{container['type']}' has no counterpart in rlcli"
-            model.report.problem(model.key, what, "write type: linear")
+            model.report.problem(
+                model.key, what, "only networks of type: linear (and conv2d layers) are read: write it"
+            )
         for layer in container.get("layers") or []:
             if isinstance(layer, dict) and "conv2d" in layer:
                 conv = layer["conv2d"]

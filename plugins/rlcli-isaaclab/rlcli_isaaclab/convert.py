@@ -130,7 +130,7 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
     groups = top.get("obs_groups")
     if isinstance(groups, Mapping):
         if list(groups.get("policy", ["policy"])) != ["policy"]:
-            top.note("ignored", "obs_groups", "the policy always observes the group 'policy'")
+            top.note("ignored", "obs_groups", "the actor observes the group 'policy'; other groups are left out")
         if groups.get("critic"):
             config["critic_obs"] = list(groups["critic"])
     adaptive = algorithm.get("schedule", "adaptive") == "adaptive"

@@ -34,7 +34,7 @@ class HookTerm:
         return self
 
     def __call__(self, *args: Any) -> Any:
-        """Raise an error: only the bound term can be called."""
+        """Raise an error: only the copy that the environment makes of the term can be called."""
         raise TypeError(f"the term {self.hook} cannot be called before it is bound to an environment")
 
     def __rlcli_term__(self, name: str) -> Signature:

@@ -6,16 +6,16 @@ from typing import Any
 
 
 class VisualizationMarkers:
-    """Markers that are not drawn."""
+    """Markers that are never drawn, so that tasks which create them run."""
 
     def __init__(self, cfg: Any) -> None:
         self.cfg = cfg
 
     def visualize(self, *poses: Any, **options: Any) -> None:
-        """Do nothing."""
+        """Do nothing: rlcli does not draw a task's own markers."""
 
     def set_visibility(self, visible: bool) -> None:
-        """Do nothing."""
+        """Do nothing: rlcli does not draw a task's own markers."""
 
     def is_visible(self) -> bool:
         """Return False."""

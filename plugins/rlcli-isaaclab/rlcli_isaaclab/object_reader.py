@@ -16,7 +16,7 @@ from rlcli_isaaclab.table import ACTIONS, ONCE_PER_STEP
 from rlcli_isaaclab.term_values import has_no_effect, is_plain
 
 OBJECT_KEYS = ("class_type", "resampling_time_range", "debug_vis")
-"""Settings of an action or a command that are not its own."""
+"""Settings of Isaac Lab's base configuration of actions and commands, which the user's class does not receive."""
 
 
 class ObjectReader:

@@ -1,4 +1,4 @@
-"""Reader of Isaac Lab's contact and ray sensors."""
+"""Reader of the settings of Isaac Lab's sensors: contact and ray sensors, cameras, IMUs, frame transformers."""
 
 from __future__ import annotations
 
@@ -82,7 +82,13 @@ _FORWARD = {
 
 
 def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, Any] | None:
-    """Return the settings of a camera, which is fixed in the environment or to a body of an entity."""
+    """Return the settings of a camera, or None after reporting why it cannot be read.
+
+    Args:
+        item: Isaac Lab's settings of the camera.
+        entity: entity to whose body the camera is fixed; None: it is fixed in the environment.
+        inside: parts of the camera's prim path below the entity.
+    """
     wanted = list(item.get("data_types", ["rgb"]))
     if len(wanted) != 1 or wanted[0] not in _CAMERA_DATA:
         what = f"a camera has one of {listing(_CAMERA_DATA)}; found {listing(wanted)}"

@@ -260,7 +260,7 @@ class TermReader(ObjectReader):
             config["mode"] = node.require("mode")
             if config["mode"] == "prestartup":
                 config["mode"] = "startup"
-                node.note("approximated", "mode", "runs at startup")
+                node.note("approximated", "mode", "the event runs at startup, after the model is compiled")
             if "interval_range_s" in node and config["mode"] == "interval":
                 config["interval_range_s"] = [as_float(v) for v in node.get("interval_range_s")]
             if node.get("is_global_time", False):

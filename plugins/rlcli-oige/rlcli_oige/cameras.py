@@ -119,7 +119,7 @@ def add_update_semantics(prim: Any, semantic_label: str, type_label: str = "clas
 
 
 class Camera(Counterpart):
-    """`omni.isaac.sensor.Camera`: settings of a camera of a robot's model."""
+    """`omni.isaac.sensor.Camera`: stores the task's settings of a camera that the robot's MJCF already has."""
 
     def __init__(self, prim_path: str, *args: Any, **kwargs: Any) -> None:
         self.prim_path = prim_path

@@ -44,7 +44,7 @@ def compose(document: Document, file: FilePath, label: str) -> Document:
 
 
 def label_at(document: Document, path: Path, label: str) -> str:
-    """Return the name of the file that has a key; `label` if the document is one file."""
+    """Return the name, for messages, of the YAML file that set the key at a path; `label` if there is one file only."""
     if not isinstance(document, Composed):
         return label
     while path and path not in document.labels:

@@ -54,7 +54,11 @@ def _on_cpu(task_class: type) -> type:
 
 
 class OigeEnv(DirectEnv):
-    """Direct workflow for `RLTask`: it splits the reset flag, clips after rewards, and applies forces for one step."""
+    """Direct workflow for `RLTask`.
+
+    The task's reset flag is split into terminated and truncated, observations are clipped after the rewards are
+    computed, and external forces act for one step.
+    """
 
     task: RLTask
     not_recorded: ClassVar[str | None] = "tasks in OmniIsaacGymEnvs' form run step by step on a GPU"

@@ -229,7 +229,8 @@ class DelayConfig(StrictModel):
                 near = f"{lower:g} or {lower + step_dt:g}"
                 raise ValueError(f"{value:g} s is no multiple of the control period of {step_dt:g} s; give {near}")
         if low > high or high / step_dt > 1000:
-            raise ValueError(f"the range is {low:g} to {high:g} s; give [low, high] of at most 1000 control periods")
+            allowed = f"give [low, high] in seconds, with low <= high <= {1000 * step_dt:g}"
+            raise ValueError(f"the delay is {low:g} to {high:g} s; {allowed}")
         return round(low / step_dt), round(high / step_dt)
 
 
