@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import TaskError, UsageError
-from rlcli.robot_model import SCALAR, Robot, short
+from rlcli.scaffold_mjcf import SCALAR, Robot, short
 from rlcli.scene.mjcf_scan import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf
 

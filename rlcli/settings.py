@@ -1,6 +1,6 @@
 """The user's settings of the command line. They hold for all folders and tasks and are never a part of a task.
 
-The file `settings.yaml` is in the platform's folder for user configuration; `rlcli.config.settings_file` reads it.
+The file `settings.yaml` is in the platform's folder for user configuration; `rlcli.config.user_settings` reads it.
 Precedence: flag, environment variable, settings file, default. Programs that import the library ignore the file.
 """
 

@@ -17,7 +17,7 @@ REPOSITORY = PACKAGE.parent
 LAYERS = """
     errors task trainers formats random machine settings safe_text progress
     registry  config  sim  scene  managers  envs  mdp  rl  runs  replay  evaluation  deploy  viewer  reporting  testing
-    training  adapters  tuning  doctor  robot_model  scaffold_robot  scaffold  api  cli  gym  pytest_plugin
+    training  adapters  tuning  doctor  scaffold_mjcf  scaffold_robot  scaffold  api  cli  gym  pytest_plugin
 """
 """Lowest first. All names of the first line are one layer; each later name is a separate layer."""
 TRAINERS = sorted(file.parent.name for file in PACKAGE.glob("rl/*/config.py"))
@@ -226,7 +226,7 @@ def test_importing_package_imports_nothing_else():
 def test_training_on_cpu_loads_no_gpu_engine(tmp_path):
     words = ["train", "cartpole", "--agent", "ppo", "--device", "cpu", "--num-envs", "4", "--max-iterations", "1"]
     words += ["--logger", "none", "-q", "--runs-dir", str(tmp_path)]
-    modules = [name for name in MODULES if name.startswith("rlcli.sim.warp") or name == "rlcli.sim.mask_selection"]
+    modules = [name for name in MODULES if name.startswith("rlcli.sim.warp") or name == "rlcli.sim.gpu_selection"]
     assert len(modules) > 3
     program = (
         f"import sys; from rlcli.cli.app import main; code = main({words!r}); "

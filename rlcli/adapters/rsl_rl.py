@@ -7,8 +7,8 @@ from rsl_rl.env import VecEnv as RslRlBase
 from tensordict import TensorDict
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
-from rlcli.rl.statistics import EpisodeStatistics
+from rlcli.envs.environment_protocol import Environment
+from rlcli.rl.episode_statistics import EpisodeStatistics
 
 
 class RslRlVecEnv(RslRlBase):  # type: ignore[misc]  # RSL-RL has no types

@@ -18,7 +18,7 @@ from typer._click.exceptions import UsageError as ClickUsageError
 from rlcli.cli.ui.console import console, discard, print_log_records
 from rlcli.cli.ui.help_text import HelpGroup
 from rlcli.cli.ui.options import CHOOSE, add_command
-from rlcli.config.settings_file import read_settings
+from rlcli.config.user_settings import read_settings
 from rlcli.errors import INTERRUPTED, CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
 from rlcli.machine import AddressSpaceCheck, MatplotlibFinder, delay_garbage_collection, memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, exit_refused, load_entry, load_object, malformed_metadata_ignored

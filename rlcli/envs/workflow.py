@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.layout import Layout
 from rlcli.scene.scene import Scene
 from rlcli.scene.terrain import Terrain

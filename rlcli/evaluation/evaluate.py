@@ -8,7 +8,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.step import Episodes, StepRecord, StepResult
 from rlcli.managers.termination import DIVERGED

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rlcli.config.load import Resolved
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.observers import StepObserver
 from rlcli.errors import MachineError
 from rlcli.replay.resimulate import ReplayWorld

@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from rlcli.config.schema import AutopsyConfig
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.step import Episodes, StepRecord
 from rlcli.errors import CheckpointError, MachineError, RlcliError

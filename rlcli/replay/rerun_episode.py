@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.step import StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError

@@ -33,7 +33,7 @@ from torch import Tensor
 import rlcli
 from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.layout import TermLayout
 from rlcli.envs.step import Episodes
 from rlcli.errors import CheckpointError

@@ -10,10 +10,10 @@ from importlib import metadata
 import torch
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.errors import ConfigError, DependencyError, pip_install
+from rlcli.rl.episode_statistics import EpisodeStatistics
 from rlcli.rl.policy import Policy, PolicySpec
-from rlcli.rl.statistics import EpisodeStatistics
 from rlcli.rl.trainer import Report
 
 _RECENT_OBS = 256

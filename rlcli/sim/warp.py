@@ -19,11 +19,11 @@ from rlcli.sim import warp_kernels
 from rlcli.sim.acceleration_fields import force_sensor_columns
 from rlcli.sim.column_views import as_index
 from rlcli.sim.divergence_report import STATE_LIMIT, Divergence, StateLayout
-from rlcli.sim.mask_selection import MaskSelection
+from rlcli.sim.gpu_selection import MaskSelection
 from rlcli.sim.selection import ALL, Field, Groups, Selection
 from rlcli.sim.warp_fields import FORCE, STATE
 from rlcli.sim.warp_memory import OVERFLOW_SETTINGS, overflow_error
-from rlcli.sim.warp_worlds import WarpWorlds
+from rlcli.sim.warp_world_state import WarpWorlds
 
 _GroupFlags = wp.types.vector(length=mujoco.mjNGROUP, dtype=float)
 

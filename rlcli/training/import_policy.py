@@ -25,7 +25,7 @@ from rlcli.rl.policy import blank_policy, filled
 from rlcli.rl.trainer import TrainerState
 from rlcli.runs.provenance import environment_record
 from rlcli.runs.run import create_run
-from rlcli.runs.untrusted_archive import VEC_NORMALIZE_HINT, read_archive_file, read_member, read_tensors
+from rlcli.runs.untrusted_weights import VEC_NORMALIZE_HINT, read_archive_file, read_member, read_tensors
 from rlcli.training.checkpoint_writer import manifest_entries, write_checkpoint
 
 _NORMALIZER_EPS = 1e-2

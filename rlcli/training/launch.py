@@ -23,7 +23,7 @@ from rlcli.training.job import Job, TrainingResult, threads
 from rlcli.training.loggers import check_loggers
 
 if TYPE_CHECKING:
-    from rlcli.envs.environment import Environment
+    from rlcli.envs.environment_protocol import Environment
     from rlcli.registry import TaskSource
     from rlcli.rl.trainer import Trainer
     from rlcli.training.signals import StopRequest

@@ -24,7 +24,7 @@ from rlcli.training.signals import Interrupted, StopRequest
 
 if TYPE_CHECKING:
     from rlcli.training.trackers import Logger
-    from rlcli.viewer.training_videos import TrainingVideos
+    from rlcli.viewer.training_video_recorder import TrainingVideos
 
 _log = logging.getLogger(__name__)
 

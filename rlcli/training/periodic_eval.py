@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.evaluation.evaluate import evaluate
 from rlcli.rl.acting import trained_policy
 from rlcli.rl.policy import Policy

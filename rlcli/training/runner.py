@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from rlcli.config.dump import to_data
 from rlcli.deploy.env_description import describe
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import DivergedError, RlcliError, Stopped
@@ -35,7 +35,7 @@ from rlcli.training.time_to_threshold import read_threshold, training_s
 
 if TYPE_CHECKING:
     from rlcli.training.trackers import Logger
-    from rlcli.viewer.training_videos import TrainingVideos
+    from rlcli.viewer.training_video_recorder import TrainingVideos
 
 _log = logging.getLogger(__name__)
 
@@ -250,7 +250,7 @@ def _training_videos(job: Job, stop: StopRequest) -> TrainingVideos | None:
     if not job.video_every or not job.writes:
         return None
     # imported here: most trainings do not need OpenGL and the video modules
-    from rlcli.viewer.training_videos import TrainingVideos
+    from rlcli.viewer.training_video_recorder import TrainingVideos
 
     def make() -> VecEnv:
         return _make_play_env(job, "video", {"scene.num_envs": 1, "sim.engine_threads": 1})

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rlcli.config.load import Resolved
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.sharding.training_env import make_training_env
 from rlcli.errors import CheckpointError, RlcliError, one_line
 from rlcli.random import derive

@@ -8,8 +8,8 @@ import pytest
 from support.pseudo_terminal import run_on_terminal
 
 from rlcli.cli.ui import viewer_choice
-from rlcli.config.settings_file import read_settings
-from rlcli.config.settings_schema import UserSettings
+from rlcli.config.user_settings import read_settings
+from rlcli.config.user_settings_schema import UserSettings
 from rlcli.runs.run_ref import default_runs_dir
 from rlcli.settings import settings_file, use_settings
 from rlcli.training.loggers import LOGGERS

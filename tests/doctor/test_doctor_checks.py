@@ -13,8 +13,8 @@ from rlcli.doctor.compute_and_graphics import (
     run_isolated,
     shared_memory_check,
 )
+from rlcli.doctor.host_and_settings import harmful_variables, machine_checks, memory_check, settings_checks
 from rlcli.doctor.installation import installation_checks, violates_bounds
-from rlcli.doctor.machine import harmful_variables, machine_checks, memory_check, settings_checks
 from rlcli.errors import pip_install
 from rlcli.machine import memory_limit
 from rlcli.settings import settings_file

@@ -6,7 +6,7 @@ import torch
 from rlcli.errors import ConfigError
 from rlcli.evaluation.evaluate import evaluate
 from rlcli.rl.acting import random_policy, zero_policy
-from rlcli.rl.statistics import EpisodeStatistics
+from rlcli.rl.episode_statistics import EpisodeStatistics
 
 
 @pytest.mark.parametrize("episodes", [1, 3, 4, 10])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rlcli.envs.step import Episodes
-from rlcli.rl.statistics import EpisodeStatistics
+from rlcli.rl.episode_statistics import EpisodeStatistics
 
 LENGTH_S = 2.0
 

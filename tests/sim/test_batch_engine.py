@@ -55,7 +55,7 @@ def test_engine_refuses_more_worlds_than_memory_holds(monkeypatch):
 
 def test_engine_states_the_memory_of_many_worlds_before_it_builds_them(monkeypatch, caplog):
     monkeypatch.setattr("rlcli.machine.available_memory", lambda: 2**24)
-    monkeypatch.setattr("rlcli.sim.batch_worlds.make_batch", None)
+    monkeypatch.setattr("rlcli.sim.batch_world_state.make_batch", None)
     with pytest.raises(TypeError):  # nothing is built
         engine_of(model_of(), 3000)
     assert re.search(r"3000 environments need at least 0\.0 GiB of the 0\.0 GiB that are free", caplog.text)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from rlcli import random
-from rlcli.sim.mask_selection import MaskSelection
+from rlcli.sim.gpu_selection import MaskSelection
 from rlcli.sim.selection import IdSelection
 
 N = 11

@@ -13,7 +13,7 @@ from rlcli.training.job import Job
 from rlcli.training.loggers import read_metrics
 from rlcli.training.runner import _training_videos
 from rlcli.training.signals import StopRequest
-from rlcli.viewer.training_videos import TrainingVideos
+from rlcli.viewer.training_video_recorder import TrainingVideos
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 

@@ -285,9 +285,8 @@ class Stage(Counterpart):
     def clone(self, source: Prim, path: str, pos: Any, quat: Any) -> None:
         """Add a copy of a prim with its model and settings; a path that exists only gets the pose."""
         if path != source.prim_path:
-            copy = self.define(
-                path, *(getattr(source, name) if name in source.given else None for name in ("pos", "quat"))
-            )
+            given = (getattr(source, name) if name in source.given else None for name in ("pos", "quat"))
+            copy = self.define(path, *given)
             copy.child = None if source.child is None else source.child.copy()
             copy.label, copy.shape, copy._settings = source.label, source.shape, dict(source.settings)
         self.define(path, pos, quat)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.errors import ConfigError
 from rlcli.random import derive
 from rlcli.rl.nan_check import require_finite_learner

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli_rl_games.base import RlGamesTrainer
 from rlcli_rl_games.config import RlGamesConfig, SacConfig
 from rlcli_rl_games.ppo import PpoTrainer

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.step import StepResult
-from rlcli.rl.statistics import EpisodeStatistics
+from rlcli.rl.episode_statistics import EpisodeStatistics
 from rlcli_rl_games.library import IVecEnv, gym
 
 

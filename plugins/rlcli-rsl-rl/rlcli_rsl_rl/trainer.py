@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.random import derive
 from rlcli.registry import is_offered, load_object
 from rlcli.rl.nan_check import require_finite_learner

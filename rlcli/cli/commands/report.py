@@ -73,7 +73,7 @@ def command(
 
 def _add_media(page: Page, run: Run, checkpoint: Path | None, *, no_eval: bool, no_video: bool) -> tuple[str, str]:
     """Add evaluation and video to the page; return for each `stored`, `made`, `older` or an empty text (missing)."""
-    from rlcli.reporting.page_media import PageMedia
+    from rlcli.reporting.page_evaluation import PageMedia
 
     if checkpoint is None:
         page.missing["evaluation"] = "There is no evaluation: the run has no complete checkpoint."

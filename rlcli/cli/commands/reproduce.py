@@ -12,7 +12,7 @@ from rlcli.cli.ui.options import RunRef, RunsDir
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rlcli.envs.environment import Environment
+    from rlcli.envs.environment_protocol import Environment
     from rlcli.runs.run import Run
 
 Row = tuple[str, Any, Any]

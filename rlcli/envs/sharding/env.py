@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from rlcli.config.load import Resolved
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.make import make_env
 from rlcli.envs.observers import Observers
 from rlcli.envs.shard_range import Shard, split
 from rlcli.envs.sharding import worker
 from rlcli.envs.sharding.arrays import ArraySpec, map_tensors
-from rlcli.envs.sharding.engine import ShardedEngine, sums
+from rlcli.envs.sharding.engine_view import ShardedEngine, sums
 from rlcli.envs.sharding.shard_step import (
     SLOTS,
     Columns,

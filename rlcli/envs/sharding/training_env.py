@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rlcli.config.load import Resolved
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.make import make_env
 from rlcli.envs.sharding.choice import number_of_workers
 

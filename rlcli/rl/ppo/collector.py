@@ -11,10 +11,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.mirror import MirrorMaps
 from rlcli.envs.step import StepResult
 from rlcli.rl import distributed
+from rlcli.rl.episode_statistics import EpisodeStatistics
 from rlcli.rl.nan_check import moments, require_finite
 from rlcli.rl.policy import Normalizer
 from rlcli.rl.ppo.config import PpoConfig
@@ -22,7 +23,6 @@ from rlcli.rl.ppo.loss import log_prob, standardize
 from rlcli.rl.ppo.networks import ActorCritic, ValueNormalizer, unroll
 from rlcli.rl.ppo.rollout_buffer import RolloutBuffer
 from rlcli.rl.ppo.setup import minibatch_sizes
-from rlcli.rl.statistics import EpisodeStatistics
 
 
 class Collector:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.mirror import ColumnMap
 from rlcli.rl.cnn import Cnn, CnnSpec
 from rlcli.rl.mlp import Mlp

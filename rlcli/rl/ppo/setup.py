@@ -7,7 +7,7 @@ import math
 import torch
 from pydantic import ValidationError
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.mirror import MirrorMaps, mirror_maps
 from rlcli.rl.cnn import CnnSpec
 from rlcli.rl.policy import PolicySpec

@@ -11,10 +11,10 @@ import torch
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
+from rlcli.rl.episode_statistics import EpisodeStatistics
 from rlcli.rl.policy import Normalizer
 from rlcli.rl.sb3.buffers import TorchReplayBuffer, TorchRolloutBuffer
-from rlcli.rl.statistics import EpisodeStatistics
 
 
 class _Collecting:

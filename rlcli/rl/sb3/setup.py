@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.rl.optimizers import Adam
 from rlcli.rl.policy import ACTIVATIONS, PolicySpec
 from rlcli.rl.sb3.algorithms import FastA2C, FastDDPG, FastPPO, FastSAC, FastTD3

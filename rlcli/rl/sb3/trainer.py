@@ -11,7 +11,7 @@ import torch
 from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.errors import DivergedError
 from rlcli.random import derive
 from rlcli.rl.budget import remaining_budget

@@ -10,7 +10,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv as Sb3Base
 
-from rlcli.envs.environment import Environment
+from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.step import StepResult
 
 UNBOUNDED = 1e6

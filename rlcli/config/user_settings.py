@@ -20,7 +20,7 @@ def read_settings() -> dict[str, Any]:
 
     from rlcli.config import messages
     from rlcli.config.layers import document_origins, read
-    from rlcli.config.settings_schema import UserSettings
+    from rlcli.config.user_settings_schema import UserSettings
 
     hint = "correct the file, or set RLCLI_SETTINGS=none to ignore it"
     try:

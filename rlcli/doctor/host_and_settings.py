@@ -6,7 +6,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from rlcli.config.settings_file import read_settings
+from rlcli.config.user_settings import read_settings
 from rlcli.doctor.check import Check
 from rlcli.errors import ConfigError
 from rlcli.machine import available_cores, available_memory, core_quota, memory_limit
