@@ -27,7 +27,7 @@ from rlcli.config.term_signatures import (
 from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing, pip_install
 from rlcli.formats import Note
 from rlcli.registry import TRAINERS, TaskSource, catalog, find_entry, formats, load_entry
-from rlcli.registry.imports import load_spec
+from rlcli.registry.plugin_imports import load_spec
 from rlcli.trainers import TrainerSpec
 
 PATCHES = ("agents", "play")

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from rlcli.deploy.graph import DeployedPolicy
+from rlcli.deploy.deployed_policy import DeployedPolicy
 from rlcli.runs.checkpoint_manifest import ActionColumns, DeploymentRecord, LayoutRecord, ObservationColumns
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.run import RECORD

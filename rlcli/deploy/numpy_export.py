@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.deploy.graph import DeployedPolicy
+from rlcli.deploy.deployed_policy import DeployedPolicy
 
 _TEMPLATE = Path(__file__).parent / "deployed" / "policy.py"
 

@@ -14,7 +14,7 @@ from rlcli.doctor.check import Check
 from rlcli.doctor.installation import TRIPLE, version
 from rlcli.errors import MachineError, pip_install
 from rlcli.machine import available_cores, has_gpu_driver, python_command
-from rlcli.registry.imports import release_numbers
+from rlcli.registry.plugin_imports import release_numbers
 from rlcli.registry.probe import signal_name
 from rlcli.sim.gl import candidates
 

@@ -11,7 +11,7 @@ import rlcli
 from rlcli.doctor.check import Check
 from rlcli.errors import pip_install
 from rlcli.registry import Entry, catalog, unreadable_distributions
-from rlcli.registry.imports import release_numbers
+from rlcli.registry.plugin_imports import release_numbers
 from rlcli.registry.probe import probe
 
 TRIPLE = ("mujoco", "mujoco-core", "mujoco-studio")

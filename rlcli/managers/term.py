@@ -18,7 +18,7 @@ from rlcli.config.strict_yaml import Path
 from rlcli.config.term_signatures import SELECTORS, Signature
 from rlcli.errors import ConfigError, DivergedError, Problem, ShapeError, TaskError, did_you_mean, listing
 from rlcli.managers.attribute_state import AttributeState
-from rlcli.managers.tunable import TunableValues
+from rlcli.managers.curriculum_values import TunableValues
 from rlcli.random import stream
 from rlcli.registry import is_framework, load_module
 from rlcli.scene.entity import Entity

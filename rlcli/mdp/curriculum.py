@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import Address, Command
+from rlcli.mdp.parameter_types import Address, Command
 from rlcli.mdp.term import EntityTerm, Term
 from rlcli.sim.selection import Selection
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import listing
-from rlcli.mdp.parameters import Entity, ManagedEnv
+from rlcli.mdp.parameter_types import Entity, ManagedEnv
 from rlcli.mdp.randomization_base import Pair, Ranges, element_names
 from rlcli.mdp.term import BodyTerm, JointTerm, Term
 from rlcli.scene.names import NameProblem

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import CameraSensor, Command, ContactSensor, Entity, ManagedEnv, RaySensor
+from rlcli.mdp.parameter_types import CameraSensor, Command, ContactSensor, Entity, ManagedEnv, RaySensor
 from rlcli.mdp.term_helpers import HandleTerm, constant, single
 from rlcli.sim.rotations import atan2, conjugate, length, multiply, roll_pitch_yaw, rotate_inverse, unique, wrap_to_pi
 from rlcli.task import Bodies, Joints, Sensors, Sites, reads_body_forces

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import listing
-from rlcli.mdp.parameters import Entity
+from rlcli.mdp.parameter_types import Entity
 from rlcli.mdp.term import Term
 from rlcli.mdp.term_helpers import column_numbers
 from rlcli.scene.model_fields import ModelField

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from rlcli.mdp.parameters import Command, Entity, ManagedEnv, VecEnv
+from rlcli.mdp.parameter_types import Command, Entity, ManagedEnv, VecEnv
 from rlcli.mdp.term_helpers import angle_to_goal, constant, distance_to_goal, goal_in_world, single
 from rlcli.sim.rotations import length, wrap_to_pi
 from rlcli.task import Bodies, Joints, Sites

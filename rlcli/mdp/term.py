@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rlcli.mdp.parameters import ManagedEnv
+from rlcli.mdp.parameter_types import ManagedEnv
 from rlcli.sim.selection import Columns
 from rlcli.task import Actuators, Bodies, Entity, Geoms, Joints, Pairs, Sites, Tendons
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import Command
+from rlcli.mdp.parameter_types import Command
 from rlcli.mdp.term import EntityTerm
 from rlcli.sim.rotations import length, multiply, rotate, turn_between
 from rlcli.sim.selection import Columns

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import Command, ContactSensor, Entity, ManagedEnv
+from rlcli.mdp.parameter_types import Command, ContactSensor, Entity, ManagedEnv
 from rlcli.mdp.term_helpers import any_column, cosine, goal_in_world, strongest_force
 from rlcli.sim.rotations import length
 from rlcli.task import Joints, Range

@@ -15,7 +15,7 @@ from typing import Any
 from rlcli.errors import DependencyError, TaskError, pip_install
 from rlcli.formats import FormatSpec
 from rlcli.registry.entries import FORMATS, OWN, Entry, catalog, find_entry
-from rlcli.registry.imports import PluginError, call_entry, load_entry, load_spec
+from rlcli.registry.plugin_imports import PluginError, call_entry, load_entry, load_spec
 from rlcli.registry.task_location import TaskSource
 
 _log = logging.getLogger(__name__)

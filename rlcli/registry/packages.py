@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rlcli.errors import TaskError
 from rlcli.registry.entries import GROUPS, Entry, catalog
-from rlcli.registry.imports import contain_side_effects, error_location, load_spec
+from rlcli.registry.plugin_imports import contain_side_effects, error_location, load_spec
 from rlcli.registry.task_location import TaskSource
 from rlcli.task import TaskSpec
 

@@ -134,7 +134,7 @@ def probe(
             stop.set()
             raise
     if stop.is_set():
-        raise InterruptedError("the probe was stopped before its end")
+        raise InterruptedError("loading the plugins was stopped before its end; run the command again")
     if group == TASKS and address_space() is None:  # with a limit on the memory, a task may only seem broken
         _update_cache({_key(entry): found[entry.qualified].record() for entry in entries})
     return {entry.qualified: found[entry.qualified] for entry in entries}

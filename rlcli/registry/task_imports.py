@@ -11,8 +11,8 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
-from rlcli.registry.imports import contain_side_effects
 from rlcli.registry.module_aliases import TaskFileLoader, files_below, import_by_name, is_alias, register_package
+from rlcli.registry.plugin_imports import contain_side_effects
 
 CONFIGURATION = "env_cfg_entry_point"
 """Argument of a registration with Gymnasium that names the configuration of a task."""

@@ -60,7 +60,7 @@ class CnnSpec(BaseModel):
                 )
             if image.shape[0] % image.steps:
                 raise ValueError(
-                    f"the {image.shape[0]} channels of an image must be a multiple of its {image.steps} steps"
+                    f"an image with {image.shape[0]} channels cannot hold a history of {image.steps} equal steps"
                 )
             end = image.stop
             self.sizes(image)

@@ -49,7 +49,7 @@ def check_formula(value: Any) -> None:
             raise ValueError("the constant of a formula must be a list of numbers")
         return
     if not isinstance(value, dict):
-        raise ValueError(f"{str(value)[:60]} is not a formula, which is a list of numbers or a mapping")
+        raise ValueError(f"{str(value)[:60]} is not a list of numbers or a mapping; the manifest is damaged")
     keys, at, name = set(value), value.get("at", []), value.get("given")
     if not isinstance(at, list) or not all(type(i) is int and 0 <= i < 2**31 for i in at):
         raise ValueError("`at` of a formula must be a list of indices, which are not negative")
@@ -59,7 +59,7 @@ def check_formula(value: Any) -> None:
         return
     own = {"b", "a", "key"} if value.get("op") == "filter" else set()
     if keys != {"op", "of"} | own or not isinstance(value["op"], str) or value["op"] not in OPS:
-        raise ValueError(f"{str(value)[:60]} is not a formula that this rlcli knows")
+        raise ValueError(f"{str(value)[:60]} is no formula of this rlcli version; use another checkpoint")
     count, of = OPS[value["op"]], value["of"]
     if not isinstance(of, list) or (count is not None and len(of) != count) or not of:
         raise ValueError(f"operation '{value['op']}' of a formula takes {count or 'one or more'} operands")
@@ -146,7 +146,7 @@ class _Formula(_Record):
         if value is not None:
             check_formula(value)
         if closed and value is None:
-            raise ValueError("'value' must be a formula, because 'closed' is true")
+            raise ValueError("the manifest is damaged: a closed term has no formula in 'value'; use another checkpoint")
         if not closed and isinstance(self, ObservationFormula) and not _is_external_input(value):
             raise ValueError("'value' must be {'given': 'observation/NAME'}, because 'closed' is false")
         return self

@@ -32,7 +32,7 @@ class Threshold:
         return low is not None and low >= self.value
 
     def episodes(self, least: int) -> int:
-        """Return how many episodes, at least `least`, give an interval that can reach the threshold."""
+        """Return how many evaluation episodes, at least `least`, make the interval narrow enough for the threshold."""
         if self.key != "success":
             return max(least, 2)
         from rlcli.rl.confidence import NORMAL  # it imports numpy

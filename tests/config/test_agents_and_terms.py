@@ -304,9 +304,9 @@ def test_ambiguous_trainer_is_not_reported_as_missing(task, monkeypatch):
 def test_trainer_with_newer_api_is_refused(task, monkeypatch):
     from dataclasses import replace
 
-    from rlcli.registry import imports
+    from rlcli.registry import plugin_imports
 
-    real, newer = imports.load_entry, imports.API_VERSION + 1
-    monkeypatch.setattr(imports, "load_entry", lambda entry, kind: replace(real(entry, kind), api=newer))
-    with pytest.raises(TaskError, match=rf"needs plugin API {newer}; this rlcli has {imports.API_VERSION}"):
+    real, newer = plugin_imports.load_entry, plugin_imports.API_VERSION + 1
+    monkeypatch.setattr(plugin_imports, "load_entry", lambda entry, kind: replace(real(entry, kind), api=newer))
+    with pytest.raises(TaskError, match=rf"needs plugin API {newer}; this rlcli has {plugin_imports.API_VERSION}"):
         resolve(task())

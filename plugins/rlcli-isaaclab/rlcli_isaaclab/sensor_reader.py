@@ -33,7 +33,7 @@ def read_sensor(kind: str, item: Node, prims: Mapping[str, str], frames: dict[st
     inside = parts[parts.index(prims[entity]) + 1 :]
     body = inside[-1] if inside else None
     if item.data.get("update_period"):
-        item.note("ignored", "update_period", "sensors are updated in every step")
+        item.note("ignored", "update_period", "rlcli updates sensors in every environment step")
     else:
         item.skip("update_period")
     if kind == "ContactSensor":

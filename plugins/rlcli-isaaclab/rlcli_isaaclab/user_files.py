@@ -1,4 +1,4 @@
-"""Source code of the user's functions, which is searched for calls that a model must be prepared for."""
+"""Adaptation of the user's functions: what they read from the model, found in their source, and where they run."""
 
 from __future__ import annotations
 

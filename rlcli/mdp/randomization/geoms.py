@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import mujoco
 
-from rlcli.mdp.parameters import Entity
+from rlcli.mdp.parameter_types import Entity
 from rlcli.mdp.randomization_base import (
     SMALLEST,
     AxisRandomization,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import Command, Entity, ManagedEnv, RaySensor
+from rlcli.mdp.parameter_types import Command, Entity, ManagedEnv, RaySensor
 from rlcli.mdp.term import EntityTerm, Term
 from rlcli.mdp.term_helpers import commanded_speed, constant
 from rlcli.scene.names import match

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import Command, ContactSensor, Entity, ManagedEnv
+from rlcli.mdp.parameter_types import Command, ContactSensor, Entity, ManagedEnv
 from rlcli.mdp.term import EntityTerm
 from rlcli.mdp.term_helpers import all_columns, commanded_speed, is_moving, require_one_per_body, strongest_force
 from rlcli.sim.rotations import length

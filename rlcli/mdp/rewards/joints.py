@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import Command, Entity, ManagedEnv
+from rlcli.mdp.parameter_types import Command, Entity, ManagedEnv
 from rlcli.mdp.term import JointTerm
 from rlcli.mdp.term_helpers import commanded_speed, is_moving, sum_columns
 from rlcli.sim.rotations import length

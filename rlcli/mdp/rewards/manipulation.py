@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rlcli.mdp.parameters import Command, Entity, ManagedEnv
+from rlcli.mdp.parameter_types import Command, Entity, ManagedEnv
 from rlcli.mdp.term_helpers import HandleTerm, angle_to_goal, distance_to_goal, goal_in_world, single
 from rlcli.sim.rotations import axis_x, axis_y, axis_z, length, turn_between
 from rlcli.task import Bodies, Joints, Sites
