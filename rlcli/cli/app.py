@@ -166,6 +166,8 @@ def _run(arguments: list[str]) -> int:
         failure: RlcliError = UsageError("no command given", hint="rlcli --help lists the commands")
     except (Exception, KeyboardInterrupt, SystemExit) as error:
         failure = _as_rlcli_error(error, arguments)
+        if failure.kind == "bug" and isinstance(error, SystemExit):
+            raise  # not from the code of a task or plugin: typer ends completions and closed pipes in this way
         is_expected = isinstance(error, ClickException | KeyboardInterrupt | typer.Abort)
         if failure.kind == "bug" or (console.debug and not is_expected):
             traceback.print_exc()

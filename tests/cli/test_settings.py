@@ -144,7 +144,7 @@ def test_missing_settings_file_names_variable(monkeypatch, in_process, tmp_path)
         monkeypatch.setenv("RLCLI_SETTINGS", str(named))
         code, _, err = in_process("runs")
         assert code == 3
-        assert err.startswith(f"error: {named}: cannot be read")
+        assert err.startswith(f"error: {named}: the file cannot be read")
         assert "RLCLI_SETTINGS=none" in err
 
 
