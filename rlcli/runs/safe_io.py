@@ -173,11 +173,11 @@ def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:
         )
         _check_depth(value)
     except _StrictError as error:
-        raise CheckpointError(f"{file} is corrupt: {error}; restore it from a copy") from None
+        raise CheckpointError(f"{file} is corrupt: {error}", hint="restore it from a copy") from None
     except (ValueError, RecursionError):
-        raise CheckpointError(f"{file} is corrupt: not JSON; restore it from a copy") from None
+        raise CheckpointError(f"{file} is corrupt: not JSON", hint="restore it from a copy") from None
     if not isinstance(value, dict):
-        raise CheckpointError(f"{file} is corrupt: not a JSON object; restore it from a copy")
+        raise CheckpointError(f"{file} is corrupt: not a JSON object", hint="restore it from a copy")
     return value
 
 
@@ -234,7 +234,7 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(value) != len(pairs):
         seen: set[str] = set()
         twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-        raise _StrictError(f"key '{twice[:40]}' appears twice in an object")
+        raise _StrictError(f"key '{twice[:40]}' appears twice")
     return value
 
 
