@@ -135,7 +135,7 @@ class TrainLoop:
         known = {finding.check for finding in health.findings}
         probed = probe(self.trainer) if health.due(self.trainer.iteration) else {}
         health.add(self.trainer.iteration, metrics | probed)
-        if health.findings or known:
+        if health.findings or "health" in self.run.record:
             self.run.record["health"] = [asdict(finding) for finding in health.findings]
         for finding, text in zip(health.findings, self.run.findings(), strict=True):
             if finding.check not in known:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
-from rlcli.errors import CheckpointError, DependencyError, MachineError, UsageError, one_line, pip_install
+from rlcli.errors import CheckpointError, DependencyError, MachineError, RlcliError, UsageError, one_line, pip_install
 from rlcli.runs.atomic_io import disk_errors
 
 if TYPE_CHECKING:
@@ -134,7 +134,9 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
 
     try:
         return JournalStorage(Backend(str(file), lock_obj=lock))
-    except (TypeError, ValueError, LookupError, AttributeError) as error:  # of Optuna, for entries with wrong values
+    except (RlcliError, OSError, MemoryError):
+        raise
+    except Exception as error:  # Optuna raises many kinds for entries with wrong values, AssertionError among them
         raise _corrupt(file, error) from None
 
 

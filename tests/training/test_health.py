@@ -100,6 +100,19 @@ def test_training_without_rewards_records_and_prints_the_finding(tmp_path, monke
     assert "the return is 0 in all" in capsys.readouterr().err
 
 
+def test_resumed_run_drops_a_finding_of_iterations_after_its_checkpoint(tmp_path, monkeypatch):
+    """A killed training may have recorded findings after its newest checkpoint."""
+    monkeypatch.chdir(tmp_path)
+    words = ["--num-envs", "8", "--logger", "none", "episode_length_s=0.2"]
+    assert main(["train", "cartpole", *words, "--max-iterations", "9", "--agent", "sb3-ppo"]) == 0
+    (file,) = Path("runs").glob("cartpole/*/run.json")
+    finding = {"check": "no-reward", "iteration": 10, "message": "the return is 0", "hint": "other weights"}
+    record = json.loads(file.read_text())
+    file.write_text(json.dumps({**record, "state": "running", "health": [finding]}))
+    assert main(["train", "--resume", "latest", "--max-iterations", "12"]) == 0
+    assert json.loads(file.read_text())["health"] == []
+
+
 @pytest.mark.parametrize("until", [0.2, 0.25])
 def test_bound_that_no_state_reaches(until):
     """The value comes near its bound while the return rises: only the states tell that the bound is out of reach."""

@@ -139,7 +139,10 @@ def test_partial_journal_line_is_dropped(tmp_path):
     assert len(read_sweep(tmp_path).ended()) == 5
 
 
-@pytest.mark.parametrize("damage", [b"nonsense\n", b"{}\n", b"5\n", b"\xff\xfe\n", b"\n"])
+TWO_ATTRIBUTES = b'{"op_code":2,"worker_id":"w","study_id":0,"user_attr":{"a":1,"b":2}}\n'
+
+
+@pytest.mark.parametrize("damage", [b"nonsense\n", b"{}\n", b"5\n", b"\xff\xfe\n", b"\n", TWO_ATTRIBUTES])
 def test_corrupt_journal_is_checkpoint_error(tmp_path, damage):
     finish(open_or_join(tmp_path), 2)
     with (tmp_path / JOURNAL).open("ab") as journal:
