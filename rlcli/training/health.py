@@ -304,7 +304,7 @@ def blocked_success(health: Health) -> Found:
         never = max(health.values(f"Success/{name}")) == 0.0 and (learned or health.progress == 1.0)
         gaps, states = _gaps(values, condition.model_dump()), health.values(f"Health/held/{name}")
         # the mean is near the bound, but no environment is within it in any of the states at the checks
-        halved = len(gaps) > 3 and statistics.fmean(gaps[-3:]) > 0.5 * statistics.fmean(gaps[:3])
+        halved = _halved(gaps)
         # an error that must be exactly 0
         exact = bool(values) and condition.at_most is not None and condition.at_most <= 0.0 < min(values)
         unmet = not any(health.values(f"Success/{name}")) and len(states) > 2 and not any(states)
@@ -315,10 +315,30 @@ def blocked_success(health: Health) -> Found:
             yield message, f"a larger reward for it, or another bound of success.{name}"
 
 
+def reward_without_success(health: Health) -> Found:
+    """Report a return that has risen while a success condition holds in as few of the states as at the beginning."""
+    if not (health.struggles(0.15) and health.change(RETURN) > 0.7):
+        return
+    for name, condition in health.task.success.items():
+        states = f"Health/held/{name}"
+        if condition is None or _halved(_gaps(health.values(f"Success_Value/{name}"), condition.model_dump())):
+            continue
+        before, now = (statistics.median(part or [0.0]) for part in (health.first(states), health.last(states)))
+        if len(health.values(states)) >= 6 and before > 0.0 and now <= 1.2 * before:
+            message = (
+                f"the return rises, but the condition '{name}' of success holds in {now:.1%} of the states, as at first"
+            )
+            yield message, "other signs or weights of the rewards, or a reward for this condition"
+
+
 def _gaps(values: list[float], bounds: Mapping[str, Any]) -> list[float]:
     """Return the negative distance of each value to its bounds, 0 within them; it rises as a value comes closer."""
     low, high = bounds.get("at_least"), bounds.get("at_most")
     return [-max((low if low is not None else v) - v, v - (high if high is not None else v), 0.0) for v in values]
+
+
+def _halved(gaps: list[float]) -> bool:
+    return len(gaps) > 3 and statistics.fmean(gaps[-3:]) > 0.5 * statistics.fmean(gaps[:3])
 
 
 def _approaches(values: list[float]) -> bool:
@@ -334,7 +354,7 @@ def _approaches(values: list[float]) -> bool:
 
 _IN_ORDER: tuple[Callable[[Health], Found], ...] = (
     *(no_reward, short_episodes, observations, update_size, learning_rate_floor, exploration, dying_pays),
-    *(one_termination, value_function, actions_at_bound, blocked_success, no_progress),
+    *(one_termination, value_function, actions_at_bound, blocked_success, reward_without_success, no_progress),
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in _IN_ORDER}
 """Name -> check, in the order in which findings are listed."""

@@ -100,6 +100,15 @@ def test_training_without_rewards_records_and_prints_the_finding(tmp_path, monke
     assert "the return is 0 in all" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("held", "named"), [(lambda i: 0.03, True), (lambda i: 0.03 + 0.005 * i, False)])
+def test_rewards_that_lead_away_from_success_are_named(held, named):
+    """The return rises, but the pole is upright in as few states as at the beginning."""
+    found = findings({**FAILING, "Success_Value/pole": lambda i: 1.6, "Health/held/pole": held})
+    assert ("reward-without-success" in found) is named
+    if named:
+        assert "'pole' of success holds in 3.0% of the states" in found["reward-without-success"].message
+
+
 def test_resumed_run_drops_a_finding_of_iterations_after_its_checkpoint(tmp_path, monkeypatch):
     """A killed training may have recorded findings after its newest checkpoint."""
     monkeypatch.chdir(tmp_path)
