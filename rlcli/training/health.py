@@ -179,7 +179,8 @@ def no_reward(health: Health) -> Found:
 def no_progress(health: Health) -> Found:
     """Report that neither return, reward terms, episode length nor values of success conditions have changed."""
     watched = [RETURN, LENGTH, *health.names("Episode_Reward/"), *health.names("Success_Value/")]
-    if health.struggles(0.15) and all(abs(health.change(name)) < 1.0 for name in watched):
+    solved = max(health.values(SUCCESS), default=0.0) >= _SOLVED
+    if not solved and health.struggles(0.15) and all(abs(health.change(name)) < 1.0 for name in watched):
         value = statistics.fmean(health.last(RETURN)) if health.values(RETURN) else 0.0
         done = f"{health.progress:.0%} of the training"
         message = f"return, reward terms and episode length have not moved in {done} (return {value:.4g})"
@@ -316,19 +317,19 @@ def blocked_success(health: Health) -> Found:
 
 
 def reward_without_success(health: Health) -> Found:
-    """Report a return that has risen while a success condition holds in as few of the states as at the beginning."""
-    if not (health.struggles(0.15) and health.change(RETURN) > 0.7):
-        return
+    """Report a return that has risen while all success conditions hold in as few of the states as at the beginning."""
+    shares = []
     for name, condition in health.task.success.items():
-        states = f"Health/held/{name}"
-        if condition is None or _halved(_gaps(health.values(f"Success_Value/{name}"), condition.model_dump())):
+        if condition is None:
             continue
+        states, gaps = f"Health/held/{name}", _gaps(health.values(f"Success_Value/{name}"), condition.model_dump())
         before, now = (statistics.median(part or [0.0]) for part in (health.first(states), health.last(states)))
-        if len(health.values(states)) >= 6 and before > 0.0 and now <= 1.2 * before:
-            message = (
-                f"the return rises, but the condition '{name}' of success holds in {now:.1%} of the states, as at first"
-            )
-            yield message, "other signs or weights of the rewards, or a reward for this condition"
+        if len(health.values(states)) < 6 or not 0.0 < before < 0.2 or now > 1.2 * before or _halved(gaps):
+            return
+        shares.append(f"'{name}' in {now:.1%}")
+    if shares and health.struggles(0.15) and health.change(RETURN) > 0.7:
+        message = f"the return rises, but conditions of success hold in as few states as at first: {', '.join(shares)}"
+        yield message, "other signs or weights of the rewards, or a reward for success"
 
 
 def _gaps(values: list[float], bounds: Mapping[str, Any]) -> list[float]:

@@ -72,6 +72,13 @@ def test_training_that_does_not_move_has_findings():
     assert {"no-progress", "one-termination"} <= {*found}
 
 
+def test_training_that_lost_its_success_has_moved():
+    still = {name: lambda i, name=name: HEALTHY[name](1) + 1e-3 * (i % 3) for name in HEALTHY}
+    lost = {**still, **FAILING, "Train/success_rate": lambda i: 0.8 if i < 10 else 0.1}
+    assert "no-progress" in findings({**still, **FAILING}, until=0.5)
+    assert "no-progress" not in findings(lost, until=0.5)
+
+
 def test_adaptive_learning_rate_at_its_floor_is_found():
     changes = {**FAILING, "Loss/learning_rate": lambda i: 1e-5}
     assert "learning-rate-floor" in findings(changes, "agent.schedule=adaptive")
@@ -106,7 +113,7 @@ def test_rewards_that_lead_away_from_success_are_named(held, named):
     found = findings({**FAILING, "Success_Value/pole": lambda i: 1.6, "Health/held/pole": held})
     assert ("reward-without-success" in found) is named
     if named:
-        assert "'pole' of success holds in 3.0% of the states" in found["reward-without-success"].message
+        assert "as few states as at first: 'pole' in 3.0%" in found["reward-without-success"].message
 
 
 def test_resumed_run_drops_a_finding_of_iterations_after_its_checkpoint(tmp_path, monkeypatch):
