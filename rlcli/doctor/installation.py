@@ -59,7 +59,7 @@ def entry_checks(group: str, timeout_s: float, stop: threading.Event) -> list[Ch
         owners = _other_owners(entry, entries) if kind == "task" else ""
         state, hint = "ok", None
         if row.broken:
-            state, hint = "broken", _remedy(entry, row.broken)
+            state, hint = "broken", row.remedy or _remedy(entry, row.broken)
         elif owners:
             state, hint = "warning", f"{owners} has a task of the same name; write {entry.qualified}"
         text = f"{entry.distribution} {entry.version}: {row.broken or row.summary or 'loads'}"

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from rlcli import registry
-from rlcli.errors import RlcliError
+from rlcli.errors import MissingModelError, RlcliError
 from rlcli.registry.formats import load_format
 from rlcli.registry.probe import Details
 from rlcli.trainers import TrainerSpec
@@ -99,7 +99,8 @@ def _details(name: str, load: Callable[[str], Details]) -> Details:
         return load(name)
     except RlcliError as error:
         first, *more = error.message.splitlines()
-        return Details(broken=f"{first[:300]} (and {len(more)} more)" if more else first[:300])
+        reason = f"{first[:300]} (and {len(more)} more)" if more else first[:300]
+        return Details(broken=reason, remedy=error.hint if isinstance(error, MissingModelError) else None)
     except BaseException as error:
         return Details(broken=f"{type(error).__name__}: {error}"[:300])
 

@@ -51,6 +51,8 @@ class Details:
     """Whether a trained policy is shipped with the task."""
     broken: str | None = None
     """Why the task cannot be loaded; None: it can be loaded, or it has not been probed."""
+    remedy: str | None = None
+    """How the user provides the model that a broken task needs; None if nothing is missing."""
 
     @property
     def status(self) -> str:
@@ -68,7 +70,7 @@ class Details:
 
 _TYPES: dict[str, Any] = {
     **dict.fromkeys(("observation_size", "action_size", "num_envs"), int | None),
-    **dict.fromkeys(("workflow", "agent", "broken"), str | None),
+    **dict.fromkeys(("workflow", "agent", "broken", "remedy"), str | None),
     "summary": str,
     "policy": bool,
 }

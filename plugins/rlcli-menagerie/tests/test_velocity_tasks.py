@@ -97,6 +97,8 @@ def test_missing_model_error_says_what_to_install(task, tmp_path):
         " that has the package mjlab"
     )
     assert len(done.stderr.splitlines()) <= 2
+    checks = json.loads(rlcli("doctor", "--json", PYTHONPATH=_without_mjlab()).stdout)["checks"]
+    assert error["hint"] in [check["hint"] for check in checks if check["name"] == f"task {task}"]
     shown = rlcli("show", task, PYTHONPATH=_without_mjlab())
     assert shown.returncode == 0, shown.stderr
     assert "track_lin_vel" in shown.stdout
