@@ -167,7 +167,10 @@ def pip_install(package: str) -> str:
 
 def one_line(error: BaseException, limit: int | None = None) -> str:
     """Return the message of an error on one line, cut to `limit` characters; its class name if it has no message."""
-    return " ".join(str(error).split())[:limit] or type(error).__name__
+    text = " ".join(str(error).split())
+    if "set_int_max_str_digits" in text:  # Python's advice does not help users of rlcli
+        text = "it has a number of more than 4300 digits"
+    return text[:limit] or type(error).__name__
 
 
 def require_known(name: str, names: Sequence[str], what: str, plural: str) -> None:

@@ -662,3 +662,13 @@ def test_refusal_of_torch_is_no_advice_to_unpickle(capfd):
     assert "is corrupt, or has more than tensors, numbers and text" in message
     assert "weights_only" not in message
     assert "Warning" not in message
+
+
+@pytest.mark.parametrize("opcode", [b"L%sL\n.", b"I%s\n."])
+def test_long_number_in_a_pickle_gives_no_advice_to_change_python(opcode, capfd):
+    with zipfile.ZipFile("model.pt", "w") as archive:
+        archive.writestr("archive/data.pkl", b"\x80\x02" + opcode % (b"9" * 5000))
+        archive.writestr("archive/version", "3")
+    assert main(["import", "rsl-rl", "model.pt", "--task", "cartpole"]) == 5
+    message = capfd.readouterr().err
+    assert "model.pt is corrupt: it has a number of more than 4300 digits; save the file again" in message
