@@ -21,7 +21,8 @@ from rlcli.cli.ui.options import CHOOSE, add_command
 from rlcli.config.user_settings import read_settings
 from rlcli.errors import INTERRUPTED, CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
 from rlcli.machine import AddressSpaceCheck, MatplotlibFinder, delay_garbage_collection, memory_error
-from rlcli.registry import OWN, TRAINERS, catalog, exit_refused, load_entry, load_object, malformed_metadata_ignored
+from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
+from rlcli.registry.plugin_imports import exit_refused
 from rlcli.safe_text import remember_given
 from rlcli.settings import settings_file, use_settings
 from rlcli.trainers import TrainerSpec

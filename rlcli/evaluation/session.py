@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.config.layers import flags
 from rlcli.errors import CheckpointError, MachineError, TaskError, UsageError, require_known
-from rlcli.registry import path_of
+from rlcli.registry.find import path_of
 from rlcli.runs.atomic_io import require_regular
 from rlcli.runs.run import RECORD, Run
 from rlcli.runs.run_ref import default_runs_dir, find_run, list_runs

@@ -17,11 +17,11 @@ from rlcli.registry.entries import (
     unknown_wanted,
     unreadable_distributions,
 )
-from rlcli.registry.find import find_task, path_of, task_source
+from rlcli.registry.find import find_task, task_source
 from rlcli.registry.formats import is_framework
 from rlcli.registry.models import chosen_model, model_file
 from rlcli.registry.packages import installed_task, is_offered, package_folder, packaged_task, task_of_file
-from rlcli.registry.plugin_imports import exit_refused, load_entry
+from rlcli.registry.plugin_imports import load_entry
 from rlcli.registry.task_imports import import_file, load_module, load_object
 from rlcli.registry.task_location import TaskSource
 from rlcli.registry.uninstalled_tasks import folder_task, python_config, python_place, python_task
@@ -36,7 +36,6 @@ __all__ = [
     "TaskSource",
     "catalog",
     "chosen_model",
-    "exit_refused",
     "find_entry",
     "find_task",
     "folder_task",
@@ -51,7 +50,6 @@ __all__ = [
     "model_file",
     "package_folder",
     "packaged_task",
-    "path_of",
     "plugins_chosen_by",
     "python_config",
     "python_place",

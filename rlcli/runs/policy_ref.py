@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rlcli.errors import CheckpointError, UsageError
-from rlcli.registry import TaskSource, path_of
+from rlcli.registry import TaskSource
+from rlcli.registry.find import path_of
 from rlcli.runs.bundle import is_bundle, open_bundle
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.restore import recorded_task, source_of

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from rlcli.errors import CheckpointError, UsageError, did_you_mean, listing
-from rlcli.registry import path_of
+from rlcli.registry.find import path_of
 from rlcli.runs.run import RECORD, STUDY, Run, open_run, run_folders, runs_below, seconds_since
 from rlcli.settings import setting
 

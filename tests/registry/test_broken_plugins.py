@@ -11,7 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from support.broken_plugins import BROKEN, FILES
 
-from rlcli.registry import catalog, exit_refused
+from rlcli.registry import catalog
+from rlcli.registry.plugin_imports import exit_refused
 from rlcli.registry.probe import probe
 
 pytestmark = pytest.mark.processes

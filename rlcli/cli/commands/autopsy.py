@@ -14,7 +14,7 @@ import typer
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import RunRef, RunsDir, TaskFolder, choice, video_file
 from rlcli.errors import RlcliError, UsageError, require_known
-from rlcli.registry import path_of
+from rlcli.registry.find import path_of
 
 if TYPE_CHECKING:
     from rlcli.registry import TaskSource

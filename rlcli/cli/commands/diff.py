@@ -12,7 +12,8 @@ from rlcli.cli.ui.console import console
 from rlcli.cli.ui.difference_table import report_differences
 from rlcli.cli.ui.options import Agent, RunsDir, choice
 from rlcli.errors import CheckpointError, TaskError, UsageError, did_you_mean, listing, require_known
-from rlcli.registry import TASKS, catalog, path_of, task_source
+from rlcli.registry import TASKS, catalog, task_source
+from rlcli.registry.find import path_of
 
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved

@@ -10,7 +10,7 @@ import typer
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import CheckpointRef, RunsDir, TaskOfPolicy, choice
 from rlcli.errors import UsageError, listing
-from rlcli.registry import path_of
+from rlcli.registry.find import path_of
 
 if TYPE_CHECKING:
     from rlcli.deploy.verify_export import ClosedLoopResult, ReferenceEnv
