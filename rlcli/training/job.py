@@ -67,6 +67,8 @@ class TrainingResult:
     elapsed_s: float | None = None
     """Duration of this training [s]."""
     seed: int | None = None
+    new_steps: int | None = None
+    """Environment steps of this training; for a resumed run, without those before."""
 
 
 def threads(resolved: Resolved) -> tuple[int, int]:

@@ -72,6 +72,7 @@ def run_training(
     )
     if job.writes:
         CrashDumper(env, run.folder / "dumps")
+    first_step = trainer.env_steps
     try:
         _train(job, trainer, env, stop, view)
     finally:
@@ -81,8 +82,8 @@ def run_training(
     if not job.writes:
         return None
     newest = run.checkpoints / f"{steps(run.checkpoints)[-1]:012d}"
-    elapsed = time.monotonic() - job.begin
-    return TrainingResult(run.folder, newest, trainer.env_steps, trainer.iteration, elapsed, run.record["seed"])
+    elapsed, seed, step = time.monotonic() - job.begin, run.record["seed"], trainer.env_steps
+    return TrainingResult(run.folder, newest, step, trainer.iteration, elapsed, seed, step - first_step)
 
 
 def _train(job: Job, trainer: Trainer, env: Environment, stop: StopRequest, view: ProgressView) -> None:

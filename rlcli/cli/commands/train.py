@@ -178,8 +178,10 @@ def _train(request: TrainingRequest, resolved: Resolved | None, device: str, sto
 
 def _print(result: TrainingResult) -> None:
     if result.elapsed_s is not None:
+        total = "" if result.new_steps == result.step else f", {result.step:,} in the whole run"
         console.info(
-            f"trained {result.step:,} steps in {result.elapsed_s:.1f} s; next: rlcli play --checkpoint {result.run}"
+            f"trained {result.new_steps:,} steps in {result.elapsed_s:.1f} s{total};"
+            f" next: rlcli play --checkpoint {result.run}"
         )
     console.data(str(result.run))
     training = {"iteration": result.iteration, "elapsed_s": result.elapsed_s, "seed": result.seed}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -313,7 +314,11 @@ def test_resume_of_locked_run_is_machine_error(cli, only_run):
     holder.communicate()
     assert done.code == 10
     assert "another process writes to" in done.err
-    assert cli("train", "--resume", "latest", "--max-iterations", 2, "-q").code == 0
+    done = cli("train", "--resume", "latest", "--max-iterations", 2)
+    assert done.code == 0
+    match = re.search(r"trained (\d+) steps in [\d.]+ s, (\d+) in the whole run", done.err)
+    assert match is not None, done.err
+    assert int(match[2]) == 2 * int(match[1]), "two equal iterations, one of them before the resume"
 
 
 def test_resume_removes_temporary_files(cli, only_run):
