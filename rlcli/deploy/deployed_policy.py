@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from rlcli.rl.policy import Policy
-from rlcli.runs.checkpoint_manifest import ActionColumns
+from rlcli.runs.manifest_schema import ActionColumns
 
 
 class DeployedPolicy(nn.Module):

@@ -23,8 +23,8 @@ from rlcli.deploy.metadata import metadata_of, mjlab_properties
 from rlcli.errors import MachineError, UsageError, VerdictError, require_known
 from rlcli.rl.policy import PolicySpec
 from rlcli.runs.atomic_io import remove_leftovers, require_regular, sync_folder, write_synced
-from rlcli.runs.checkpoint_manifest import deployment_of, layout_of
 from rlcli.runs.checkpoint_reader import Checkpoint
+from rlcli.runs.manifest_schema import deployment_of, layout_of
 
 __all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "refusal", "require_self_contained"]
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from rlcli.deploy.deployed_policy import DeployedPolicy
-from rlcli.runs.checkpoint_manifest import ActionColumns, DeploymentRecord, LayoutRecord, ObservationColumns
 from rlcli.runs.checkpoint_reader import Checkpoint
+from rlcli.runs.manifest_schema import ActionColumns, DeploymentRecord, LayoutRecord, ObservationColumns
 from rlcli.runs.run import RECORD
 
 SCHEMA = 2

@@ -38,8 +38,8 @@ from rlcli.registry import TaskSource
 from rlcli.rl.acting import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators
-from rlcli.runs.checkpoint_manifest import deployment_differences
 from rlcli.runs.checkpoint_reader import Checkpoint
+from rlcli.runs.manifest_schema import deployment_differences
 from rlcli.runs.policy_ref import Choice
 from rlcli.runs.restore import require_fit
 

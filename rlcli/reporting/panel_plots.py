@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rlcli.errors import DependencyError, pip_install
-from rlcli.reporting.panels import Item, Panel
+from rlcli.reporting.curve_panels import Item, Panel
 from rlcli.safe_text import UNSAFE, shorten
 
 FORMATS = (".png", ".svg", ".pdf")

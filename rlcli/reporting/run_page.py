@@ -21,8 +21,8 @@ from rlcli.config.schema import TaskConfig
 from rlcli.config.term_signatures import Vocabulary
 from rlcli.errors import CheckpointError, RlcliError
 from rlcli.reporting.card_text import number
+from rlcli.reporting.curve_panels import choose
 from rlcli.reporting.curves import AXES, Curve, gather
-from rlcli.reporting.panels import choose
 from rlcli.reporting.task_card import Card, card, task_card
 from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.config_diff import as_text
@@ -129,7 +129,7 @@ def _card(run: Run, document: strict_yaml.Document | None, checkpoint: Path | No
 
 
 def _layout(checkpoint: Path | None) -> dict[str, Any] | None:
-    from rlcli.runs.checkpoint_manifest import LayoutRecord
+    from rlcli.runs.manifest_schema import LayoutRecord
 
     if checkpoint is not None:
         with contextlib.suppress(CheckpointError, ValidationError):

@@ -8,8 +8,8 @@ import pytest
 from support.written_runs import learning, write_metrics, write_run
 
 from rlcli.errors import CheckpointError, UsageError
+from rlcli.reporting.curve_panels import choose
 from rlcli.reporting.curves import align, gather, interval, iqm, read_history
-from rlcli.reporting.panels import choose
 
 
 def column(*values):

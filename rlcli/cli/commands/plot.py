@@ -13,8 +13,8 @@ from rlcli.cli.ui.options import RunsDir, check_output, choice
 from rlcli.errors import MachineError, UsageError, require_known
 
 if TYPE_CHECKING:
+    from rlcli.reporting.curve_panels import Panel
     from rlcli.reporting.curves import Curve
-    from rlcli.reporting.panels import Panel
     from rlcli.runs.run import Run
 
 _CURVES = Path("curves.png")
@@ -74,7 +74,7 @@ def command(
 
 
 def _choose_panels(curves: list[Curve], names: list[str] | None, x: str) -> list[Panel]:
-    from rlcli.reporting.panels import choose
+    from rlcli.reporting.curve_panels import choose
 
     panels = choose(curves, names, x)
     if not panels:
