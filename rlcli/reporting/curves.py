@@ -7,6 +7,7 @@ a fixed seed: the same runs give the same curves.
 """
 
 import json
+import logging
 import math
 import re
 from array import array
@@ -24,6 +25,7 @@ from rlcli.runs.metric_rows import read_rows
 from rlcli.runs.run import STUDY, Run
 from rlcli.safe_text import shorten
 
+_log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 AXES = {"steps": "environment steps", "iterations": "iterations", "time": "training time [s]"}
@@ -134,6 +136,8 @@ def read_history(run: Run) -> History:
     for row in read_rows(run):
         current = (row["iteration"], row["step"])
         if not all(before < now < 2**62 for before, now in zip(last, current, strict=True)):
+            what = f"iteration {current[0]}, step {current[1]} after iteration {last[0]}, step {last[1]}"
+            _log.warning("%s: %s: the rows from there on are left out", run.metrics, what)
             break
         last = current
         numbers = {name: float(value) for name, value in row.items()}

@@ -1,6 +1,7 @@
 """Reader of a run's `metrics.jsonl`, which has one row for each iteration."""
 
 import json
+import logging
 from collections.abc import Iterator
 from typing import Any
 
@@ -8,6 +9,7 @@ from rlcli.errors import CheckpointError
 from rlcli.runs.run import Run
 from rlcli.runs.safe_io import read_errors
 
+_log = logging.getLogger(__name__)
 LONGEST_LINE = 2**20
 """Longest line of `metrics.jsonl`, which has the metrics of one iteration [bytes]."""
 _MOST_BYTES = 2**30
@@ -20,7 +22,7 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
 
     Args:
         run: the run.
-        strict: raise an error at a corrupt line; otherwise stop before it.
+        strict: raise an error at a corrupt line; otherwise log a warning, and stop before it.
 
     Raises:
         CheckpointError: if the file cannot be read or is too large, or at a corrupt line.
@@ -40,6 +42,7 @@ def read_rows(run: Run, *, strict: bool = False) -> Iterator[dict[str, Any]]:
                 elif strict:
                     raise CheckpointError(f"{run.metrics}:{number} is corrupt: not a row of metrics; delete this line")
                 else:
+                    _log.warning("%s:%d is not a row of metrics: the rows from there on are left out", file.name, number)
                     return
     except FileNotFoundError:
         return

@@ -92,11 +92,12 @@ def test_missing_metric_in_iteration_is_skipped(tmp_path):
         "[" * 100_000,
     ],
 )
-def test_rows_before_corrupt_line_are_read(tmp_path, line):
+def test_rows_before_corrupt_line_are_read_with_a_warning(tmp_path, line, caplog):
     run = write_run(tmp_path, rows=learning(2))
     with run.metrics.open("a") as file:
         file.write(line + "\n" + json.dumps({"iteration": 4, "step": 400}) + "\n")
     assert read_history(run).axes["steps"].tolist() == [100, 200]
+    assert "the rows from there on are left out" in caplog.text
 
 
 def test_non_numeric_values_are_not_metrics(tmp_path):
