@@ -11,6 +11,7 @@ import contextlib
 import functools
 import importlib
 import os
+import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.abc import MetaPathFinder
@@ -22,9 +23,9 @@ from typing import Any
 from rlcli.registry.formats import Format, aliasing_formats
 
 _COMMON = ("gym", "numpy")
-"""Libraries that files of all formats mention."""
+"""Libraries that files of all formats import."""
 _MOST_FILES = 200
-"""Most files of a task in which names of formats are counted."""
+"""Most files of a task in which imports of formats are counted."""
 _python_import = builtins.__import__
 _trees: dict[str, str] = {}
 """Module name of an imported package or folder -> name under which its own files import it."""
@@ -238,7 +239,7 @@ def _alias_module(form: Format, name: str, file: str, below_top: bool = False) -
 def _formats_for(first: str, file: str) -> tuple[Format, ...]:
     """Return the formats that replace modules of the package `first`; of several the one that fits the importing file.
 
-    It is the one whose other modules the file mentions most often; if it mentions none, all files of its task count.
+    It is the one whose other modules the file imports most often; if it imports none, all files of its task count.
     """
     forms = [
         form for form in aliasing_formats() if any(alias.partition(".")[0] == first for alias in form.spec.aliases)
@@ -247,20 +248,21 @@ def _formats_for(first: str, file: str) -> tuple[Format, ...]:
         return tuple(forms)
     shared = {*_COMMON, *set.intersection(*(set(form.spec.aliases) for form in forms))}
     own = {form.name: tuple(set(form.spec.aliases) - shared) for form in forms}
-    counts = {name: _mentions(file, aliases) for name, aliases in own.items()}
+    counts = {name: _imports(file, aliases) for name, aliases in own.items()}
     if len(set(counts.values())) == 1:
         root = next((root for root in _roots if Path(file).is_relative_to(root)), Path(file).parent)
         files = sorted(root.rglob("*.py"))[:_MOST_FILES]
-        counts = {name: sum(_mentions(str(path), aliases) for path in files) for name, aliases in own.items()}
+        counts = {name: sum(_imports(str(path), aliases) for path in files) for name, aliases in own.items()}
     most = max(counts.values())  # other formats have no part in the task
     return tuple(form for form in forms if counts[form.name] == most)
 
 
 @functools.cache
-def _mentions(file: str, aliases: tuple[str, ...]) -> int:
-    """Return how often a file mentions one of the names."""
+def _imports(file: str, modules: tuple[str, ...]) -> int:
+    """Return the number of import statements of a file that import one of the modules."""
     text = Path(file).read_text(encoding="utf-8", errors="replace")
-    return sum(text.count(alias) for alias in aliases)
+    names = "|".join(re.escape(name) for name in modules)
+    return len(re.findall(rf"^[ \t]*(?:from|import)[ \t]+(?:{names})\b", text, re.MULTILINE))
 
 
 _FINDER = _TaskFinder()

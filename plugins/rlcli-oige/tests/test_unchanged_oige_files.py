@@ -76,6 +76,18 @@ def test_original_import_lines_step_like_changed_ones(tmp_path):
     assert not new & {"omni", "pxr", "carb", "gym", "omniisaacgymenvs"}
 
 
+def test_helper_file_that_only_mentions_another_framework_belongs_to_its_task(tmp_path):
+    """`trimesh` is a module that Isaac Lab's plugin replaces; here it is part of a name, and no import statement."""
+    config = package(
+        tmp_path, UNCHANGED.replace("import carb", "import carb\nfrom omniisaacgymenvs.robots import marks")
+    )
+    helper = "from pxr import UsdPhysics\n\n\ndef convert_to_trimesh():\n    return UsdPhysics.CollisionAPI\n"
+    (config.parents[2] / "robots" / "marks.py").write_text(helper)
+    env = build(config)
+    marks = sys.modules[type(env.task).__module__].marks
+    assert marks.convert_to_trimesh().__module__.startswith("rlcli_oige")
+
+
 def test_folder_without_package_has_its_own_modules(tmp_path):
     env = build(arm_folder(tmp_path / "arm", task=UNCHANGED))
     assert env.step(torch.zeros(4, 1)).obs["policy"].isfinite().all()
