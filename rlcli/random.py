@@ -60,12 +60,19 @@ def bits(keys: Keys, stream: np.uint64, index: int, count: int) -> Keys:
 
 def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
     """Return uniform random numbers in [0, 1), multiples of 2**-24; the arguments are as in `bits`. (n, count)"""
-    unit = np.empty((len(keys), count), np.float32)
     rows = max(1, _BLOCK // max(1, count))
+    if len(keys) <= rows:
+        return _to_unit(bits(keys, stream, index, count))
+    unit = np.empty((len(keys), count), np.float32)
     for first in range(0, len(keys), rows):
-        words = bits(keys[first : first + rows], stream, index, count)
-        words >>= _S40  # 24 bits remain, as many as the significand of a float32 holds exactly
-        unit[first : first + rows] = words.view(np.int64)  # numpy converts signed words faster
+        unit[first : first + rows] = _to_unit(bits(keys[first : first + rows], stream, index, count))
+    return unit
+
+
+def _to_unit(words: Keys) -> NDArray[np.float32]:
+    """Return random words as numbers in [0, 1). The words are overwritten."""
+    words >>= _S40  # 24 bits remain, as many as the significand of a float32 holds exactly
+    unit = words.view(np.int64).astype(np.float32)  # numpy converts signed words faster
     unit *= _TO_UNIT
     return unit
 
