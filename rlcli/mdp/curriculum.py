@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 from dataclasses import dataclass
 
 import torch
@@ -36,11 +35,10 @@ class Stages(Term):
 
     def advance(self, step: Tensor) -> Tensor:
         """Set the setting at `address` to its value at this training step, and return the value. step () int64"""
-        if step.device.type == "cpu":
-            value = self._values[bisect.bisect_right(self.steps, int(step))]
-        else:  # indexing with a tensor would read the number on the host
-            value = self._values.index_select(0, torch.bucketize(step, self._steps, right=True)[None])[0]
-        return self.address.copy_(value)
+        number = torch.bucketize(step, self._steps, right=True)
+        # index_select: indexing with a tensor would read the number on the host
+        self.address.copy_(self._values.index_select(0, number[None])[0])
+        return self.address
 
 
 @dataclass(kw_only=True, eq=False)
