@@ -20,6 +20,8 @@ _MIX1 = np.array(0xBF58476D1CE4E5B9, np.uint64)
 _MIX2 = np.array(0x94D049BB133111EB, np.uint64)
 _S30, _S27, _S31, _S40 = (np.array(shift, np.uint64) for shift in (30, 27, 31, 40))
 _TO_UNIT = np.array(2.0**-24, np.float32)
+_NARROW = 8
+"""Number of words of a key up to which numpy adds faster along the keys than along the words."""
 _BLOCK = 1 << 14
 """Number of words that are mixed at once: their copies stay in the cache of a core."""
 
@@ -55,17 +57,27 @@ def row_keys(seed: int, env_ids: NDArray[np.int64], counters: NDArray[np.int64])
 
 def bits(keys: Keys, stream: np.uint64, index: int, count: int) -> Keys:
     """Return `count` random 64-bit words for each key: number `index` and the following ones of a stream. (n, count)"""
-    return mix(keys[:, None] + _offsets(int(stream), index, count))
+    offsets = _offsets(int(stream), index, count)
+    if count > _NARROW:
+        return mix(keys[:, None] + offsets)
+    return mix(keys + offsets[:, None]).T  # numpy's inner loop then runs over the keys
 
 
 def uniform(keys: Keys, stream: np.uint64, index: int, count: int) -> NDArray[np.float32]:
     """Return uniform random numbers in [0, 1), multiples of 2**-24; the arguments are as in `bits`. (n, count)"""
-    unit = np.empty((len(keys), count), np.float32)
     rows = max(1, _BLOCK // max(1, count))
+    if len(keys) <= rows:
+        return _to_unit(bits(keys, stream, index, count))
+    unit = np.empty((len(keys), count), np.float32)
     for first in range(0, len(keys), rows):
-        words = bits(keys[first : first + rows], stream, index, count)
-        words >>= _S40  # 24 bits remain, as many as the significand of a float32 holds exactly
-        unit[first : first + rows] = words.view(np.int64)  # numpy converts signed words faster
+        unit[first : first + rows] = _to_unit(bits(keys[first : first + rows], stream, index, count))
+    return unit
+
+
+def _to_unit(words: Keys) -> NDArray[np.float32]:
+    """Return random words as numbers in [0, 1). The words are overwritten."""
+    words >>= _S40  # 24 bits remain, as many as the significand of a float32 holds exactly
+    unit = words.view(np.int64).astype(np.float32, order="C")  # numpy converts signed words faster
     unit *= _TO_UNIT
     return unit
 

@@ -215,7 +215,8 @@ class ManagedEnv(VecEnv):
 
     def _select_by_step(self, mask: Field) -> Selection | None:
         """Return a selection of environments by a mask; its random numbers depend on the current step."""
-        return self.engine.select(mask, self.seed, self._counters.common_step.expand(self.num_envs).contiguous())
+        counters = self._counters.common_step.expand(self.num_envs)
+        return self.engine.select(mask, self.seed, counters.contiguous() if self.engine.asynchronous else counters)
 
     def _compute_observations(self) -> dict[str, Tensor]:
         return self.observation_manager.compute()

@@ -16,7 +16,7 @@ from rlcli.managers.action import CommandMap
 from rlcli.mdp.term import JointTerm
 from rlcli.mdp.term_helpers import column_numbers
 from rlcli.scene.actuators import JointCommand
-from rlcli.scene.jacobian import Jacobian
+from rlcli.scene.jacobian import Jacobian, sums_of_products
 from rlcli.scene.names import NameProblem, match_values
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotation_vector
 from rlcli.sim.saved_tensors import TensorState
@@ -327,38 +327,56 @@ class DifferentialInverseKinematics(_ScaledJointAction):
         if self.mode == "pose":
             self.elements += ("rx", "ry", "rz") if self.relative else ("w", "i", "j", "k")
         self.size = len(self.elements)
+        rows = 3 if self.mode == "position" else 6
+        self._damped = self.damping**2 * torch.eye(rows, device=self.env.device)[:, :, None]
 
     def _compute_command(self, action: Tensor) -> None:
         data = self.entity.data
-        quat = data.body_quat_w[:, self._body]
-        arm = rotate(quat, self._point.expand(len(quat), 3))
-        position, quat = data.body_pos_w[:, self._body] + arm, multiply(quat, self._turn.expand(len(quat), 4))
+        quat, position = data.body_quat_w[:, self._body], data.body_pos_w[:, self._body]
+        if any(self.offset_pos):
+            position = position + rotate(quat, self._point.expand(len(quat), 3))
         error = self._pose_error(action * self._scale, position, quat)
-        jacobian = self._jacobian(position)[:, : error.shape[1]]
-        square = jacobian @ jacobian.mT + self.damping**2 * torch.eye(error.shape[1], device=error.device)
-        joints, wanted = data.joint_pos_of(self.joints), error[:, :, None]
-        # solve_ex: solve would wait for the device to check the result
-        if not self.posture:
-            step = jacobian.mT @ torch.linalg.solve_ex(square, wanted)[0]
-        else:
-            rest = (self.posture * (data.default_joint_pos[:, self.joints] - joints))[:, :, None]
-            step = rest + jacobian.mT @ torch.linalg.solve_ex(square, wanted - jacobian @ rest)[0]
-        torch.add(joints, step[:, :, 0], out=self.command)
+        columns = self._jacobian.columns(position)[:, : error.shape[1]]
+        joints = data.joint_pos_of(self.joints)
+        rest = self.posture * (data.default_joint_pos_of(self.joints) - joints) if self.posture else None
+        step = self._least_squares(columns, error, rest)
+        torch.add(joints, step if rest is None else rest + step, out=self.command)
+
+    def _least_squares(self, columns: Tensor, error: Tensor, rest: Tensor | None) -> Tensor:
+        """Return J^T (J J^T + damping^2 I)^-1 (error - J rest) for the columns of J.
+
+        columns (k, e, n), error (n, e), rest (n, k) -> (n, k)
+        """
+        size, n = error.shape[1], len(error)
+        wanted, others = error, columns
+        if rest is not None:
+            others = torch.cat([columns, rest.mT[:, None]], dim=1)
+        products = sums_of_products(columns, others)  # J J^T, then J rest
+        if rest is not None:
+            wanted = error - products[:, size].mT
+        square = (products[:, :size] + self._damped).view(-1, n).mT.contiguous().view(n, size, size)
+        # the matrix is symmetric; LAPACK needs no copy of its transpose. solve_ex: solve would wait for the device to
+        # check the result
+        solved = torch.linalg.solve_ex(square.mT, wanted[:, :, None])[0]
+        return sums_of_products(columns.transpose(0, 1), solved.permute(1, 2, 0).contiguous())[:, 0].mT
 
     def _pose_error(self, goal: Tensor, position: Tensor, quat: Tensor) -> Tensor:
-        """Return the error to the goal pose, world frame: position, and axis times angle. (num_envs, 3 or 6)"""
+        """Return the error to the goal pose, world frame: position, and axis times angle. (num_envs, 3 or 6)
+
+        Args:
+            goal: the scaled action.
+            position: position of the controlled frame, world frame. (num_envs, 3)
+            quat: orientation of the body, world frame. (num_envs, 4)
+        """
         root = self.entity.data
-        move = rotate(root.root_quat_w, goal[:, :3])
-        if not self.relative:
-            move = root.root_pos_w + move - position
+        if self.relative:  # the columns are vectors in the root's frame
+            return rotate(root.root_quat_w[:, None], goal.reshape(len(goal), -1, 3)).flatten(1)
+        move: Tensor = root.root_pos_w + rotate(root.root_quat_w, goal[:, :3]) - position
         if self.mode == "position":
             return move
-        if self.relative:
-            turn = rotate(root.root_quat_w, goal[:, 3:])
-        else:
-            wanted = multiply(root.root_quat_w, torch.nn.functional.normalize(goal[:, 3:], dim=1))
-            turn = rotation_vector(multiply(wanted, conjugate(quat)))
-        return torch.cat([move, turn], dim=1)
+        wanted = multiply(root.root_quat_w, torch.nn.functional.normalize(goal[:, 3:], dim=1))
+        now = multiply(quat, self._turn.expand(len(quat), 4))
+        return torch.cat([move, rotation_vector(multiply(wanted, conjugate(now)))], dim=1)
 
 
 def _command_limits(model: mujoco.MjModel, actuators: list[int | None], kind: str) -> tuple[tuple[float, float], ...]:

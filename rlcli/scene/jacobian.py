@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rlcli.scene.entity import Entity
+from rlcli.sim.column_views import as_index
 from rlcli.sim.rotations import cross
 
 
@@ -35,14 +36,33 @@ class Jacobian:
         hinge = int(mujoco.mjtJoint.mjJNT_HINGE)
         moves_body = [float(int(model.jnt_bodyid[j]) in ancestors) for j in joints]
         is_hinge = [float(model.jnt_type[j] == hinge) for j in joints]
-        self._moves_body = torch.tensor(moves_body, device=device)[:, None]
-        self._is_hinge = torch.tensor(is_hinge, device=device)[:, None]
-        self._joints = torch.tensor(joints, device=device)
+        self._moves_body = None if all(moves_body) else torch.tensor(moves_body, device=device)[:, None, None]
+        self._is_hinge = None if all(is_hinge) else torch.tensor(is_hinge, device=device)[:, None, None]
+        self._joints = as_index(joints, device)
         self._sim = entity.sim
 
     def __call__(self, point: Tensor) -> Tensor:
         """Return the Jacobian of a point, linear velocity before angular, world frame. (n, 3) -> (n, 6, k)"""
-        axis = self._sim.derived_field("xaxis")[:, self._joints] * self._moves_body
-        arm = point[:, None] - self._sim.derived_field("xanchor")[:, self._joints]
-        linear = torch.where(self._is_hinge > 0.0, cross(axis, arm), axis)
-        return torch.cat([linear, axis * self._is_hinge], dim=2).mT
+        return self.columns(point).permute(2, 1, 0)
+
+    def columns(self, point: Tensor) -> Tensor:
+        """Return the columns of the Jacobian; contiguous vectors over the environments. (n, 3) -> (k, 6, n)"""
+        axis, anchor = (self._sim.derived_vectors(name, self._joints) for name in ("xaxis", "xanchor"))
+        if self._moves_body is not None:
+            axis = axis * self._moves_body
+        linear, angular = cross(axis, point.mT.contiguous() - anchor, dim=1), axis
+        if self._is_hinge is not None:
+            linear, angular = torch.where(self._is_hinge > 0.0, linear, axis), axis * self._is_hinge
+        return torch.cat([linear, angular], dim=1)
+
+
+def sums_of_products(left: Tensor, right: Tensor) -> Tensor:
+    """Return the sum over the first dimension of the outer products. (k, r, n), (k, c, n) -> (r, c, n)
+
+    For each environment, which is the last dimension, this is a matrix product. On a CPU it takes a third of the time
+    of `torch.bmm`, and rounds like it: the products are added to 0 in order.
+    """
+    total = (left[0, :, None] * right[0]).add_(0.0)
+    for one, other in zip(left[1:].unbind(), right[1:].unbind(), strict=True):
+        total += one[:, None] * other
+    return total

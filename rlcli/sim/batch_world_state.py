@@ -28,7 +28,7 @@ from rlcli.sim.mujoco_private import (
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 from rlcli.sim.saved_tensors import require_matching_tensors, substate
 from rlcli.sim.selection import Selection, ids_of
-from rlcli.sim.skippable_work import skippable_flags
+from rlcli.sim.skippable_work import FIELDS_OF_FRICTION, skippable_flags
 
 INTEGRATION_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _FLAGS = {
@@ -56,9 +56,9 @@ class BatchWorlds:
         self.num_envs = num_envs
         self.threads = threads
         self._disable_flags = model.opt.disableflags
-        self._batch = make_batch(model, num_envs, threads, disable_flags=skippable_flags(model), persistent=persistent)
-        self._skips = True
-        """Whether steps skip the work that does not change the state."""
+        self._skipped = skippable_flags(model)
+        """Disable flags (mjtDisableBit) of the work that steps skip because it does not change the state."""
+        self._batch = make_batch(model, num_envs, threads, disable_flags=self._skipped, persistent=persistent)
         self._expanded = expanded_fields(self._batch)
         self.own_constants = False
         """Whether `set_constants` has been called."""
@@ -84,7 +84,8 @@ class BatchWorlds:
             hint = did_you_mean(name, MODEL_FIELDS) or f"fields that can: {listing(sorted(MODEL_FIELDS))}"
             raise ValueError(f"model field '{name}' cannot differ between environments; {hint}")
         values = torch.from_numpy(self._batch.expand(name))
-        if not values.is_floating_point():
+        adds_constraints = name in FIELDS_OF_FRICTION and self._skipped & int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+        if adds_constraints or not values.is_floating_point():
             self._skip_nothing()
         return values
 
@@ -208,8 +209,8 @@ class BatchWorlds:
 
     def _skip_nothing(self) -> None:
         """Stop skipping work: from now on, compute everything that the flags of the original model do not disable."""
-        if self._skips:
-            self._skips = False
+        if self._skipped:
+            self._skipped = 0
             expand_disable_flags(self._batch)[:] = self._disable_flags
 
 

@@ -27,6 +27,8 @@ Groups: TypeAlias = tuple[int, ...] | None
 ALL = slice(None)
 """Index of all columns."""
 DEFAULT_STREAM = np.uint64(0)
+_FEW_ROWS, _AHEAD = 16, 8
+"""In selections of at most so many rows, so many random numbers are computed at once."""
 
 
 def in_place(tensor: Tensor) -> Any:
@@ -146,6 +148,8 @@ class IdSelection:
     stream_ids: NDArray[np.int64] | None = None
     _keys: random.Keys | None = field(default=None, init=False)
     _drawn: int = field(default=0, init=False)
+    _ready: tuple[int, NDArray[np.float32] | None] = field(default=(0, None), init=False)
+    """Uniform numbers of each row that are computed already, and the index of the first of them. (rows, n)"""
 
     @property
     def count(self) -> int:
@@ -155,7 +159,7 @@ class IdSelection:
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
         """Draw uniform numbers in [low, high). (rows, *shape)"""
         lowest, highest = _on_host(low), _on_host(high)
-        return self._scaled(random.uniform(*self._next(math.prod(shape))), highest - lowest, lowest, shape)
+        return self._scaled(self._units(math.prod(shape)), highest - lowest, lowest, shape)
 
     def uniform_of_first(self, low: float, high: float) -> Tensor:
         """Draw one uniform number for all environments: the number that environment 0 draws. (1,)"""
@@ -239,6 +243,21 @@ class IdSelection:
             streams = self.ids if self.stream_ids is None else self.stream_ids[self.ids]
             self._keys = random.row_keys(self.seed, streams, self.counters)
         return self._keys
+
+    def _units(self, count: int) -> NDArray[np.float32]:
+        """Return the next `count` uniform numbers in [0, 1) of each row. (rows, count)
+
+        For few rows several numbers take as long as one: the next ones are computed with them.
+        """
+        if len(self.ids) > _FEW_ROWS or count >= _AHEAD:
+            return random.uniform(*self._next(count))
+        first, ready = self._ready
+        begin = self._drawn - first
+        if ready is None or begin + count > ready.shape[1]:
+            ready, begin = random.uniform(self._row_keys(), self.stream_key, self._drawn, _AHEAD), 0
+            self._ready = self._drawn, ready
+        self._drawn += count
+        return ready[:, begin : begin + count].copy()
 
     def _next(self, count: int) -> tuple[random.Keys, np.uint64, int, int]:
         """Return the arguments of `random.uniform` for the next `count` numbers of each row."""

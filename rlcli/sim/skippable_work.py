@@ -1,8 +1,9 @@
 """Work that MuJoCo can skip in a step without changing a bit of the state.
 
-MuJoCo prepares collision detection even if no two geoms may touch, and it searches constraint islands even in a model
-of one kinematic tree, which is one island. Its Python bindings also keep the profiler on, which reads the clock about
-thirty times per step, a third of the time of a small model: see `rlcli.sim.mujoco_private.without_profiler`.
+MuJoCo prepares collision detection even if no two geoms may touch, it prepares constraints even if the model can have
+none, and it searches constraint islands even in a model of one kinematic tree, which is one island. Its Python bindings
+also keep the profiler on, which reads the clock about thirty times per step, a third of the time of a small model: see
+`rlcli.sim.mujoco_private.without_profiler`.
 """
 
 from __future__ import annotations
@@ -17,17 +18,24 @@ FIELDS_OF_SKIPPED_WORK = frozenset(
     ["nisland", "nidof", "solver_niter", "solver_nnz", "solver_fwdinv", "bvh_active", "bvh_aabb_dyn"]
 )
 """Fields of MjData that only the skipped work writes: a task that reads one turns the skipping off."""
+FIELDS_OF_FRICTION = frozenset(["dof_frictionloss", "tendon_frictionloss"])
+"""Fields of MjModel, other than integers, that decide whether a model can have constraints."""
 
 
 def skippable_flags(model: mujoco.MjModel) -> int:
     """Return the disable flags (mjtDisableBit) that can be set without changing a bit of the model's states.
 
-    The flags are valid as long as no integer field of the model changes: integers decide which geoms may touch.
+    The flags are valid as long as no integer field of the model changes: integers decide which geoms may touch. That of
+    the constraints also needs unchanged `FIELDS_OF_FRICTION`.
     """
     flags = 0
+    sleeps = model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     if not model.npair and not model.nflex and next(colliding_pairs(model), None) is None:
         flags |= int(_D.mjDSBL_CONTACT)
-    sleeps = model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        limited = model.jnt_limited.any() or model.tendon_limited.any()
+        friction = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
+        if not (model.neq or limited or friction or sleeps):
+            flags |= int(_D.mjDSBL_CONSTRAINT)
     newton = model.opt.solver == int(mujoco.mjtSolver.mjSOL_NEWTON) and not model.opt.noslip_iterations
     if model.ntree == 1 and newton and not sleeps and not model.nflex:
         flags |= int(_D.mjDSBL_ISLAND)
@@ -46,9 +54,9 @@ def colliding_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
     excluded = model.exclude_signature
     kind, affinity = model.geom_contype, model.geom_conaffinity
     solid = np.flatnonzero(kind | affinity)
-    moves = weld[model.geom_bodyid] > 0
+    moves = model.body_treeid[model.geom_bodyid] >= 0
     for a in solid:
-        # two static geoms never touch; leave them out early, because a terrain may have thousands
+        # two static or mocap geoms never touch; leave them out early, because a terrain may have thousands
         others = solid[(solid > a) & (moves[a] | moves[solid])]
         others = others[((kind[a] & affinity[others]) | (kind[others] & affinity[a])) != 0]
         one, many = model.geom_bodyid[a], model.geom_bodyid[others]

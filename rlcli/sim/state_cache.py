@@ -138,10 +138,18 @@ class SimData:
 
     def derived_columns(self, name: str, columns: Columns) -> Tensor:
         """Return `derived_field(name)[:, columns]`; only these columns are cast. (num_envs, k, ...)"""
+        return self._of_columns(name, columns).float()
+
+    def derived_vectors(self, name: str, columns: Columns) -> Tensor:
+        """Return `derived_columns`, with contiguous vectors over the environments. (k, ..., num_envs)"""
+        part = self._of_columns(name, columns).movedim(0, -1)
+        return part.to(torch.float32, memory_format=torch.contiguous_format).contiguous()
+
+    def _of_columns(self, name: str, columns: Columns) -> Tensor:
         self.forward_moved()
         stamp, value = self._derived.get(name, (-1, None))
         source = self.engine.field(name) if stamp != self.stamp or value is None else value
-        return source[:, columns].float()
+        return source[:, columns]
 
 
 def _joined(left: Tensor, right: Tensor) -> Tensor | None:

@@ -19,7 +19,10 @@ from rlcli.sim.engine import open_engine
 from rlcli.sim.mujoco_private import without_profiler
 from rlcli.sim.skippable_work import colliding_pairs, skippable_flags
 
-CONTACT, ISLAND = (int(f) for f in (mujoco.mjtDisableBit.mjDSBL_CONTACT, mujoco.mjtDisableBit.mjDSBL_ISLAND))
+CONTACT, ISLAND, CONSTRAINT = (
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("CONTACT", "ISLAND", "CONSTRAINT")
+)
+ALL = CONTACT | ISLAND | CONSTRAINT
 FLOOR = '<geom type="plane" size="5 5 1"/>'
 
 
@@ -28,8 +31,8 @@ def model_of(body, more="", options="", flags=""):
     return mujoco.MjModel.from_xml_string(f"<mujoco>{option}<worldbody>{body}</worldbody>{more}</mujoco>")
 
 
-def slider(inside="", *, name="cart", geom='<geom size="0.1"/>'):
-    return f'<body name="{name}"><joint type="slide" axis="0 0 1"/>{geom}{inside}</body>'
+def slider(inside="", *, name="cart", geom='<geom size="0.1"/>', joint=""):
+    return f'<body name="{name}"><joint name="{name}" type="slide" axis="0 0 1" {joint}/>{geom}{inside}</body>'
 
 
 def engine_of(model, num_envs=3, **more):
@@ -37,21 +40,22 @@ def engine_of(model, num_envs=3, **more):
 
 
 GHOST = '<geom name="ghost" size="0.1" contype="0" conaffinity="0"/>'
+TARGET = '<body name="target" mocap="true" pos="0 0 0.05"><geom size="0.1"/></body>'
 PAIR = '<geom name="floor" type="plane" size="5 5 1" contype="0" conaffinity="0"/>'
 
 
 @pytest.mark.parametrize(
     ("model", "flags"),
     [
-        pytest.param(model_of(FLOOR + slider(geom=GHOST)), CONTACT | ISLAND, id="no bits"),
-        pytest.param(model_of(slider()), CONTACT | ISLAND, id="alone"),
+        pytest.param(model_of(FLOOR + slider(geom=GHOST)), ALL, id="no bits"),
+        pytest.param(model_of(slider()), ALL, id="alone"),
         pytest.param(model_of(FLOOR + slider()), ISLAND, id="floor"),
         pytest.param(model_of(slider() + slider(name="other")), 0, id="two"),
-        pytest.param(model_of(slider(slider(name="child"))), CONTACT | ISLAND, id="child"),
+        pytest.param(model_of(slider(slider(name="child"))), ALL, id="child"),
         pytest.param(model_of(slider(slider(name="c")), flags="filterparent='disable'"), ISLAND, id="unfiltered"),
         pytest.param(
             model_of(FLOOR + slider(), "<contact><exclude body1='world' body2='cart'/></contact>"),
-            CONTACT | ISLAND,
+            ALL,
             id="excluded",
         ),
         pytest.param(
@@ -62,6 +66,13 @@ PAIR = '<geom name="floor" type="plane" size="5 5 1" contype="0" conaffinity="0"
         pytest.param(model_of(FLOOR + slider(), options='solver="PGS"'), 0, id="pgs"),
         pytest.param(model_of(FLOOR + slider(), options='noslip_iterations="3"'), 0, id="noslip"),
         pytest.param(model_of(slider(), flags="sleep='enable'"), CONTACT, id="sleep"),
+        pytest.param(model_of(slider(joint="range='0 1' limited='true'")), CONTACT | ISLAND, id="limit"),
+        pytest.param(model_of(slider(joint="frictionloss='1'")), CONTACT | ISLAND, id="friction"),
+        pytest.param(
+            model_of(slider(), "<equality><joint joint1='cart'/></equality>"), CONTACT | ISLAND, id="equality"
+        ),
+        pytest.param(model_of(FLOOR + TARGET + slider(geom=GHOST)), ALL, id="mocap"),
+        pytest.param(model_of(FLOOR + TARGET + slider()), ISLAND, id="mocap and floor"),
     ],
 )
 def test_skippable_flags_of_models(model, flags):
@@ -78,7 +89,8 @@ def test_colliding_pairs_equal_mujoco_contacts(seed):
     bodies = [spec.worldbody]
     for n in range(9):
         body = bodies[random.integers(len(bodies))].add_body(name=f"body{n}")
-        if random.random() < 0.6:
+        body.mocap = body.parent == spec.worldbody and seed % 2 == 1
+        if not body.mocap and random.random() < 0.6:
             body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[1, 0, 0])
         bodies.append(body)
     for body in bodies:
@@ -102,7 +114,17 @@ def test_colliding_pairs_equal_mujoco_contacts(seed):
 
 
 TASKS = [
-    *("cartpole", "ant-direct", "humanoid", "quadruped-flat", "quadruped-rough", "ball-balance", "biped-velocity"),
+    *(
+        "cartpole",
+        "ingenuity",
+        "quadcopter",
+        "ant-direct",
+        "humanoid",
+        "quadruped-flat",
+        "quadruped-rough",
+        "ball-balance",
+        "biped-velocity",
+    ),
     *("crazyflie", "hand-reorient", "lift-cube", "open-drawer", "reach-ik"),
 ]
 
@@ -221,6 +243,17 @@ def test_expanded_contact_bits_enable_contacts():
     assert "opt.disableflags" not in engine.expanded_fields()
     assert set(engine.state_dict()) >= {"model.geom_contype"}
     assert "model.opt.disableflags" not in engine.state_dict()
+
+
+def test_expanded_friction_enables_constraints():
+    engine = engine_of(model_of(slider(geom=GHOST), options="gravity='0 0 -1'"))
+    engine.step(10)
+    assert (engine.field("qvel") < 0.0).all()
+    engine.expand("body_gravcomp")
+    engine.expand("dof_frictionloss")[1] = 1000.0
+    engine.step(200)
+    speed = engine.field("qvel")[:, 0].abs().tolist()
+    assert speed[1] < 0.01 < speed[0]
 
 
 def test_binding_island_fields_enables_islands():
