@@ -33,24 +33,17 @@ def rotate_inverse(quat: Tensor, vector: Tensor) -> Tensor:
 
 def multiply(left: Tensor, right: Tensor) -> Tensor:
     """Return the Hamilton product: the rotation `right`, then `left`. (..., 4), (..., 4) -> (..., 4)"""
-    columns, signs, _ = _product_tables(right.device)
-    # the elements of the product in order: w1 [w2 x2 y2 z2] + x1 [-x2 w2 -z2 y2] + y1 [-y2 z2 w2 -x2] + ...
-    by_w, by_x, by_y, by_z = right.index_select(-1, columns).mul_(signs).chunk(4, dim=-1)
-    w, x, y, z = left.split_with_sizes([1, 1, 1, 1], dim=-1)
-    return (w * by_w).add_(x * by_x).add_(y * by_y).add_(z * by_z)
-
-
-@functools.lru_cache
-@torch.inference_mode(False)  # tensors that can be used in both modes
-def _product_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the constants of `multiply`: columns and signs (16,) of the right factor; and of `from_euler`: rows (24,).
-
-    The rows are those of (cos roll, cos pitch, cos yaw, sin roll, sin pitch, sin yaw).
-    """
-    columns = torch.tensor([0, 1, 2, 3, 1, 0, 3, 2, 2, 3, 0, 1, 3, 2, 1, 0], device=device)
-    signs = torch.tensor([1.0, 1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0, 1.0])
-    rows = [0, 3, 0, 0, 3, 0, 3, 3, 1, 1, 4, 1, 4, 4, 1, 4, 2, 2, 2, 5, 5, 5, 5, 2]
-    return columns, signs.to(device), torch.tensor(rows, device=device)
+    w1, x1, y1, z1 = left.unbind(-1)
+    w2, x2, y2, z2 = right.unbind(-1)
+    return torch.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        dim=-1,
+    )
 
 
 def conjugate(quat: Tensor) -> Tensor:
@@ -139,14 +132,19 @@ def rotation_vector(quat: Tensor) -> Tensor:
 
 
 def from_euler(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
-    """Return the quaternion of rotations about the fixed axes x, then y, then z [rad]. (...) each -> (..., 4)"""
-    half = torch.stack([roll, pitch, yaw]).mul_(0.5)
-    # (cr cp cy, sr cp cy, cr sp cy, cr cp sy), then what is added to them: (sr sp sy, -cr sp sy, sr cp sy, -sr sp cy)
-    rows = torch.cat([half.cos(), half.sin()]).index_select(0, _product_tables(half.device)[2])
-    of_roll, of_pitch, of_yaw = rows.chunk(3)
-    first, second = (of_roll * of_pitch).mul_(of_yaw).chunk(2)
-    second[1::2].neg_()
-    return (first + second).movedim(0, -1).contiguous()
+    """Return the quaternion of rotations about the fixed axes x, then y, then z [rad]. (n,) each -> (n, 4)"""
+    cr, sr = torch.cos(0.5 * roll), torch.sin(0.5 * roll)
+    cp, sp = torch.cos(0.5 * pitch), torch.sin(0.5 * pitch)
+    cy, sy = torch.cos(0.5 * yaw), torch.sin(0.5 * yaw)
+    return torch.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        dim=-1,
+    )
 
 
 def random_quaternion(u: Tensor, v: Tensor, w: Tensor) -> Tensor:
