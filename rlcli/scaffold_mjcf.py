@@ -1,4 +1,4 @@
-"""What `rlcli new --robot FILE.xml` must know of a robot: joints, efforts, default pose, height, asset files."""
+"""Properties of a robot for `rlcli new --robot FILE.xml`: joints, efforts, default pose, height, asset files."""
 
 from __future__ import annotations
 
@@ -76,9 +76,9 @@ class Robot:
         self.inertia = self._inertia()
 
     def kind(self) -> str:
-        """Return the kind of task that fits the robot.
+        """Return the kind of task that fits the robot: velocity, reach or balance.
 
-        It is velocity (walk as commanded), reach (move the last body to a goal) or balance (keep the default pose).
+        They mean: follow velocity commands, move the last body to a goal, keep the default pose.
         """
         legged = self.free and self.gravity > 0.0 and self.feet()
         if legged and len(self.driven) >= max(4, len(self.passive) + 1):
@@ -96,9 +96,10 @@ class Robot:
         return str(self.model.body(number).name)
 
     def effort(self, joint: int) -> float:
-        """Return the largest effort of a joint [N or N m]: its actuator's limit, or an estimate from carried weight.
+        """Return the largest effort of a joint [N or N m]: the limit in the file, else an estimate from carried weight.
 
-        A joint of a floating base is assumed to carry half of the robot's weight, at half of its height.
+        A slide holds twice the weight of the bodies that it carries; a hinge holds this weight at a distance of 0.6 m.
+        In a robot with a floating base every joint carries the whole robot, a hinge at half the height of the root.
         """
         model, a = self.model, self.actuator.get(joint)
         if model.jnt_actfrclimited[joint]:
@@ -242,9 +243,9 @@ def _home(spec: mujoco.MjSpec) -> np.ndarray | None:
 
 
 def _clean(spec: mujoco.MjSpec) -> None:
-    """Remove ground, lights and keyframes from a model, because the task's scene has its own; name every element.
+    """Remove ground, lights and keyframes, which the task's scene has; name all bodies, joints and actuators.
 
-    Welds to mocap bodies are removed, too: a task does not move them, so that they would hold the robot.
+    Welds and connections to mocap bodies are removed, too: a task does not move them, so they would hold the robot.
     """
     for key in list(spec.keys):
         spec.delete(key)
@@ -268,9 +269,9 @@ def _clean(spec: mujoco.MjSpec) -> None:
 
 
 def _put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
-    """Move the body with most driven joints to the first place of an MJCF: the first body is the root of an entity.
+    """Make the top-level body with most driven joints the first one: rlcli takes the first body as the root.
 
-    If it is free, it is placed at the origin, and made level.
+    A free body is placed at the origin, and gets a level parent if its z axis does not point up.
     """
     joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     driven = model.actuator_trnid[joint_actuator, 0] if model.nu else np.flatnonzero(np.isin(model.jnt_type, SCALAR))
@@ -342,7 +343,7 @@ def _compile_copy(xml: str, assets: Mapping[str, Path]) -> mujoco.MjModel:
 
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """Return the lowest z of a geom [m]: exact for spheres, capsules, boxes and meshes, a lower bound for others."""
+    """Return the lowest z of a geom [m]: inf for planes, a lower bound for cylinders and ellipsoids, else exact."""
     kind, size, turn = int(model.geom_type[geom]), model.geom_size[geom], data.geom_xmat[geom].reshape(3, 3)
     z, kinds = float(data.geom_xpos[geom, 2]), mujoco.mjtGeom
     if kind == int(kinds.mjGEOM_SPHERE):

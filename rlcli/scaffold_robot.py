@@ -1,7 +1,8 @@
 """Task design for `rlcli new --robot`: read an MJCF, choose a kind of task, and return the model and the YAML data.
 
-velocity: a floating base with feet and at least four driven joints follows velocity commands. reach: a fixed base with
-two or more joints, all driven, brings its last body to goals. balance: any other robot keeps its default pose.
+velocity: a floating base with feet, at least four driven joints and fewer passive ones follows velocity commands.
+reach: a fixed base with two or more joints, all driven, brings its last body to goals. balance: any other robot keeps
+its default pose.
 """
 
 from __future__ import annotations
@@ -48,10 +49,10 @@ def read_robot(file: Path, name: str) -> RobotTask:
 
     Raises:
         UsageError: if there is no such file, or the robot has nothing that can be controlled.
-        TaskError: if the model is refused.
+        TaskError: if MuJoCo cannot compile the model, or it has an element that rlcli refuses.
     """
     if not file.is_file():
-        raise UsageError(f"there is no file {file}", hint="give the MJCF of a robot, as in --robot robot.xml")
+        raise UsageError(f"--robot: there is no file {file}", hint="give the MJCF of a robot, as in --robot robot.xml")
     try:
         spec = read_mjcf(file, [file.parent.resolve(), file.resolve().parent.parent])
         robot = Robot(spec, file)

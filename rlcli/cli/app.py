@@ -141,7 +141,9 @@ def _require_words(arguments: list[str]) -> None:
     for position, word in enumerate(arguments):
         if not word or (word.startswith("--") and word.endswith("=")):
             name = word or (arguments[position - 1] if position else "rlcli")
-            raise UsageError(f"there is an empty word after {name.rstrip('=')}", hint="give a value, or leave it out")
+            raise UsageError(
+                f"there is an empty word after {name.rstrip('=')}", hint="give a value, or leave out the option"
+            )
     words = dict.fromkeys(arguments, "a word of the command line") | {
         value: name for name, value in os.environ.items() if name.startswith("RLCLI_")
     }
@@ -261,7 +263,7 @@ def _usage_hint(error: ClickException, arguments: list[str]) -> str | None:
 
 
 def _hint_for_option(name: str, arguments: list[str]) -> str | None:
-    """Return what to write instead of an unknown option `--NAME`: `KEY=VALUE`, or an option of rlcli; None: unknown."""
+    """Return what to write instead of the unknown option `--NAME`: `KEY=VALUE` or an option of rlcli; else None."""
     keys = _matching_settings(name)
     if not keys:
         return _FOREIGN_OPTIONS.get(name)
@@ -275,7 +277,7 @@ def _hint_for_option(name: str, arguments: list[str]) -> str | None:
 
 
 def _matching_settings(option: str) -> list[str]:
-    """Return the keys of the configuration that an unknown option may mean: they are or end with its name.
+    """Return the configuration keys that an unknown option may mean: keys that equal or end with its name.
 
     The list is empty if more than three keys end with the name.
     """
@@ -300,7 +302,7 @@ def _agent_models() -> set[type[BaseModel]]:
 _FOREIGN_OPTIONS = {
     "task": "the task is named without an option, as in `rlcli train cartpole`",
     "load-run": "--checkpoint RUN names a run or one of its checkpoints; `rlcli train --resume RUN` continues a run",
-    "enable-cameras": "leave it out: cameras of a task need no option",
+    "enable-cameras": "leave out this option: cameras of a task need none",
 }
 """Option of another program -> what to write for rlcli."""
 _SHORT_FOR = {"lr": "learning_rate"}

@@ -196,7 +196,7 @@ def _requirements(distribution: str) -> list[tuple[str, str, str | None]]:
 
 
 def _remedy(entry: Entry, reason: str) -> str:
-    """Return the hint for a plugin that cannot be loaded, for a reason."""
+    """Return how to repair a plugin that cannot be loaded; `reason` is the error of the import."""
     if entry.distribution == "rlcli":
         return "pip install --upgrade --force-reinstall rlcli"
     late = "; if the machine is busy: `rlcli doctor --probe-timeout 120`" if " within " in reason else ""

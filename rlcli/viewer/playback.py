@@ -54,7 +54,7 @@ class Playback:
     follow: bool = False
     """Switch to each new checkpoint as soon as it appears."""
     patience: float = 0.1
-    """Longest time that `advance` makes steps before it returns to the viewer [s]."""
+    """Time after which `advance` returns to the viewer, even if steps are still due [s]."""
     initial_obs: Tensor | None = None
     """Current observations of an environment whose episodes continue; None: the environment is reset."""
     steps: int = 0

@@ -254,7 +254,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
 
 
 def _legend(markers: Sequence[Marker]) -> list[tuple[str, Sequence[float] | None]]:
-    """Return the meanings of markers with their colours; None for frames, whose axes have three."""
+    """Return (label, colour) of each marker; the colour of a frame is None, because its axes have three colours."""
     entries = [
         (f"{m.label}: x red, y green, z blue", None) if isinstance(m, Frame) else (m.label, m.color) for m in markers
     ]

@@ -87,7 +87,7 @@ def _row(run: Overview, runs_dir: Path) -> list[str]:
 
 
 def _tags(run: Overview) -> str:
-    """Return what is special about a run: a device other than the CPU, several processes, weights of another run."""
+    """Return the remarks on a run: a device other than the CPU, several processes, weights of another run."""
     tags = []
     if (device := str(run.tags.get("device", "cpu"))) != "cpu":
         tags.append(device)

@@ -49,7 +49,7 @@ def command(
             push [m/s or rad/s].
         points: Number of values in a range.
         episodes: Number of episodes in each variant.
-        worst: Number of further variants, between the values of the ranges, in which to search for a worse one.
+        worst: Number of further random variants within the ranges, half of them near the worst, to find a worse one.
         against: Other policy to compare with: lqr, zero or random.
         fail_under: Exit with code 9 if the mean is below X in any variant, such as success=0.9; repeatable.
         output: Write the heat map to FILE.png or FILE.svg.

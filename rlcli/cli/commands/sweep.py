@@ -49,7 +49,7 @@ def command(
     config: options.ConfigFile = None,
     runs_dir: options.RunsDir = None,
 ) -> None:
-    """Search the settings with which an agent learns best. `sweep show` lists trials, `sweep compare` tests the best.
+    """Search for the settings with which an agent learns best; `sweep show` lists trials, `compare` tests the best one.
 
     Options:
         task: Task to sweep; or show or compare, followed by the folder or name of a sweep (else the newest).
@@ -57,7 +57,7 @@ def command(
         trials: Number of trials, over all processes of the sweep.
         objective: return, success, length, reward_terms.NAME or terminations.NAME of the trained policy; @30s stops
             a training after 30 s, @1e6 after 1,000,000 steps.
-        minimize: Search the smallest value of the objective.
+        minimize: Search for the smallest value of the objective.
         episodes: Number of episodes that evaluate a trial; with compare: each policy.
         jobs: Number of trials at a time in this process.
         pruner: median (stop trials that learn worse than most) or none.

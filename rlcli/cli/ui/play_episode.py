@@ -136,7 +136,7 @@ def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) ->
 
 @dataclass(slots=True)
 class Filming:
-    """Policy that also renders each state of its environment into a video before it acts."""
+    """Policy that also renders its environment into a video, once every `stride` steps, before it acts."""
 
     session: Session
     env_id: int

@@ -14,7 +14,7 @@ _MIN_BROKEN = 24
 
 
 def flow(parts: Sequence[str], width: int, indent: int = 0) -> list[str]:
-    """Arrange parts of text side by side, in lines of at most `width` characters; only a too long part is longer."""
+    """Arrange parts of text side by side, in lines of at most `width` characters; a longer part has its own line."""
     lines: list[str] = []
     line = ""
     for part in parts:

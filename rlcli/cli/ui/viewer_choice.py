@@ -34,7 +34,7 @@ def require_viewer(viewer: str | None, port: int | None, *, to_file: bool) -> No
         to_file: whether --video or --record writes a file, so that no viewer opens.
 
     Raises:
-        UsageError: with both options.
+        UsageError: for --viewer with --video or --record, or --port with another viewer than web.
     """
     if viewer is not None:
         require_known(viewer, CHOICES, "viewer", "viewers")
