@@ -15,7 +15,7 @@ import typer
 from typer._click.exceptions import ClickException, NoArgsIsHelpError
 from typer._click.exceptions import UsageError as ClickUsageError
 
-from rlcli.cli.ui.console import console, discard, print_log_records
+from rlcli.cli.ui.console import console, print_log_records, redirect_to_null
 from rlcli.cli.ui.help_text import HelpGroup
 from rlcli.cli.ui.options import CHOOSE, add_command
 from rlcli.config.user_settings import read_settings
@@ -111,7 +111,7 @@ def main(arguments: list[str] | None = None) -> int:
         if sys.stdout is not None:
             sys.stdout.flush()
     except OSError:
-        discard(sys.stdout)
+        redirect_to_null(sys.stdout)
     return code
 
 

@@ -26,7 +26,7 @@ from rlcli.runs.atomic_io import remove_leftovers, require_regular, sync_folder,
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.manifest_schema import deployment_of, layout_of
 
-__all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "refusal", "require_self_contained"]
+__all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "require_self_contained"]
 
 BUNDLE = "bundle"
 """Format that is a folder which rlcli itself reads: `rlcli.runs.bundle`."""
@@ -72,7 +72,7 @@ def check_target(format_: str, output: Path | None) -> None:
     require_regular(output)
 
 
-def refusal(spec: PolicySpec) -> str | None:
+def _export_obstacle(spec: PolicySpec) -> str | None:
     """Return why a policy cannot be exported, as text after `its policy has`; None if it can be exported."""
     if len(set(spec.memory)) > 1:
         return f"recurrent layers of different sizes ({', '.join(map(str, spec.memory))})"
@@ -102,7 +102,7 @@ def export(
     check_target(format_, file)
     formats.require_packages(format_)
     policy = checkpoint.policy()
-    reason = refusal(policy.spec)
+    reason = _export_obstacle(policy.spec)
     if reason is not None:
         raise UsageError(
             f"{checkpoint.folder} cannot be exported: its policy has {reason}",

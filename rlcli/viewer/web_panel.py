@@ -75,7 +75,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
     @_handler(messages.Priority.USER)
     def _on_update(self, _: messages.UpdateEvent) -> None:
         view = self._playback.view
-        place = self._place(view.shown)
+        place = self._followed_point(view.shown)
         self.viewer.camera.lookat[:] += place - self._last_place
         self._last_place = place
         self.viewer.extra_geoms[:] = self.overlay_geoms
@@ -223,7 +223,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         camera.distance, camera.azimuth, camera.elevation = begin.distance, begin.azimuth, begin.elevation
         self._ux.camera_index = ux.TUMBLE_CAMERA_IDX
 
-    def _place(self, shown: int) -> np.ndarray:
+    def _followed_point(self, shown: int) -> np.ndarray:
         """Return the point that the camera follows: the environment's origin or `viewer.follow`. (3,) [m]"""
         if self._followed is None:
             return np.asarray(self._env_origins[shown])

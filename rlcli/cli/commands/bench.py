@@ -13,7 +13,7 @@ import typer
 from rlcli.cli.ui.console import console, plain
 from rlcli.cli.ui.options import Agent, ConfigFile, NumEnvs, Overrides, TaskName
 from rlcli.cli.ui.progress_view import LiveView
-from rlcli.cli.ui.tables import cell, flow
+from rlcli.cli.ui.tables import cell, fill
 from rlcli.errors import MachineError, Stopped, UsageError
 from rlcli.formats import log_notes
 
@@ -268,8 +268,8 @@ class _View(LiveView):
     def _draw(self) -> None:
         if self._live is not None:
             width, max_lines = self._live.console.width, max(4, self._live.console.height - 4)
-            lines = [line for row in self._rows for line in flow(row, width)]
-            self.update([plain(self._title), *lines[-max_lines:], *flow([f"... {self._current}"], width)])
+            lines = [line for row in self._rows for line in fill(row, width)]
+            self.update([plain(self._title), *lines[-max_lines:], *fill([f"... {self._current}"], width)])
 
 
 def _step_parts(row: Stepped) -> list[str]:

@@ -83,7 +83,7 @@ def _sides(words: list[str]) -> tuple[Side, Side]:
         elif sides:
             sides[-1][1].append(word)
         else:
-            raise UsageError(f"the override '{word}' stands before any task", hint="rlcli diff TASK key.path=value")
+            raise UsageError(f"the override '{word}' comes before any task", hint="rlcli diff TASK key.path=value")
     if len(sides) == 1 and sides[0][1]:
         sides.insert(0, (sides[0][0], []))
     if len(sides) != 2:

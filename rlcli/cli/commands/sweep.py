@@ -84,7 +84,7 @@ def command(
     _check_options(ctx, task)
     request = TrainingRequest(runs_dir or default_runs_dir(), agent=agent, device=device, config=config, seed=seed)
     request.overrides, request.flags = overrides or [], flags(scene__num_envs=num_envs)
-    request.budget, request.loggers = options.budget(max_iterations, max_steps), ["none"]
+    request.budget, request.loggers = options.budget_keys(max_iterations, max_steps), ["none"]
     stop = StopRequest(ends_process=console.owns_process)
     if task is None:
         raise UsageError("no task given", hint="rlcli sweep TASK --param agent.learning_rate=log:1e-4:1e-2")

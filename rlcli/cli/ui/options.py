@@ -191,7 +191,7 @@ def _with_strict_number(parameter: inspect.Parameter) -> inspect.Parameter:
     return parameter.replace(annotation=Annotated[strict | None, info])
 
 
-def budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
+def budget_keys(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
     """Return the changes for --max-iterations and --max-steps (key -> value); empty without both.
 
     One of them replaces the agent's whole budget.

@@ -135,7 +135,7 @@ def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) ->
 
 
 @dataclass(slots=True)
-class Filming:
+class FilmedPolicy:
     """Policy that also renders its environment into a video, once every `stride` steps, before it acts."""
 
     session: Session
@@ -161,7 +161,7 @@ class Filming:
 
 
 @contextlib.contextmanager
-def film(session: Session, file: Path, env_id: int = 0, drawn: int = 1) -> Iterator[Filming]:
+def film(session: Session, file: Path, env_id: int = 0, drawn: int = 1) -> Iterator[FilmedPolicy]:
     """Open a video of the environments in which a policy acts.
 
     Args:
@@ -175,7 +175,7 @@ def film(session: Session, file: Path, env_id: int = 0, drawn: int = 1) -> Itera
 
     env = session.env
     with open_video(env.engine.model, env.config, file, EnvGrid(env, drawn)) as (renderer, writer, stride):
-        yield Filming(session, env_id, stride, renderer, writer)
+        yield FilmedPolicy(session, env_id, stride, renderer, writer)
 
 
 def _outcome(last: StepResult, env_id: int) -> dict[str, Any]:
