@@ -44,8 +44,8 @@ def command(
     Options:
         save_preset: Write the recommended settings to FILE.yaml, or to NAME.yaml here, for train --config.
         overwrite: Allow --save-preset to replace a file.
-        quick: Measure only briefly, for a first impression.
-        profile: Measure no sizes; show where the time of an environment step goes, by stage and term.
+        quick: Measure for a shorter time; the figures are less exact.
+        profile: Instead, show the time of each stage and term of an environment step.
 
     Examples:
         rlcli bench cartpole --save-preset fast.yaml
@@ -167,7 +167,7 @@ def _preset_file(name: str, overwrite: bool) -> Path:
 
     file = Path(name)
     if not name or file.name in ("", ".."):
-        raise UsageError("--save-preset needs the name of a file", hint="as in --save-preset cartpole.yaml")
+        raise UsageError("--save-preset needs the name of a file", hint="for example: --save-preset cartpole.yaml")
     if file.suffix not in (".yaml", ".yml"):
         file = file.with_name(f"{file.name}.yaml")
     folder = file.absolute().parent

@@ -103,7 +103,7 @@ def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
     from rlcli.evaluation.stress_sweeps import read_sweeps
 
     if not texts:
-        raise UsageError("no --sweep given", hint="as in --sweep body_mass=0.5:2 or --sweep action_delay=0:3")
+        raise UsageError("no --sweep given", hint="for example: --sweep body_mass=0.5:2 or --sweep action_delay=0:3")
     return read_sweeps(texts, points)
 
 

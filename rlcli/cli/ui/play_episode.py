@@ -35,7 +35,7 @@ def check_choice(
     """
     if env is None or episode is None:
         given, missing = ("--episode", "--env") if env is None else ("--env", "--episode")
-        raise UsageError(f"{given} needs {missing} too", hint="as in --env 317 --episode 12, both counted from 0")
+        raise UsageError(f"{given} needs {missing} too", hint="for example: --env 317 --episode 12, counted from 0")
     if num_envs is not None and num_envs <= env:
         raise UsageError(
             f"--env {env} does not exist: --num-envs is {num_envs}, and environments are counted from 0",
