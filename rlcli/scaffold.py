@@ -67,9 +67,7 @@ def create(
     try:
         _write(folder, files, package, assets)
     except OSError as error:
-        raise MachineError(
-            f"cannot write {folder}: {error.strerror or error}", hint="choose another folder with --output FOLDER"
-        ) from error
+        raise MachineError(f"cannot write {folder}: {error.strerror or error}", hint="try --output FOLDER") from error
     return folder, sorted([*files, *assets, _SCHEMA])
 
 

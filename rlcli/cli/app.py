@@ -141,9 +141,7 @@ def _require_words(arguments: list[str]) -> None:
     for position, word in enumerate(arguments):
         if not word or (word.startswith("--") and word.endswith("=")):
             name = word or (arguments[position - 1] if position else "rlcli")
-            raise UsageError(
-                f"there is an empty word after {name.rstrip('=')}", hint="give a value, or leave out the option"
-            )
+            raise UsageError(f"there is an empty word after {name.rstrip('=')}", hint="give a value, or leave it out")
     words = dict.fromkeys(arguments, "a word of the command line") | {
         value: name for name, value in os.environ.items() if name.startswith("RLCLI_")
     }

@@ -88,10 +88,7 @@ def command(
 def _profile(resolved: Resolved, preset: Path | None, seconds: float) -> None:
     """Print the table of `--profile`: where the time of an environment step goes."""
     if preset is not None:
-        raise UsageError(
-            "--save-preset and --profile contradict each other: a profile recommends no settings",
-            hint="leave out --profile or --save-preset",
-        )
+        raise UsageError("--profile finds no settings for --save-preset", hint="leave out --profile or --save-preset")
     import torch
 
     from rlcli.tuning.step_profile import profile_step
@@ -132,9 +129,7 @@ def _report(
     for line in explanation(findings):
         console.data(line)
     if findings.unsteady:
-        console.warn(
-            "repeated measurements differ by more than 15 %: end other programs on this machine and measure again"
-        )
+        console.warn("repeats differ by more than 15 %: end other programs on this machine and measure again")
     changes = None if findings.recommended is None else bench.changes(findings.recommended.setting)
     if changes is not None and file is not None:
         write_atomic(file, bench_preset(resolved, changes, findings, machine, names_agent))
