@@ -1,7 +1,7 @@
 """Python interface: make an environment, train, evaluate, act with a trained policy, and export it.
 
-Each function does what the command of the same name does, and returns objects instead of printing. Errors are the
-exceptions of `rlcli.errors`.
+`train`, `evaluate` and `export` do the work of the commands `rlcli train`, `rlcli eval` and `rlcli export`, and return
+the result instead of printing it. Errors are the exceptions of `rlcli.errors`.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ def make(
         num_envs: number of environments; None takes the task's own.
         seed: seed of all random numbers.
         device: `cpu`, or `cuda` for MuJoCo Warp.
-        overrides: `key.path=value`, as on the command line.
+        overrides: list of `key.path=value`, as on the command line.
 
     Raises:
         TaskError: if the task is not found.
-        ConfigError: if an override or the task is wrong.
+        ConfigError: if an override or the configuration of the task is not valid.
         UsageError: if `seed` is not an integer from 0 to 2^62, or `overrides` is one text.
     """
     _check(seed, overrides)
@@ -84,7 +84,7 @@ def train(
         max_iterations: iterations to train; None takes the agent's own.
         seed: seed of the training.
         device: `auto`, `cpu` or `cuda`.
-        overrides: `key.path=value`; `agent.key=value` changes the agent.
+        overrides: list of `key.path=value`; `agent.key=value` changes the agent.
         runs_dir: folder of the runs; None: the environment variable RLCLI_RUNS_DIR, else `runs`.
         name: part of the name of the run's folder.
         resume: run to resume.
@@ -96,7 +96,7 @@ def train(
     _check(seed, overrides)
     if task is None and resume is None:
         raise UsageError(
-            "train() needs a task, or a run to resume", hint='as in train("cartpole") or train(resume=RUN)'
+            "train(): no task and no run to resume given", hint='write train("cartpole") or train(resume=RUN)'
         )
     request = TrainingRequest(
         Path(runs_dir or default_runs_dir()),
@@ -192,7 +192,7 @@ def export(
 
     Args:
         checkpoint: run or checkpoint.
-        file: path to write; its folder exists.
+        file: path to write; missing folders are created.
         format: `onnx`, `torch` or `numpy`.
         runs_dir: folder of the runs.
 
@@ -212,7 +212,7 @@ def _check(seed: object, overrides: object) -> None:
     if isinstance(overrides, str):
         raise UsageError(
             f"overrides must be a list, found the text '{shorten(overrides, 40)}'",
-            hint="give a list, as in overrides=[...]",
+            hint='write a list, such as overrides=["sim.dt=0.005"]',
         )
 
 
@@ -222,7 +222,7 @@ def _find(checkpoint: Path | str | None, task: str | None, runs_dir: Path | str 
 
 
 class _ProgressCallback:
-    """Progress view of a training that calls the function of the user after each iteration."""
+    """Progress view for `run_training` that calls a function of the user after each iteration."""
 
     def __init__(self, function: Callable[[Progress], None] | None) -> None:
         self._function = function

@@ -1,4 +1,9 @@
-"""Interface for plugins that read the task files of other frameworks: what a plugin declares, and what it returns."""
+"""Interface for plugins that read the task files of other frameworks: what a plugin declares, and what it returns.
+
+Types of other modules: [`TaskSource`](registry.md#tasksource) has the name, the folder and the files of a task;
+`Document` (`rlcli.config.strict_yaml`) is a parsed YAML file, with the line and column of each key; `Origin`
+(`rlcli.config.layers`) is the place where a value was set, such as `file:line:column`.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +40,8 @@ class FormatSpec:
         read: `(document: Document, source: TaskSource) -> Translation | None`. Translate a YAML document of this format
             into the data of a task; None for a document of another format.
         key: the top-level key of a task file whose content only the format's environment reads.
-        check: `(block: Mapping) -> Iterable[(path, message, hint)]`. Yield the mistakes in the content of `key`.
+        check: `(block: Mapping) -> Iterable[(path, message, hint)]`. Yield the mistakes in the content of `key`;
+            `path` has the keys from the block to the wrong value.
         open_scene: the format's environment adds entities to the scene, so a task file may have no entities.
         environment: the `VecEnv` class that runs a task whose file has content at `key`.
         importer: the function of the command `rlcli import NAME`, which returns an `Imported`. Its parameters have
@@ -43,8 +49,9 @@ class FormatSpec:
         hint: `(error: BaseException) -> str | None`. Return what to do about an error of a task's code.
         agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration
             in the folder.
-        models: dotted key in a task's data that `--model NAME=FILE` sets, with `{name}` in the place of NAME; empty: a
-            configuration in this format receives the models as an argument, `__rlcli_task__(root, models)`.
+        models: dotted key in a task's data that `--model NAME=FILE` sets, with `{name}` in the place of NAME; empty:
+            the configuration is a Python object with a method `__rlcli_task__(root: Path, models: Mapping)`, which
+            returns it as data of a task, with the given models; `root` is the folder of the task.
         agent_file: `(file: Path, library: str, notes: list[Note]) -> dict | None`. Return the settings of an agent
             that a registration with Gymnasium names by a file; None if the format does not read the library's files.
         agent_order: libraries of agents, best first; the first one for which a registration with Gymnasium has an agent
@@ -79,13 +86,13 @@ class Translation:
     data: dict[str, Any]
     """Content of an equivalent `task.yaml`."""
     origin: Callable[[tuple[str | int, ...]], Origin]
-    """Function from a path in `data` to the place in the source file from which the value comes."""
+    """Function that returns the place in the source file of the value at a path (keys and list indices) in `data`."""
     notes: list[Note]
     """How each key was translated."""
     agents: dict[str, Any] = field(default_factory=dict)
     """Agents that were read from a separate file: name -> settings."""
     agents_origin: Callable[[tuple[str | int, ...]], Origin] | None = None
-    """The same as `origin` for the paths in `agents`; None without such a file."""
+    """Function like `origin` for the paths in `agents`; None: no agents were read from a file."""
 
 
 @dataclass(slots=True)

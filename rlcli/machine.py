@@ -45,7 +45,7 @@ def launcher_number(name: str, default: int, least: int = 0) -> int:
     """Return the number in an environment variable that a launcher such as torchrun sets; `default` if it is not set.
 
     Raises:
-        UsageError: if it is no whole number, or below `least`.
+        UsageError: if the variable is not a whole number, or is below `least`.
     """
     text = os.environ.get(name) or str(default)
     number = read_number(text)
@@ -108,11 +108,12 @@ def read_plain(file: Path, most: int, *, pipe: bool = False) -> bytes:
 
     Args:
         file: the file.
-        most: largest size [bytes].
+        most: largest size of the file [bytes].
         pipe: whether the file may be a pipe, as a shell creates it for `--config <(...)`.
 
     Raises:
-        OSError: if the file is missing, is not a regular file, or is larger than `most` bytes.
+        OSError: if the file is missing, is not a regular file, is larger than `most` bytes, or if a pipe stays empty
+            for 10 s.
     """
     descriptor = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with open(descriptor, "rb") as opened:
@@ -198,7 +199,7 @@ def require_memory(size: int, what: str) -> None:
         what: what needs the memory, for the message.
 
     Raises:
-        DeviceError: if it is not free.
+        DeviceError: if less memory is free.
     """
     free = min(available_memory(), memory_limit() or _NO_LIMIT)
     if size > free:
@@ -296,7 +297,7 @@ def restore_garbage_collection() -> None:
 
 
 def _quota(group: Path) -> float | None:
-    """Return the CPU quota, in cores, that the control group of a folder sets; None if it sets none."""
+    """Return the CPU quota of the control group with this folder, in cores; None if the group sets no quota."""
     try:
         if (group / "cpu.max").is_file():
             limit, period = (group / "cpu.max").read_text(encoding="utf-8").split()
@@ -352,7 +353,7 @@ def choose_device(wanted: str) -> str:
 
 
 def has_gpu_driver() -> bool:
-    """Return whether an NVIDIA driver is installed, also that of WSL, without importing torch."""
+    """Return whether an NVIDIA driver is installed (in WSL: that of Windows), without importing torch."""
     files = ("/proc/driver/nvidia", "/dev/nvidiactl", "/dev/dxg")
     return shutil.which("nvidia-smi") is not None or any(Path(file).exists() for file in files)
 

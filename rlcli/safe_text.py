@@ -30,13 +30,13 @@ _input_pieces: set[int] = set()
 
 
 def remember_given(words: Iterable[str]) -> None:
-    """Forget all inputs, and store the words of a command line and of its environment variables."""
+    """Replace the inputs of `remember_input` by the words of a command line and of its environment variables."""
     _inputs.clear()
     remember_input(words)
 
 
 def remember_input(texts: Iterable[str]) -> None:
-    """Store long texts from a command line or a file; messages shorten what they repeat of them."""
+    """Store the long ones of these texts from a command line or a file; `message_line` shortens their parts."""
     _input_pieces.clear()
     for text in texts:
         if len(text) > _MAX_ECHO or not text.isprintable():
@@ -106,6 +106,6 @@ def read_number(text: str) -> int | float | None:
 
 
 def float_or_nan(text: str) -> float:
-    """Return the number that a text spells, with spaces around it; NaN for any other text."""
+    """Return the number that a text spells, ignoring spaces around it; NaN for any other text."""
     number = read_number(text.strip())
     return math.nan if number is None else float(number)

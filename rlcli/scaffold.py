@@ -67,7 +67,7 @@ def create(
     try:
         _write(folder, files, package, assets)
     except OSError as error:
-        raise MachineError(f"cannot write {folder}: {error.strerror or error}", hint="give --output FOLDER") from error
+        raise MachineError(f"cannot write {folder}: {error.strerror or error}", hint="try --output FOLDER") from error
     return folder, sorted([*files, *assets, _SCHEMA])
 
 
@@ -92,7 +92,7 @@ def check_name(name: str) -> None:
         if reserved:
             raise UsageError(f"'{name}' cannot be a package: it is {reason}", hint=f"use {name}-task, for example")
     owners = [f"{entry.distribution} {entry.version}" for entry in catalog(TASKS, hidden=True)[0] if entry.name == name]
-    distribution, module = _installed(name), _module_file(package)
+    distribution, module = _installed_version(name), _module_file(package)
     if owners:
         message = f"{owners[0]} already has a task '{name}'"
     elif distribution is not None:
@@ -183,7 +183,7 @@ def _suggest_name(name: str) -> str | None:
     return f"did you mean '{near}'?" if near and near != name and name.isascii() else "use my-arm, for example"
 
 
-def _installed(name: str) -> str | None:
+def _installed_version(name: str) -> str | None:
     """Return name and version of the installed distribution of this name; None if there is none."""
     try:
         return f"{name} {metadata.version(name)}"

@@ -1,4 +1,4 @@
-"""What `rlcli new --robot FILE.xml` must know of a robot: joints, efforts, default pose, height, asset files."""
+"""Properties of a robot for `rlcli new --robot FILE.xml`: joints, efforts, default pose, height, asset files."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Robot:
             "sensors": [sensor.name for sensor in spec.sensors],
             "keyframes": [key.name for key in spec.keys],
         }
-        home = _home(spec)
-        _clean(spec)
+        home = _default_pose(spec)
+        _remove_scene_elements(spec)
         original = spec.compile()
         tree = ElementTree.fromstring(spec.to_xml())
         _put_robot_first(tree, original)
@@ -45,7 +45,7 @@ class Robot:
         self.model = model = _compile_copy(self.xml, self.assets)
         self.dt = model.opt.timestep if model.opt.timestep <= 0.01 else 0.005
         self.decimation = min(max(1, round(_CONTROL_DT / self.dt)), _MAX_DECIMATION)
-        self.tempo = short(min(1.0, _MAX_DECIMATION * self.dt / _CONTROL_DT))
+        self.tempo = round3(min(1.0, _MAX_DECIMATION * self.dt / _CONTROL_DT))
         """Factor of all times of the task: less than 1 if the decimation would be too large."""
         self.gravity = float(np.linalg.norm(model.opt.gravity))
         """Gravity of the file, in the units of the file [m/s^2]."""
@@ -64,7 +64,7 @@ class Robot:
             if model.jnt_limited[joint]:
                 address = model.jnt_qposadr[joint]
                 self.data.qpos[address] = np.clip(self.data.qpos[address], *model.jnt_range[joint])
-        self.height = self._stand() if self.free else 0.0
+        self.height = self._lower_to_ground() if self.free else 0.0
         """Height of the root above the ground in the default pose [m]."""
         locked = {j for j in self.joints if j not in self.actuator and self._is_locked(j)}
         # without any actuator in the file, the task drives every joint that can move
@@ -76,9 +76,9 @@ class Robot:
         self.inertia = self._inertia()
 
     def kind(self) -> str:
-        """Return the kind of task that fits the robot.
+        """Return the kind of task that fits the robot: velocity, reach or balance.
 
-        It is velocity (walk as commanded), reach (move the last body to a goal) or balance (keep the default pose).
+        They mean: follow velocity commands, move the last body to a goal, keep the default pose.
         """
         legged = self.free and self.gravity > 0.0 and self.feet()
         if legged and len(self.driven) >= max(4, len(self.passive) + 1):
@@ -91,14 +91,15 @@ class Robot:
         """Return the name of the joint with this id."""
         return str(self.model.joint(joint).name)
 
-    def body(self, number: int) -> str:
+    def body_name(self, body: int) -> str:
         """Return the name of the body with this id."""
-        return str(self.model.body(number).name)
+        return str(self.model.body(body).name)
 
-    def effort(self, joint: int) -> float:
-        """Return the largest effort of a joint [N or N m]: its actuator's limit, or an estimate from carried weight.
+    def max_effort(self, joint: int) -> float:
+        """Return the largest effort of a joint [N or N m]: the limit in the file, else an estimate from carried weight.
 
-        A joint of a floating base is assumed to carry half of the robot's weight, at half of its height.
+        A slide holds twice the weight of the bodies that it carries; a hinge holds this weight at a distance of 0.6 m.
+        In a robot with a floating base every joint carries the whole robot, a hinge at half the height of the root.
         """
         model, a = self.model, self.actuator.get(joint)
         if model.jnt_actfrclimited[joint]:
@@ -121,9 +122,9 @@ class Robot:
         """
         dof = self.model.jnt_dofadr[joint]
         resistance = 0.01 * self.model.dof_damping[dof] + self.model.dof_frictionloss[dof]
-        return bool(resistance > abs(self.effort(joint)))
+        return bool(resistance > abs(self.max_effort(joint)))
 
-    def settings(self) -> dict[str, dict[str, float]]:
+    def joint_settings(self) -> dict[str, dict[str, float]]:
         """Return joint name -> kp, kv and effort_limit, for joints without a position actuator in the file.
 
         They are estimated from the largest effort and the inertia of each joint.
@@ -132,24 +133,24 @@ class Robot:
         for joint in self.driven:
             if joint in self.actuator and self.model.actuator_biasprm[self.actuator[joint], 1] < 0.0:
                 continue  # a position actuator: the file has its gains
-            effort = abs(self.effort(joint))
+            effort = abs(self.max_effort(joint))
             kp = effort * (10.0 if self.model.jnt_type[joint] == SCALAR[1] else 1.0)  # full effort at 0.1 m or 1 rad
             kv = 2.0 * 0.5 * math.sqrt(kp * self.inertia[joint])  # damping ratio 0.5
-            settings[self.name(joint)] = {"kp": short(kp), "kv": short(kv), "effort_limit": short(effort)}
+            settings[self.name(joint)] = {"kp": round3(kp), "kv": round3(kv), "effort_limit": round3(effort)}
         return settings
 
-    def sim(self) -> dict[str, Any]:
+    def sim_settings(self) -> dict[str, Any]:
         """Return the physics settings of the task as data of its YAML."""
         settings: dict[str, Any] = {"dt": self.dt, "integrator": "implicitfast"}  # stable with the damping of servos
         gravity = [float(value) for value in self.model.opt.gravity]
         return settings if gravity == [0.0, 0.0, -9.81] else settings | {"gravity": gravity}
 
-    def scene(self) -> dict[str, Any]:
+    def scene_settings(self) -> dict[str, Any]:
         """Return the key `scene` of the task for this robot, as data for its YAML."""
         robot: dict[str, Any] = {"model": "model.xml"}
         if self.free:
             robot["pos"] = [0.0, 0.0, round(self.height + 0.005, 4)]
-        if self.kind() != "balance" and (settings := self.settings()):
+        if self.kind() != "balance" and (settings := self.joint_settings()):
             robot["joints"] = settings
         pose = {self.name(j): round(float(self.data.qpos[self.model.jnt_qposadr[j]]), 4) for j in self.joints}
         if pose := {name: value for name, value in pose.items() if value}:
@@ -159,13 +160,13 @@ class Robot:
 
     def feet(self) -> list[str]:
         """Return the names of the bodies, without the root, that touch the ground in the default pose within 1 cm."""
-        return [self.body(b) for b in self._touching(-0.01) if self.model.body_weldid[b] != _ROOT]
+        return [self.body_name(b) for b in self._touching(-0.01) if self.model.body_weldid[b] != _ROOT]
 
     def trunk(self) -> list[str]:
         """Return the names of the root and of the bodies that are fixed to it, if they have a geom."""
-        return [self.body(b) for b in dict.fromkeys(self.model.geom_bodyid) if self.model.body_weldid[b] == _ROOT]
+        return [self.body_name(b) for b in dict.fromkeys(self.model.geom_bodyid) if self.model.body_weldid[b] == _ROOT]
 
-    def _stand(self) -> float:
+    def _lower_to_ground(self) -> float:
         """Lower the root until the robot touches the ground; return the height of the root [m]."""
         low, high = -5.0, 5.0
         for _ in range(30):
@@ -186,7 +187,7 @@ class Robot:
         found = []
         for geom in range(model.ngeom):
             solid, body = model.geom_contype[geom] or model.geom_conaffinity[geom], int(model.geom_bodyid[geom])
-            if solid and model.body_rootid[body] == _ROOT and _lowest(model, data, geom) < 0.0:
+            if solid and model.body_rootid[body] == _ROOT and _lowest_z(model, data, geom) < 0.0:
                 found.append(body)
         return list(dict.fromkeys(found))
 
@@ -229,7 +230,7 @@ class Robot:
         return max(range(1, self.model.nbody), key=lambda body: (length(body), body))
 
 
-def _home(spec: mujoco.MjSpec) -> np.ndarray | None:
+def _default_pose(spec: mujoco.MjSpec) -> np.ndarray | None:
     """Return the robot's default pose as `qpos`: of the keyframe home or stand, else of the first keyframe.
 
     Without a keyframe it is the numeric `init_qpos`; None if there is none.
@@ -241,10 +242,10 @@ def _home(spec: mujoco.MjSpec) -> np.ndarray | None:
     return None if start is None else np.array(start.data)
 
 
-def _clean(spec: mujoco.MjSpec) -> None:
-    """Remove ground, lights and keyframes from a model, because the task's scene has its own; name every element.
+def _remove_scene_elements(spec: mujoco.MjSpec) -> None:
+    """Remove ground, lights and keyframes, which the task's scene has; name all bodies, joints and actuators.
 
-    Welds to mocap bodies are removed, too: a task does not move them, so that they would hold the robot.
+    Welds and connections to mocap bodies are removed, too: a task does not move them, so they would hold the robot.
     """
     for key in list(spec.keys):
         spec.delete(key)
@@ -268,9 +269,9 @@ def _clean(spec: mujoco.MjSpec) -> None:
 
 
 def _put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
-    """Move the body with most driven joints to the first place of an MJCF: the first body is the root of an entity.
+    """Make the top-level body with most driven joints the first one: rlcli takes the first body as the root.
 
-    If it is free, it is placed at the origin, and made level.
+    A free body is placed at the origin, and gets a level parent if its z axis does not point up.
     """
     joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     driven = model.actuator_trnid[joint_actuator, 0] if model.nu else np.flatnonzero(np.isin(model.jnt_type, SCALAR))
@@ -341,8 +342,8 @@ def _compile_copy(xml: str, assets: Mapping[str, Path]) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(xml, {place: origin.read_bytes() for place, origin in assets.items()})
 
 
-def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """Return the lowest z of a geom [m]: exact for spheres, capsules, boxes and meshes, a lower bound for others."""
+def _lowest_z(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Return the lowest z of a geom [m]: inf for planes, a lower bound for cylinders and ellipsoids, else exact."""
     kind, size, turn = int(model.geom_type[geom]), model.geom_size[geom], data.geom_xmat[geom].reshape(3, 3)
     z, kinds = float(data.geom_xpos[geom, 2]), mujoco.mjtGeom
     if kind == int(kinds.mjGEOM_SPHERE):
@@ -358,6 +359,6 @@ def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
     return z - float(np.abs(turn[2]) @ size)
 
 
-def short(value: float) -> float:
+def round3(value: float) -> float:
     """Return a number, rounded to three significant digits."""
     return float(f"{value:.3g}")

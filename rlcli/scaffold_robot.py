@@ -1,7 +1,8 @@
 """Task design for `rlcli new --robot`: read an MJCF, choose a kind of task, and return the model and the YAML data.
 
-velocity: a floating base with feet and at least four driven joints follows velocity commands. reach: a fixed base with
-two or more joints, all driven, brings its last body to goals. balance: any other robot keeps its default pose.
+velocity: a floating base with feet, at least four driven joints and fewer passive ones follows velocity commands.
+reach: a fixed base with two or more joints, all driven, brings its last body to goals. balance: any other robot keeps
+its default pose.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import TaskError, UsageError
-from rlcli.scaffold_mjcf import SCALAR, Robot, short
+from rlcli.scaffold_mjcf import SCALAR, Robot, round3
 from rlcli.scene.mjcf_scan import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf
 
@@ -48,10 +49,10 @@ def read_robot(file: Path, name: str) -> RobotTask:
 
     Raises:
         UsageError: if there is no such file, or the robot has nothing that can be controlled.
-        TaskError: if the model is refused.
+        TaskError: if MuJoCo cannot compile the model, or it has an element that rlcli refuses.
     """
     if not file.is_file():
-        raise UsageError(f"there is no file {file}", hint="give the MJCF of a robot, as in --robot robot.xml")
+        raise UsageError(f"--robot: there is no file {file}", hint="give the MJCF of a robot, as in --robot robot.xml")
     try:
         spec = read_mjcf(file, [file.parent.resolve(), file.resolve().parent.parent])
         robot = Robot(spec, file)
@@ -69,9 +70,9 @@ def read_robot(file: Path, name: str) -> RobotTask:
     task = {
         "summary": f"{_SUMMARIES[kind]} ({name}).",
         "decimation": robot.decimation,
-        "episode_length_s": short(robot.tempo * (20.0 if kind == "velocity" else 8.0)),
-        "sim": robot.sim(),
-        "scene": robot.scene() | {"sensors": sensors},
+        "episode_length_s": round3(robot.tempo * (20.0 if kind == "velocity" else 8.0)),
+        "sim": robot.sim_settings(),
+        "scene": robot.scene_settings() | {"sensors": sensors},
         **parts,
         "play": {"scene": {"num_envs": 16}},
         "agents": {
@@ -92,13 +93,13 @@ _SUMMARIES = {
 
 def _velocity(robot: Robot) -> dict[str, Any]:
     joints, feet = [robot.name(j) for j in robot.driven], robot.feet()
-    speed = short(math.sqrt(robot.gravity * robot.com_height / 15.0))  # a slow walk for every size: Froude number 1/15
-    yaw_rate, period = short(0.6 / robot.tempo), short(10.0 * robot.tempo)
+    speed = round3(math.sqrt(robot.gravity * robot.com_height / 15.0))  # a slow walk for every size: Froude number 1/15
+    yaw_rate, period = round3(0.6 / robot.tempo), round3(10.0 * robot.tempo)
     return {
         "commands": {
             "velocity": {
                 **{"func": "uniform_velocity", "resampling_time_s": [period, period], "lin_vel_x": [-speed, speed]},
-                "lin_vel_y": [short(-0.5 * speed), short(0.5 * speed)],
+                "lin_vel_y": [round3(-0.5 * speed), round3(0.5 * speed)],
                 **{"ang_vel_z": [-yaw_rate, yaw_rate], "rel_standing": 0.05},
             }
         },
@@ -128,11 +129,11 @@ def _velocity(robot: Robot) -> dict[str, Any]:
         "rewards": {
             "track_lin_vel": {
                 **{"func": "track_lin_vel_xy_exp", "weight": 1.5, "command": "velocity"},
-                "std": short(0.5 * speed),  # a robot that stands still earns a third of this reward
+                "std": round3(0.5 * speed),  # a robot that stands still earns a third of this reward
             },
             "track_ang_vel": {
                 **{"func": "track_ang_vel_z_exp", "weight": 0.75, "command": "velocity"},
-                "std": short(0.5 * yaw_rate),
+                "std": round3(0.5 * yaw_rate),
             },
             "lin_vel_z": {"func": "lin_vel_z_l2", "weight": -2.0},
             "ang_vel_xy": {"func": "ang_vel_xy_l2", "weight": -0.05},
@@ -145,7 +146,7 @@ def _velocity(robot: Robot) -> dict[str, Any]:
                 "weight": 0.5,
                 "sensor": "feet",
                 "command": "velocity",
-                "threshold": short(0.2 * robot.tempo),
+                "threshold": round3(0.2 * robot.tempo),
             },
             "fall": {"func": "is_terminated", "weight": -100.0},
         },
@@ -155,8 +156,8 @@ def _velocity(robot: Robot) -> dict[str, Any]:
             "tilted": {"func": "bad_orientation", "limit_angle": 1.0},
         },
         "success": {
-            "velocity": {"func": "mean_velocity_error", "command": "velocity", "at_most": short(0.42 * speed)},
-            "yaw_rate": {"func": "mean_yaw_rate_error", "command": "velocity", "at_most": short(0.5 * yaw_rate)},
+            "velocity": {"func": "mean_velocity_error", "command": "velocity", "at_most": round3(0.42 * speed)},
+            "yaw_rate": {"func": "mean_yaw_rate_error", "command": "velocity", "at_most": round3(0.5 * yaw_rate)},
         },
         "_sensors": {
             "feet": {"kind": "contact", "bodies": feet, "against": "ground"},
@@ -166,14 +167,14 @@ def _velocity(robot: Robot) -> dict[str, Any]:
 
 
 def _reach(robot: Robot) -> dict[str, Any]:
-    joints, hand, box = [robot.name(j) for j in robot.driven], robot.body(robot.last_body()), robot.workspace()
+    joints, hand, box = [robot.name(j) for j in robot.driven], robot.body_name(robot.last_body()), robot.workspace()
     goal = {"bodies": hand, "command": "goal"}
     return {
         "commands": {
             "goal": {
                 "func": "uniform_pose",
                 "bodies": hand,
-                "resampling_time_s": [short(8.0 * robot.tempo)] * 2,
+                "resampling_time_s": [round3(8.0 * robot.tempo)] * 2,
                 **dict(zip("xyz", box, strict=True)),
             }
         },
@@ -200,7 +201,7 @@ def _reach(robot: Robot) -> dict[str, Any]:
         },
         "terminations": {"time_out": {"func": "time_out", "time_out": True}},
         "success": {
-            "position": {"func": "body_goal_distance", **goal, "at_most": 0.05, "hold_s": short(0.5 * robot.tempo)}
+            "position": {"func": "body_goal_distance", **goal, "at_most": 0.05, "hold_s": round3(0.5 * robot.tempo)}
         },
     }
 
@@ -212,7 +213,7 @@ def _balance(robot: Robot) -> dict[str, Any]:
     for joint in hinges:
         held.setdefault(round(float(robot.data.qpos[robot.model.jnt_qposadr[joint]]), 4), []).append(robot.name(joint))
     every = [robot.name(j) for j in sorted([*robot.driven, *robot.passive])]
-    scale = {robot.name(j): short(abs(robot.effort(j))) for j in robot.driven}
+    scale = {robot.name(j): round3(abs(robot.max_effort(j))) for j in robot.driven}
     floating: dict[str, Any] = {"projected_gravity": {"func": "projected_gravity"}} if robot.free else {}
     start = {"root": {"func": "reset_root_state_uniform", "mode": "reset"}} if robot.free else {}
     hold = {"at_most": 0.2, "hold_s": robot.tempo}

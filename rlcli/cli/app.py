@@ -15,7 +15,7 @@ import typer
 from typer._click.exceptions import ClickException, NoArgsIsHelpError
 from typer._click.exceptions import UsageError as ClickUsageError
 
-from rlcli.cli.ui.console import console, discard, print_log_records
+from rlcli.cli.ui.console import console, print_log_records, redirect_to_null
 from rlcli.cli.ui.help_text import HelpGroup
 from rlcli.cli.ui.options import CHOOSE, add_command
 from rlcli.config.user_settings import read_settings
@@ -111,7 +111,7 @@ def main(arguments: list[str] | None = None) -> int:
         if sys.stdout is not None:
             sys.stdout.flush()
     except OSError:
-        discard(sys.stdout)
+        redirect_to_null(sys.stdout)
     return code
 
 
@@ -261,7 +261,7 @@ def _usage_hint(error: ClickException, arguments: list[str]) -> str | None:
 
 
 def _hint_for_option(name: str, arguments: list[str]) -> str | None:
-    """Return what to write instead of an unknown option `--NAME`: `KEY=VALUE`, or an option of rlcli; None: unknown."""
+    """Return what to write instead of the unknown option `--NAME`: `KEY=VALUE` or an option of rlcli; else None."""
     keys = _matching_settings(name)
     if not keys:
         return _FOREIGN_OPTIONS.get(name)
@@ -275,7 +275,7 @@ def _hint_for_option(name: str, arguments: list[str]) -> str | None:
 
 
 def _matching_settings(option: str) -> list[str]:
-    """Return the keys of the configuration that an unknown option may mean: they are or end with its name.
+    """Return the configuration keys that an unknown option may mean: keys that equal or end with its name.
 
     The list is empty if more than three keys end with the name.
     """
@@ -300,7 +300,7 @@ def _agent_models() -> set[type[BaseModel]]:
 _FOREIGN_OPTIONS = {
     "task": "the task is named without an option, as in `rlcli train cartpole`",
     "load-run": "--checkpoint RUN names a run or one of its checkpoints; `rlcli train --resume RUN` continues a run",
-    "enable-cameras": "leave it out: cameras of a task need no option",
+    "enable-cameras": "leave out this option: cameras of a task need none",
 }
 """Option of another program -> what to write for rlcli."""
 _SHORT_FOR = {"lr": "learning_rate"}

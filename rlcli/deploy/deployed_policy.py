@@ -1,4 +1,4 @@
-"""Module that every export format contains: the policy, followed by the scaling of the action terms."""
+"""Torch module that is exported in every format: the policy, followed by the scaling of the action terms."""
 
 import copy
 import math

@@ -25,7 +25,7 @@ _INPUT = "observation/"
 
 
 def describe(env: VecEnv) -> dict[str, Any]:
-    """Describe an environment as plain JSON: its joints, actuators, start state, and formulas (`DeploymentRecord`).
+    """Describe an environment as JSON data: its joints, actuators, start state, and formulas (`DeploymentRecord`).
 
     Raises:
         ConfigError: if the terms of a direct task's `in_terms` do not fit the task.

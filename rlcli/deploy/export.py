@@ -26,7 +26,7 @@ from rlcli.runs.atomic_io import remove_leftovers, require_regular, sync_folder,
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.manifest_schema import deployment_of, layout_of
 
-__all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "refusal", "require_self_contained"]
+__all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "require_self_contained"]
 
 BUNDLE = "bundle"
 """Format that is a folder which rlcli itself reads: `rlcli.runs.bundle`."""
@@ -45,9 +45,9 @@ class Exported:
     file: Path
     metadata: dict[str, Any]
     observations: int
-    """Number of observations on which the file was compared with the policy."""
+    """Number of test observations, on which the outputs of the file and of the policy were compared."""
     max_difference: float
-    """Largest difference from the policy, relative to max(1, |value|)."""
+    """Largest difference of an output from that of the policy, relative to max(1, |value|)."""
 
 
 def check_target(format_: str, output: Path | None) -> None:
@@ -72,7 +72,7 @@ def check_target(format_: str, output: Path | None) -> None:
     require_regular(output)
 
 
-def refusal(spec: PolicySpec) -> str | None:
+def _export_obstacle(spec: PolicySpec) -> str | None:
     """Return why a policy cannot be exported, as text after `its policy has`; None if it can be exported."""
     if len(set(spec.memory)) > 1:
         return f"recurrent layers of different sizes ({', '.join(map(str, spec.memory))})"
@@ -82,7 +82,7 @@ def refusal(spec: PolicySpec) -> str | None:
 def export(
     checkpoint: Checkpoint, file: Path, format_: str = "onnx", deployment: Mapping[str, Any] | None = None
 ) -> Exported:
-    """Write the policy of a checkpoint to one file.
+    """Write the policy of a checkpoint to one file, and check that the file computes the same outputs.
 
     Args:
         checkpoint: the checkpoint.
@@ -96,12 +96,13 @@ def export(
         DependencyError: if a package that writes or checks the format is not installed.
         CheckpointError: if the checkpoint is corrupt, or has no layout of the policy's columns.
         MachineError: if the file cannot be written.
-        VerdictError: if the file computes something else than the policy; the file is deleted.
+        VerdictError: if the outputs of the file differ from those of the policy, or its metadata cannot be read back;
+            the file is deleted.
     """
     check_target(format_, file)
     formats.require_packages(format_)
     policy = checkpoint.policy()
-    reason = refusal(policy.spec)
+    reason = _export_obstacle(policy.spec)
     if reason is not None:
         raise UsageError(
             f"{checkpoint.folder} cannot be exported: its policy has {reason}",
@@ -116,7 +117,7 @@ def export(
         write_synced(temporary, formats.write(format_, graph, text, mjlab_properties(metadata)))
         run, found = formats.read(format_, temporary)
         if json.loads(found) != metadata:
-            raise VerdictError(f"{file} is not kept: its metadata cannot be read back; report this bug")
+            raise VerdictError(f"{file} was not kept: its metadata cannot be read back", hint="report this bug")
         difference = _require_equal(run, graph, observations, file)
     return Exported(file, metadata, len(observations), difference)
 
@@ -164,7 +165,7 @@ def _require_equal(run: PolicyFunction, graph: DeployedPolicy, observations: Ten
                     raise VerdictError(
                         f"{file} was not kept: with batch size {batch} its output '{name}' differs from the policy's"
                         f" by a relative {float(difference.max()):.3g}; at most {TOLERANCE:g} is allowed",
-                        hint="please report it with the versions of torch, onnx and onnxruntime",
+                        hint="report this bug with the versions of torch, onnx and onnxruntime",
                     )
                 worst = max(worst, float(difference.max()))
     return worst

@@ -87,7 +87,7 @@ def numbers(values: Tensor) -> Formula:
 
 
 def _is_defined_in(module: Any, function: Any) -> bool:
-    """Return whether a function or class belongs to a module of rlcli: a task may have another one of the same name."""
+    """Return whether a module of rlcli defines this function or class; a task may define another of the same name."""
     return bool(getattr(function, "__module__", None) == module.__name__)
 
 

@@ -1,4 +1,4 @@
-"""Metadata of an exported file: everything that a program needs to run the policy, also in mjlab's format."""
+"""Metadata of an exported file, which a program needs to run the policy: in rlcli's format and in that of mjlab."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -63,7 +63,7 @@ def check_overwrites(policy: Path) -> None:
         UsageError: if the policy has the program's name, or the folder has a model that export did not write.
     """
     if policy.name == PROGRAM:
-        message = f"--verify writes its program to {PROGRAM}, so the policy needs another name"
+        message = f"--verify writes the program {PROGRAM}, which would overwrite the policy"
         raise UsageError(message, hint="give the policy another name with --output FILE")
     for name in (MODEL, BINARY_MODEL):
         require_regular(policy.with_name(name))

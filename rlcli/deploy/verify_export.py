@@ -63,7 +63,7 @@ class ReferenceEnv:
 
     env: VecEnv
     deployment: dict[str, Any]
-    """Its description for code without rlcli."""
+    """Description of the environment for programs without rlcli."""
 
 
 @dataclass(slots=True)
@@ -121,7 +121,7 @@ class ClosedLoopResult:
         return all(row[3] for row in self.rows())
 
     def record(self) -> dict[str, Any]:
-        """Return the result as JSON."""
+        """Return the result as JSON data."""
         synchronized = None
         if self.synchronized_return is not None:
             synchronized = {"return": self.synchronized_return, "parted": self.disagreeing_steps}
@@ -234,7 +234,7 @@ def verify(
 
 
 def _may_randomize(env: VecEnv) -> bool:
-    """Return whether the task may randomise gains or the initial state: it has an event that is no plain reset."""
+    """Return whether the task may randomise gains or initial states: a direct task, or events other than resets."""
     events = [event for event in env.config.events.values() if event is not None]
     return isinstance(env, DirectEnv) or not all(event.func.startswith("reset_") for event in events)
 

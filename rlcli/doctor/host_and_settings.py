@@ -26,7 +26,7 @@ LOW_MEMORY_BYTES = 1e9
 
 def machine_checks(runs_dir: Path) -> list[Check]:
     """Return the checks of cores, memory, the runs folder (where trainings are written) and the encoding of text."""
-    return [_cores(), memory_check(available_memory(), memory_limit()), _runs_folder(runs_dir), _text()]
+    return [_core_check(), memory_check(available_memory(), memory_limit()), _runs_folder(runs_dir), _encodings()]
 
 
 def memory_check(free: int, limit: int | None) -> Check:
@@ -45,7 +45,7 @@ def memory_check(free: int, limit: int | None) -> Check:
     return Check("memory", "warning", f"{found}: too little to train", f"{hint}, or set scene.num_envs lower", details)
 
 
-def _cores() -> Check:
+def _core_check() -> Check:
     """Report how many cores this process may use."""
     cores, quota = available_cores(), core_quota()
     found = f"{cores} of {os.cpu_count()} cores for this process; engine_threads defaults to {cores}"
@@ -74,7 +74,7 @@ def _runs_folder(folder: Path) -> Check:
     return Check("runs folder", "warning", found, "free some space, or choose another folder: --runs-dir", details)
 
 
-def _text() -> Check:
+def _encodings() -> Check:
     """Check the encodings of file names and of the output, and describe the terminal."""
     encodings = {"files": sys.getfilesystemencoding(), "output": getattr(sys.stdout, "encoding", None) or "none"}
     width = shutil.get_terminal_size().columns
@@ -89,10 +89,10 @@ def _text() -> Check:
 
 def settings_checks() -> list[Check]:
     """Return the checks of the settings file and of the environment variables."""
-    return [_file(), _variables()]
+    return [_settings_file(), _variables_check()]
 
 
-def _file() -> Check:
+def _settings_file() -> Check:
     """Check that the user's settings file is valid."""
     file = settings_file()
     if file is None:
@@ -107,7 +107,7 @@ def _file() -> Check:
     return Check("settings", "ok", text, details={"file": str(file), "settings": found})
 
 
-def _variables() -> Check:
+def _variables_check() -> Check:
     """Check that no environment variable names a missing plugin or slows training down."""
     variables = {name: os.environ[name] for name in VARIABLES if name in os.environ}
     texts = [", ".join(f"{name}={value}" for name, value in variables.items()) or "none"]

@@ -28,9 +28,9 @@ def installation_checks() -> list[Check]:
     return [
         Check("python", "ok", python, details={"platform": platform.platform(), "prefix": sys.prefix}),
         Check("rlcli", "ok", f"{rlcli.__version__} at {Path(rlcli.__file__).parent}"),
-        _packages(),
-        _mujoco_packages(),
-        *_extras(),
+        _dependencies_check(),
+        _mujoco_packages_check(),
+        *_extras_checks(),
     ]
 
 
@@ -95,7 +95,7 @@ def violates_bounds(wanted: str, found: str) -> bool:
     return False
 
 
-def _packages() -> Check:
+def _dependencies_check() -> Check:
     """Check that the dependencies of rlcli are installed in versions that fit."""
     bad, versions = [], {}
     for name, wanted, extra in _requirements("rlcli"):
@@ -109,10 +109,10 @@ def _packages() -> Check:
     details = {"versions": versions}
     if bad:
         return Check("packages", "broken", "; ".join(bad), "pip install --upgrade rlcli", details)
-    return Check("packages", "ok", _listed(versions), details=details)
+    return Check("packages", "ok", _versions_text(versions), details=details)
 
 
-def _mujoco_packages() -> Check:
+def _mujoco_packages_check() -> Check:
     """Check that the packages of MuJoCo have the same version and that each is installed once."""
     copies = {name: _copies(name) for name in TRIPLE}
     first = {name: next(iter(found.values()), None) for name, found in copies.items()}
@@ -127,7 +127,7 @@ def _mujoco_packages() -> Check:
             places = ", ".join(f"{found} in {place}" for place, found in copies[name].items())
             bad.append(f"{name} is installed {len(copies[name])} times: {places}")
     if not bad:
-        return Check("mujoco packages", "ok", _listed(first), details=first)
+        return Check("mujoco packages", "ok", _versions_text(first), details=first)
     newest = max((found for found in first.values() if found), key=release_numbers, default=None)
     wanted = f"mujoco=={first['mujoco'] or newest}" if newest else "mujoco"
     # uninstall first: see compute_and_graphics.REINSTALL
@@ -147,7 +147,7 @@ def _copies(name: str) -> dict[str, str]:
     return found
 
 
-def _extras() -> list[Check]:
+def _extras_checks() -> list[Check]:
     """Return one check for each extra of rlcli, such as `rlcli[export]`: whether its packages are installed."""
     wanted: dict[str, list[tuple[str, str]]] = {}
     for name, bounds, extra in _requirements("rlcli"):
@@ -159,16 +159,16 @@ def _extras() -> list[Check]:
         versions = {name: version(name) for name, _ in packages}
         missing = [name for name, found in versions.items() if found is None]
         if not missing:
-            state, text = "ok", _listed(versions)
+            state, text = "ok", _versions_text(versions)
         elif len(missing) < len(packages):
-            state, text = "warning", f"{_listed(versions)}; missing: {', '.join(missing)}"
+            state, text = "warning", f"{_versions_text(versions)}; missing: {', '.join(missing)}"
         else:
             state, text = "absent", "not installed"
         checks.append(Check(f"extra {extra}", state, text, hint if missing else None, versions))
     return checks
 
 
-def _listed(versions: dict[str, str | None]) -> str:
+def _versions_text(versions: dict[str, str | None]) -> str:
     """Return the installed packages with their versions, as text."""
     return ", ".join(f"{name} {found}" for name, found in versions.items() if found)
 
@@ -196,7 +196,7 @@ def _requirements(distribution: str) -> list[tuple[str, str, str | None]]:
 
 
 def _remedy(entry: Entry, reason: str) -> str:
-    """Return the hint for a plugin that cannot be loaded, for a reason."""
+    """Return how to repair a plugin that cannot be loaded; `reason` is the error of the import."""
     if entry.distribution == "rlcli":
         return "pip install --upgrade --force-reinstall rlcli"
     late = "; if the machine is busy: `rlcli doctor --probe-timeout 120`" if " within " in reason else ""

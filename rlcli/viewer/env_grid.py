@@ -33,7 +33,7 @@ class EnvGrid:
     count: int
 
     def others(self, shown: int) -> list[int]:
-        """Return the indices of the `count - 1` environments after the shown one; after the last index follows 0."""
+        """Return the indices of the `count - 1` environments after the shown one; 0 follows the last index."""
         return [(shown + number) % self.env.num_envs for number in range(1, self.count)]
 
     def offsets(self) -> NDArray[np.float64]:

@@ -22,13 +22,13 @@ class RewardCurves:
     """Rewards of the shown environment over the last seconds, for a plot."""
 
     time_s: tuple[float, ...] = ()
-    """Time of each point, at most 0: now [s]."""
+    """Time of each point relative to now, at most 0 [s]."""
     values: tuple[tuple[str, tuple[float, ...]], ...] = ()
     """(name, points) of the reward and of each of its terms, with their weights."""
 
 
 class EpisodeHistory:
-    """What a viewer's panel shows: rewards of the last seconds in one environment, and episodes of all environments."""
+    """Rewards of the last seconds in one environment, and episodes of all environments, for a viewer's panel."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env

@@ -70,7 +70,7 @@ def press(playback: Playback, code: int) -> None:
 
 
 def captions(view: View) -> tuple[str, str]:
-    """Return the text in the corner of the window: the names, and their values, one in each line."""
+    """Return the two columns of text in the corner of the window: the names, and their values, one per line."""
     rows = {
         "speed": "paused" if view.paused else f"{view.speed:g} x",
         "environment": f"{view.shown} of {view.num_envs}",

@@ -53,8 +53,8 @@ class Playback:
     speed: float = 1.0
     follow: bool = False
     """Switch to each new checkpoint as soon as it appears."""
-    patience: float = 0.1
-    """Longest time that `advance` makes steps before it returns to the viewer [s]."""
+    max_advance_s: float = 0.1
+    """Time after which `advance` returns to the viewer, even if steps are still due [s]."""
     initial_obs: Tensor | None = None
     """Current observations of an environment whose episodes continue; None: the environment is reset."""
     steps: int = 0
@@ -123,7 +123,7 @@ class Playback:
             self._due += min(elapsed, _LAG) * self.speed / self.env.step_dt
             count = int(self._due)
             self._due -= count
-        end = time.perf_counter() + self.patience
+        end = time.perf_counter() + self.max_advance_s
         done = 0
         while done < count and (done == 0 or time.perf_counter() < end):
             self._step()

@@ -39,7 +39,7 @@ def record_episode(
         env: the environments.
         act: the policy: observations (num_envs, d) -> actions (num_envs, a).
         file: an .mp4 or .gif. It gets its name when it is complete.
-        longest_s: longest simulated time of the video [s]; None: `PATIENCE` episode lengths, as in an evaluation.
+        longest_s: longest simulated time of the video [s]; None: ten times the time limit of the task.
 
     Returns:
         Number of frames, frames per second, and the OpenGL backend.

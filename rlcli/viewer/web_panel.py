@@ -75,7 +75,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
     @_handler(messages.Priority.USER)
     def _on_update(self, _: messages.UpdateEvent) -> None:
         view = self._playback.view
-        place = self._place(view.shown)
+        place = self._followed_point(view.shown)
         self.viewer.camera.lookat[:] += place - self._last_place
         self._last_place = place
         self.viewer.extra_geoms[:] = self.overlay_geoms
@@ -223,7 +223,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
         camera.distance, camera.azimuth, camera.elevation = begin.distance, begin.azimuth, begin.elevation
         self._ux.camera_index = ux.TUMBLE_CAMERA_IDX
 
-    def _place(self, shown: int) -> np.ndarray:
+    def _followed_point(self, shown: int) -> np.ndarray:
         """Return the point that the camera follows: the environment's origin or `viewer.follow`. (3,) [m]"""
         if self._followed is None:
             return np.asarray(self._env_origins[shown])
@@ -254,7 +254,7 @@ class WebPanel(plugin.ViewerPlugin):  # type: ignore[misc]  # MuJoCo has no type
 
 
 def _legend(markers: Sequence[Marker]) -> list[tuple[str, Sequence[float] | None]]:
-    """Return the meanings of markers with their colours; None for frames, whose axes have three."""
+    """Return (label, colour) of each marker; the colour of a frame is None, because its axes have three colours."""
     entries = [
         (f"{m.label}: x red, y green, z blue", None) if isinstance(m, Frame) else (m.label, m.color) for m in markers
     ]

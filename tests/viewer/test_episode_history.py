@@ -15,7 +15,7 @@ def played():
     """Return a playback of the zero policy and the sums of its rewards, when first episodes have ended."""
     overrides = ["scene.num_envs=3", "sim.engine_threads=1", "episode_length_s=0.5"]
     env = make_env(resolve(find_task("cartpole"), overrides=overrides))
-    playback = Playback(env, zero_policy(env), patience=60.0, shown=1)
+    playback = Playback(env, zero_policy(env), max_advance_s=60.0, shown=1)
     total = torch.zeros(3)
     for _ in range(20):
         playback.single_step()

@@ -29,7 +29,7 @@ def cartpole(num_envs=3):
 @pytest.fixture
 def playback():
     env = cartpole()
-    return Playback(env, zero_policy(env), patience=60.0)
+    return Playback(env, zero_policy(env), max_advance_s=60.0)
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_change_speed_stops_at_limits(playback):
 
 def test_advance_returns_after_patience(counted):
     playback, steps = counted
-    playback.patience = 0.0
+    playback.max_advance_s = 0.0
     playback.set_speed(8.0)
     assert playback.advance(0.2) == 1
     assert len(steps) == 1

@@ -36,7 +36,7 @@ def test_playback_follows_checkpoints_of_running_training(tmp_path, caplog):
         (folder,) = tmp_path.glob("*/*")
         env = make_env(resolve(find_task("cartpole"), overrides=["scene.num_envs=2", "sim.engine_threads=1"]))
         caplog.set_level(logging.INFO, "rlcli.viewer")
-        playback = Playback(env, zero_policy(env), RunCheckpoints(open_run(folder), env), None, patience=60.0)
+        playback = Playback(env, zero_policy(env), RunCheckpoints(open_run(folder), env), None, max_advance_s=60.0)
         playback.set_follow(True)
         played = set()
         while len(played) < 4:

@@ -34,7 +34,7 @@ class _Arm(GymnasiumTask):
         super().post_reset()
 
     def velocities(self, selection: Selection, still: int) -> Tensor:
-        """Sample small joint velocities, with 0 for the last `still` joints, which have no actuator. (rows, nv)"""
+        """Sample joint velocities in +-0.005; the last `still` joints, which have no actuator, get 0. (rows, nv)"""
         noise = self.noise(selection, 0.005, self.model.nv)
         noise[:, -still:] = 0.0
         return noise
@@ -69,7 +69,7 @@ class Reacher(_Arm):
         return self.body_position("fingertip") - self.body_position("target")
 
     def compute_reward(self) -> Tensor:
-        """Return minus the distance and the cost of actions."""
+        """Return minus the weighted distance from fingertip to target, minus the cost of the actions. (num_envs,)"""
         params = self.params
         return -length(self.gap()) * params.reward_dist_weight - self.action_cost(params.reward_control_weight)
 
@@ -108,14 +108,14 @@ class Pusher(_Arm):
         return [self.field.qpos[:, :7], self.field.qvel[:, :7], *places]
 
     def compute_reward(self) -> Tensor:
-        """Return minus the distances and the cost of actions."""
+        """Return minus the weighted distances arm-puck and puck-goal, minus the cost of the actions. (num_envs,)"""
         params, puck = self.params, self.body_position("object")
         near = -length(puck - self.body_position("tips_arm")) * params.reward_near_weight
         far = -length(puck - self.body_position("goal")) * params.reward_dist_weight
         return far - self.action_cost(params.reward_control_weight) + near
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Sample the puck's position in a box: the first sample that is not too close to the goal."""
+        """Sample the puck's position in a box, more than 0.17 m from the goal."""
         x = selection.uniform(-0.3, 0.0, (_CANDIDATES,))
         y = selection.uniform(-0.2, 0.2, (_CANDIDATES,))
         off = (x * x + y * y).sqrt() > 0.17

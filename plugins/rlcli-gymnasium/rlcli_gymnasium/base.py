@@ -1,4 +1,4 @@
-"""Base of Gymnasium's MuJoCo tasks. It computes in the engine's dtype and converts only its outputs to float32.
+"""Base class of Gymnasium's MuJoCo tasks. It computes in the engine's dtype; only its outputs become float32.
 
 Two things are as in Gymnasium and differ from the rest of rlcli. Derived fields (xpos, cinert, forces) lag by one
 physics step, as `mj_step` leaves them; the setting `sim.derived_fields: substep` of the tasks does this. The cost of an
@@ -120,7 +120,7 @@ class GymnasiumTask(DirectTask):
         return self.start_pos + noise[:, :positions], noise[:, positions:]
 
     def gaussian_start(self, selection: Selection, scale: float) -> tuple[Tensor, Tensor]:
-        """Sample positions uniformly in +-scale, and Gaussian velocities. (rows, nq), (rows, nv)"""
+        """Sample positions within +-scale of the model's, and velocities of std `scale`. (rows, nq), (rows, nv)"""
         qpos = self.start_pos + self.noise(selection, scale, self.model.nq)
         return qpos, selection.normal(0.0, scale, (self.model.nv,))
 
@@ -147,7 +147,7 @@ def square_sum(values: Tensor) -> Tensor:
 
 
 def within(values: Tensor, low: float, high: float) -> Tensor:
-    """Return whether values are strictly between two bounds, element by element."""
+    """Return whether each value is above `low` and below `high`. bool, in the shape of `values`"""
     return (values > low) & (values < high)
 
 

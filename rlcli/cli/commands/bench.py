@@ -13,7 +13,7 @@ import typer
 from rlcli.cli.ui.console import console, plain
 from rlcli.cli.ui.options import Agent, ConfigFile, NumEnvs, Overrides, TaskName
 from rlcli.cli.ui.progress_view import LiveView
-from rlcli.cli.ui.tables import cell, flow
+from rlcli.cli.ui.tables import cell, fill
 from rlcli.errors import MachineError, Stopped, UsageError
 from rlcli.formats import log_notes
 
@@ -44,8 +44,8 @@ def command(
     Options:
         save_preset: Write the recommended settings to FILE.yaml, or to NAME.yaml here, for train --config.
         overwrite: Allow --save-preset to replace a file.
-        quick: Measure only briefly, for a first impression.
-        profile: Measure no sizes; show where the time of an environment step goes, by stage and term.
+        quick: Measure for a shorter time; the figures are less exact.
+        profile: Instead, show the time of each stage and term of an environment step.
 
     Examples:
         rlcli bench cartpole --save-preset fast.yaml
@@ -88,7 +88,7 @@ def command(
 def _profile(resolved: Resolved, preset: Path | None, seconds: float) -> None:
     """Print the table of `--profile`: where the time of an environment step goes."""
     if preset is not None:
-        raise UsageError("--profile recommends no settings to save", hint="leave out --profile or --save-preset")
+        raise UsageError("--profile finds no settings for --save-preset", hint="leave out --profile or --save-preset")
     import torch
 
     from rlcli.tuning.step_profile import profile_step
@@ -129,7 +129,7 @@ def _report(
     for line in explanation(findings):
         console.data(line)
     if findings.unsteady:
-        console.warn("repeated measurements differ much: end other programs on this machine and measure again")
+        console.warn("repeats differ by more than 15 %: end other programs on this machine and measure again")
     changes = None if findings.recommended is None else bench.changes(findings.recommended.setting)
     if changes is not None and file is not None:
         write_atomic(file, bench_preset(resolved, changes, findings, machine, names_agent))
@@ -162,7 +162,7 @@ def _preset_file(name: str, overwrite: bool) -> Path:
 
     file = Path(name)
     if not name or file.name in ("", ".."):
-        raise UsageError("--save-preset needs the name of a file", hint="as in --save-preset cartpole.yaml")
+        raise UsageError("--save-preset needs the name of a file", hint="for example: --save-preset cartpole.yaml")
     if file.suffix not in (".yaml", ".yml"):
         file = file.with_name(f"{file.name}.yaml")
     folder = file.absolute().parent
@@ -263,8 +263,8 @@ class _View(LiveView):
     def _draw(self) -> None:
         if self._live is not None:
             width, max_lines = self._live.console.width, max(4, self._live.console.height - 4)
-            lines = [line for row in self._rows for line in flow(row, width)]
-            self.update([plain(self._title), *lines[-max_lines:], *flow([f"... {self._current}"], width)])
+            lines = [line for row in self._rows for line in fill(row, width)]
+            self.update([plain(self._title), *lines[-max_lines:], *fill([f"... {self._current}"], width)])
 
 
 def _step_parts(row: Stepped) -> list[str]:

@@ -26,9 +26,9 @@ def command(
     """Check that a task keeps rlcli's rules (its contract) for shapes, seeds, resets, rewards and devices.
 
     Options:
-        only: Run only this check; repeatable.
-        record: Write the columns of observations and actions to a file in the task's folder. The check `layout`
-            compares them later.
+        only: Run only the check with this name; repeatable.
+        record: Write the columns of observations and actions to task.layout.json in the task's folder, with which the
+            check `layout` compares them from then on.
 
     Examples:
         rlcli check cartpole

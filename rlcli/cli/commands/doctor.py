@@ -13,7 +13,7 @@ def command(
     timeout: ProbeTimeout = TIMEOUT_S,
     runs_dir: RunsDir = None,
 ) -> None:
-    """Check the installation, the machine and all plugins, and show how to repair what does not work.
+    """Check the installation, the machine and all plugins, and print how to repair the faults.
 
     Examples:
         rlcli doctor

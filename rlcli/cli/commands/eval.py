@@ -43,7 +43,7 @@ def command(
         episodes: Number of episodes. By default each has its own environment (at most 8192 at a time); with --num-envs
             N each environment runs its share of them.
         fail_under: Exit with code 9 if a mean is below X. Keys: success, return, length, reward_terms.NAME,
-            terminations.NAME, a value of the task (speed); KEY.low is the lower end of the interval; repeatable.
+            terminations.NAME, a metric of the task (speed); KEY.low is the lower end of the interval; repeatable.
         fail_over: Exit with code 9 if a mean is above X. The same keys; KEY.high is the upper end; repeatable.
 
     Examples:

@@ -55,7 +55,7 @@ def sb3(
 
     Options:
         file: File written by model.save of Stable-Baselines3.
-        normalizer: File with `mean` and `var` of its VecNormalize.
+        normalizer: Safetensors file with `mean` and `var` of VecNormalize, the observation normalisation.
 
     Examples:
         rlcli import sb3 model.zip --task cartpole
@@ -185,7 +185,7 @@ def _add_formats() -> None:
 
 
 def _missing(name: str) -> Callable[[], None]:
-    """Return the command of a task format whose plugin is missing or broken; it raises the error that says so."""
+    """Return the command for a task format whose plugin is missing or broken; it raises an error with the remedy."""
 
     def command() -> None:
         missing = missing_formats()

@@ -33,8 +33,8 @@ def command(
 
     Options:
         seconds: Simulated time for which each fixed policy acts [s]. [default: an episode, at most 1000 steps]
-        only: Run only this rule; repeatable.
-        ignore: Leave this rule out; repeatable.
+        only: Run only the rule with this name; repeatable.
+        ignore: Leave out the rule with this name; repeatable.
 
     Examples:
         rlcli lint cartpole

@@ -23,7 +23,7 @@ def command(
 
     Options:
         pattern: Show only tasks whose name or summary contains this text.
-        probe_all: Load each listed task again, also if its details are cached.
+        probe_all: Load each listed task again, even if its details are cached.
 
     Examples:
         rlcli list-tasks

@@ -20,8 +20,8 @@ def command(
 
     Options:
         name: Name of the task in lowercase letters, digits and hyphens, such as my-arm.
-        robot: MJCF of a robot, for which the task is written: velocity tracking for a floating base on feet, reaching
-            goals for a fixed base with all joints driven, balancing for any other robot.
+        robot: MJCF of a robot, for which the task is written: velocity tracking for a floating base with feet and at
+            least four driven joints, reaching goals for a fixed base with all joints driven, else balancing.
         flavour: yaml (lists of terms), or direct (one class with the hooks of the direct workflow).
         output: Folder to write. [default: a new folder named after the task]
 

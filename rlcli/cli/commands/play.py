@@ -45,15 +45,16 @@ def command(
     """Play a policy in a window or the browser, or write a video.
 
     Options:
-        video: Write one episode to FILE.mp4 or FILE.gif, without a window; without FILE into the run. After an
-            episode that is terminated within 5 s the next episodes follow.
+        video: Write one episode to FILE.mp4 or FILE.gif, without a window; without FILE into the run. If the episode
+            terminates within 5 s, the next episodes follow.
         viewer: auto, native (a window), web (the browser) or none (printed values). auto is a window if there is a
             display, else the browser if started from a terminal, else none. [default: the settings' viewer, or
             auto]
         port: Port of --viewer web, on this machine only; 0 takes any free port. [default: 8080]
-        drawn: Number of environments to show, side by side on the grid.
-        commands: Hold commands of the task, such as vx=0.5,wz=0; repeatable. A wrong name lists the valid ones.
-        env: With --episode: environment whose episode of an evaluation is repeated.
+        drawn: Number of environments in the image, side by side at the distance scene.env_spacing.
+        commands: Hold commands of the task (goals such as a velocity), as in vx=0.5,wz=0; repeatable. The error for a
+            wrong name lists the valid names.
+        env: With --episode: index of the environment, from 0, whose episode of an evaluation is repeated.
         episode: With --env: index of the episode in that environment, from 0.
 
     Examples:

@@ -50,7 +50,7 @@ def command(
     require_known(x, ("steps", "iterations", "time"), "--x", "axes")
     names = None if metrics is None else [name.strip() for name in metrics.split(",") if name.strip()]
     if names == []:
-        raise UsageError("--metrics names no metric", hint="as in --metrics return,success")
+        raise UsageError("--metrics names no metric", hint="for example: --metrics return,success")
     check_output(output, "picture", FORMATS)
     check_drawing()
     found = find_runs(runs, runs_dir or default_runs_dir())

@@ -30,14 +30,14 @@ def command(
 
     Options:
         iterations: Train and compare only the first iterations. [default: all]
-        force: Also train if versions, code or machine differ from those recorded in run.json.
+        force: Train even if versions, code or machine differ from those recorded in run.json.
         name: Text at the end of the new run folder's name.
 
     Examples:
         rlcli reproduce latest
             Train the newest run again and compare.
         rlcli reproduce latest --iterations 5 --force
-            Compare five iterations, also if software or machine have changed.
+            Compare five iterations, even if software or machine have changed.
     """
     from rlcli.cli.ui.difference_table import report_differences
     from rlcli.machine import limit_openmp_spinning

@@ -62,12 +62,12 @@ def command(
 
 
 def _row(run: Overview, runs_dir: Path) -> list[str]:
-    from rlcli.cli.ui.progress_view import clock
+    from rlcli.cli.ui.progress_view import duration_text
 
     folder = run.folder.relative_to(runs_dir) if run.folder.is_relative_to(runs_dir) else run.folder
     resumable = run.resumable and run.state in ("interrupted", "stopped", "diverged", "failed")
     if run.state == "broken":
-        return [str(folder), run.state, *["-"] * 7, size(run.size_bytes), "-", "-", _one_line(run.reason or "")]
+        return [str(folder), run.state, *["-"] * 7, size_text(run.size_bytes), "-", "-", _one_line(run.reason or "")]
     total = "?" if run.iterations is None else run.iterations
     return [
         str(folder),
@@ -77,9 +77,9 @@ def _row(run: Overview, runs_dir: Path) -> list[str]:
         cell(run.last.get("success"), ".1%"),
         _best(run.best),
         _best(run.evaluation),
-        "-" if run.age_s is None else age(run.age_s),
-        "-" if run.duration_s is None else clock(run.duration_s),
-        size(run.size_bytes),
+        "-" if run.age_s is None else age_text(run.age_s),
+        "-" if run.duration_s is None else duration_text(run.duration_s),
+        size_text(run.size_bytes),
         _one_line(run.agent or "-"),
         cell(run.seed),
         _one_line(run.reason or "") or _tags(run),
@@ -87,7 +87,7 @@ def _row(run: Overview, runs_dir: Path) -> list[str]:
 
 
 def _tags(run: Overview) -> str:
-    """Return what is special about a run: a device other than the CPU, several processes, weights of another run."""
+    """Return the remarks on a run: a device other than the CPU, several processes, weights of another run."""
     tags = []
     if (device := str(run.tags.get("device", "cpu"))) != "cpu":
         tags.append(device)
@@ -106,7 +106,7 @@ def _one_line(text: str) -> str:
     return shorten(" ".join(text.split()), _MAX_REMARK, "…")
 
 
-def age(seconds: float) -> str:
+def age_text(seconds: float) -> str:
     """Return a duration [s] as text in its largest unit, such as `3 d` or `5 min`."""
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
         if seconds >= length:
@@ -114,7 +114,7 @@ def age(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
-def size(count: int) -> str:
+def size_text(count: int) -> str:
     """Return a number of bytes with a unit, as `1.5 MB`."""
     value = float(count)
     for unit in ("B", "kB", "MB", "GB"):

@@ -19,7 +19,7 @@ def command(
     num_envs: NumEnvs = None,
     config: ConfigFile = None,
 ) -> None:
-    """Print a task's resolved configuration, or the parts of it whose keys follow the task.
+    """Print a task's resolved configuration, or only the parts whose keys (such as `rewards`) follow the task.
 
     Options:
         origin: Show the origin of each value: file and line, override, flag or default.

@@ -49,7 +49,7 @@ def command(
             push [m/s or rad/s].
         points: Number of values in a range.
         episodes: Number of episodes in each variant.
-        worst: Number of further variants, between the values of the ranges, in which to search for a worse one.
+        worst: Number of further random variants within the ranges, half of them near the worst, to find a worse one.
         against: Other policy to compare with: lqr, zero or random.
         fail_under: Exit with code 9 if the mean is below X in any variant, such as success=0.9; repeatable.
         output: Write the heat map to FILE.png or FILE.svg.
@@ -103,7 +103,7 @@ def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
     from rlcli.evaluation.stress_sweeps import read_sweeps
 
     if not texts:
-        raise UsageError("no --sweep given", hint="as in --sweep body_mass=0.5:2 or --sweep action_delay=0:3")
+        raise UsageError("no --sweep given", hint="for example: --sweep body_mass=0.5:2 or --sweep action_delay=0:3")
     return read_sweeps(texts, points)
 
 

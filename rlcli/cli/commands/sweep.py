@@ -49,7 +49,7 @@ def command(
     config: options.ConfigFile = None,
     runs_dir: options.RunsDir = None,
 ) -> None:
-    """Search the settings with which an agent learns best. `sweep show` lists trials, `sweep compare` tests the best.
+    """Search for the settings with which an agent learns best; `sweep show` lists trials, `compare` tests the best one.
 
     Options:
         task: Task to sweep; or show or compare, followed by the folder or name of a sweep (else the newest).
@@ -57,7 +57,7 @@ def command(
         trials: Number of trials, over all processes of the sweep.
         objective: return, success, length, reward_terms.NAME or terminations.NAME of the trained policy; @30s stops
             a training after 30 s, @1e6 after 1,000,000 steps.
-        minimize: Search the smallest value of the objective.
+        minimize: Search for the smallest value of the objective.
         episodes: Number of episodes that evaluate a trial; with compare: each policy.
         jobs: Number of trials at a time in this process.
         pruner: median (stop trials that learn worse than most) or none.
@@ -84,7 +84,7 @@ def command(
     _check_options(ctx, task)
     request = TrainingRequest(runs_dir or default_runs_dir(), agent=agent, device=device, config=config, seed=seed)
     request.overrides, request.flags = overrides or [], flags(scene__num_envs=num_envs)
-    request.budget, request.loggers = options.budget(max_iterations, max_steps), ["none"]
+    request.budget, request.loggers = options.budget_keys(max_iterations, max_steps), ["none"]
     stop = StopRequest(ends_process=console.owns_process)
     if task is None:
         raise UsageError("no task given", hint="rlcli sweep TASK --param agent.learning_rate=log:1e-4:1e-2")

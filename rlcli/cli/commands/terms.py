@@ -16,7 +16,7 @@ def command(
     pattern: Annotated[str | None, typer.Argument()] = None,
     task: Annotated[str | None, typer.Option("--task", metavar="TASK")] = None,
 ) -> None:
-    """List the terms that a task file can use: its observations, actions, rewards, events and more.
+    """List the terms that a task file can use: functions for observations, actions, rewards, events and more.
 
     The list has the name of each term, and its keys, types and defaults. An exact name prints the meaning of each
     key, with its unit, and an example.

@@ -20,7 +20,7 @@ def command(
     reference: RunRef = "latest",
     runs_dir: RunsDir = None,
 ) -> None:
-    """Follow a training from another terminal. Ctrl-C stops only the view; --json prints the state once.
+    """Show the progress of a training from another terminal. Ctrl-C ends only the view; --json prints the state once.
 
     Examples:
         rlcli watch

@@ -12,7 +12,7 @@ _MAX_RUNS = 50
 
 
 def words(*choices: str) -> Callable[[str], list[str]]:
-    """Return a completion function that offers a few words."""
+    """Return a completion function that offers these words."""
 
     def offer(incomplete: str) -> list[str]:
         return [choice for choice in choices if choice.startswith(incomplete)]

@@ -187,7 +187,7 @@ def output_error(error: OSError) -> MachineError:
     return MachineError(f"cannot write the output: {error.strerror or error}", hint="redirect it to another place")
 
 
-def discard(stream: Any) -> None:
+def redirect_to_null(stream: Any) -> None:
     """Redirect a broken stream to the null device, so that nothing fails when Python flushes it at exit."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
@@ -206,7 +206,7 @@ def _write(stream: Any, *lines: str) -> None:
     try:
         print(text, file=stream, flush=True)
     except OSError as error:
-        discard(stream)  # the reader has ended, or the disk of a log is full: the command continues
+        redirect_to_null(stream)  # the reader has ended, or the disk of a log is full: the command continues
         if error.errno not in _NO_READER and stream is not sys.stderr:
             raise output_error(error) from None
     except UnicodeEncodeError:

@@ -29,7 +29,7 @@ def error_of_task(error: BaseException) -> TaskError | None:
 
 
 def missing_dependency(error: BaseException) -> DependencyError | None:
-    """Return an error with the command that installs a missing dependency of rlcli; None for any other exception."""
+    """Return the error for a missing dependency of rlcli, with its pip command; None for other exceptions."""
     module = error.name if isinstance(error, ModuleNotFoundError) else None
     if module is None:
         return None

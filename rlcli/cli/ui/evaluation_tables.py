@@ -36,7 +36,7 @@ def show_summary(summary: Mapping[str, Any]) -> None:
 
 
 def show_comparison(comparison: Comparison) -> None:
-    """Print the metrics of all policies, and the paired differences of the first to each other policy."""
+    """Print the metrics of all policies, and the paired differences between the first and each other policy."""
     from rlcli.evaluation.comparison import METRICS
 
     labels = _labels(comparison.names)

@@ -33,7 +33,7 @@ def report_findings(
         kind: `check` or `rule`.
         results: names of the checks with their findings; None instead of findings: the check did not run.
         records: all findings as JSON.
-        notes: name of a check -> a remark of it that is no problem.
+        notes: name of a check -> a remark that is not a problem.
         fail_on_warnings: whether a task with warnings fails.
     """
     findings = [finding for _, found in results for finding in found or ()]

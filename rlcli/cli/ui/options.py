@@ -24,7 +24,7 @@ CHOOSE = "auto"
 
 
 def choice(metavar: str, *names: str, help: str | None = None) -> Any:
-    """Return the typer declaration of an option with a few values, which the shell completes."""
+    """Return typer's declaration of an option with a fixed list of values, which the shell completes."""
     return typer.Option(autocompletion=words(*names), metavar=metavar, help=help)
 
 
@@ -72,7 +72,7 @@ CheckpointRef = Annotated[str | None, typer.Option(autocompletion=checkpoints, m
 Policy = Annotated[str, choice("POLICY", "trained", "zero", "random", "lqr", help="trained, zero, random or lqr.")]
 Stochastic = Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")]
 ProbeTimeout = Annotated[float, typer.Option("--probe-timeout", help="Time limit per task, trainer or driver [s].")]
-Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Accepted; windows open only on request.")]
+Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Open no viewer unless --viewer is given.")]
 
 
 def _set_verbosity(option: typer.CallbackParam, is_set: bool) -> bool:
@@ -160,7 +160,7 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
 
 @dataclass(frozen=True)
 class _StrictNumber:
-    """Annotation of a number for pydantic, which this module does not import: the list of commands needs none."""
+    """Annotation for pydantic: read a number in the form of a task file. This module does not import pydantic."""
 
     least: float | None
     most: float | None
@@ -191,7 +191,7 @@ def _with_strict_number(parameter: inspect.Parameter) -> inspect.Parameter:
     return parameter.replace(annotation=Annotated[strict | None, info])
 
 
-def budget(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
+def budget_keys(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
     """Return the changes for --max-iterations and --max-steps (key -> value); empty without both.
 
     One of them replaces the agent's whole budget.

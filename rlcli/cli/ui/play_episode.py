@@ -35,7 +35,7 @@ def check_choice(
     """
     if env is None or episode is None:
         given, missing = ("--episode", "--env") if env is None else ("--env", "--episode")
-        raise UsageError(f"{given} needs {missing} too", hint="as in --env 317 --episode 12, both counted from 0")
+        raise UsageError(f"{given} needs {missing} too", hint="for example: --env 317 --episode 12, counted from 0")
     if num_envs is not None and num_envs <= env:
         raise UsageError(
             f"--env {env} does not exist: --num-envs is {num_envs}, and environments are counted from 0",
@@ -135,8 +135,8 @@ def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) ->
 
 
 @dataclass(slots=True)
-class Filming:
-    """Policy that also renders each state of its environment into a video before it acts."""
+class FilmedPolicy:
+    """Policy that also renders its environment into a video, once every `stride` steps, before it acts."""
 
     session: Session
     env_id: int
@@ -161,7 +161,7 @@ class Filming:
 
 
 @contextlib.contextmanager
-def film(session: Session, file: Path, env_id: int = 0, drawn: int = 1) -> Iterator[Filming]:
+def film(session: Session, file: Path, env_id: int = 0, drawn: int = 1) -> Iterator[FilmedPolicy]:
     """Open a video of the environments in which a policy acts.
 
     Args:
@@ -175,7 +175,7 @@ def film(session: Session, file: Path, env_id: int = 0, drawn: int = 1) -> Itera
 
     env = session.env
     with open_video(env.engine.model, env.config, file, EnvGrid(env, drawn)) as (renderer, writer, stride):
-        yield Filming(session, env_id, stride, renderer, writer)
+        yield FilmedPolicy(session, env_id, stride, renderer, writer)
 
 
 def _outcome(last: StepResult, env_id: int) -> dict[str, Any]:

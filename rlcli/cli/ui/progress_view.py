@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 from rlcli.cli.ui.console import console, plain
-from rlcli.cli.ui.tables import flow
-from rlcli.cli.ui.terminal import is_terminal, screen
+from rlcli.cli.ui.tables import fill
+from rlcli.cli.ui.terminal import is_terminal, rich_console
 from rlcli.progress import Work, track
 from rlcli.training.progress import PARTS, Progress
 
@@ -43,7 +43,7 @@ class LiveView:
         if is_terminal(sys.stderr) and not console.quiet:
             from rlcli.cli.ui.resizable_live import ResizableLive
 
-            self._live = ResizableLive(console=screen(sys.stderr), **self._options)
+            self._live = ResizableLive(console=rich_console(sys.stderr), **self._options)
             self._live.__enter__()
         return self
 
@@ -95,7 +95,7 @@ class WorkView:
         while not self._ended.is_set():
             if not any(work.has_own_view for work in list(self._running)):
                 console.clear_line()
-                stream.write(plain(work_line(self._running))[: screen(stream).width - 1])
+                stream.write(plain(work_line(self._running))[: rich_console(stream).width - 1])
                 stream.flush()
                 console.has_line = True
             self._ended.wait(_REDRAW_EVERY_S)
@@ -113,8 +113,8 @@ def work_line(running: Sequence[Work]) -> str:
     elapsed = time.monotonic() - counted[0].begin if counted else 0.0
     title = "" if not works or works[0].total else f"{counts.pop(0)}: "
     if share > 0.0:
-        return f"{title}{', '.join(counts)}, {share:.0%}, {clock(elapsed * (1.0 - share) / share)} left"
-    since = f"{clock(time.monotonic() - works[0].begin)} so far" if works else ""
+        return f"{title}{', '.join(counts)}, {share:.0%}, {duration_text(elapsed * (1.0 - share) / share)} left"
+    since = f"{duration_text(time.monotonic() - works[0].begin)} so far" if works else ""
     return title + ", ".join([*counts, since])
 
 
@@ -154,7 +154,7 @@ class TrainingView(LiveView):
         speed = [f"{progress.env_steps:,} steps", f"{progress.steps_per_s:,.0f} steps/s"]
         state = [self._title, _iteration(progress), *speed, _left(progress)]
         width = self._live.console.width
-        head = Text.assemble(("\n".join(flow(state, width)), "bold"), "\n", ("\n".join(flow(split, width)), "dim"))
+        head = Text.assemble(("\n".join(fill(state, width)), "bold"), "\n", ("\n".join(fill(split, width)), "dim"))
         tables = []
         for heading, prefix in (
             ("training", "Train/"),
@@ -187,10 +187,10 @@ def _iteration(progress: Progress) -> str:
 
 
 def _left(progress: Progress) -> str:
-    return f"{'?' if progress.remaining_s is None else clock(progress.remaining_s)} left"
+    return f"{'?' if progress.remaining_s is None else duration_text(progress.remaining_s)} left"
 
 
-def clock(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Return a duration [s] as `h:mm:ss`; `?` if it is negative or endless."""
     if not 0.0 <= seconds < _MAX_S:
         return "?"

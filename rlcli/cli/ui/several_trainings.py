@@ -7,7 +7,7 @@ from typing import Any
 
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.progress_view import LiveView
-from rlcli.cli.ui.tables import cell, flow
+from rlcli.cli.ui.tables import cell, fill
 from rlcli.errors import Stopped
 from rlcli.reporting.curves import FEWEST_FOR_IQM
 from rlcli.runs.overview import Overview, overview
@@ -78,7 +78,7 @@ class SeedsView(LiveView):
         if self._live is None:
             console.info("; ".join(map(" ".join, seeds)))
             return
-        lines = [line for cells in seeds for line in flow(cells, self._live.console.width)]
+        lines = [line for cells in seeds for line in fill(cells, self._live.console.width)]
         self.update([self._title, *lines], refresh=True)
 
 

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from rlcli.cli.ui.terminal import screen
+from rlcli.cli.ui.terminal import rich_console
 
 _GAP = 2
 _MAX_UNBROKEN = 30
@@ -13,8 +13,8 @@ _MIN_BROKEN = 24
 """Smallest width of a column with broken cells [characters]."""
 
 
-def flow(parts: Sequence[str], width: int, indent: int = 0) -> list[str]:
-    """Arrange parts of text side by side, in lines of at most `width` characters; only a too long part is longer."""
+def fill(parts: Sequence[str], width: int, indent: int = 0) -> list[str]:
+    """Arrange parts of text side by side, in lines of at most `width` characters; a longer part has its own line."""
     lines: list[str] = []
     line = ""
     for part in parts:
@@ -36,7 +36,7 @@ def draw_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str
     from rich.table import Table
     from rich.text import Text
 
-    page = screen(sys.stdout)
+    page = rich_console(sys.stdout)
     min_widths = [max(map(_min_width, cells)) for cells in zip(columns, *rows, strict=True)]
     if sum(min_widths) + _GAP * (len(columns) - 1) > page.width:
         if title:
@@ -59,12 +59,12 @@ def draw_map(
     from rich.table import Table
     from rich.text import Text
 
-    page = screen(sys.stdout)
+    page = rich_console(sys.stdout)
     name_width = max((len(row[0]) for row in rows), default=0)
     texts = [*columns, *(text for row in rows for text in row[1:])]
     cell_width = max(map(len, texts)) + 2
     fit = max(1, (page.width - name_width) // (cell_width + 1))
-    page.print(Text("\n".join(flow(heading, page.width)), "bold"))
+    page.print(Text("\n".join(fill(heading, page.width)), "bold"))
     for begin in range(0, len(columns), fit):
         part = slice(begin, begin + fit)
         table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
@@ -83,7 +83,7 @@ def _block(columns: Sequence[str], row: Sequence[str], width: int) -> list[Any]:
 
     first, *others = (f"{name} {cell}".strip() for name, cell in zip(columns, row, strict=True))
     rest = [part for part, cell in zip(others, row[1:], strict=True) if cell not in ("", "-")]
-    return [Text(first, "bold"), *map(Text, flow(rest, width, indent=2))]
+    return [Text(first, "bold"), *map(Text, fill(rest, width, indent=2))]
 
 
 def _min_width(cell: str) -> int:

@@ -21,10 +21,10 @@ def is_terminal(stream: TextIO | None) -> bool:
 
 def supports_styles(stream: TextIO | None) -> bool:
     """Return whether to print styled tables on a stream: it is a terminal, or colours are forced."""
-    return stream is not None and (stream.isatty() or colors() == "always")
+    return stream is not None and (stream.isatty() or color_mode() == "always")
 
 
-def colors() -> str:
+def color_mode() -> str:
     """Return never, always or auto (only on a terminal), from NO_COLOR, FORCE_COLOR or the user's settings."""
     if os.environ.get("NO_COLOR"):
         return "never"
@@ -33,11 +33,11 @@ def colors() -> str:
     return str(setting("color") or "auto")
 
 
-def screen(stream: TextIO) -> Console:
+def rich_console(stream: TextIO) -> Console:
     """Return rich's console for a stream, with colours if the stream supports them and the user wants them."""
     from rich.console import Console
 
-    chosen, width = colors(), None if stream.isatty() or os.environ.get("COLUMNS") else _ANY_WIDTH
+    chosen, width = color_mode(), None if stream.isatty() or os.environ.get("COLUMNS") else _ANY_WIDTH
     if chosen == "never":
         return Console(file=stream, highlight=False, width=width, color_system=None)
     return Console(file=stream, highlight=False, width=width, force_terminal=True if chosen == "always" else None)

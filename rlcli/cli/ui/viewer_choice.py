@@ -34,7 +34,7 @@ def require_viewer(viewer: str | None, port: int | None, *, to_file: bool) -> No
         to_file: whether --video or --record writes a file, so that no viewer opens.
 
     Raises:
-        UsageError: with both options.
+        UsageError: for --viewer with --video or --record, or --port without the web viewer.
     """
     if viewer is not None:
         require_known(viewer, CHOICES, "viewer", "viewers")
@@ -43,7 +43,8 @@ def require_viewer(viewer: str | None, port: int | None, *, to_file: bool) -> No
             f"--viewer {viewer} opens a viewer, but --video and --record only write files", hint="leave out --viewer"
         )
     if port is not None and (to_file or viewer not in (None, "auto", "web")):
-        raise UsageError("--port is an option of the web viewer", hint="add --viewer web")
+        hint = "leave out --port" if to_file else "write --viewer web, or leave out --port"
+        raise UsageError("--port is an option of the web viewer", hint=hint)
 
 
 def read_commands(texts: Sequence[str]) -> dict[str, float]:
@@ -57,7 +58,7 @@ def read_commands(texts: Sequence[str]) -> dict[str, float]:
         name, _, text = part.partition("=")
         values[name.strip()] = float_or_nan(text)
         if not math.isfinite(values[name.strip()]):
-            raise UsageError(f"--command '{part}' is not NAME=NUMBER", hint="as in --command vx=0.5,wz=0")
+            raise UsageError(f"--command '{part}' is not NAME=NUMBER", hint="for example: --command vx=0.5,wz=0")
     return values
 
 

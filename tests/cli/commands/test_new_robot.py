@@ -222,7 +222,7 @@ def test_task_passes_check_and_trains(cli, tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "code", "message"),
     [
-        (None, 2, "there is no file robot.xml"),
+        (None, 2, "--robot: there is no file robot.xml"),
         ("<mujoco>", 4, "robot.xml cannot be used"),
         ("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>", 2, "no joint can be driven"),
         (

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from rlcli.cli.commands.runs import age, size
+from rlcli.cli.commands.runs import age_text, size_text
 from rlcli.runs.eval_store import write_evaluation
 from rlcli.runs.overview import overviews
 from rlcli.runs.run import create_run, open_run
@@ -384,12 +384,12 @@ def test_watch_shows_live_table_on_terminal(made):
     ("value", "words"), [(0.4, "0 s"), (59, "59 s"), (60, "1 min"), (7200, "2 h"), (86400 * 3, "3 d")]
 )
 def test_age_in_largest_unit(value, words):
-    assert age(value) == words
+    assert age_text(value) == words
 
 
 @pytest.mark.parametrize(("value", "words"), [(0, "0 B"), (999, "999 B"), (1500, "1.5 kB"), (2.5e12, "2500.0 GB")])
 def test_size_with_unit(value, words):
-    assert size(value) == words
+    assert size_text(value) == words
 
 
 @pytest.mark.slow

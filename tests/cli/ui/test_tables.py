@@ -8,7 +8,7 @@ import pytest
 
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.progress_view import TrainingView
-from rlcli.cli.ui.tables import flow
+from rlcli.cli.ui.tables import fill
 from rlcli.evaluation.stress_sweeps import read_sweeps
 from rlcli.reporting.heat_map import heat_map
 from rlcli.training.progress import progress_from_metrics
@@ -83,12 +83,12 @@ def test_wide_heat_map_continues_below(terminal, width, headers):
 
 
 def test_flow_keeps_parts_whole_and_in_order():
-    assert flow(["iteration 80/240", "655,360 steps", "0:23 left"], 32) == [
+    assert fill(["iteration 80/240", "655,360 steps", "0:23 left"], 32) == [
         "iteration 80/240  655,360 steps",
         "0:23 left",
     ]
-    assert flow(["a" * 9, "b"], 5, indent=2) == ["  " + "a" * 9, "  b"]
-    assert flow([], 5) == []
+    assert fill(["a" * 9, "b"], 5, indent=2) == ["  " + "a" * 9, "  b"]
+    assert fill([], 5) == []
 
 
 @pytest.mark.parametrize("width", [80, 40])

@@ -115,7 +115,7 @@ def test_play_prints_viewer_and_reason(cli):
         ),
         (("--viewer", "web", "--port", "70000"), "'--port'"),
         (("--viewer", "web", "--video", "x.gif"), "leave out --viewer"),
-        (("--port", "0", "--video", "x.gif"), "--port is an option of the web viewer"),
+        (("--port", "0", "--video", "x.gif"), "--port is an option of the web viewer; hint: leave out --port"),
         (("--show", "3"), "above the number of environments, 2; hint: --num-envs 3"),
         (("--show", "0"), "'--show'"),
         (("--command", "vx"), "--command 'vx' is not NAME=NUMBER"),
