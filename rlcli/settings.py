@@ -18,7 +18,7 @@ def settings_file() -> Path | None:
     """Return the path of the settings file, whether it exists or not; None if RLCLI_SETTINGS is `none`."""
     named = os.environ.get("RLCLI_SETTINGS", "").strip()
     if named:
-        return None if named == NO_FILE else Path(named).expanduser()
+        return None if named == NO_FILE else Path(os.path.expanduser(named))
     import platformdirs
 
     return Path(platformdirs.user_config_dir("rlcli", appauthor=False, roaming=True)) / "settings.yaml"

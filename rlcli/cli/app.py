@@ -102,6 +102,10 @@ def main(arguments: list[str] | None = None) -> int:
         delay_garbage_collection()
         sys.meta_path[:0] = [AddressSpaceCheck, MatplotlibFinder]
     arguments = sys.argv[1:] if arguments is None else arguments
+    if not {"COMP_WORDS", "_TYPER_COMPLETE_ARGS"}.intersection(os.environ) and "complete_" in os.environ.get(
+        _COMPLETION_VARIABLE, ""
+    ):
+        del os.environ[_COMPLETION_VARIABLE]  # left over from a shell: without its words there is nothing to complete
     remember_given([*arguments, *(value for name, value in os.environ.items() if name.startswith("RLCLI_"))])
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
     console.has_document = False  # an earlier command of this process may have printed one

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from rlcli.config.schema import StrictModel
 
-Text = Annotated[str, Field(min_length=1)]
+Text = Annotated[str, Field(min_length=1, pattern=r"^[^\x00]*$")]
 Loggers = Annotated[list[Literal["tensorboard", "wandb", "mlflow", "trackio", "none"]], Field(min_length=1)]
 
 

@@ -93,7 +93,7 @@ def _menagerie_models(robot: str) -> list[Path]:
 
 def _file_of_user_models(file: str) -> Path:
     """Return a file from one of the folders of RLCLI_MODELS, else from the cache of the package mujoco-menagerie."""
-    folders = [Path(folder).expanduser() for folder in os.environ.get(MODELS, "").split(os.pathsep) if folder]
+    folders = [Path(os.path.expanduser(folder)) for folder in os.environ.get(MODELS, "").split(os.pathsep) if folder]
     for folder in folders:
         found = _inside(folder, file, f"the folder {folder} of {MODELS}")
         if found.is_file():

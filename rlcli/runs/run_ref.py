@@ -198,7 +198,7 @@ def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Pat
 
 def default_runs_dir() -> Path:
     """Return the folder of runs: RLCLI_RUNS_DIR, else the user's setting, else `runs` in the current folder."""
-    return Path(os.environ.get("RLCLI_RUNS_DIR") or Path(setting("runs_dir") or "runs").expanduser())
+    return Path(os.environ.get("RLCLI_RUNS_DIR") or os.path.expanduser(setting("runs_dir") or "runs"))
 
 
 def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, str]:

@@ -308,7 +308,7 @@ def _has_key() -> bool:
     files = [os.environ["NETRC"]] if os.environ.get("NETRC") else ["~/.netrc", "~/_netrc"]
     for file in files:
         with contextlib.suppress(OSError, netrc.NetrcParseError, UnicodeDecodeError):
-            if netrc.netrc(str(Path(file).expanduser())).authenticators(host):
+            if netrc.netrc(os.path.expanduser(file)).authenticators(host):
                 return True
     return False
 

@@ -257,7 +257,7 @@ class Bench:
         measured = sorted(smaller, key=lambda row: row.num_envs)
         first, last = (measured[0], measured[-1]) if measured else (None, None)
         env_bytes = _ENV_BYTES
-        if first and last and first is not last and first.resident is not None and last.resident is not None:
+        if first and last and first.num_envs < last.num_envs and first.resident is not None and last.resident is not None:
             # memory grows linearly with the number of environments
             env_bytes = max(4096, (last.resident - first.resident) // (last.num_envs - first.num_envs))
         if env_bytes * num_envs > available_memory() // 2:

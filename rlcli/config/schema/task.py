@@ -92,7 +92,7 @@ class TaskConfig(StrictModel):
     """One line that describes the task."""
     sim: SimConfig
     """Physics simulation."""
-    decimation: Count
+    decimation: Annotated[Count, Field(le=10_000)]
     """Number of physics steps in an environment step; step_dt = dt x decimation."""
     episode_length_s: Seconds
     """Largest length of an episode [s]; longer episodes are truncated."""
