@@ -62,7 +62,7 @@ _Dumper.add_representer(list, _sequence)
 def to_data(resolved: Resolved) -> dict[str, Any]:
     """Return the whole configuration as plain data, as YAML or JSON can hold it.
 
-    It has all defaults, the changes that the chosen agent and `play:` make, and of the agents only the chosen one.
+    The data contains all defaults, the changes by the chosen agent and by `play:`, and only the chosen agent.
     """
     data = resolved.task.model_dump(mode="json", exclude={"agents"})
     data |= data.pop("foreign")

@@ -136,7 +136,7 @@ class DirectTask:
         return None
 
     def draws(self, env_ids: Tensor, name: str = "reset") -> IdSelection:
-        """Return random numbers for the running episodes: `draws(ids).uniform(-1, 1, (k,))` is (n, k).
+        """Return a selection for random numbers in running episodes: `draws(ids).uniform(-1, 1, (k,))` is (n, k).
 
         The numbers depend only on the seed, the environment, its episode and `name`.
         """

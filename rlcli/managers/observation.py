@@ -34,7 +34,7 @@ _FINAL = np.uint64(0x46494E414C)
 
 
 class ObservationManager(TensorState):
-    """Manager of the observation terms. Each group has three buffers in turn: consecutive observations share no memory.
+    """Manager of the observation terms. Each group cycles through three buffers: a step overwrites no newer result.
 
     Args:
         groups: the bound terms of each group.

@@ -160,11 +160,11 @@ class Contact:
 
     geoms: tuple[str, str]
     distance: float
-    """Negative if they penetrate [m]."""
+    """Distance between the geoms; negative if they penetrate [m]."""
     force: float
-    """Along the contact normal [N]."""
+    """Force along the contact normal [N]."""
     position: tuple[float, float, float]
-    """In the world frame [m]."""
+    """Position of the contact, world frame [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +198,7 @@ class StagedCase:
 def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase:
     """Build the task of a failure case, to compute contacts and draw images.
 
-    `named` is the task on the command line: if the recorded task is not installed, its code is used.
+    `named` is the task on the command line; its code is used if neither it nor the recorded task is installed.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `rlcli.replay.resimulate.stage`.

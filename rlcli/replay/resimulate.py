@@ -269,7 +269,7 @@ class Staged:
 def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
     """Build the task of a failure or crash file, and a simulation for each of the recorded environments.
 
-    `named` is the task on the command line: if the recorded task is not installed, its code is used.
+    `named` is the task on the command line; its code is used if neither it nor the recorded task is installed.
 
     Raises:
         TaskError: if the task is not installed any more.
@@ -300,8 +300,8 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
 def replay_calls(trajectory: Trajectory, named: TaskSource | None = None) -> Replay:
     """Simulate every engine call of a failure or crash file again, and compare the states with the recorded ones.
 
-    A state that an event changed between two calls is not compared. `named` is the task on the command line: if the
-    recorded task is not installed, its code is used.
+    A state that an event changed between two calls is not compared. `named` is the task on the command line; its code
+    is used if neither it nor the recorded task is installed.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `stage`.

@@ -85,11 +85,11 @@ class Episode(_Strict):
     total_reward: float
     """Undiscounted sum of rewards of the whole episode."""
     truncated: bool
-    """Whether it ended by a time-out and no other termination."""
+    """Whether the episode ended by a time-out and no other termination."""
     success: bool | None
-    """Whether it met the task's success condition; None if the task has none."""
+    """Whether the episode met the task's conditions of success; None if the task has none."""
     causes: list[str]
-    """Terminations that fired at its end."""
+    """Terminations that fired in the last step."""
 
     @staticmethod
     def of(env: Environment, ended: Episodes, row: int, begin: int = 0, kept: int | None = None) -> Episode:
@@ -129,13 +129,13 @@ class DivergencePoint(_Strict):
     substep: Count
     """Physics step of that call, counted from 0."""
     time: float
-    """Simulated time at its beginning [s]."""
+    """Simulated time at the beginning of the physics step [s]."""
     cause: str
     """See `rlcli.sim.divergence_report.Divergence`."""
     place: str
     """The joint, actuator or array element whose value shows the divergence."""
     value: str
-    """Its value as Python prints it: `nan`, `1e+30`."""
+    """Value of that joint, actuator or element as text, such as `nan` or `1e+30`."""
 
     def __str__(self) -> str:
         """Return the cause, time and value on one line."""
@@ -160,7 +160,7 @@ class World(_Strict):
     first: Count
     """Index of the first call of the last environment step."""
     diverged_at: DivergencePoint | None
-    """None if it did not diverge, or if one world alone does not reproduce the divergence."""
+    """Where the simulation diverged; None if it did not, or if one world alone does not reproduce the divergence."""
 
     @property
     def ended_by(self) -> str:
@@ -287,7 +287,7 @@ class Trajectory:
         A failure or crash file gets one environment, in which the calls of each recorded environment are simulated.
 
         Args:
-            named: the task that the command line names: if the recorded task is not installed, its code is used.
+            named: the task on the command line; it is used if neither it nor the recorded task is installed.
 
         Raises:
             TaskError: if the task is not installed any more.

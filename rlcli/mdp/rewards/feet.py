@@ -30,7 +30,10 @@ def desired_contacts(env: ManagedEnv, *, sensor: ContactSensor, threshold: float
 
 
 def contact_forces(env: ManagedEnv, *, sensor: ContactSensor, threshold: float) -> Tensor:
-    """Sum of the excess of contact forces over `threshold`, the largest in the sensor's history [N]. (num_envs,)"""
+    """Sum of max(force - threshold, 0) over the sensor's bodies [N]. (num_envs,)
+
+    force: largest contact force of the body in the sensor's history.
+    """
     return (strongest_force(sensor) - threshold).clamp_(min=0.0).sum(dim=1)
 
 
