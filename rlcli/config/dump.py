@@ -25,7 +25,7 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
     def resolve(self, kind: type[yaml.Node], value: Any, implicit: tuple[bool, bool]) -> str:
         """Return the tag that the strict reader gives to a plain scalar.
 
-        PyYAML quotes a string whose tag is not that of a string, so that the strict reader reads it back as a string.
+        PyYAML puts a string in quotes if this tag is not the tag of strings. So the strict reader reads a string again.
         """
         if kind is not yaml.ScalarNode or not implicit[0]:
             return str(super().resolve(kind, value, implicit))
@@ -181,7 +181,7 @@ def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -
     definitions = schema.setdefault("$defs", {})
 
     def model_schema(model: type[BaseModel]) -> dict[str, Any]:
-        """Return the schema of a model and move its definitions to those of the whole schema."""
+        """Return the schema of a model, and move its definitions to the definitions of the whole schema."""
         part = model.model_json_schema()
         definitions.update(part.pop("$defs", {}))
         return part

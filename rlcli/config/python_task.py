@@ -251,7 +251,7 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
 def _agents_in_modules(modules: Iterable[Any]) -> dict[str, Any]:
     """Return the settings of agents in another framework's form that some modules define, by name.
 
-    The name is that of the variable or class; a single agent has the name of its library.
+    The name is the name of the variable or class; a single agent has the name of its library.
     """
     found = {
         name: item

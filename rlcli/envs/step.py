@@ -36,7 +36,7 @@ class Episodes:
     mask: Tensor | None = None
     """Which rows are valid, on a GPU, whose tensors have a row for every environment; None: all. (num_envs,) bool
 
-    The tensors are overwritten by the next step, earlier than those of `StepResult`.
+    The next step overwrites these tensors; the tensors of `StepResult` stay valid for one step more.
     """
 
     def ended(self) -> Episodes:

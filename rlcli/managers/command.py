@@ -91,7 +91,7 @@ class CommandManager(TensorState):
         self._sums = context.zeros(len(self._measured))
         self._steps = context.zeros()
         self.held: dict[str, float] = {}
-        """Values that replace those of the terms in every environment, by the name of the knob."""
+        """Values that replace the drawn values in every environment, by the name of the knob."""
         self._held_knobs: dict[str, Knob] = {}
 
     def knobs(self) -> list[Knob]:

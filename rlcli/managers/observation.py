@@ -30,7 +30,7 @@ class _Group:
 
 
 _FINAL = np.uint64(0x46494E414C)
-"""Salt of the random streams for the last observation of an episode: its noise differs from that of the next one."""
+"""Salt of the random streams for the last observation of an episode: the next one gets other noise."""
 
 
 class ObservationManager(TensorState):

@@ -238,7 +238,7 @@ class _Filter(Stage):
 
 
 class _DigitalFilter(_Filter):
-    """Linear filter. `past`: the inputs before this step, newest first, then the outputs likewise. (num_envs, m, k)"""
+    """Linear filter. `past`: earlier inputs, then earlier outputs, the newest first in each. (num_envs, m, k)"""
 
     def __init__(self, past: Tensor, config: schema.DigitalFilterModifierConfig) -> None:
         self._past, self._inputs = past, len(config.b) - 1

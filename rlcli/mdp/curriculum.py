@@ -105,7 +105,7 @@ class TerrainLevels(EntityTerm):
 def _require_shape(what: str, shape: torch.Size, address: Tensor) -> None:
     if shape != address.shape:
         wanted = tuple(address.shape)
-        raise ValueError(f"{what} has shape {tuple(shape)}; give shape {wanted}, that of the setting at `address`")
+        raise ValueError(f"{what} has shape {tuple(shape)}; give shape {wanted}, the shape of the setting at `address`")
 
 
 def _length_xy(vector: Tensor) -> Tensor:

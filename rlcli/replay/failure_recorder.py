@@ -230,9 +230,9 @@ class FailureRecorder(StepObserver):
         self._diverging.clear()
 
     def _choose(self, ended: Episodes) -> None:
-        """Keep those of the ended episodes that diverged, have an unusual return, or were terminated.
+        """Keep the ended episodes that diverged, have an unusual return, or were terminated.
 
-        Of each kind, one episode of an iteration is kept: the first that diverged, else the one with the lowest value.
+        One episode of each kind is kept per iteration: the first that diverged, else the one with the lowest value.
         """
         returns, rest = ended.returns.detach().numpy().copy(), ~ended.truncated.numpy()
         self._returns.append(returns)

@@ -80,7 +80,9 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
             raise UsageError(message, hint="to film a failure case: `rlcli autopsy RUN N --video FILE.mp4`")
         return []
     if episode is not None and episode >= count:
-        raise UsageError(f"there is no episode {episode} in {trajectory.file}", hint=f"it has {count} episodes, from 0")
+        raise UsageError(
+            f"there is no episode {episode} in {trajectory.file}", hint=f"its {count} episodes are numbered from 0"
+        )
     if not count:
         raise UsageError(f"{trajectory.file} has no episodes", hint="record with --record-mode all")
     return list(range(count)) if episode is None else [episode]

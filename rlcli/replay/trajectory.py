@@ -404,7 +404,7 @@ def _check_tensors(header: Header, tensors: Mapping[str, Tensor]) -> None:
             or len(shape) != tensor.dim()
             or any(size not in (None, found) for size, found in zip(shape, tensor.shape, strict=True))
         ):
-            raise ValueError(f"the file is damaged: tensor {name} is missing, or has not the shape in the header")
+            raise ValueError(f"the file is damaged: tensor {name} is missing, or its shape differs from the header")
         expected = torch.float64 if name.startswith("world.") else torch.float32
         if tensor.dtype != expected and not name.endswith(STATE_FIELDS):  # states have the engine's precision
             raise ValueError(f"the file is damaged: tensor {name} has type {tensor.dtype}, expected {expected}")

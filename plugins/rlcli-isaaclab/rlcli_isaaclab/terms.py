@@ -49,7 +49,7 @@ class TermContext:
     """Parts of a configuration that only the user's terms read."""
 
     cfg: Any = None
-    """The user's configuration object; None: that of rlcli."""
+    """The user's configuration object; None: rlcli's configuration."""
     frames: dict[str, Any] = field(default_factory=dict)
     """Settings of the frame transformers, by name."""
 

@@ -58,7 +58,7 @@ class LightsConfig(StrictModel):
     dome: DomeLightConfig | None = None
     """Ambient light; null: none."""
     distant: DistantLightConfig | None = None
-    """Parallel light like that of the sun; null: none."""
+    """Parallel light, like sunlight; null: none."""
 
 
 class JointConfig(StrictModel):

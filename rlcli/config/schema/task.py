@@ -39,11 +39,11 @@ class SimConfig(StrictModel):
     gravity: Vec3 = (0.0, 0.0, -9.81)
     """Gravity in the world frame [m/s^2]."""
     integrator: Literal["euler", "rk4", "implicit", "implicitfast"] | None = None
-    """MuJoCo's integrator; null: the one in the MJCF of the first entity."""
+    """MuJoCo's integrator; null: the integrator in the MJCF of the first entity."""
     iterations: Count | None = None
-    """Largest number of solver iterations; null: the one in the MJCF of the first entity."""
+    """Largest number of solver iterations; null: the number in the MJCF of the first entity."""
     ls_iterations: Count | None = None
-    """Largest number of line-search iterations of the solver; null: the one in the MJCF of the first entity."""
+    """Largest number of line-search iterations of the solver; null: the number in the MJCF of the first entity."""
     engine: Literal["auto", "batch", "warp"] = "auto"
     """Physics engine. batch: MuJoCo on CPU threads; warp: MuJoCo Warp on a GPU; auto: batch on a CPU, warp on a GPU."""
     engine_threads: Threads | None = None

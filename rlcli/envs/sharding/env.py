@@ -188,7 +188,7 @@ class ShardedEnv(Environment):
         )
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Restore a state returned by `state_dict()`, also by that of another number of processes."""
+        """Restore a state returned by `state_dict()`, also with another number of processes."""
         shapes = self.call_all(_state_shapes)
         present = {name: [part[name] for part in shapes] for name in shapes[0]}
         own, *others = split_state(state, present, self._shards)
@@ -256,7 +256,7 @@ class ShardedEnv(Environment):
                 own = function(self.local, *arguments)
             except KeyboardInterrupt:
                 raise
-            except BaseException:  # an unread reply would be taken for the next one
+            except BaseException:  # else the next call would read this reply
                 self._workers.replies()
                 raise
             values = self._workers.replies()

@@ -100,7 +100,7 @@ class Worker:
             self._process.send_signal(signal.SIGCONT)
 
     def wait(self, seconds: float) -> None:
-        """Wait for the end of the process; kill it after so many seconds."""
+        """Wait for the end of the process; kill it if it still runs after `seconds`."""
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:

@@ -119,7 +119,7 @@ class RandomizePdGains(DrawKeys, JointTerm):
 class RandomizeEffortLimit(RangeKeys, ActuatorTerm):
     """Random effort limits of actuators, the same in both directions of the joint [N or N m].
 
-    The limit of a joint with an actuator model (`kind: pd` or `dc_motor`) is that of the model.
+    For a joint with an actuator model (`kind: pd` or `dc_motor`), the effort limit of the model is drawn.
     """
 
     derives = False

@@ -66,7 +66,7 @@ def feet_air_time_positive_biped(
 def feet_slide(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies, sensor: ContactSensor) -> Tensor:
     """Sum of the horizontal speeds of feet with more than 1 N within the sensor's history [m/s]. (num_envs,)
 
-    bodies: those of the sensor, in its order.
+    bodies: the bodies of the sensor, in the same order.
     """
     return foot_slip_penalty(env, entity=entity, bodies=bodies, sensor=sensor)
 
@@ -76,7 +76,7 @@ def foot_slip_penalty(
 ) -> Tensor:
     """Sum of the horizontal speeds of feet with more than `threshold` [N] in the sensor's history [m/s]. (num_envs,)
 
-    bodies: those of the sensor, in its order.
+    bodies: the bodies of the sensor, in the same order.
     """
     speed = length(require_one_per_body(entity.data.body_lin_vel_of(bodies)[..., :2], sensor, "bodies"))
     return (speed * (strongest_force(sensor) > threshold)).sum(dim=1)
