@@ -45,7 +45,7 @@ def self_collision_cost(env: ManagedEnv, *, sensor: ContactSensor) -> Tensor:
 def feet_air_time(env: ManagedEnv, *, sensor: ContactSensor, command: Command, threshold: float) -> Tensor:
     """Sum of (time in the air - threshold) of the feet that touch down in this step [s]. (num_envs,)
 
-    0 where the commanded speed is below 0.1 m/s.
+    0 where the commanded speed is at most 0.1 m/s.
     """
     excess = (sensor.last_air_time - threshold) * sensor.first_contact
     return excess.sum(dim=1) * (commanded_speed(command) > 0.1)
@@ -54,9 +54,9 @@ def feet_air_time(env: ManagedEnv, *, sensor: ContactSensor, command: Command, t
 def feet_air_time_positive_biped(
     env: ManagedEnv, *, sensor: ContactSensor, command: Command, threshold: float
 ) -> Tensor:
-    """Time for which exactly one foot has been in contact, at most `threshold` [s]. (num_envs,)
+    """Time since which exactly one of two feet has been in contact, clipped to `threshold` [s]. (num_envs,)
 
-    0 where the commanded speed is below 0.1 m/s.
+    0 where both or no feet are in contact, or the commanded speed is at most 0.1 m/s.
     """
     down = sensor.contact_time > 0.0
     lasted = torch.where(down, sensor.contact_time, sensor.air_time).amin(dim=1).clamp(max=threshold)
