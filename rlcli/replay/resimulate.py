@@ -81,7 +81,7 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
         return []
     if episode is not None and episode >= count:
         raise UsageError(
-            f"there is no episode {episode} in {trajectory.file}", hint=f"its {count} episodes are numbered from 0"
+            f"there is no episode {episode} in {trajectory.file}", hint=f"it has {count} episodes, numbered from 0"
         )
     if not count:
         raise UsageError(f"{trajectory.file} has no episodes", hint="record with --record-mode all")
