@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 FOLDER = "autopsy"
 """Folder of the files in a run."""
 FILE_NAME = re.compile(r"(\d{12,15})-env-(\d{6,12})-episode-(\d{6,15})\.safetensors")
-"""Environment steps of the run, environment, episode."""
+"""Pattern of file names. Its groups are the environment steps of the run, the environment and the episode."""
 _MAX_FILES = 10_000
 
 
@@ -49,7 +49,7 @@ class FailureCase:
 
     @property
     def world(self) -> World:
-        """The recorded engine calls, which simulate the physics steps of the recorded steps."""
+        """The recorded engine calls, each of which simulates physics steps of the recorded steps."""
         return self.trajectory.header.worlds[0]
 
     @property

@@ -82,7 +82,7 @@ class FailureBatch:
     remove: list[str]
     """Names of files to remove."""
     returns: list[float]
-    """Returns of recent episodes, which a resumed training needs to tell unusual returns."""
+    """Returns of recent episodes, from which a resumed training recognises unusual returns."""
 
 
 class _RecentReturns(BaseModel):

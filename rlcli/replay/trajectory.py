@@ -46,7 +46,7 @@ from rlcli.sim.divergence_report import MAX_DESCRIBED
 
 FORMAT = 2
 STATE_FIELDS = ("qpos", "qvel", "act", "ctrl")
-"""Fields of the simulation state that a recording holds of each step."""
+"""Fields of the simulation state that a recording holds for each step."""
 MAX_SUBSTEPS = 300_000
 """Physics steps that a replay of engine calls simulates at most."""
 _MAX_BYTES = 2**28
@@ -79,7 +79,7 @@ class Episode(_Strict):
     begin: Count
     """Number of steps in the recording before the episode; 0 in a failure file."""
     length: int = Field(ge=1, le=2**53)
-    """Environment steps."""
+    """Length in environment steps."""
     kept: int = Field(ge=1, le=2**53)
     """Number of steps in the file: the last ones in a failure file, all in a recording."""
     total_reward: float

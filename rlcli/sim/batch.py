@@ -67,7 +67,7 @@ class BatchEngine(BatchWorlds):
             self.state_layout, self._rows, self._batch.warning, self._expanded, self._max_velocity
         )
         self._bound_inputs: list[NDArray[np.float64]] = []
-        """Fields in use of the state, without positions and velocities, to which terms may write."""
+        """Fields of the state that are in use and that terms may write, except positions and velocities."""
         self._substep_fields = config.derived_fields == "substep"
         self.step_stage = _NONE
         """Stage (mjtStage) that is computed after the last substep, for the fields in use."""

@@ -52,7 +52,10 @@ def one_column(columns: Columns, count: int, parameter: str) -> int:
 
 
 class Selection(Protocol):
-    """Some of the environments, such as those to reset. Each is a row; `shape` is the shape of one row of numbers."""
+    """Some of the environments, such as those to reset. Each selected environment is one row of a result.
+
+    `shape` is the shape of the random numbers of one row.
+    """
 
     @property
     def count(self) -> int | Tensor:

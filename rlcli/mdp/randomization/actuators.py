@@ -197,7 +197,7 @@ class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
 
 
 _AXES = {"actuator_gainprm": [0, 1, 2], "actuator_biasprm": [0, 1, 2]}
-"""Columns of a linear force (constant, length, velocity); the further columns belong to muscles."""
+"""Field -> its columns for a linear force (constant, length, velocity); further columns belong to muscles."""
 
 
 def _changes_actuators(event: Any) -> bool:
