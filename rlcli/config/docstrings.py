@@ -27,7 +27,7 @@ def describe(schema: dict[str, Any], model: type[BaseModel]) -> None:
 def _class_docstrings(module: ModuleType) -> dict[str, dict[str, str]]:
     """Return the docstrings of a module: qualified class name -> field -> the string below the field.
 
-    If two classes have the same qualified name, both have no docstrings, because the right one is unknown.
+    Two classes with the same qualified name are left out, because the right one is unknown.
     """
     try:
         tree = ast.parse(inspect.getsource(module))

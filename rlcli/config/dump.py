@@ -25,7 +25,7 @@ class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # PyYAML has no types
     def resolve(self, kind: type[yaml.Node], value: Any, implicit: tuple[bool, bool]) -> str:
         """Return the tag that the strict reader gives to a plain scalar.
 
-        PyYAML quotes a string whose tag is not that of a string, so that the strict reader reads it back as a string.
+        PyYAML puts a string in quotes if this tag is not the tag of strings. So the strict reader reads a string again.
         """
         if kind is not yaml.ScalarNode or not implicit[0]:
             return str(super().resolve(kind, value, implicit))
@@ -62,7 +62,7 @@ _Dumper.add_representer(list, _sequence)
 def to_data(resolved: Resolved) -> dict[str, Any]:
     """Return the whole configuration as plain data, as YAML or JSON can hold it.
 
-    It has all defaults, the changes that the chosen agent and `play:` make, and of the agents only the chosen one.
+    The data contains all defaults, the changes by the chosen agent and by `play:`, and only the chosen agent.
     """
     data = resolved.task.model_dump(mode="json", exclude={"agents"})
     data |= data.pop("foreign")
@@ -181,7 +181,7 @@ def json_schema(vocabulary: Vocabulary, params: type[BaseModel] | None = None) -
     definitions = schema.setdefault("$defs", {})
 
     def model_schema(model: type[BaseModel]) -> dict[str, Any]:
-        """Return the schema of a model and move its definitions to those of the whole schema."""
+        """Return the schema of a model, and move its definitions to the definitions of the whole schema."""
         part = model.model_json_schema()
         definitions.update(part.pop("$defs", {}))
         return part

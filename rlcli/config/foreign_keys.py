@@ -1,6 +1,6 @@
 """Keys of a task file that only the environment class of another framework's format reads.
 
-Such a key is at the top level of the file; in a `TaskConfig` it is inside of the key `foreign`.
+In the file such a key is at the top level; in a `TaskConfig` it is below the key `foreign`.
 """
 
 from collections.abc import Mapping

@@ -17,9 +17,10 @@ MODELS = "models"
 def read_models(words: Iterable[str]) -> dict[str, Any]:
     """Return the name of each robot or object -> its MJCF file, from the values of `--model`.
 
-    A value is `NAME=FILE` or a YAML file with `{NAME: FILE}`. FILE is an MJCF, relative to the YAML file if it is in
-    one, or `TASK:FILE`, a model of an installed task. In a YAML file it may be `{model: FILE, gains: {GROUP:
-    {stiffness: S, damping: D}}}`, with PD gains for actuators that the task describes by a neural network.
+    A value is `NAME=FILE`, or a YAML file with `{NAME: FILE}`. FILE is the path of an MJCF file, or `TASK:FILE` for a
+    file of an installed task. Paths in a YAML file are relative to that file. A YAML file may also have `NAME: {model:
+    FILE, gains: {GROUP: {stiffness: S, damping: D}}}`, with PD gains for actuators that the task describes by a neural
+    network.
 
     Raises:
         ConfigError: if a YAML file cannot be read, or is not such a mapping.
@@ -57,8 +58,8 @@ def recorded_models(task: Mapping[str, Any]) -> dict[str, Any]:
 def model_path(path: Path, form: Format | None, problems: list[Problem]) -> Path:
     """Return the path of the key that `--model NAME=FILE` sets in a task's data; an empty path if it sets no key.
 
-    It sets none in a format whose configurations receive the models while they are read. `--model` is a mistake for a
-    task in rlcli's own format, which names its models itself.
+    `--model` sets no key in a format whose reader receives the models directly. For a task in rlcli's own format, which
+    names its model files itself, `--model` is a mistake.
 
     Args:
         path: `("models", NAME)`.

@@ -107,7 +107,7 @@ class Layers:
         return origin.where if origin else "configuration"
 
     def _descend(self, target: object, step: str | int, taken: Path, origin: Origin) -> tuple[Any, Path]:
-        """Return the member `step` of a mapping or list, and its path; a mapping without it gets an empty mapping.
+        """Return the member `step` of a mapping or list, and its path; create a missing member as an empty mapping.
 
         Args:
             target: the mapping or list.

@@ -104,7 +104,7 @@ def _message(
         tag, expected = items[0]["ctx"]["tag"], items[0]["ctx"]["expected_tags"].replace(", ", " or ")
         similar = did_you_mean(tag, _tags(model, path))
         return f"expected {expected}, found {format_value(tag)}", similar, (*path, "kind")
-    refused = [item for item in items if item["type"] == "value_error"]  # of a type that one alternative has
+    refused = [item for item in items if item["type"] == "value_error"]  # a validator of a union's member failed
     if refused:
         return str(refused[0]["ctx"]["error"]), None, path
     if kind == "missing" and isinstance(items[0]["loc"][-1], str):

@@ -44,7 +44,7 @@ _OWN_KEYS = {
     "root_distance_to": ("entity", "goal"),
     "root_speed": ("entity",),
 }
-"""Keys of terms that do not take all keys of the earlier condition."""
+"""Term -> its keys, for terms that do not take all keys of the earlier condition."""
 
 
 def upgraded(document: Document, file: Path) -> Document:

@@ -251,7 +251,7 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
 def _agents_in_modules(modules: Iterable[Any]) -> dict[str, Any]:
     """Return the settings of agents in another framework's form that some modules define, by name.
 
-    The name is that of the variable or class; a single agent has the name of its library.
+    The name is the name of the variable or class; a single agent has the name of its library.
     """
     found = {
         name: item
@@ -325,7 +325,7 @@ def _agent_object(entry: object) -> Any:
 
 
 def _is_entry(entry: object, module: str, attribute: str) -> bool:
-    """Return whether `entry`, a reference `module:name` or an object, means the object `attribute` of a module."""
+    """Return whether `entry`, a reference `module:name` or an object, is the object `attribute` of a module."""
     if isinstance(entry, str):
         return entry == f"{module}:{attribute}"
     return getattr(entry, "__module__", "") == module and getattr(entry, "__qualname__", "") == attribute
@@ -336,9 +336,10 @@ def _module_of(entry: object) -> str:
 
 
 def _object(entry: object) -> Any:
-    """Return what an argument of a registration means.
+    """Return the object that an argument of a registration with Gymnasium refers to.
 
-    `module:name` is imported; `module:file.yaml` becomes the file's path; an argument that is no text is returned.
+    For `module:name` this is the imported object, and for `module:file.yaml` the path of the file. An argument that is
+    not a string is returned unchanged.
     """
     if not isinstance(entry, str):
         return entry

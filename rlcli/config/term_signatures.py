@@ -100,7 +100,7 @@ class Signature:
 
 @dataclass(slots=True)
 class Vocabulary:
-    """The terms that the YAML of a task may name: those of the task (`own`) first, then those of `rlcli.mdp`.
+    """The terms that the YAML of a task may name: first the task's own terms (`own`), then the terms of `rlcli.mdp`.
 
     A section is a key of the task that has terms, such as `rewards`. A task's own term fits every section.
     """

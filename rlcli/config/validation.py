@@ -438,7 +438,7 @@ def _kept_terms(terms: Mapping[Path, TermConfig | None], at: Path, names: Iterab
 
 @functools.lru_cache(maxsize=16)
 def _key_locations(prefix: str, agent: type[BaseModel]) -> messages.KeyLocations:
-    """Return each key of a task and of an agent -> the dotted paths at which it is allowed. `prefix`: the agent's."""
+    """Return each key of a task and of an agent -> the dotted paths where it is allowed. `prefix`: agent's path."""
     return messages.key_locations({"": TaskConfig, prefix: agent})
 
 

@@ -16,15 +16,15 @@ from rlcli.sim.selection import Columns, write_rows
 
 
 class ArticulationView:
-    """View of one entity in all environments. Register it with `scene.add`; it works once the simulation runs.
+    """View of one entity in all environments. Register it with `scene.add`; it works once the environment is built.
 
     Columns are the hinge and slide joints of the entity, in the order of the model. `indices` selects environments;
-    values then have one row for each. Positions are in the world frame of each environment's own simulation. Unlike in
-    OmniIsaacGymEnvs, a setter may be called several times in a step, and getters always return current values.
+    values then have one row for each index. Positions are in the world frame of each environment's own simulation.
+    Unlike in OmniIsaacGymEnvs, setters may be called several times in a step, and getters return current values.
 
     Args:
         entity: name of the entity in the YAML's scene.
-        name: name of the view, for dictionaries of observations.
+        name: name of the view in messages and dictionaries of observations; None: `entity`.
     """
 
     def __init__(self, entity: str, name: str | None = None) -> None:
@@ -100,13 +100,13 @@ class ArticulationView:
 
     def set_joint_positions(self, positions: Tensor, indices: Tensor | None = None) -> None:
         """Set joint positions, and position actuators' targets to the same values. (n, num_dof) [m or rad]"""
-        self._set("qpos", positions, indices, self._qpos_index)
-        self._command("position", positions, indices)
+        self._write_state("qpos", positions, indices, self._qpos_index)
+        self._write_controls("position", positions, indices)
 
     def set_joint_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
         """Set joint velocities, and velocity actuators' targets to the same values. (n, num_dof) [m/s or rad/s]"""
-        self._set("qvel", velocities, indices, self._dof_index)
-        self._command("velocity", velocities, indices)
+        self._write_state("qvel", velocities, indices, self._dof_index)
+        self._write_controls("velocity", velocities, indices)
 
     def set_joint_efforts(self, efforts: Tensor, indices: Tensor | None = None) -> None:
         """Set the efforts of the joint motors; they last until the next call. (n, num_dof) [N or N m]
@@ -118,22 +118,22 @@ class ArticulationView:
         """
         if self._without_motor and bool(efforts[:, self._without_motor].any()):
             names = listing(self._entity.joint_names[j] for j in self._without_motor)
-            hint = "give them `actuator: motor` in scene.entities, or set targets"
+            hint = "give these joints `actuator: motor` in scene.entities, or set targets of their actuators"
             raise TaskError(f"view '{self.name}': no motor drives {names}, so efforts cannot act", hint=hint)
-        self._command("motor", efforts, indices)
+        self._write_controls("motor", efforts, indices)
 
     def set_joint_position_targets(self, positions: Tensor, indices: Tensor | None = None) -> None:
         """Set the targets of position actuators. (n, num_dof) [m or rad]"""
-        self._command("position", positions, indices)
+        self._write_controls("position", positions, indices)
 
     def set_joint_velocity_targets(self, velocities: Tensor, indices: Tensor | None = None) -> None:
         """Set the targets of velocity actuators. (n, num_dof) [m/s or rad/s]"""
-        self._command("velocity", velocities, indices)
+        self._write_controls("velocity", velocities, indices)
 
     def set_world_poses(self, positions: Tensor, orientations: Tensor, indices: Tensor | None = None) -> None:
         """Set root poses of a floating robot, world frame. (n, 3) [m], (n, 4) w, x, y, z"""
         root, _ = self._entity.floating()
-        self._set("qpos", torch.cat([positions, orientations], dim=1), indices, slice(root, root + 7))
+        self._write_state("qpos", torch.cat([positions, orientations], dim=1), indices, slice(root, root + 7))
 
     def set_velocities(self, velocities: Tensor, indices: Tensor | None = None) -> None:
         """Set velocities of the root's origin of a floating robot, world frame. (n, 6) [m/s, rad/s]"""
@@ -142,14 +142,14 @@ class ArticulationView:
         quat = self._qpos[rows][:, qpos + 3 : qpos + 7].float()
         # MuJoCo: the angular velocity of a free joint is in the body frame
         local = torch.cat([velocities[:, :3], rotate_inverse(quat, velocities[:, 3:])], dim=1)
-        self._set("qvel", local, indices, slice(dof, dof + 6))
+        self._write_state("qvel", local, indices, slice(dof, dof + 6))
 
-    def _command(self, kind: str, values: Tensor, indices: Tensor | None) -> None:
+    def _write_controls(self, kind: str, values: Tensor, indices: Tensor | None) -> None:
         drive = self._actuators[kind]
         if drive is not None:
             self._write(self._ctrl, drive.controls_for(values), indices, drive.controls)
 
-    def _set(self, name: str, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
+    def _write_state(self, name: str, values: Tensor, indices: Tensor | None, columns: Columns) -> None:
         self._write(self._env.engine.field(name), values, indices, columns)
         self._write(getattr(self._env.sim, name), values, indices, columns)  # getters read this copy
         self._env.sim.stamp += 1  # values that were computed from the old state are computed again
@@ -179,10 +179,10 @@ class _Drive:
     controls: Columns
     """Columns of the actuators in the controls."""
     factor: Tensor | None
-    """Factor from the value of a joint to the control; None: 1."""
+    """Factor from the effort or target of a joint to the control. (k,); None: 1."""
 
     def controls_for(self, values: Tensor) -> Tensor:
-        """Return the controls (ctrl) of the k actuators for given values of the joints. (n, num_dof) -> (n, k)"""
+        """Return the controls (ctrl) of the k actuators for efforts or targets of the joints. (n, num_dof) -> (n, k)"""
         driven = values if self.joints is None else values[:, self.joints]
         return driven if self.factor is None else driven * self.factor
 

@@ -52,7 +52,7 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
 
     Args:
         scene: the scene, with everything that the task adds.
-        binder: collects the names that do not resolve.
+        binder: binder of the task; it collects the names that the model does not have.
         device: device of the engine.
         seed: seed of the terrain's random numbers.
         streams: index of the random stream of each environment. (num_envs,) int64
@@ -133,7 +133,7 @@ def _default_state(engine: Engine, entities: dict[str, Entity]) -> dict[str, Ten
         if entity.is_floating:
             _, dof = entity.floating()
             root = entity.data.default_root_state[:1].double().cpu()
-            local = rotate_inverse(root[:, 3:7], root[:, 10:])  # a free joint's is in the body frame
+            local = rotate_inverse(root[:, 3:7], root[:, 10:])  # a free joint's angular velocity is in the body frame
             linear = root[:, 7:10]
             if entity.config.velocity_point == "com":
                 state = entity.data.default_root_state[:1]

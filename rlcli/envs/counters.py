@@ -66,7 +66,7 @@ class SuccessCondition:
 
 
 class EpisodeCounters(TensorState):
-    """Counters of steps and episodes of all environments; `*_field` is the fastest form of a tensor for writing."""
+    """Counters of steps and episodes of all environments; `*_field` attributes share the tensors' memory."""
 
     def __init__(self, shard: Shard, device: torch.device) -> None:
         num_envs = shard.count
@@ -82,7 +82,7 @@ class EpisodeCounters(TensorState):
         self.conditions: list[SuccessCondition] = []
 
     def attach(self, engine: Engine) -> None:
-        """Make the attributes `*_field` with `Engine.as_field`, once the engine exists."""
+        """Make the attributes `*_field` with `Engine.as_field`: the forms of the tensors that are written fastest."""
         self._as_field = engine.as_field
         self.id_field, self.length_field = engine.as_field(self.ids), engine.as_field(self.lengths)
         self.index_field = engine.as_field(self.indices)

@@ -77,13 +77,13 @@ class DirectTask:
         self.extras: dict[str, Any] = {}
         """Values and tensors to log, by name. The metric `Task/<name>` is their mean, once an iteration.
 
-        `rlcli eval` logs means over episodes, of the means over their steps, for tensors with one row for each
-        environment.
+        `rlcli eval` reports the mean over the steps of each episode, then over episodes; a value without a row for each
+        environment counts for all environments.
         """
         self.episode_metrics: dict[str, Tensor] = {}
         """Values of the running episodes, by name, (num_envs,) each.
 
-        `Metrics/<name>` is the mean over the episodes that end, of their values in the last step. Fill the dictionary
+        `Metrics/<name>` is the mean, over the episodes that end, of the values in their last step. Fill the dictionary
         in `post_reset`, and write to the tensors in place.
         """
 
@@ -136,7 +136,7 @@ class DirectTask:
         return None
 
     def draws(self, env_ids: Tensor, name: str = "reset") -> IdSelection:
-        """Return random numbers for the running episodes: `draws(ids).uniform(-1, 1, (k,))` is (n, k).
+        """Return a selection for random numbers in running episodes: `draws(ids).uniform(-1, 1, (k,))` is (n, k).
 
         The numbers depend only on the seed, the environment, its episode and `name`.
         """
@@ -193,7 +193,7 @@ class DirectEnv(VecEnv):
         return task_class
 
     def _import_task(self, reference: str) -> Any:
-        """Import the class of the task."""
+        """Return the object that a reference such as `module:Class` names."""
         return load_object(reference)
 
     def _build_workflow(self) -> None:
@@ -271,7 +271,7 @@ class DirectEnv(VecEnv):
         return found
 
     def episode_dependencies(self) -> list[str]:
-        """Return the direct task: its episodes may depend on earlier ones, because its class may keep any state."""
+        """Add the class of the direct task: it may keep any state, so an episode may depend on earlier ones."""
         return [*super().episode_dependencies(), f"the class {type(self.task).__name__}"]
 
     def _before_full_reset(self) -> None:
@@ -337,7 +337,7 @@ class DirectEnv(VecEnv):
         self._mark_reset(selection)
 
     def _mark_reset(self, selection: Selection) -> None:
-        """Set the task's buffers for environments that start a new episode, and store that they were reset."""
+        """Set the task's buffers of environments that start a new episode, and mark these environments as reset."""
         selection.write(self.task.progress_buf, 0)
         selection.write(self.task.reset_buf, 1)
         selection.write(self._fresh_field, True)

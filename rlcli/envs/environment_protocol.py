@@ -119,7 +119,7 @@ class Environment(Protocol):
         return []
 
     def extras(self) -> dict[str, float]:
-        """Return further values to log: those of the task (`extras`, curriculum), and new divergences by cause."""
+        """Return values to log, by metric: means of the task's `extras` or curriculum, and new divergences by cause."""
 
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each

@@ -2,8 +2,8 @@
 
 The map of the action follows from the geometry of the entities (`rlcli.scene.mirror`). Then environments in random
 states and their mirror images take the same steps on the CPU engine, with mirrored actions. Their motions and rewards
-must stay mirror images of each other. The map of the observations follows from what is observed there: each column has
-to be the column of the mirror image, or another column of the same term, or its negative.
+must stay mirror images of each other. The map of the observations follows from the observations of both: the mirror
+image of each column must equal that column or another one of the same term, or its negative.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class _MirrorTest:
         self._write_states()
         observed, rewards = [], []
         for _ in range(_STEPS):
-            action, before = self._draw(size), env.engine.field("qvel").clone()
+            action, before = self._normal_samples(size), env.engine.field("qvel").clone()
             env._apply_action(torch.cat([action, self._action(action)]))
             env._simulate()
             for sensor in env.sensors.values():
@@ -138,7 +138,7 @@ class _MirrorTest:
             raise TaskError("the mirror changes nothing: everything moves in the x-z plane, so symmetry has no effect")
         return MirrorMaps(maps, self._action)
 
-    def _draw(self, *shape: int) -> Tensor:
+    def _normal_samples(self, *shape: int) -> Tensor:
         return torch.randn(_PAIRS, *shape, generator=self._random)
 
     def _action_map(self) -> ColumnMap:
@@ -170,14 +170,14 @@ class _MirrorTest:
         """Write random states, their mirror images, random commands and episode times."""
         env, model = self._env, self._env.engine.model
         qpos, qvel = (env.engine.field(name) for name in ("qpos", "qvel"))
-        qpos[:_PAIRS] += 0.3 * self._draw(model.nq)
-        qvel[:_PAIRS] = self._draw(model.nv).double()
+        qpos[:_PAIRS] += 0.3 * self._normal_samples(model.nq)
+        qvel[:_PAIRS] = self._normal_samples(model.nv).double()
         for joint, kind in enumerate(model.jnt_type):
             start = int(model.jnt_qposadr[joint])
             if kind == mujoco.mjtJoint.mjJNT_FREE:
                 height = env.default_state["qpos"][start + 2]
                 qpos[:_PAIRS, start + 2] = height * (0.85 + 0.4 * torch.rand(_PAIRS, generator=self._random))
-                turn = 0.7 * self._draw(3).double()
+                turn = 0.7 * self._normal_samples(3).double()
                 turn[: _PAIRS // 2] *= 3.0  # half of them lie on the ground
                 qpos[:_PAIRS, start + 3 : start + 7] = from_euler(*turn.unbind(1))
             elif model.jnt_limited[joint]:
@@ -190,10 +190,10 @@ class _MirrorTest:
             command, signs = term.instance.command, getattr(term.instance, "mirror_signs", None)
             if signs is None:
                 raise TaskError(
-                    f"command '{term.name}' ({term.config.func}) does not say how it is mirrored; give its class an"
-                    " attribute mirror_signs: +1 or -1 for each column"
+                    f"command '{term.name}' ({term.config.func}) has no mirror image; give its class an attribute"
+                    " mirror_signs: +1 or -1 for each column of the command"
                 )
-            command[:_PAIRS] = self._draw(command.shape[1])
+            command[:_PAIRS] = self._normal_samples(command.shape[1])
             if tuple(signs[3:]) == QUATERNION:
                 command[:_PAIRS, 3:] = torch.nn.functional.normalize(command[:_PAIRS, 3:], dim=1)
             command[_PAIRS:] = command[:_PAIRS] * torch.tensor(signs)
@@ -248,7 +248,7 @@ class _MirrorTest:
     def _term_map(self, name: str, pipeline: Pipeline, own: Tensor, images: Tensor) -> list[tuple[int, float]]:
         """Return, for each column of a term, the column that its mirror image comes from, and the sign."""
         if len(pipeline.shape) > 1:
-            raise TaskError(f"observation '{name}' is an image, which has no mirror map; leave it out")
+            raise TaskError(f"observation '{name}' is an image, which has no mirror map; remove it from the group")
         rays = _ray_partners(pipeline)
         if rays is not None:
             return [(partner, 1.0) for partner in rays]
@@ -258,13 +258,13 @@ class _MirrorTest:
             if image.max() == image.min():
                 raise TaskError(
                     f"the sign of {place} in the mirror is unknown: it is {float(image[0]):g} in all tested states;"
-                    " leave the column out, or make it vary"
+                    " remove the column, or make its value vary"
                 )
             errors = torch.stack([_relative(image[:, None] - s * own, image[:, None].expand_as(own)) for s in (1, -1)])
             fits = (errors <= self._tolerance).nonzero().tolist()
             if len(fits) != 1:
                 nearest = f"equals no column of the term (the nearest differs by {float(errors.min()):.2%})"
-                matches = "equals several columns of the term: leave out the equal ones" if fits else nearest
+                matches = "equals several columns of the term: remove the equal columns" if fits else nearest
                 raise TaskError(f"the mirror image of {place} {matches}")
             found.append((fits[0][1], 1.0 - 2.0 * fits[0][0]))
         return found

@@ -22,7 +22,7 @@ class _Stateful(Protocol):
 
 def save_state(env: VecEnv) -> dict[str, Tensor]:
     """Return copies of everything that the next steps of an environment depend on."""
-    return _own_state(env) | {f"workflow.{name}": value for name, value in env._workflow_state().items()}
+    return _state_without_workflow(env) | {f"workflow.{name}": value for name, value in env._workflow_state().items()}
 
 
 def load_state(env: VecEnv, state: Mapping[str, Tensor]) -> None:
@@ -32,7 +32,7 @@ def load_state(env: VecEnv, state: Mapping[str, Tensor]) -> None:
         KeyError: if a tensor is missing.
         ValueError: if a tensor has another shape or type, because it was saved from a different environment.
     """
-    require_matching_tensors(state, _own_state(env), "env")
+    require_matching_tensors(state, _state_without_workflow(env), "env")
     env._counters.load_state_dict(state)
     env.seed = int(state["seed"])
     env._guard.load_quarantined(state.get("set_aside"))
@@ -44,7 +44,7 @@ def load_state(env: VecEnv, state: Mapping[str, Tensor]) -> None:
     env._load_workflow_state(substate(state, "workflow."))
 
 
-def _own_state(env: VecEnv) -> dict[str, Tensor]:
+def _state_without_workflow(env: VecEnv) -> dict[str, Tensor]:
     state = env._counters.state_dict()
     state |= {"seed": torch.tensor(env.seed), "set_aside": env._guard.quarantined.clone()}
     for prefix, part in {"engine.": env.engine, **_parts(env)}.items():

@@ -20,7 +20,7 @@ class Episodes:
     lengths: Tensor
     """Lengths in environment steps. (n,) int64"""
     reward_terms: dict[str, Tensor]
-    """Term -> its share of the return, with its weight. (n,) each"""
+    """Reward term -> its weighted sum over the episode. (n,) each"""
     causes: dict[str, Tensor]
     """Termination -> whether it fired at the end. (n,) bool each"""
     truncated: Tensor
@@ -32,11 +32,11 @@ class Episodes:
     condition_values: dict[str, Tensor] = field(default_factory=dict)
     """Condition of success with a bound -> its value in the last step. (n,) each"""
     metrics: dict[str, Tensor] = field(default_factory=dict)
-    """`command/metric` -> its mean over the episode. (n,) each"""
+    """`command/metric` -> mean over the episode; for a direct task: metric -> value in the last step. (n,) each"""
     mask: Tensor | None = None
     """Which rows are valid, on a GPU, whose tensors have a row for every environment; None: all. (num_envs,) bool
 
-    The tensors are overwritten by the next step, earlier than those of `StepResult`.
+    The next step overwrites these tensors; the tensors of `StepResult` stay valid for one step more.
     """
 
     def ended(self) -> Episodes:

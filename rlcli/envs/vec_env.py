@@ -314,7 +314,7 @@ class VecEnv(Workflow):
             actuator.compute()
 
     def extras(self) -> dict[str, float]:
-        """Return further values to log: those of the task (`extras`, curriculum), and new divergences by cause."""
+        """Return values to log, by metric: means of the task's `extras` or curriculum, and new divergences by cause."""
         return {**means(self.metric_values()), **self.divergence_metrics()}
 
     def divergence_metrics(self) -> dict[str, float]:

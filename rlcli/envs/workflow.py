@@ -61,7 +61,7 @@ class Workflow(Environment):
         """Return returns, reward terms and causes (the latter two by name) of the episodes that end. (n,) each"""
 
     def _episode_metrics(self, ended: Selection) -> dict[str, Tensor]:
-        """Return metrics of the episodes that end, as means over their steps, by name. (n,) each"""
+        """Return `Episodes.metrics` of the episodes that end. (n,) each"""
         return {}
 
     def _reward_terms(self) -> Tensor:
@@ -69,7 +69,7 @@ class Workflow(Environment):
         return torch.zeros(0, self.num_envs, device=self.device)
 
     def _before_reset(self, ended: Selection) -> None:
-        """Do what must happen before the environments of ended episodes are reset: update the curriculum."""
+        """Update the curriculum with the episodes that end, before their environments are reset."""
 
     @abstractmethod
     def _reset_workflow(self, selection: Selection) -> None:

@@ -45,8 +45,8 @@ class Evaluation:
     diverged_by: dict[str, int] = field(default_factory=dict)
     """Cause of a divergence -> number of simulations that diverged, also in episodes that are not counted."""
     values: dict[str, list[float]] = field(default_factory=dict)
-    """Metric of the task -> its mean over each episode: values that a direct task logs, by name, and metrics of
-    commands, as `command/metric`."""
+    """Metric of the task -> a value for each episode: the means of a direct task's `extras` by name, the last values of
+    its `episode_metrics`, and the means of commands' metrics, as `command/metric`."""
 
     def summary(self) -> dict[str, Any]:
         """Return the statistics of all episodes, as `rlcli eval --json` prints them.

@@ -191,7 +191,7 @@ def open_session(request: PolicyRequest, check: Callable[[Resolved], None] = lam
 
 
 def one_each(resolved: Resolved, episodes: int) -> Resolved:
-    """Return the task with one environment for each episode, unless the user has set the number of environments."""
+    """Return the task with an environment for each episode, up to `MAX_ENVS`, unless the user set their number."""
     from rlcli.config.dump import explicit_values
 
     return (
@@ -215,7 +215,7 @@ def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
 
 
 def is_run_name(word: str, runs_dir: Path | None) -> bool:
-    """Return whether a word names a run or a checkpoint and not a task."""
+    """Return whether a word is `latest` or names a run or a checkpoint that exists; a task may have the same name."""
     runs = runs_dir or default_runs_dir()
     path = path_of(word)
     name = word if path.exists() else word.partition("@")[0]

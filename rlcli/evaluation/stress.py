@@ -186,7 +186,7 @@ def run_points(
 
 
 def search(sweeps: Sequence[Sweep], center: Point, count: int, seed: int) -> list[Point]:
-    """Return `count` random points between the lowest and the highest values of the sweeps.
+    """Return at most `count` random points between the lowest and the highest values of the sweeps, each once.
 
     Half of them are near the point `center`, the others are uniformly distributed.
     """

@@ -40,7 +40,7 @@ class ActionTerm(Protocol):
     size: int
     """Number of columns of the policy's action that the term uses."""
     elements: tuple[str, ...]
-    """What each column drives, such as a joint or an axis, by name."""
+    """Name of what each column drives, such as a joint or an axis."""
     unit: str
     """Unit of the command to the actuators."""
 

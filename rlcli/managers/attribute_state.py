@@ -32,7 +32,7 @@ class NotSerializableError(TypeError):
 
 
 class AttributeState:
-    """Saver of the attributes of an object, and of those of helper objects of the task's own classes.
+    """Saver of the attributes of an object and of its helper objects, which are objects of the task's own classes.
 
     Args:
         owner: the object, before the first step.

@@ -91,7 +91,7 @@ class CommandManager(TensorState):
         self._sums = context.zeros(len(self._measured))
         self._steps = context.zeros()
         self.held: dict[str, float] = {}
-        """Values that replace those of the terms in every environment, by the name of the knob."""
+        """Values that replace the drawn values in every environment, by the name of the knob."""
         self._held_knobs: dict[str, Knob] = {}
 
     def knobs(self) -> list[Knob]:
@@ -162,7 +162,7 @@ class CommandManager(TensorState):
         return term
 
     def time_left(self, name: str) -> Tensor:
-        """Return the time until a command is drawn again, at the latest at its end. (num_envs,) [s]"""
+        """Return the time until a command is resampled; the end of the episode may come first. (num_envs,) [s]"""
         number = list(self._by_name).index(name)
         return self._steps_left[number] * self._step_dt
 

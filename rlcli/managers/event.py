@@ -135,6 +135,6 @@ def _is_global(term: BoundTerm) -> bool:
 
 
 _NEVER = -(1 << 62)
-"""Step at which a reset event fired that has not fired yet."""
+"""Value of `fired_at` where a reset event has not fired yet."""
 # Two random streams: the first interval of an episode depends on the episode's index, later ones on the step's.
 _FIRST, _NEXT = np.uint64(0x5449_4D45_5231), np.uint64(0x5449_4D45_5232)

@@ -30,11 +30,11 @@ class _Group:
 
 
 _FINAL = np.uint64(0x46494E414C)
-"""Salt of the random streams for the last observation of an episode: its noise differs from that of the next one."""
+"""Salt of the random streams for the last observation of an episode: the next one gets other noise."""
 
 
 class ObservationManager(TensorState):
-    """Manager of the observation terms. Each group has three buffers in turn: consecutive observations share no memory.
+    """Manager of the observation terms. Each group cycles through three buffers: a step overwrites no newer result.
 
     Args:
         groups: the bound terms of each group.

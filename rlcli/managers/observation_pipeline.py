@@ -238,7 +238,7 @@ class _Filter(Stage):
 
 
 class _DigitalFilter(_Filter):
-    """Linear filter. `past`: the inputs before this step, newest first, then the outputs likewise. (num_envs, m, k)"""
+    """Linear filter. `past`: earlier inputs, then earlier outputs, the newest first in each. (num_envs, m, k)"""
 
     def __init__(self, past: Tensor, config: schema.DigitalFilterModifierConfig) -> None:
         self._past, self._inputs = past, len(config.b) - 1
@@ -280,7 +280,7 @@ class Delay(Stage):
         self._lag = torch.full((len(frames),), self._low, dtype=torch.int64, device=frames.device)
 
     def __call__(self, value: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
-        """Replace the value by the one of some steps ago."""
+        """Replace the value with the value from as many steps ago as the delay."""
         frames = torch.cat([self._frames[:, 1:], value[:, None]], dim=1)
         if fresh is not None:
             fresh.write(frames, fresh.read_view(value)[:, None].expand(-1, frames.shape[1], -1))

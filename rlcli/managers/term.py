@@ -282,7 +282,7 @@ def first_value(term: BoundTerm) -> Any:
     """Call a term for the first time, when the environment is built.
 
     Raises:
-        ShapeError: if the term raises a ValueError; its message becomes that of the ShapeError.
+        ShapeError: if the term raises a ValueError; it has the message of the ValueError.
     """
     try:
         return term.call()

@@ -48,7 +48,7 @@ class TerminationManager:
         return functools.reduce(torch.logical_or, masks)
 
     def causes(self, ended: Selection) -> dict[str, Tensor]:
-        """Return by term whether it fired at the end of the episodes that end. (n,) bool each"""
+        """Return, by term, whether it fired in the last step of the episodes that end. (n,) bool each"""
         return {name: ended.read_view(fired) for name, fired in self.fired.items()}
 
     def reset(self, selection: Selection) -> None:

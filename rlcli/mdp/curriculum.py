@@ -72,9 +72,10 @@ class Interpolate(Term):
 class TerrainLevels(EntityTerm):
     """Terrain difficulty (level): robots that walk far move up, those that walk little down. -> levels (num_envs,)
 
-    A robot moves up one level if its episode ends farther from the environment's origin than half the length of a
-    terrain patch along x. It moves down if it covers less than half of the distance of `command` (a velocity, x and y
-    first); without a command, less than `least` [m]. A robot that moves up from the last level gets a random level.
+    d is the horizontal distance of the robot from the environment's origin at the end of an episode. The robot moves up
+    one level if d exceeds half the length of a terrain patch along x. Else the robot moves down if d is below half of
+    commanded speed x episode_length_s (`command`: a velocity, x and y first), or without a command below `least` [m]. A
+    robot that moves up from the last level gets a random level.
 
     Isaac Lab: terrain_levels_vel.
     """
@@ -105,7 +106,7 @@ class TerrainLevels(EntityTerm):
 def _require_shape(what: str, shape: torch.Size, address: Tensor) -> None:
     if shape != address.shape:
         wanted = tuple(address.shape)
-        raise ValueError(f"{what} has shape {tuple(shape)}; give shape {wanted}, that of the setting at `address`")
+        raise ValueError(f"{what} has shape {tuple(shape)}; give shape {wanted}, the shape of the setting at `address`")
 
 
 def _length_xy(vector: Tensor) -> Tensor:

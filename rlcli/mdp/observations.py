@@ -122,7 +122,7 @@ def base_up_proj(env: ManagedEnv, *, entity: Entity = "robot") -> Tensor:
 
 
 def base_heading_proj(env: ManagedEnv, *, entity: Entity = "robot", target: tuple[float, float, float]) -> Tensor:
-    """Horizontal part of the root's forward axis in the direction of `target`: 1 where it faces it. (num_envs, 1)
+    """Cosine between the root's forward axis and the horizontal direction to `target`. (num_envs, 1)
 
     target: a point from the environment's origin [m].
     """

@@ -82,7 +82,7 @@ def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], l
         folder = Path(str(getattr(distribution, "_path", "?"))).name
         try:
             if group not in _entry_points_text(distribution):
-                continue  # true for most distributions: reading their metadata would be slow
+                continue  # most distributions end here, before their metadata, which is slow to read
             name, version = _name_and_version(distribution)
             if wanted is not None and _normalized(name) not in wanted:
                 continue

@@ -18,7 +18,8 @@ KEYWORDS = ("latest", "shipped")
 def path_of(word: str) -> Path:
     """Return the path that a word of the command line names.
 
-    A keyword, or a keyword before an @, names no file: the returned path never exists. The folder needs `./latest`.
+    A keyword, also before an @, is never a file: the path returned for it does not exist. Write `./latest` to name a
+    folder called `latest`.
     """
     return Path(os.devnull, word) if word.partition("@")[0] in KEYWORDS else Path(word)
 

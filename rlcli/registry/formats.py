@@ -24,7 +24,7 @@ _KNOWN = Path(__file__).with_name("known_plugins.json")
 _LARGEST = 1024 * 1024
 """Files above this size [bytes] are not searched for the patterns of known formats."""
 _MOST_FILES = 100
-"""Most files of a folder that are searched for each pattern of file names."""
+"""Largest number of files in a folder that are searched for each glob pattern."""
 
 
 @dataclass(frozen=True, slots=True)

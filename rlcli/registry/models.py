@@ -27,7 +27,7 @@ def model_file(root: Path, model: str) -> Path:
 
 
 def chosen_model(root: Path, model: str) -> str:
-    """Return the first of the alternatives in `model`, separated by ` | `, that exists; a single one is not checked.
+    """Return the first existing one of the alternatives in `model`, separated by ` | `; do not check a single one.
 
     Raises:
         MissingModelError: if none of the alternatives exists.

@@ -25,7 +25,7 @@ from rlcli.registry.formats import Format, aliasing_formats
 _COMMON = ("gym", "numpy")
 """Libraries that files of all formats import."""
 _MOST_FILES = 200
-"""Most files of a task in which imports of formats are counted."""
+"""Largest number of files of a task in which imports of formats are counted."""
 _python_import = builtins.__import__
 _trees: dict[str, str] = {}
 """Module name of an imported package or folder -> name under which its own files import it."""
@@ -121,7 +121,7 @@ def _folders_above() -> list[Path]:
 
 
 def _add_own_paths() -> None:
-    """Treat folders that files of a task have added to `sys.path` as folders of the task, but not those of packages."""
+    """Treat folders that a task's files have added to `sys.path` as folders of the task, except folders of packages."""
     for entry in sys.path if _known_paths else ():
         folder = Path(entry).resolve()
         installed = {"site-packages", "dist-packages"} & set(folder.parts) or Path(sys.prefix).is_relative_to(folder)
@@ -237,9 +237,10 @@ def _alias_module(form: Format, name: str, file: str, below_top: bool = False) -
 
 @functools.cache
 def _formats_for(first: str, file: str) -> tuple[Format, ...]:
-    """Return the formats that replace modules of the package `first`; of several the one that fits the importing file.
+    """Return the formats that replace modules of the package `first`. If there are several, choose by the imports.
 
-    It is the one whose other modules the file imports most often; if it imports none, all files of its task count.
+    The chosen format is the one whose other modules the importing file imports most often. If the file favours none,
+    the imports of all files of its task are counted.
     """
     forms = [
         form for form in aliasing_formats() if any(alias.partition(".")[0] == first for alias in form.spec.aliases)

@@ -23,7 +23,7 @@ from rlcli.trainers import TrainerSpec
 _log = logging.getLogger(__name__)
 
 _SLOW_S = 10
-"""Time after which a plugin that is still imported is named [s]."""
+"""Time after which a warning names a plugin whose import has not ended [s]."""
 _Spec = TypeVar("_Spec", TaskSpec, TrainerSpec, FormatSpec)
 
 

@@ -27,9 +27,9 @@ from rlcli.registry import OWN, TASKS, Entry, package_folder
 
 TIMEOUT_S = 30.0
 _IDLE_S = 3.0
-"""Time after which a process that has loaded nothing more no longer counts as one that uses a core [s]."""
+"""Time without a newly loaded plugin after which a process no longer counts as using a core [s]."""
 _MAX_TIMEOUTS = 2
-"""Entries of one distribution that may exceed the time limit; its other entries are not loaded then."""
+"""Number of entry points of a distribution that may exceed the time limit before the others are skipped."""
 _MAX_PROCESSES = 64
 _SUFFIXES = (".py", ".yaml", ".xml")
 _BUILDER = "rlcli.envs.describe_plugins"
@@ -154,7 +154,7 @@ def _update_cache(details: dict[str, Any]) -> None:
 def _probe_distribution(
     entries: list[Entry], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str], work: Work
 ) -> dict[str, Details]:
-    """Load the entry points of one distribution, after a crash in a new process; the arguments are as in `probe`."""
+    """Load the entry points of one distribution; continue in a new process after a crash. Arguments as in `probe`."""
     found: dict[str, Details] = {}
     late = f"did not load within {timeout_s:g} s"
     while remaining := [entry.qualified for entry in entries if entry.qualified not in found]:
@@ -178,9 +178,9 @@ def _cores() -> threading.Semaphore:
 def _probe_names(
     names: list[str], timeout_s: float, group: str, stop: threading.Event, env: dict[str, str]
 ) -> dict[str, Details]:
-    """Load entry points, in this order, in one process; return the details by name, as far as the process came.
+    """Load entry points, in this order, in one process; return the details of those that were tried, by name.
 
-    The entry point at which the process crashed or exceeded the time limit is the last one, marked as broken.
+    If the process crashes or exceeds the time limit, the entry point at fault is the last one, marked as broken.
     """
     with (
         tempfile.TemporaryDirectory(prefix="rlcli-probe-", ignore_cleanup_errors=True) as folder,

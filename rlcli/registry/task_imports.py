@@ -124,7 +124,7 @@ def _sibling_modules(folder: Path) -> Iterator[None]:
 
 
 def _package(folder: Path, run_start: bool = True) -> str:
-    """Import a folder as a package and return the package's name: that of the folder, or a unique one if it is taken.
+    """Import a folder as a package and return the package's name: the folder's, or a unique one if that is taken.
 
     With `run_start` false, the folder's `__init__.py` is not executed.
     """

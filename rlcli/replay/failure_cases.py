@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 FOLDER = "autopsy"
 """Folder of the files in a run."""
 FILE_NAME = re.compile(r"(\d{12,15})-env-(\d{6,12})-episode-(\d{6,15})\.safetensors")
-"""Environment steps of the run, environment, episode."""
+"""Pattern of file names. Its groups are the environment steps of the run, the environment and the episode."""
 _MAX_FILES = 10_000
 
 
@@ -49,7 +49,7 @@ class FailureCase:
 
     @property
     def world(self) -> World:
-        """The recorded engine calls, which simulate the physics steps of the recorded steps."""
+        """The recorded engine calls, each of which simulates physics steps of the recorded steps."""
         return self.trajectory.header.worlds[0]
 
     @property
@@ -160,11 +160,11 @@ class Contact:
 
     geoms: tuple[str, str]
     distance: float
-    """Negative if they penetrate [m]."""
+    """Distance between the geoms; negative if they penetrate [m]."""
     force: float
-    """Along the contact normal [N]."""
+    """Force along the contact normal [N]."""
     position: tuple[float, float, float]
-    """In the world frame [m]."""
+    """Position of the contact, world frame [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +198,7 @@ class StagedCase:
 def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase:
     """Build the task of a failure case, to compute contacts and draw images.
 
-    `named` is the task on the command line: if the recorded task is not installed, its code is used.
+    `named` is the task on the command line; its code is used if neither it nor the recorded task is installed.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `rlcli.replay.resimulate.stage`.

@@ -1,7 +1,7 @@
 """Recorder of the last seconds of failed and unusual episodes of a training, for `rlcli autopsy`.
 
-Ring buffers hold the last seconds of all environments: the states at the beginning of each engine call
-(`sim.divergence.StateHistory`), observations, actions and rewards. In each iteration one episode of every kind is
+Ring buffers hold the last seconds of all environments: the states at the beginning of each engine call (`StateHistory`
+in `rlcli.sim.divergence_report`), observations, actions and rewards. In each iteration one episode of every kind is
 copied: for each set of terminations the one with the lowest return, the ones with unusually low and high returns, and
 the first that diverged for each cause. The thread that writes the next checkpoint writes them to files. When a training
 resumes, files that are newer than the checkpoint are removed, because their episodes are run again.
@@ -55,7 +55,7 @@ _MIN_SPREAD = 1e-3
 """Smallest interquartile range, as a share of the quartiles: returns with three equal digits are not unusual."""
 
 _Key = tuple[FailureKind, *tuple[str, ...]]
-"""Kind of an episode, and the causes of its end: of episodes with an equal key one is kept in an iteration."""
+"""Kind of an episode, and the causes of its end: for each key, one episode is kept per iteration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class KeptEpisode:
     """The last steps of a failed or unusual episode, in memory, before they are written to a file."""
 
     value: float
-    """Rank of the episode: of each kind, the episode with the lowest value is kept."""
+    """Rank of the episode: the episode with the lowest value of its kind is kept."""
     kind: FailureKind
     episode: Episode
     trace: CallTrace
@@ -82,7 +82,7 @@ class FailureBatch:
     remove: list[str]
     """Names of files to remove."""
     returns: list[float]
-    """Returns of recent episodes, which a resumed training needs to tell unusual returns."""
+    """Returns of recent episodes, from which a resumed training recognises unusual returns."""
 
 
 class _RecentReturns(BaseModel):
@@ -215,7 +215,7 @@ class FailureRecorder(StepObserver):
                 self._diverging[divergence.env] = trace_calls(self._env, divergence, pending)
 
     def on_step(self, record: StepRecord) -> None:
-        """Write the step into the ring buffers, and keep the failed and unusual ones of the episodes that end."""
+        """Write the step into the ring buffers, and keep the failed and the unusual episodes that end in this step."""
         slot = self._step % self._slots
         for name, value in (
             ("observations", record.obs["policy"]),
@@ -230,9 +230,9 @@ class FailureRecorder(StepObserver):
         self._diverging.clear()
 
     def _choose(self, ended: Episodes) -> None:
-        """Keep those of the ended episodes that diverged, have an unusual return, or were terminated.
+        """Keep the ended episodes that diverged, have an unusual return, or were terminated.
 
-        Of each kind, one episode of an iteration is kept: the first that diverged, else the one with the lowest value.
+        One episode of each kind is kept per iteration: the first that diverged, else the one with the lowest value.
         """
         returns, rest = ended.returns.detach().numpy().copy(), ~ended.truncated.numpy()
         self._returns.append(returns)

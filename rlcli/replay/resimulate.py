@@ -80,7 +80,9 @@ def choose_episodes(trajectory: Trajectory, episode: int | None, *, filmed: bool
             raise UsageError(message, hint="to film a failure case: `rlcli autopsy RUN N --video FILE.mp4`")
         return []
     if episode is not None and episode >= count:
-        raise UsageError(f"there is no episode {episode} in {trajectory.file}", hint=f"it has {count} episodes, from 0")
+        raise UsageError(
+            f"there is no episode {episode} in {trajectory.file}", hint=f"it has {count} episodes, numbered from 0"
+        )
     if not count:
         raise UsageError(f"{trajectory.file} has no episodes", hint="record with --record-mode all")
     return list(range(count)) if episode is None else [episode]
@@ -269,7 +271,7 @@ class Staged:
 def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
     """Build the task of a failure or crash file, and a simulation for each of the recorded environments.
 
-    `named` is the task on the command line: if the recorded task is not installed, its code is used.
+    `named` is the task on the command line; its code is used if neither it nor the recorded task is installed.
 
     Raises:
         TaskError: if the task is not installed any more.
@@ -300,8 +302,8 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
 def replay_calls(trajectory: Trajectory, named: TaskSource | None = None) -> Replay:
     """Simulate every engine call of a failure or crash file again, and compare the states with the recorded ones.
 
-    A state that an event changed between two calls is not compared. `named` is the task on the command line: if the
-    recorded task is not installed, its code is used.
+    A state that an event changed between two calls is not compared. `named` is the task on the command line; its code
+    is used if neither it nor the recorded task is installed.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `stage`.

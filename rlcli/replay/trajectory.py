@@ -46,7 +46,7 @@ from rlcli.sim.divergence_report import MAX_DESCRIBED
 
 FORMAT = 2
 STATE_FIELDS = ("qpos", "qvel", "act", "ctrl")
-"""Fields of the simulation state that a recording holds of each step."""
+"""Fields of the simulation state that a recording holds for each step."""
 MAX_SUBSTEPS = 300_000
 """Physics steps that a replay of engine calls simulates at most."""
 _MAX_BYTES = 2**28
@@ -79,17 +79,17 @@ class Episode(_Strict):
     begin: Count
     """Number of steps in the recording before the episode; 0 in a failure file."""
     length: int = Field(ge=1, le=2**53)
-    """Environment steps."""
+    """Length in environment steps."""
     kept: int = Field(ge=1, le=2**53)
     """Number of steps in the file: the last ones in a failure file, all in a recording."""
     total_reward: float
     """Undiscounted sum of rewards of the whole episode."""
     truncated: bool
-    """Whether it ended by a time-out and no other termination."""
+    """Whether the episode ended by a time-out and no other termination."""
     success: bool | None
-    """Whether it met the task's success condition; None if the task has none."""
+    """Whether the episode met the task's conditions of success; None if the task has none."""
     causes: list[str]
-    """Terminations that fired at its end."""
+    """Terminations that fired in the last step."""
 
     @staticmethod
     def of(env: Environment, ended: Episodes, row: int, begin: int = 0, kept: int | None = None) -> Episode:
@@ -129,13 +129,13 @@ class DivergencePoint(_Strict):
     substep: Count
     """Physics step of that call, counted from 0."""
     time: float
-    """Simulated time at its beginning [s]."""
+    """Simulated time at the beginning of the physics step [s]."""
     cause: str
     """See `rlcli.sim.divergence_report.Divergence`."""
     place: str
     """The joint, actuator or array element whose value shows the divergence."""
     value: str
-    """Its value as Python prints it: `nan`, `1e+30`."""
+    """Value of that joint, actuator or element as text, such as `nan` or `1e+30`."""
 
     def __str__(self) -> str:
         """Return the cause, time and value on one line."""
@@ -160,7 +160,7 @@ class World(_Strict):
     first: Count
     """Index of the first call of the last environment step."""
     diverged_at: DivergencePoint | None
-    """None if it did not diverge, or if one world alone does not reproduce the divergence."""
+    """Where the simulation diverged; None if it did not, or if one world alone does not reproduce the divergence."""
 
     @property
     def ended_by(self) -> str:
@@ -287,7 +287,7 @@ class Trajectory:
         A failure or crash file gets one environment, in which the calls of each recorded environment are simulated.
 
         Args:
-            named: the task that the command line names: if the recorded task is not installed, its code is used.
+            named: the task on the command line; it is used if neither it nor the recorded task is installed.
 
         Raises:
             TaskError: if the task is not installed any more.
@@ -404,7 +404,7 @@ def _check_tensors(header: Header, tensors: Mapping[str, Tensor]) -> None:
             or len(shape) != tensor.dim()
             or any(size not in (None, found) for size, found in zip(shape, tensor.shape, strict=True))
         ):
-            raise ValueError(f"the file is damaged: tensor {name} is missing, or has not the shape in the header")
+            raise ValueError(f"the file is damaged: tensor {name} is missing, or its shape differs from the header")
         expected = torch.float64 if name.startswith("world.") else torch.float32
         if tensor.dtype != expected and not name.endswith(STATE_FIELDS):  # states have the engine's precision
             raise ValueError(f"the file is damaged: tensor {name} has type {tensor.dtype}, expected {expected}")

@@ -74,7 +74,7 @@ def task_card(resolved: Resolved, layout: Mapping[str, Any] | None = None) -> Ca
 
     Args:
         resolved: the configuration.
-        layout: sizes and units of the compiled terms, from `rlcli.envs.vec_env.Layout.record`; None leaves them out.
+        layout: sizes and units of the compiled terms, from `rlcli.envs.layout.Layout.record`; None leaves them out.
     """
     source = resolved.source
     return card(resolved.task, resolved.vocabulary, name=source.name, source=source, layout=layout)

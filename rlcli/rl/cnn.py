@@ -60,7 +60,7 @@ class CnnSpec(BaseModel):
                 )
             if image.shape[0] % image.steps:
                 raise ValueError(
-                    f"an image with {image.shape[0]} channels cannot hold a history of {image.steps} equal steps"
+                    f"`steps: {image.steps}` must divide the {image.shape[0]} channels of an image's `shape`"
                 )
             end = image.stop
             self.sizes(image)
@@ -90,7 +90,7 @@ class CnnSpec(BaseModel):
         return sizes
 
     def features(self, columns: int) -> int:
-        """Return the number of outputs of the CNN for an observation with `columns` columns."""
+        """Return the number of outputs of `Cnn` for `columns` columns: image features, then the columns of no image."""
         kept = columns - sum(math.prod(image.shape) for image in self.pictures)
         return kept + sum(math.prod(self.sizes(image)[-1]) for image in self.pictures)
 

@@ -30,7 +30,7 @@ class EpisodeStatistics:
     - `Episode_Reward/<term>`: mean sum of the term over an episode, divided by the full episode length [s] (Isaac
       Lab's definition);
     - `Episode_Termination/<term>`: share of the episodes that the term ended;
-    - `Metrics/<command>/<metric>`: mean of the means of the episodes;
+    - `Metrics/<command>/<metric>`: mean of `Episodes.metrics`;
     - `Success/<condition>`: share of the episodes at whose end the condition of success held;
     - `Success_Value/<condition>`: mean of the condition's value in the last step.
 

@@ -302,7 +302,7 @@ def size_of(policy: Policy) -> int:
 
 
 def filled(policy: Policy, weights: Mapping[str, Tensor]) -> Policy:
-    """Load the weights of a policy that `blank_policy` has made; return it in evaluation mode.
+    """Load weights into a policy returned by `blank_policy`; return the policy in evaluation mode.
 
     Raises:
         CheckpointError: if the weights do not fit, or a weight is not finite.

@@ -23,7 +23,7 @@ def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
 
     Args:
         run: the run.
-        named: the task on the command line, if there is one. If it is not installed, its code is used.
+        named: the task on the command line; it is used if neither it nor the recorded task is installed. None: no task.
 
     Raises:
         TaskError: if the task is not installed any more.
@@ -44,7 +44,7 @@ def recorded_task(
         record: the record.
         what: name of the task in messages, such as `the task of RUN`.
         run: the run that holds the record, if there is one.
-        named: the task on the command line, if there is one. If it is not installed, its code is used.
+        named: the task on the command line; it is used if neither it nor the recorded task is installed. None: no task.
 
     Raises:
         TaskError: if the task is not installed any more.
@@ -85,7 +85,7 @@ def resolve_run(
         run: the run.
         play: whether to apply the task's `play:` changes.
         flags: dotted key -> value.
-        named: the task on the command line, if there is one. If it is not installed, its code is used.
+        named: the task on the command line; it is used if neither it nor the recorded task is installed. None: no task.
     """
     return resolve(source_of(run, named), play=play, flags=flags)
 

@@ -29,7 +29,7 @@ _ROWS = 4096
 def compare(left: Run, right: Run, *, sections: Iterable[str] = SECTIONS, until: int | None = None) -> list[Section]:
     """Compare two runs, part by part.
 
-    Of configuration and environment all differences are found, of each other part only the first one.
+    All differences of the configuration and the environment are returned, but only the first one of each other part.
 
     Args:
         left: a run.

@@ -47,9 +47,9 @@ class RunLock:
         self._lock.release()
 
     def require(self) -> None:
-        """Check that the file at this path still is the one that this process has locked.
+        """Check that the lock file is still the one that this process has locked.
 
-        It is another one or none if it was deleted, or if the folder was moved away and another folder is in its place.
+        It differs if the file was deleted, or if the folder was moved away and another folder is in its place.
 
         Raises:
             MachineError: if it is not: another process may then lock the folder, too.

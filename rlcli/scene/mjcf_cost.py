@@ -12,7 +12,7 @@ ENDLESS = 1e18
 
 @dataclass(frozen=True, slots=True)
 class ModelCost:
-    """Cost of a model, in ordinary elements; a cost of nothing by default."""
+    """Cost of a model, in ordinary elements; 0 by default."""
 
     size: float = 0.0
     """Cost of the model's elements, with those that it attaches."""

@@ -66,7 +66,7 @@ class _Text:
     replicas: float = 0.0
     """Sum of the counts of the elements `replicate`."""
     free_sensors: int = 0
-    """Sensors of no object, which MuJoCo doubles with every replica."""
+    """Number of sensors without an object, which MuJoCo doubles with every replica."""
     includes: list[tuple[float, Path]] = field(default_factory=list)
     """Number of copies, and file, of each include."""
     models: list[tuple[int, str, Path]] = field(default_factory=list)

@@ -106,7 +106,7 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
 
 @dataclass(slots=True)
 class _Part:
-    """What is known of a regular expression, or of one group in it, while it is read from left to right."""
+    """State of the check of a regular expression, or of one group in it, which reads from left to right."""
 
     repeats: int = 0
     """Number of quantifiers * + {m,n} in the present alternative."""
@@ -115,7 +115,7 @@ class _Part:
     varies: bool = False
     """Whether the part can match texts of several lengths, or has alternatives."""
     last_varies: bool = False
-    """Whether the element that was read last does."""
+    """Whether the element that was read last can match texts of several lengths."""
     _most: tuple[int, int] = (0, 0)
 
     def most(self) -> tuple[int, int]:

@@ -66,7 +66,7 @@ class Scene:
         self._add_sensors()
 
     def add(self, view: View) -> View:
-        """Register an object for access to the simulation, such as a sensor's; it is connected after compilation."""
+        """Register a view such as an `ArticulationView`; the environment connects the view after compilation."""
         self.views.append(view)
         return view
 

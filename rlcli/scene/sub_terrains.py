@@ -30,7 +30,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class PatchSite:
-    """What the shape of one patch of terrain depends on besides its kind: size, resolution, difficulty, randomness."""
+    """Size, resolution, difficulty and random generator of one patch of terrain, whatever its kind of ground."""
 
     size: tuple[float, float]
     """Extent along x and y [m]."""

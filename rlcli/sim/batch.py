@@ -67,7 +67,7 @@ class BatchEngine(BatchWorlds):
             self.state_layout, self._rows, self._batch.warning, self._expanded, self._max_velocity
         )
         self._bound_inputs: list[NDArray[np.float64]] = []
-        """Fields in use of the state, without positions and velocities, to which terms may write."""
+        """Fields of the state that are in use and that terms may write, except positions and velocities."""
         self._substep_fields = config.derived_fields == "substep"
         self.step_stage = _NONE
         """Stage (mjtStage) that is computed after the last substep, for the fields in use."""
@@ -154,8 +154,8 @@ class BatchEngine(BatchWorlds):
         """Return the worlds that diverged since the last call, (num_envs,) bool; None if there are none.
 
         `described_divergences` then has the first of them. MuJoCo itself resets a diverging world to finite values, so
-        that its state shows nothing; its warning counters do, and they are read and cleared after every step. A
-        divergence without a warning leaves a state that is not finite, and then the sum of all states is not finite.
+        the state does not show the divergence. MuJoCo's warning counters show it; they are read and cleared after every
+        step. A divergence without a warning leaves a state that is not finite: the sum of all states is not finite.
 
         This sum takes longer than all other checks. If physics changes only positions and velocities, and the caller
         has checked these (`motion_is_finite`), only the inputs that terms may have written to are summed.

@@ -116,7 +116,7 @@ class BatchWorlds:
         target = self.expand(name)
         require_matching_tensors({name: values}, {name: target}, "model field")
         if not target.dtype.is_floating_point and name not in _FLAGS and not torch.equal(target, values):
-            raise ValueError(f"model field '{name}' is not as saved; restore the MJCF with which the state was saved")
+            raise ValueError(f"model field '{name}' differs from the saved one; restore the MJCF of the saved state")
         target.copy_(values)
 
     def write_own_model(self, env: int, model: mujoco.MjModel) -> None:

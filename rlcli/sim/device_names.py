@@ -1,4 +1,4 @@
-"""Code that names the device `cuda`, on a machine without a GPU: its tensors are on the CPU."""
+"""Context for code that names the device `cuda` on a machine without a GPU: the CPU takes the place of `cuda`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 class CudaAsCpu(TorchFunctionMode):
-    """Context in which torch takes the device `cuda` for the CPU, also in `tensor.cuda()` and `tensor.to("cuda")`."""
+    """Context in which torch uses the CPU for the device `cuda`, also in `tensor.cuda()` and `tensor.to("cuda")`."""
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None

@@ -26,7 +26,7 @@ class Arrow(NamedTuple):
     end: Tensor
     """Tip of the arrow. (num_envs, 3) [m]"""
     color: Color = COMMANDED
-    """Colour; the default is that of commanded values."""
+    """Colour; the default colour marks commanded values."""
     radius: float = 0.015
     """Radius of the shaft [m]."""
     label: str = ""
@@ -39,7 +39,7 @@ class Sphere(NamedTuple):
     center: Tensor
     """Centre of the sphere. (num_envs, 3) [m]"""
     color: Color = COMMANDED
-    """Colour; the default is that of commanded values."""
+    """Colour; the default colour marks commanded values."""
     radius: float = 0.02
     """Radius of the sphere [m]."""
     label: str = ""

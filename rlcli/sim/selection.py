@@ -28,7 +28,7 @@ ALL = slice(None)
 """Index of all columns."""
 DEFAULT_STREAM = np.uint64(0)
 _FEW_ROWS, _AHEAD = 16, 8
-"""In selections of at most so many rows, so many random numbers are computed at once."""
+"""A selection of at most `_FEW_ROWS` rows computes `_AHEAD` random numbers for each row at once."""
 
 
 def in_place(tensor: Tensor) -> Any:
@@ -52,7 +52,10 @@ def one_column(columns: Columns, count: int, parameter: str) -> int:
 
 
 class Selection(Protocol):
-    """Some of the environments, such as those to reset, one row each; `shape` is that of one row's random numbers."""
+    """Some of the environments, such as those to reset. Each selected environment is one row of a result.
+
+    `shape` is the shape of the random numbers of one row.
+    """
 
     @property
     def count(self) -> int | Tensor:
@@ -247,7 +250,7 @@ class IdSelection:
     def _units(self, count: int) -> NDArray[np.float32]:
         """Return the next `count` uniform numbers in [0, 1) of each row. (rows, count)
 
-        For few rows several numbers take as long as one: the next ones are computed with them.
+        For few rows, several numbers take as long as one, so further numbers are computed in advance.
         """
         if len(self.ids) > _FEW_ROWS or count >= _AHEAD:
             return random.uniform(*self._next(count))

@@ -25,8 +25,8 @@ FIELDS_OF_FRICTION = frozenset(["dof_frictionloss", "tendon_frictionloss"])
 def skippable_flags(model: mujoco.MjModel) -> int:
     """Return the disable flags (mjtDisableBit) that can be set without changing a bit of the model's states.
 
-    The flags are valid as long as no integer field of the model changes: integers decide which geoms may touch. That of
-    the constraints also needs unchanged `FIELDS_OF_FRICTION`.
+    The flags are valid as long as no integer field of the model changes: integers decide which geoms may touch. The
+    flag that disables constraints is valid only as long as no field in `FIELDS_OF_FRICTION` changes either.
     """
     flags = 0
     sleeps = model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)

@@ -163,7 +163,7 @@ class WarpWorlds:
         for name, values in substate(state, "model.").items():
             if not values.is_floating_point() and self.expanded(name) is None:
                 raise ValueError(
-                    f"model field '{name}' is not as saved; restore the MJCF with which the state was saved"
+                    f"model field '{name}' differs from the saved one; restore the MJCF of the saved state"
                 )
             require_matching_tensors({name: values}, {name: self.expand(name)}, "engine")
             self.expand(name).copy_(values)

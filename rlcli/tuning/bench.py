@@ -252,7 +252,7 @@ class Bench:
             return Stepped(num_envs, engine_threads, workers, rate, physics, _spread(blocks), resident_memory())
 
     def _too_large(self, num_envs: int) -> str | None:
-        """Return the reason for not measuring so many environments (memory, time); None if they can be measured."""
+        """Return the reason (memory, time) why this number of environments is not measured; None if it is measured."""
         smaller = [row for row in self.findings.stepped if row.left_out is None and row.num_envs < num_envs]
         measured = sorted(smaller, key=lambda row: row.num_envs)
         first, last = (measured[0], measured[-1]) if measured else (None, None)

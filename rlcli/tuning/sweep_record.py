@@ -121,7 +121,7 @@ class Sweep:
     def claim(self) -> Trial | None:
         """Return a trial to run: an unfinished one whose process has died, or a new one; None if none is left.
 
-        A lock lets one process claim a trial at a time, so that no trial starts twice, and no more than `--trials`.
+        A lock lets one process claim a trial at a time: no trial starts twice, and at most `--trials` trials start.
         """
         with _locked(self.folder / _SWEEP_LOCK):
             for trial in self.trials():

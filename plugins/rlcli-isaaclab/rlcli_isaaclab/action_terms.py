@@ -148,7 +148,7 @@ class ThrustAction(AffineActionTerm):
 _LAB_ACTIONS: dict[str, type[ActionTerm]] = {
     kind.__name__: kind for kind in (OperationalSpaceControllerAction, RelativeJointPositionAction, ThrustAction)
 }
-"""Isaac Lab's class -> the class of this package that replaces it: the core's actions run once per step."""
+"""Isaac Lab's class -> the class of this package that replaces it; rlcli's own actions run only once per step."""
 
 
 def find_action(class_type: Any) -> type[ActionTerm] | None:

@@ -78,7 +78,7 @@ def read_actuators(
                 item.note("approximated", "joint_parameter_lookup", "the effort limit is the largest in the table")
                 kind = "DelayedPDActuator"
             models[group] = _read_explicit_actuator(item, kind, order_joints(patterns, item), gains, effort_limit)
-            speed = None if kind == "DCMotor" else _speed_limit(item)  # terms read that of a DC motor by themselves
+            speed = None if kind == "DCMotor" else _speed_limit(item)  # terms read a DC motor's own speed limit
             settings = {**passive, "velocity_limit": speed}
         else:
             item.report.problem(

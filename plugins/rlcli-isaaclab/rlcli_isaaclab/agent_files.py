@@ -169,7 +169,7 @@ def _skrl_network(model: Node) -> tuple[dict[str, Any], dict[str, Any]]:
         if container.get("type") not in (None, "linear"):
             what = f"a network part of type '{container['type']}' has no counterpart in rlcli"
             model.report.problem(
-                model.key, what, "only networks of type: linear (and conv2d layers) are read: write it"
+                model.key, what, "write type: linear; rlcli reads only linear networks and conv2d layers"
             )
         for layer in container.get("layers") or []:
             if isinstance(layer, dict) and "conv2d" in layer:

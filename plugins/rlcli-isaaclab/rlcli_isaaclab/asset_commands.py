@@ -1,4 +1,4 @@
-"""What a task commands to a robot or object: targets of joints, forces on bodies, and calls of `root_physx_view`."""
+"""Commands of a task to a robot or object: joint targets, forces on bodies, and calls of `root_physx_view`."""
 
 from __future__ import annotations
 

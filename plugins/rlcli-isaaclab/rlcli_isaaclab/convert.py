@@ -225,7 +225,7 @@ def _sim(node: Node) -> dict[str, Any]:
         if plain:
             node.skip("physics_material")
         else:
-            text = "the MJCF sets the friction of bodies; scene.ground.friction sets that of the ground"
+            text = "the MJCF sets the friction of bodies; scene.ground.friction sets the friction of the ground"
             node.note("ignored", "physics_material", text)
     if node.data.get("physx"):
         node.note("ignored", "physx", "MuJoCo's solver has its own settings: sim.iterations, sim.tolerance")

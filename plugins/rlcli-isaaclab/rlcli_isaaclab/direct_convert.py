@@ -26,7 +26,7 @@ _KINDS = {"set_joint_effort_target": "motor", "set_joint_velocity_target": "velo
 
 
 def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]) -> PythonTask:
-    """Return the task of a configuration and its environment class. `models` are those of `--model`.
+    """Return the task of a configuration and its environment class. `models`: values of `--model`.
 
     Raises:
         ConfigError: if the task cannot be expressed in rlcli.

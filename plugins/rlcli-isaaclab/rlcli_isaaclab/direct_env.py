@@ -234,7 +234,7 @@ class DirectRLEnvCfg:
         self.rlcli_class = entry
 
     def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
-        """Return this configuration as a task of rlcli. `models` are those of `--model`."""
+        """Return this configuration as a task of rlcli. `models`: values of `--model`."""
         from rlcli_isaaclab.direct_convert import direct_task
 
         return direct_task(self, _environment_class(self), root, models)

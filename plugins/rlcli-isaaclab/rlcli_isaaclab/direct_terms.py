@@ -108,8 +108,8 @@ class DirectRunner:
     def observe(self, group: str, shape: tuple[int, ...]) -> Tensor:
         """Return the observations of a group. The hook runs once per step; `policy` is the first group.
 
-        rlcli also wants the last observations of episodes that end. For them the hook runs once more, and then the task
-        and torch's generator get back the state that they had before.
+        If episodes end, the hook runs once more for their last observations. Afterwards the state of the task and of
+        torch's generator is restored.
         """
         if self.phase == "build":
             return torch.zeros(self.managed.num_envs, *_channels_first(shape), device=self.managed.device)

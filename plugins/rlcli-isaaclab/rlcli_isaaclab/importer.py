@@ -59,7 +59,7 @@ def convert(env: Path, agent_file: Path | None, folder: Path, models: Mapping[st
         env: env.yaml of the run.
         agent_file: RSL-RL's agent.yaml of the run.
         folder: folder to write.
-        models: entity -> MJCF, for entities whose USD file is not in `assets.USD_TO_MJCF`.
+        models: entity -> MJCF, for entities whose USD file is not in `model_lookup.USD_TO_MJCF`.
 
     Raises:
         ConfigError: if the files do not describe a valid task; then nothing is written.

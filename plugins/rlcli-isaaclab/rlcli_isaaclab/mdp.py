@@ -171,7 +171,7 @@ def __getattr__(name: str) -> Any:
 
 
 class _UnknownTermError(AttributeError):
-    """A name that this module lacks. The search for similar names takes milliseconds: only a message needs it."""
+    """Error for a name that this module lacks. It searches for similar names, a slow step, only for its message."""
 
     def __str__(self) -> str:
         near = did_you_mean(self.args[0], _names()) or "docs/reference/isaac-lab-terms.md lists the terms"

@@ -43,10 +43,10 @@ class GivenModels:
 
 
 def given_models(root: Path, asked: Mapping[str, Any]) -> GivenModels:
-    """Return the models that the user gives: `asked`, the values of `--model`, and then every `models.yaml`.
+    """Return the models from `--model` (`asked`) and from every file `models.yaml`.
 
     These files are searched for in the task's folder, in the folders above it that belong to its package, and in the
-    folders of RLCLI_MODELS. Earlier ones win.
+    folders of RLCLI_MODELS. For each name, `--model` wins, then the first file.
 
     Raises:
         TaskError: if a file is not a mapping of text, or names a file that does not exist.

@@ -148,7 +148,7 @@ def _member(module: str, name: str) -> Any:
 
 
 class _UnknownNameError(AttributeError):
-    """A name that Isaac Lab lacks. The search for similar names takes milliseconds: only a message needs it."""
+    """Error for a name that Isaac Lab lacks. It searches for similar names, a slow step, only for its message."""
 
     def __str__(self) -> str:
         name, module = self.args

@@ -70,7 +70,7 @@ def noise_model(cfg: Any, managed: Any) -> NoNoise:
 
 
 def _with_noise(cfg: Any, data: Tensor) -> Tensor:
-    """Return data changed by noise: uniform, gaussian or constant; added, multiplied, or instead of the data."""
+    """Return data with uniform, gaussian or constant noise, which is added, multiplied or replaces the data."""
     if hasattr(cfg, "n_min"):
         noise = torch.rand_like(data) * (cfg.n_max - cfg.n_min) + cfg.n_min
     elif hasattr(cfg, "std"):

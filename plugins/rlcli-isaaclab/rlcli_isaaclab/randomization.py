@@ -100,7 +100,7 @@ class EventParameters:
             self.params.skip(name)
 
     def approximate(self, name: str, why: str) -> None:
-        """Report that rlcli's parameter has nearly the same meaning; `why` tells the difference."""
+        """Report that rlcli's parameter has nearly the same meaning; `why` is the difference."""
         self.params.note("approximated", name, why)
 
 

@@ -161,7 +161,7 @@ class TerrainImporter:
         return self._env.origins
 
     def update_env_origins(self, env_ids: Any, move_up: Tensor, move_down: Tensor) -> None:
-        """Move environments a level up or down. env_ids are those of the running curriculum term."""
+        """Move environments a level up or down. env_ids: the environments of the running curriculum term."""
         from rlcli_isaaclab.runtime import facade_of
 
         selection = facade_of(self._env).selection

@@ -1,6 +1,6 @@
 """Configuration classes of the simulation and of what is spawned. Names as in `isaaclab.sim`, often `sim_utils`.
 
-Settings of Isaac Sim without a counterpart are accepted and reported; docs/guides/isaac-lab.md lists those with one.
+Settings of Isaac Sim without a counterpart are accepted and reported; docs/guides/isaac-lab.md lists the others.
 """
 
 from __future__ import annotations
@@ -57,19 +57,23 @@ GroundPlaneCfg = _settings_class(
     "GroundPlaneCfg", "A ground plane.", func=Spawn("spawn_ground_plane"), size=(100.0, 100.0)
 )
 DomeLightCfg = _settings_class(
-    "DomeLightCfg", "Light from everywhere.", func=Spawn("spawn_light"), prim_type="DomeLight"
+    "DomeLightCfg", "Light from all directions.", func=Spawn("spawn_light"), prim_type="DomeLight"
 )
 DistantLightCfg = _settings_class(
     "DistantLightCfg", "Parallel light.", func=Spawn("spawn_light"), prim_type="DistantLight"
 )
-SphereLightCfg = _settings_class("SphereLightCfg", "A lamp.", func=Spawn("spawn_light"), prim_type="SphereLight")
-DiskLightCfg = _settings_class("DiskLightCfg", "A lamp.", func=Spawn("spawn_light"), prim_type="DiskLight")
-CylinderLightCfg = _settings_class("CylinderLightCfg", "A lamp.", func=Spawn("spawn_light"), prim_type="CylinderLight")
+SphereLightCfg = _settings_class(
+    "SphereLightCfg", "A spherical light.", func=Spawn("spawn_light"), prim_type="SphereLight"
+)
+DiskLightCfg = _settings_class("DiskLightCfg", "A light from a disk.", func=Spawn("spawn_light"), prim_type="DiskLight")
+CylinderLightCfg = _settings_class(
+    "CylinderLightCfg", "A cylindrical light.", func=Spawn("spawn_light"), prim_type="CylinderLight"
+)
 UsdFileCfg = _settings_class(
-    "UsdFileCfg", "A model by its USD path; assets.py maps it to an MJCF.", func=Spawn("spawn_from_usd")
+    "UsdFileCfg", "A model by its USD path, which `model_lookup` maps to an MJCF.", func=Spawn("spawn_from_usd")
 )
 UrdfFileCfg = _settings_class(
-    "UrdfFileCfg", "A model by its URDF path; assets.py maps it.", func=Spawn("spawn_from_urdf")
+    "UrdfFileCfg", "A model by its URDF path, which `model_lookup` maps to an MJCF.", func=Spawn("spawn_from_urdf")
 )
 CuboidCfg = _settings_class("CuboidCfg", "A box; `size` are its edges [m].", func=Spawn("spawn_cuboid"))
 SphereCfg = _settings_class("SphereCfg", "A sphere.", func=Spawn("spawn_sphere"))

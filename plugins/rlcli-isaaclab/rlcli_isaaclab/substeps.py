@@ -29,8 +29,8 @@ class StepCode(Protocol):
 class Substeps:
     """Caller of a task's code before each physics step of an environment.
 
-    Between the physics steps of one environment step rlcli does not update the values that it caches. Code that reads a
-    state there gets it updated, once per physics step.
+    Between the physics steps of one environment step rlcli does not update the values that it caches. If the code reads
+    a state there, the state is updated first, once per physics step.
     """
 
     def __init__(self, managed: VecEnv, name: str, code: StepCode) -> None:

@@ -197,7 +197,7 @@ class TermReader(ObjectReader):
                 self.report.entries[(*node.key, "func")] = ("approximated", why)
             entity = config.get("entity", "robot")
             if name in EFFORT_TERMS and self.scene.damped_joints(entity, self.driven_joints.get(entity, {})):
-                why = "without the damping of implicit actuators with zero stiffness, which becomes that of the joint"
+                why = "without the damping of implicit actuators with zero stiffness, which becomes joint damping"
                 self.report.entries[(*node.key, "func")] = ("approximated", why)
         else:
             config = self._read_user_term(section, function, name, node, params)

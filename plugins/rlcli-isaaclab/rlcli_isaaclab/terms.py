@@ -49,7 +49,7 @@ class TermContext:
     """Parts of a configuration that only the user's terms read."""
 
     cfg: Any = None
-    """The user's configuration object; None: that of rlcli."""
+    """The user's configuration object; None: rlcli's configuration."""
     frames: dict[str, Any] = field(default_factory=dict)
     """Settings of the frame transformers, by name."""
 
@@ -227,7 +227,7 @@ def entity_data(settings: Any) -> dict[str, Any]:
 
 
 _CHECKS_FOR_LIST = re.compile(r"isinstance\([\w.]+\.(joint|body)_ids, list\)")
-"""Code that tells a list of ids, as Isaac Lab has it, from a slice. rlcli has tensors, which a GPU need not copy."""
+"""Code that checks for a list of ids, Isaac Lab's form. rlcli has tensors of ids, which a GPU need not copy."""
 _AFTER_RESET = {"rewards": ("reward_manager", torch.float32), "terminations": ("termination_manager", torch.bool)}
 """Sections whose terms Isaac Lab first calls in the first step: their manager, and the type of their values."""
 
@@ -245,7 +245,7 @@ class _Bound:
             value = self.term(self._env, selection.env_ids(), **self.params)
             # a curriculum term may return several values to log; rlcli logs one
             return next(iter(value.values()), None) if isinstance(value, dict) else value
-        if self._reads_reset:  # the first value has the shape of all values: let the reset make what the term reads
+        if self._reads_reset:  # the reset events create attributes on which the shape of the value depends
             self._reads_reset = False
             self._env.run_own_reset_events()
         manager, dtype = _AFTER_RESET.get(self._section, ("num_envs", None))

@@ -19,7 +19,7 @@ _SEGMENTS = 16
 
 
 class Matrix:
-    """Pose as USD writes it: a point is a row, and multiplied from the left."""
+    """Pose as a matrix in the convention of USD: a point is a row vector p, and is moved to p M."""
 
     def __init__(self, values: NDArray[np.float64]) -> None:
         self._values = values

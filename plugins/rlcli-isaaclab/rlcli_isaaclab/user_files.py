@@ -57,7 +57,7 @@ _BODY_FORCES = (
 def placed(target: Any, device: Any) -> Any:
     """Return a function or class of the user's, changed if that is needed to run on a device.
 
-    If the device is the CPU and the file names the device `cuda`, the code takes `cuda` for the CPU.
+    If the device is the CPU and the file names the device `cuda`, the code runs with the CPU in place of `cuda`.
     """
     kinds = [kind for kind in reversed(getattr(target, "__mro__", (target,))) if not is_framework(kind.__module__)]
     if str(device) != "cpu" or not any("cuda" in file_text(kind) for kind in kinds):

@@ -58,7 +58,7 @@ class LightsConfig(StrictModel):
     dome: DomeLightConfig | None = None
     """Ambient light; null: none."""
     distant: DistantLightConfig | None = None
-    """Parallel light like that of the sun; null: none."""
+    """Parallel light, like sunlight; null: none."""
 
 
 class JointConfig(StrictModel):
@@ -77,7 +77,8 @@ class JointConfig(StrictModel):
     effort_limit: Positive | None = None
     """Largest force or torque of the joint's actuator [N or N m]."""
     velocity_limit: Positive | None = None
-    """Speed limit that terms read [m/s or rad/s]; the physics does not enforce it. null: that of its dc_motor."""
+    """Speed limit that terms read [m/s or rad/s]; the physics does not enforce it. null: the `velocity_limit` of the
+    joint's dc_motor."""
     actuator: Literal["motor", "position", "velocity"] | None = None
     """Actuator to add if the MJCF has none of this kind. Action terms add the actuators that they need by
     themselves."""
@@ -107,8 +108,8 @@ class ActuatorConfig(StrictModel):
     saturation_effort: Positive | None = None
     """Stall force or torque of a dc_motor [N or N m]."""
     velocity_limit: Positive | dict[str, Positive] | None = None
-    """No-load speed of a dc_motor [m/s or rad/s], like `stiffness` one for all joints or one for each. Terms read it as
-    the speed limit of joints whose own `velocity_limit` is null."""
+    """No-load speed of a dc_motor [m/s or rad/s]: one number for all joints, or a mapping as in `stiffness`. Terms read
+    it as the speed limit of joints whose own `velocity_limit` is null."""
     delay: StepRange = (0, 0)
     """[low, high] physics steps until a command takes effect, both included. One number is drawn for each environment
     at the start of an episode."""
@@ -229,9 +230,9 @@ class SceneConfig(StrictModel):
     num_envs: Annotated[int, Field(ge=1, le=1 << 24)] = 1024
     """Number of environments that are simulated in parallel."""
     workers: Annotated[int, Field(ge=1, le=1024)] | Literal["auto"] = "auto"
-    """Number of processes that step the environments of a training on a CPU. No result depends on it. auto: as many as
-    make the steps of this number of environments faster on these cores; one for a task with cameras or with code of its
-    own."""
+    """Number of processes that step the environments of a training on a CPU. Results do not depend on this number.
+    auto: chosen by the number of environments, the cores and the free memory; 1 for a task with cameras, and for a task
+    of your own with Python code."""
     env_spacing: NotNegative = 4.0
     """Distance between environments in viewers [m]. In the physics each environment is a world with its own origin."""
     ground: GroundConfig | None = GroundConfig()

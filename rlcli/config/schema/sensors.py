@@ -31,7 +31,7 @@ class ContactSensorConfig(StrictModel):
     against: Literal["ground"] | TouchedConfig | None = None
     """The other side of the contacts: ground (the plane or the terrain) or bodies of an entity; null: everything."""
     history: Count = 1
-    """Number of environment steps in `force_history`."""
+    """Number of environment steps whose forces the sensor keeps, in `force_history`."""
     force_threshold: NotNegative = 0.0
     """Smallest net force with which a body counts as in contact [N]; 0: every contact counts."""
 

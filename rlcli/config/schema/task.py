@@ -39,29 +39,29 @@ class SimConfig(StrictModel):
     gravity: Vec3 = (0.0, 0.0, -9.81)
     """Gravity in the world frame [m/s^2]."""
     integrator: Literal["euler", "rk4", "implicit", "implicitfast"] | None = None
-    """MuJoCo's integrator; null: the one in the MJCF of the first entity."""
+    """MuJoCo's integrator; null: the integrator in the MJCF of the first entity."""
     iterations: Count | None = None
-    """Largest number of solver iterations; null: the one in the MJCF of the first entity."""
+    """Largest number of solver iterations; null: the number in the MJCF of the first entity."""
     ls_iterations: Count | None = None
-    """Largest number of line-search iterations of the solver; null: the one in the MJCF of the first entity."""
+    """Largest number of line-search iterations of the solver; null: the number in the MJCF of the first entity."""
     engine: Literal["auto", "batch", "warp"] = "auto"
     """Physics engine. batch: MuJoCo on CPU threads; warp: MuJoCo Warp on a GPU; auto: batch on a CPU, warp on a GPU."""
     engine_threads: Threads | None = None
     """Number of CPU threads that step the physics; null: one for each core that this process may use."""
     forces_after_reset: bool = True
     """true: compute accelerations and forces also for the start state of an episode; false: they are 0 until the first
-    step. On a GPU, false saves one mj_forward of all environments in each step if terms read them."""
+    step. If terms read accelerations or forces on a GPU, false saves one mj_forward of all environments per step."""
     derived_fields: Literal["current", "substep"] = "current"
     """State that MuJoCo's derived fields (xpos, cvel, sensordata, ...) belong to. current: the state after the
-    environment step; substep: the state before the last physics step, as after `mj_step`, which saves computing them
-    again."""
+    environment step; substep: the state before the last physics step, as after `mj_step`. substep is faster, because
+    the fields are not computed again."""
     external_forces: bool = False
     """true: compute `cfrc_ext`, the contact forces on bodies, after every step, as `mj_rnePostConstraint` does. They
     are 0 in a start state. On a CPU this takes about 15 us for each environment that has contacts."""
     max_velocity: Positive | None = None
     """Speed of a joint or a free body [m/s or rad/s] above which an environment counts as diverged; checked after every
-    environment step. null: MuJoCo's own limit, 1e10. A body that a contact accelerates to a finite 1e6 m/s would spoil
-    the training."""
+    environment step. null: MuJoCo's own limit, 1e10. A lower limit also catches large finite speeds, such as 1e6 m/s
+    after a bad contact, which would spoil the training."""
     contacts_per_env: Count | None = None
     """Number of contacts for each environment that warp allocates memory for; null: estimated from the model."""
     constraints_per_env: Count | None = None

@@ -203,7 +203,8 @@ class DelayConfig(StrictModel):
     """Delay in environment steps: a number, or [low, high], both included, drawn for each environment at the start of
     an episode."""
     seconds: NotNegative | tuple[NotNegative, NotNegative] | None = None
-    """Delay in seconds, a multiple of the control period (sim.dt x decimation)."""
+    """Delay in seconds: a number, or [low, high], as in `steps`. Each must be a multiple of the control period
+    (sim.dt x decimation)."""
     redraw: Share = 0.0
     """Probability that an environment draws a new delay in a step, in [0, 1]."""
 

@@ -8,7 +8,7 @@ from rlcli.config.schema.base import Count, NotNegative, Positive, Range, ShareR
 
 
 class PatchConfig(StrictModel):
-    """Keys that all kinds of generated ground share. In their other keys, a pair of values is [easiest, hardest]."""
+    """Keys that all kinds of generated ground share."""
 
     proportion: NotNegative = 1.0
     """Share of the columns (without curriculum: of the patches), relative to the other sub-terrains."""

@@ -57,7 +57,7 @@ class Channel:
         return kind.rstrip(b"\0"), pickle.loads(self._read(size)) if size else None
 
     def is_silent(self, seconds: float) -> bool:
-        """Wait for a message or the end of the other process; return whether there is none after so many seconds."""
+        """Wait for a message or the end of the other process; return whether neither came within `seconds`."""
         return not select.select([self._socket], [], [], seconds)[0]
 
     def wait_until_closed(self) -> None:

@@ -67,7 +67,7 @@ class ShardedEngine:
 
     @property
     def history(self) -> StateHistory:
-        """History of the first shard's calls; all shards record equally many."""
+        """History of the first shard's calls; all shards record the same number of calls."""
         return self._local.history
 
     @property

@@ -169,7 +169,7 @@ class ShardedEnv(Environment):
         """Do nothing: a CPU raises errors in the step."""
 
     def extras(self) -> dict[str, float]:
-        """Return further values to log: those of the task (`extras`, curriculum), and new divergences by cause."""
+        """Return values to log, by metric: means of the task's `extras` or curriculum, and new divergences by cause."""
         return {**means(self._metric_values()), **sums(self.call_all(_divergence_metrics))}
 
     def step_metrics(self) -> dict[str, Tensor]:
@@ -178,7 +178,7 @@ class ShardedEnv(Environment):
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of everything that the next steps depend on; the same as that of one process."""
+        """Return copies of everything that the next steps depend on, the same tensors as in a single process."""
         # of all saved values, only the means that curriculum terms log are computed over all environments
         logged = {name.removeprefix("Curriculum/"): value for name, value in self._metric_values().items()}
         averages = {f"workflow.curriculum.value.{name}": mean_of(value) for name, value in logged.items()}
@@ -188,7 +188,7 @@ class ShardedEnv(Environment):
         )
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Restore the state returned by `state_dict()`, of any number of processes."""
+        """Restore a state returned by `state_dict()`, also with another number of processes."""
         shapes = self.call_all(_state_shapes)
         present = {name: [part[name] for part in shapes] for name in shapes[0]}
         own, *others = split_state(state, present, self._shards)
@@ -236,7 +236,7 @@ class ShardedEnv(Environment):
 
     def share(self, specs: Mapping[str, ArraySpec]) -> dict[str, Tensor]:
         """Return new tensors, zeros, that all processes share; in each process they are in `VecEnv.shard.shared`."""
-        self._require_whole()
+        self._require_usable()
         self._specs = {**self._specs, **specs}
         self._workers.request(worker.SHARE, (self._specs, list(specs)))
         tensors = map_tensors(self._workers.arrays, self._specs)
@@ -249,14 +249,14 @@ class ShardedEnv(Environment):
 
         `function` must be defined in a module.
         """
-        self._require_whole()
+        self._require_usable()
         self._workers.request(worker.CALL, (function, arguments))
         with self._unread_replies():
             try:
                 own = function(self.local, *arguments)
             except KeyboardInterrupt:
                 raise
-            except BaseException:  # an unread reply would be taken for the next one
+            except BaseException:  # else the next call would read this reply
                 self._workers.replies()
                 raise
             values = self._workers.replies()
@@ -264,7 +264,7 @@ class ShardedEnv(Environment):
 
     def call_one(self, env: int, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return `function(vec_env, row, *arguments)`, called in the shard where environment `env` is a `row`."""
-        self._require_whole()
+        self._require_usable()
         number = next(n for n, shard in enumerate(self._shards) if env < shard.first + shard.count)
         row = env - self._shards[number].first
         if number == 0:
@@ -278,9 +278,9 @@ class ShardedEnv(Environment):
 
     def _begin(self) -> None:
         """Choose the shared buffer (slot) of the next result, and set the stages at which shards wait for observers."""
-        self._require_whole()
+        self._require_usable()
         self._slot = (self._slot + 1) % SLOTS
-        self._command[:2] = self._slot, Needs.of(self.observers).value
+        self._command[:2] = self._slot, Needs.of_observers(self.observers).value
 
     @contextlib.contextmanager
     def _in_step(self) -> Iterator[None]:
@@ -298,7 +298,7 @@ class ShardedEnv(Environment):
             self._is_broken = True
             raise
 
-    def _require_whole(self) -> None:
+    def _require_usable(self) -> None:
         if self._is_broken and not self._stage:
             raise RuntimeError("a step was interrupted, and the environment cannot be used any more; create a new one")
 

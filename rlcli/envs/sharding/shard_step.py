@@ -54,7 +54,7 @@ class Needs(enum.Flag):
     ON_STEP = enum.auto()
 
     @staticmethod
-    def of(observers: Observers) -> Needs:
+    def of_observers(observers: Observers) -> Needs:
         """Return the kinds of observers that are registered."""
         needs = Needs(0)
         needs |= Needs.AFTER_PHYSICS if observers.after_physics else needs
@@ -73,7 +73,7 @@ class Columns:
     condition_values: tuple[str, ...]
 
     @staticmethod
-    def of(episodes: Episodes) -> Columns:
+    def of_episodes(episodes: Episodes) -> Columns:
         """Return the names of the values that these episodes have."""
         named = (episodes.reward_terms, episodes.causes, episodes.metrics)
         return Columns(*(tuple(part) for part in (*named, episodes.conditions, episodes.condition_values)))
@@ -187,14 +187,14 @@ class ShardRunner:
         self._reward[self._slot].copy_(record.reward)
         self._reward_terms.copy_(record.reward_terms)
         self._publish_episodes(record.episodes)
-        return self._take_columns()
+        return self._pop_new_columns()
 
     def _end(self, obs: Mapping[str, Tensor]) -> None:
         self._check()
         for group, values in obs.items():
             self._obs[self._slot][group].copy_(values)
         self._seconds[0], self._seconds[1] = self.env.seconds["physics"], self.env.seconds["step"]
-        self.stop(Stage.DONE, self._take_columns())
+        self.stop(Stage.DONE, self._pop_new_columns())
 
     def _observe(self, needs: Needs) -> None:
         """Stop at the stages that the observers of the main process need from now on."""
@@ -207,12 +207,12 @@ class ShardRunner:
         self._counts[0] = count = 0 if episodes is None else len(episodes.ids)
         if episodes is None:
             return
-        columns = Columns.of(episodes)
+        columns = Columns.of_episodes(episodes)
         if columns != self._columns:
             if columns.count > len(self._episodes):
                 raise RlcliError(
                     f"the task has {columns.count} values per episode (reward terms, causes, metrics, conditions of"
-                    f" success); several workers allow {len(self._episodes)}",
+                    f" success); with several workers at most {len(self._episodes)} are allowed",
                     hint="set scene.workers: 1",
                 )
             self._columns = self._new_columns = columns
@@ -223,7 +223,7 @@ class ShardRunner:
         for row, value in zip(self._episodes, values, strict=False):  # in numpy: its calls take a third of torch's time
             row[:count] = value.numpy()
 
-    def _take_columns(self) -> Columns | None:
+    def _pop_new_columns(self) -> Columns | None:
         columns, self._new_columns = self._new_columns, None
         return columns
 

@@ -52,7 +52,12 @@ class Job:
 
 
 def main(connection: int, arrays: int) -> None:
-    """Answer the main process through two file descriptors: a socket, and the file of the shared tensors."""
+    """Serve the main process until it ends or closes the connection.
+
+    Args:
+        connection: file descriptor of the socket to the main process.
+        arrays: file descriptor of the file of the shared tensors.
+    """
     for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1"):  # the main process decides when its workers end
         signal.signal(getattr(signal, name), signal.SIG_IGN)
     channel = Channel(socket.socket(fileno=connection), SPIN_S)
@@ -64,7 +69,7 @@ def main(connection: int, arrays: int) -> None:
         except ChannelClosedError:
             raise
         except BaseException as error:  # of an import, or of a message that cannot be read
-            channel.send(ERROR, _PortableError.of(error))
+            channel.send(ERROR, _PortableError.from_exception(error))
             channel.wait_until_closed()
     os._exit(0)  # without waiting for the engine's threads
 
@@ -81,11 +86,11 @@ def _serve(channel: Channel, arrays: int) -> None:
         while True:
             kind, content = channel.receive()
             try:
-                worker.do(kind, content)
+                worker.handle(kind, content)
             except ChannelClosedError:
                 raise
             except BaseException as error:
-                channel.send(ERROR, _PortableError.of(error))
+                channel.send(ERROR, _PortableError.from_exception(error))
 
 
 class _Worker:
@@ -94,7 +99,7 @@ class _Worker:
         self._env: VecEnv | None = None
         self._check: Callable[[], None] = lambda: None
 
-    def do(self, kind: bytes, content: Any) -> None:
+    def handle(self, kind: bytes, content: Any) -> None:
         """Execute the request of a message (step, reset, call, ...), and reply."""
         if kind == STEP:
             self._runner.step()
@@ -167,7 +172,7 @@ class _GlobalGenerators:
     """Detector of a task's use of the global random generators, of which each process has its own."""
 
     def __init__(self) -> None:
-        self._states = self._read()
+        self._states = self._read_states()
 
     def require_unused(self) -> None:
         """Check that no random number has been drawn since this object was made.
@@ -175,7 +180,7 @@ class _GlobalGenerators:
         Raises:
             TaskError: with the library whose generator was used.
         """
-        used = [name for name, state in self._read().items() if state != self._states[name]]
+        used = [name for name, state in self._read_states().items() if state != self._states[name]]
         if used:
             raise TaskError(
                 f"the task uses the global random generator of {used[0]}; with several workers the"
@@ -184,7 +189,7 @@ class _GlobalGenerators:
             )
 
     @staticmethod
-    def _read() -> dict[str, Any]:
+    def _read_states() -> dict[str, Any]:
         import numpy as np
         import torch
 
@@ -206,7 +211,7 @@ class _PortableError:
     trace: str
 
     @staticmethod
-    def of(error: BaseException) -> _PortableError:
+    def from_exception(error: BaseException) -> _PortableError:
         """Return the portable form of an exception; one of a task's own class becomes a RuntimeError."""
         trace = "".join(traceback.format_exception(error))
         if isinstance(error, RlcliError):

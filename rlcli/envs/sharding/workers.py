@@ -56,7 +56,7 @@ class Worker:
             )
         self._channel = Channel(ours, SPIN_S)
         self._was_named = False
-        """Whether a warning has named it because it did not answer."""
+        """Whether a warning that the worker does not answer has been logged."""
 
     def send(self, kind: bytes, content: Any = None) -> None:
         """Send a message.
@@ -67,7 +67,7 @@ class Worker:
         try:
             self._channel.send(kind, content)
         except ChannelClosedError:
-            raise self._ended() from None
+            raise self._ended_error() from None
 
     def receive(self) -> tuple[bytes, Any]:
         """Wait for a message.
@@ -79,7 +79,7 @@ class Worker:
         try:
             kind, content = self._channel.receive(self._warn_if_silent)
         except ChannelClosedError:
-            raise self._ended() from None
+            raise self._ended_error() from None
         if kind == worker.ERROR:
             raise content.rebuild()
         return kind, content
@@ -93,14 +93,14 @@ class Worker:
         """Return whether the process has ended."""
         return self._process.poll() is not None
 
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """Close the connection; the process then ends, also if it was stopped."""
         self._channel.close()
         if os.name == "posix" and not self.has_ended():
             self._process.send_signal(signal.SIGCONT)
 
     def wait(self, seconds: float) -> None:
-        """Wait for the end of the process; after this time kill it."""
+        """Wait for the end of the process; kill it if it still runs after `seconds`."""
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -120,7 +120,7 @@ class Worker:
                 self.pid,
             )
 
-    def _ended(self) -> MachineError:
+    def _ended_error(self) -> MachineError:
         """Return the error for a process that has ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_CLOSE_S)
@@ -173,7 +173,7 @@ class Workers:
             process.send(kind, content)
 
     def replies(self) -> list[Any]:
-        """Wait for a reply of every worker; return their contents.
+        """Wait for one reply of every worker; return the contents of the replies, in the order of the workers.
 
         Raises:
             MachineError: if a process has ended.
@@ -204,7 +204,7 @@ def start_early(count: int) -> None:
 
 
 def take_workers(count: int) -> Workers:
-    """Return the `count` processes that were started early; start them if another number or none was started."""
+    """Return `count` worker processes: those of `start_early` if it started this number, else new ones."""
     if _early and len(_early[-1]) == count:
         return _early.pop()
     close_early()
@@ -227,7 +227,7 @@ def _create_shared_file() -> int:
 
 def _close(workers: list[Worker], arrays: int) -> None:
     for process in workers:
-        process.hang_up()
+        process.disconnect()
     end = time.monotonic() + _CLOSE_S
     for process in workers:
         process.wait(max(0.0, end - time.monotonic()))

@@ -119,7 +119,7 @@ class RandomizePdGains(DrawKeys, JointTerm):
 class RandomizeEffortLimit(RangeKeys, ActuatorTerm):
     """Random effort limits of actuators, the same in both directions of the joint [N or N m].
 
-    The limit of a joint with an actuator model (`kind: pd` or `dc_motor`) is that of the model.
+    For a joint with an actuator model (`kind: pd` or `dc_motor`), the effort limit of the model is drawn.
     """
 
     derives = False
@@ -162,10 +162,10 @@ class RandomizeEffortLimit(RangeKeys, ActuatorTerm):
 
 @dataclass(kw_only=True, eq=False)
 class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
-    """Random strength of actuators: a factor on their whole effort, with its limits; 0.9 is a motor 10 % too weak.
+    """Random strength of actuators: a factor on their effort and its limits; 0.9 is a motor that is 10 % too weak.
 
-    Works for MuJoCo's own actuators of every kind whose force is linear, and for actuator models, whose
-    `applied_effort` stays the effort before the factor. No other event may change gains or limits of the same model.
+    The term supports MuJoCo's own actuators whose force is linear, and actuator models. `applied_effort` of an actuator
+    model is the effort before the factor. No other event may change gains or limits of the same model.
     """
 
     derives = False
@@ -179,7 +179,7 @@ class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
         gain, bias = model.actuator_gaintype[ids], model.actuator_biastype[ids]
         is_linear = (gain <= int(mujoco.mjtGain.mjGAIN_AFFINE)) & (bias <= int(mujoco.mjtBias.mjBIAS_AFFINE))
         linear = is_linear.tolist()
-        require_supported(self.entity, "Actuators", self.actuators, linear, "with nonlinear force", "leave out muscles")
+        require_supported(self.entity, "Actuators", self.actuators, linear, "with nonlinear force", "select no muscles")
         events = getattr(self.env, "config").events.items()  # noqa: B009 (events exist in managed environments only)
         others = [name for name, event in events if event is not None and _changes_actuators(event)]
         if others:
@@ -197,7 +197,7 @@ class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
 
 
 _AXES = {"actuator_gainprm": [0, 1, 2], "actuator_biasprm": [0, 1, 2]}
-"""Columns of a linear force (constant, length, velocity); the further columns belong to muscles."""
+"""Field -> its columns for a linear force (constant, length, velocity); further columns belong to muscles."""
 
 
 def _changes_actuators(event: Any) -> bool:

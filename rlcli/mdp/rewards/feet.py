@@ -30,7 +30,10 @@ def desired_contacts(env: ManagedEnv, *, sensor: ContactSensor, threshold: float
 
 
 def contact_forces(env: ManagedEnv, *, sensor: ContactSensor, threshold: float) -> Tensor:
-    """Sum of the excess of contact forces over `threshold`, the largest in the sensor's history [N]. (num_envs,)"""
+    """Sum of max(force - threshold, 0) over the sensor's bodies [N]. (num_envs,)
+
+    force: largest contact force of the body in the sensor's history.
+    """
     return (strongest_force(sensor) - threshold).clamp_(min=0.0).sum(dim=1)
 
 
@@ -42,7 +45,7 @@ def self_collision_cost(env: ManagedEnv, *, sensor: ContactSensor) -> Tensor:
 def feet_air_time(env: ManagedEnv, *, sensor: ContactSensor, command: Command, threshold: float) -> Tensor:
     """Sum of (time in the air - threshold) of the feet that touch down in this step [s]. (num_envs,)
 
-    0 where the commanded speed is below 0.1 m/s.
+    0 where the commanded speed is at most 0.1 m/s.
     """
     excess = (sensor.last_air_time - threshold) * sensor.first_contact
     return excess.sum(dim=1) * (commanded_speed(command) > 0.1)
@@ -51,9 +54,9 @@ def feet_air_time(env: ManagedEnv, *, sensor: ContactSensor, command: Command, t
 def feet_air_time_positive_biped(
     env: ManagedEnv, *, sensor: ContactSensor, command: Command, threshold: float
 ) -> Tensor:
-    """Time for which exactly one foot has been in contact, at most `threshold` [s]. (num_envs,)
+    """Time since which exactly one of two feet has been in contact, clipped to `threshold` [s]. (num_envs,)
 
-    0 where the commanded speed is below 0.1 m/s.
+    0 where both or no feet are in contact, or the commanded speed is at most 0.1 m/s.
     """
     down = sensor.contact_time > 0.0
     lasted = torch.where(down, sensor.contact_time, sensor.air_time).amin(dim=1).clamp(max=threshold)
@@ -63,7 +66,7 @@ def feet_air_time_positive_biped(
 def feet_slide(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies, sensor: ContactSensor) -> Tensor:
     """Sum of the horizontal speeds of feet with more than 1 N within the sensor's history [m/s]. (num_envs,)
 
-    bodies: those of the sensor, in its order.
+    bodies: the bodies of the sensor, in the same order.
     """
     return foot_slip_penalty(env, entity=entity, bodies=bodies, sensor=sensor)
 
@@ -73,7 +76,7 @@ def foot_slip_penalty(
 ) -> Tensor:
     """Sum of the horizontal speeds of feet with more than `threshold` [N] in the sensor's history [m/s]. (num_envs,)
 
-    bodies: those of the sensor, in its order.
+    bodies: the bodies of the sensor, in the same order.
     """
     speed = length(require_one_per_body(entity.data.body_lin_vel_of(bodies)[..., :2], sensor, "bodies"))
     return (speed * (strongest_force(sensor) > threshold)).sum(dim=1)

@@ -192,7 +192,7 @@ def joint_velocity_hinge_penalty(
 
 
 def applied_torque_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*") -> Tensor:
-    """Sum of the efforts that actuators withhold because of their limits [N or N m]. (num_envs,)
+    """Sum over joints of the magnitude by which limits reduce the actuators' effort [N or N m]. (num_envs,)
 
     The efforts of MuJoCo's own actuators follow from the present state and controls. Isaac Lab: explicit actuators
     only, with values of the last substep.

@@ -61,7 +61,7 @@ def object_is_lifted(
 ) -> Tensor:
     """1 where an object is higher than `minimal_height` [m] above its environment's origin. (num_envs,)
 
-    held_within: 0 where the object is farther than this [m] from the site of `entity`, so that a throw earns nothing.
+    held_within: distance of the object from the site of `entity` [m] above which the value is 0, as after a throw.
     """
     lifted = object.data.root_pos_w[:, 2] - env.origins[:, 2] > minimal_height
     if held_within is None:

@@ -152,7 +152,8 @@ class PpoConfig(AgentConfig):
     normalize_observations: bool = False
     """Normalise observations by their running mean and standard deviation, which are part of the policy."""
     normalizer_update: Literal["rollout", "step"] = "rollout"
-    """When these statistics are updated: at the end of a rollout, or in each step before the action."""
+    """When the statistics of normalize_observations are updated: at the end of a rollout, or in each step before the
+    action."""
     normalize_value: bool = False
     """Train the critic on returns normalised by their running mean and standard deviation."""
 

@@ -46,7 +46,7 @@ class LayerGradients(Protocol):
 
 
 MakeLayerGradients = Callable[[Sequence[Tensor]], LayerGradients]
-"""Factory of a computation that writes to the given gradients of the parameters."""
+"""Function of tensors for the gradients of the parameters; it returns the function that writes to them."""
 
 
 def threaded_gradients(networks: ActorCritic, rows: int, threads: int) -> MakeLayerGradients:

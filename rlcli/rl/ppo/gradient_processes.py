@@ -87,7 +87,7 @@ class _Job:
 
 
 class _Share:
-    """Gradient computation of one process: it computes every n-th part of a minibatch, in shared memory."""
+    """Gradient computation of one of n processes: every n-th part of a minibatch, in shared memory."""
 
     def __init__(self, env: VecEnv, job: _Job) -> None:
         tensors = {name.removeprefix("gradient."): tensor for name, tensor in env.shard.shared.items()}

@@ -15,7 +15,7 @@ from rlcli.formats import Status
 
 
 class Sink(Protocol):
-    """Receiver of what is read. `at` is the place of a key in the file: `("params", "config", "gamma")`."""
+    """Receiver of settings, notes and mistakes. `source` and `path` are places in the file: ("params", "config")."""
 
     def put(self, target: Path, value: Any, source: Path, /) -> None:
         """Set a setting of `ppo`."""

@@ -33,7 +33,10 @@ class Samples:
 
     @classmethod
     def views(cls, packed: Tensor, obs: int, critic_obs: int, action: int) -> Samples:
-        """Return the columns of `packed`; if `critic_obs` is 0, the critic reads the actor's observation."""
+        """Return views of the columns of `packed`, given the number of columns of each part.
+
+        If `critic_obs` is 0, the critic reads the actor's observation.
+        """
         parts = packed.split_with_sizes([obs, critic_obs, action, action, 1, 1, 1, 1, 1], dim=-1)
         scalars = [part.squeeze(-1) for part in parts[4:]]
         return cls(parts[0], parts[1] if critic_obs else parts[0], parts[2], parts[3], *scalars)
