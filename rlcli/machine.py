@@ -157,7 +157,8 @@ def memory_error(error: BaseException | None) -> MachineError | None:
         if isinstance(error, MemoryError) or (
             not isinstance(error, RlcliError) and (_NO_MEMORY.search(text) or (limit and _UNDER_A_LIMIT.search(text)))
         ):
-            hint = "close other programs, raise the limit of the process (`ulimit -v`), or lower scene.num_envs"
+            sizes = "scene.num_envs, or the sizes of networks and histories"
+            hint = f"close other programs, raise the limit of the process (`ulimit -v`), or lower {sizes}"
             return MachineError(f"too little memory{limited}: {one_line(error, 200)}", hint=hint)
         error = error.__cause__ or error.__context__
     return None

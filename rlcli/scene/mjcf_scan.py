@@ -33,8 +33,12 @@ _MAX_ATTRIBUTES = 200
 _MAX_LOOKUPS = 50_000
 """Largest number of assets times folders in which MuJoCo may look for them."""
 _TEXT = (".xml", ".mjcf", ".urdf")
-_NOT_FINITE = re.compile(r"[-+]?(nan|inf)|[eE]\+?\d{3}", re.IGNORECASE)
-"""Parts of numbers that may not be finite: nan, inf, an exponent of three digits."""
+_LARGEST_NUMBER = 1e30
+"""Largest absolute value of a number in MJCF, ranges apart: products of a few larger ones are infinite."""
+_NOT_NEGATIVE = ("armature", "frictionloss")
+"""Attributes of joints and tendons that must not be negative, as their `damping`; MuJoCo accepts negative ones."""
+_PERHAPS_WRONG = re.compile(r"[-+]?(nan|inf)|[eE]\+?\d{2}|\d{30}", re.IGNORECASE)
+"""Parts of numbers that may be too large or not finite: nan, inf, an exponent of two digits, thirty digits."""
 _NAMES = {
     *("name", "class", "childclass", "prefix", "model", "frame", "target", "instance", "plugin", "key", "material"),
     *("mesh", "hfield", "texture", "camera", "actuator", "tendon", "tendon1", "tendon2", "flex", "node", "objname"),
@@ -339,14 +343,20 @@ def _has_words(file: Path, number: int, words: Sequence[str]) -> bool:
 
 
 def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str]) -> None:
-    """Check the attributes of an element: no size too large, all numbers finite; only a range may be infinite."""
+    """Check the attributes of an element: no size and no number too large; only a range may be infinite."""
     for key, value in attributes.items():
         limit = MAX_MEMORY if key == "memory" else 1_000_000
         if name == "size" and number_of(value) > limit:
             raise BadModel(f'{file}:{line}: size {key}="{value[:40]}" is too large; {limit:,} is allowed')
-        if key in _NAMES or key.startswith("file") or name in ("text", "config") or not _NOT_FINITE.search(value):
+        found = f'{file}:{line}: {name} {key}="{shorten(value, 40)}"'
+        dissipates = key in _NOT_NEGATIVE or (key == "damping" and name in ("joint", "tendon", "spatial", "fixed"))
+        if dissipates and any(mjcf_number(word) < 0 for word in value.split()):
+            raise BadModel(f"{found} is negative; give a number of at least 0")
+        if key in _NAMES or key.startswith("file") or name in ("text", "config") or not _PERHAPS_WRONG.search(value):
             continue
         for word in value.split():
             number = mjcf_number(word)
-            if (math.isnan(number) and _NOT_FINITE.match(word)) or (math.isinf(number) and "range" not in key):
-                raise BadModel(f'{file}:{line}: {name} {key}="{shorten(value, 40)}" is not finite; give a number')
+            if (math.isnan(number) and _PERHAPS_WRONG.match(word)) or (math.isinf(number) and "range" not in key):
+                raise BadModel(f"{found} is not finite; give a number")
+            if abs(number) > _LARGEST_NUMBER and "range" not in key:
+                raise BadModel(f"{found} is too large; {_LARGEST_NUMBER:g} is allowed")

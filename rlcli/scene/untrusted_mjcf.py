@@ -33,6 +33,7 @@ SUBPROCESS_COST = 5_000
 TIME_S = 10
 """Limit of the CPU time of the compiling subprocess [s]; it is killed after twice this time at the latest."""
 _MAX_ITERATIONS = 100_000
+_MAX_GRAVITY = 10_000
 _compiled: set[tuple[object, ...]] = set()
 """Files of the scenes that a subprocess has compiled, with their versions; they are not compiled again."""
 MUJOCO_ERRORS = (ValueError, RuntimeError, MemoryError, mujoco.FatalError, mujoco.UnexpectedError)
@@ -179,6 +180,9 @@ def _check_options(spec: mujoco.MjSpec, file: Path) -> None:
     for name in ("gravity", "wind", "magnetic", "tolerance", "impratio", "density", "viscosity"):
         if not np.isfinite(getattr(option, name)).all():
             raise BadModel(f"{file}: option {name} is not finite; give finite numbers")
+    if np.abs(option.gravity).max() > _MAX_GRAVITY:
+        found = " ".join(f"{value:g}" for value in option.gravity)
+        raise BadModel(f'{file}: option gravity="{found}" is too large; {_MAX_GRAVITY:,} m/s^2 is allowed')
     widths = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}
     positions = sum(widths.get(joint.type, 1) for joint in spec.joints)
     for key in spec.keys:

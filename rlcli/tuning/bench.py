@@ -256,10 +256,10 @@ class Bench:
         smaller = [row for row in self.findings.stepped if row.left_out is None and row.num_envs < num_envs]
         measured = sorted(smaller, key=lambda row: row.num_envs)
         first, last = (measured[0], measured[-1]) if measured else (None, None)
-        env_bytes = _ENV_BYTES
-        if first and last and first.num_envs < last.num_envs and first.resident is not None and last.resident is not None:
+        env_bytes, more_envs = _ENV_BYTES, last.num_envs - first.num_envs if first and last else 0
+        if first and last and more_envs and first.resident is not None and last.resident is not None:
             # memory grows linearly with the number of environments
-            env_bytes = max(4096, (last.resident - first.resident) // (last.num_envs - first.num_envs))
+            env_bytes = max(4096, (last.resident - first.resident) // more_envs)
         if env_bytes * num_envs > available_memory() // 2:
             return f"needs about {env_bytes * num_envs / 2**30:.1f} GiB"
         if last and last.steps_per_s and num_envs / last.steps_per_s > self._pace.longest_s:

@@ -22,6 +22,7 @@ from rlcli.random import derive
 from rlcli.reporting.panel_plots import check_drawing, scatter
 from rlcli.runs.atomic_io import disk_error, disk_errors, to_json, write_atomic
 from rlcli.runs.run import STUDY
+from rlcli.runs.safe_io import Count, FileModel, check_json
 from rlcli.runs.study import read_study
 from rlcli.tuning.optuna_storage import open_study, without_password
 from rlcli.tuning.search_space import Parameter, read_parameters
@@ -47,6 +48,20 @@ _KINDS: dict[str, type] = {
 }
 """Types of the entries of a sweep's `study.json`."""
 _ENDED = ("COMPLETE", "PRUNED", "FAIL")
+
+
+class _TrialNotes(FileModel):
+    """Notes that `Sweep.tell` stores with a trial."""
+
+    seconds: float | None = None
+    step: Count | None = None
+    why: str | None = None
+
+
+class _FinishedTrial(_TrialNotes):
+    """A finished trial: its notes, and the value of the sweep's only objective."""
+
+    values: tuple[float]
 
 
 @dataclass(slots=True)
@@ -77,8 +92,19 @@ class Sweep:
     _claimed: dict[int, Trial] = field(default_factory=dict)
 
     def trials(self) -> list[FrozenTrial]:
-        """Return the trials in the order of their numbers, without those that were started beyond the wanted number."""
-        return [trial for trial in self.study.get_trials(deepcopy=False) if _SURPLUS not in trial.user_attrs]
+        """Return the trials in the order of their numbers, without those that were started beyond the wanted number.
+
+        Raises:
+            CheckpointError: if the storage holds a result that is no finite number, or a damaged note of a trial.
+        """
+        trials = [trial for trial in self.study.get_trials(deepcopy=False) if _SURPLUS not in trial.user_attrs]
+        for trial in trials:
+            kind = _FinishedTrial if trial.state.name == "COMPLETE" else _TrialNotes
+            check_json(kind, {**trial.user_attrs, "values": trial.values}, self.folder, f"trial {trial.number}")
+            missing = [p.key for p in self.parameters if p.key not in trial.params]
+            if kind is _FinishedTrial and missing:
+                raise CheckpointError(f"{self.folder} is corrupt: trial {trial.number} has no value of {missing[0]}")
+        return trials
 
     def ended(self) -> list[FrozenTrial]:
         """Return the trials that are finished, pruned or failed."""

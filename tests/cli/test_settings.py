@@ -52,6 +52,17 @@ def test_home_folder_is_expanded_and_library_ignores_settings(settings, in_proce
     assert str(default_runs_dir()) == "runs"
 
 
+def test_unknown_home_folder_stays_and_null_character_is_refused(settings, in_process, monkeypatch):
+    monkeypatch.delenv("RLCLI_RUNS_DIR", raising=False)
+    settings("runs_dir: ~nosuch/x\n")
+    assert "no run in ~nosuch/x" in in_process("runs")[2]
+    settings('runs_dir: "a\\0b"\n')
+    code, _, err = in_process("runs")
+    assert code == 3, err
+    assert "runs_dir" in err
+    assert "Traceback" not in err
+
+
 @pytest.mark.parametrize(
     ("verbosity", "flags", "loud"),
     [

@@ -123,6 +123,14 @@ def test_sizes_beyond_memory_are_left_out(coin, cli, short_measurements, monkeyp
     assert rows[2]["steps_per_s"] is None
 
 
+def test_single_size_is_measured_with_several_thread_counts(coin, cli, short_measurements, monkeypatch):
+    monkeypatch.setattr(bench, "SIZES", (4,))
+    monkeypatch.setattr(bench, "available_cores", lambda: 2)
+    rows = cli("bench", coin, "--quick", "--json", "--num-envs", "4").json["environment"]
+    assert {row["num_envs"] for row in rows} == {4}
+    assert len(rows) > 1
+
+
 def test_sizes_with_indivisible_rollout_are_left_out(coin, cli, short_measurements):
     rows = cli("bench", coin, "agent.n_steps=1", "--num-envs", 2, "--quick", "--json").json["training"]
     assert {(row["num_envs"], row["horizon"]) for row in rows} == {(2, 1), (1, 2)}

@@ -152,6 +152,24 @@ def test_corrupt_journal_is_checkpoint_error(tmp_path, damage):
             look()
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        *((b'"values":[', b'"values":[' + value + b",") for value in (b"1.0",)),
+        *((b'"values":[-', b'"values":[' + value) for value in (b'"latest",-', b"null,-", b"[1],-", b"true,-")),
+        (b'"values":[-0.', b'"values":[1e999'),
+        (b'"param_name":"agent.n_steps"', b'"param_name":"agent.steps"'),
+    ],
+)
+def test_damaged_result_is_checkpoint_error(tmp_path, old, new):
+    finish(open_or_join(tmp_path), 1)
+    content = (tmp_path / JOURNAL).read_bytes()
+    assert old in content
+    (tmp_path / JOURNAL).write_bytes(content.replace(old, new))
+    with pytest.raises(CheckpointError, match="corrupt: trial 0"):
+        read_sweep(tmp_path).trials()
+
+
 def test_missing_journal_is_checkpoint_error(tmp_path):
     finish(open_or_join(tmp_path), 2)
     (tmp_path / JOURNAL).unlink()

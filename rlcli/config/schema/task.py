@@ -28,6 +28,9 @@ from rlcli.config.schema.terms import (
     TerminationConfig,
 )
 
+_Acceleration = Annotated[float, _FractionString(), _Limits(-1e4, 1e4)]
+_Iterations = Annotated[Count, Field(le=100_000)]
+
 
 class SimConfig(StrictModel):
     """Physics simulation."""
@@ -36,13 +39,13 @@ class SimConfig(StrictModel):
     """Physics time step [s]."""
     render_interval: Count = 1
     """Physics steps between two frames of a video. Videos have at most one frame for each environment step."""
-    gravity: Vec3 = (0.0, 0.0, -9.81)
+    gravity: tuple[_Acceleration, _Acceleration, _Acceleration] = (0.0, 0.0, -9.81)
     """Gravity in the world frame [m/s^2]."""
     integrator: Literal["euler", "rk4", "implicit", "implicitfast"] | None = None
     """MuJoCo's integrator; null: the integrator in the MJCF of the first entity."""
-    iterations: Count | None = None
+    iterations: _Iterations | None = None
     """Largest number of solver iterations; null: the number in the MJCF of the first entity."""
-    ls_iterations: Count | None = None
+    ls_iterations: _Iterations | None = None
     """Largest number of line-search iterations of the solver; null: the number in the MJCF of the first entity."""
     engine: Literal["auto", "batch", "warp"] = "auto"
     """Physics engine. batch: MuJoCo on CPU threads; warp: MuJoCo Warp on a GPU; auto: batch on a CPU, warp on a GPU."""

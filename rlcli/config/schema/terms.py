@@ -235,6 +235,9 @@ class DelayConfig(StrictModel):
         return round(low / step_dt), round(high / step_dt)
 
 
+_History = Annotated[Count, Field(le=10_000)]
+
+
 class ObservationConfig(TermConfig):
     """An observation term. modifiers, noise, bias, clip, scale, delay and history change its value, in this order."""
 
@@ -250,7 +253,7 @@ class ObservationConfig(TermConfig):
     """Factor for all columns, or one factor for each column; null: 1."""
     delay: DelayConfig | None = None
     """Delay with which the policy gets the value; null: none."""
-    history: Count | None = None
+    history: _History | None = None
     """Number of steps that the observation contains, the oldest first. In the first steps of an episode the missing
     values are copies of the first one. null: only the current step."""
 
@@ -263,7 +266,7 @@ class ObservationGroupConfig(StrictModel):
 
     enable_corruption: bool = True
     """false: noise, bias and delay of the terms are switched off."""
-    history: Count | None = None
+    history: _History | None = None
     """History of every term, instead of the terms' own values; null: the terms' own values."""
 
     @property

@@ -19,6 +19,13 @@ sys.exit(main())
 """
 
 
+def test_variable_of_a_shell_without_its_words_is_ignored(in_process, monkeypatch):
+    monkeypatch.setenv("_RLCLI_COMPLETE", "complete_bash")
+    code, out, err = in_process("list-tasks", "--json")
+    assert code == 0, err
+    assert '"cartpole"' in out
+
+
 def completion_environment(words, shell):
     """Return the environment variables that a shell sets to complete the last word."""
     line = ["rlcli", *words]
