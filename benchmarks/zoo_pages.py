@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from rlcli.config.load import resolve
 from rlcli.registry import OWN, catalog, find_task
 from rlcli.reporting.task_card import markdown, task_card
@@ -181,6 +183,25 @@ def curves(zoo: Path, entry: Any) -> str:
     return "\n".join(parts)
 
 
+def fresh_seeds(zoo: Path) -> list[str]:
+    """Return the table of trainings with seeds on which nothing was tuned, as lines."""
+    document = yaml.safe_load((zoo / "fresh_seeds.yaml").read_text(encoding="utf-8"))
+    lines = [
+        "## Seeds on which nothing was tuned",
+        "",
+        "Success of the default command with seeds that played no part in choosing the settings; 1,000 episodes without",
+        "exploration noise. The other tasks are not measured yet.",
+        "",
+        f"| task | {' | '.join(f'seed {seed}' for seed in document['seeds'])} | longest training | machine |",
+        f"| --- | {'---: | ' * len(document['seeds'])}---: | --- |",
+    ]
+    for task, row in document["tasks"].items():
+        longest = f"{row['minutes']:.1f} min" if "minutes" in row else "below 1 min"
+        values = " | ".join(f"{value:.3f}" for value in row["success"])
+        lines.append(f"| [{task}]({task}.md) | {values} | {longest} | {row.get('machine', '2 CPU cores')} |")
+    return [*lines, ""]
+
+
 def index(zoo: Path, found: list[Any]) -> str:
     """Return the page with the table of all tasks."""
     lines = [
@@ -237,6 +258,7 @@ def index(zoo: Path, found: list[Any]) -> str:
         )
     lines += [
         "",
+        *fresh_seeds(zoo),
         "- `make learn-TASK` trains a task and compares the result with the required one in [zoo.yaml](zoo.yaml).",
         "- [Scores of other libraries](peers.md) compares results on Gymnasium's tasks.",
     ]

@@ -67,7 +67,8 @@ def check_target(format_: str, output: Path | None) -> None:
         return
     suffix = FORMATS[format_]
     if output.suffix != suffix:
-        hint = f"--format {other}" if other else f"--output {output.with_suffix(suffix) if output.name else 'FILE'}"
+        named = output.with_suffix(suffix) if output.name.strip(".") else "FILE"
+        hint = f"--format {other}" if other else f"--output {named}"
         raise UsageError(f"'{output}' does not end in {suffix}, the suffix of format {format_}", hint=hint)
     require_regular(output)
 
