@@ -257,3 +257,11 @@ def test_meshes_may_lie_anywhere_in_the_package_of_the_robot(cli, tmp_path):
     (tmp_path / "zoo" / "__init__.py").touch()
     assert cli("new", "my-robot", "--robot", robot, "-o", tmp_path / "out").code == 0
     assert (tmp_path / "out" / "my_robot" / "assets" / "cube.obj").is_file()
+
+
+def test_joints_are_driven_if_all_actuators_pull_at_tendons(cli, tmp_path):
+    begin = ARM.partition("<actuator>")[0]
+    tendon = '<tendon><fixed name="t"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed></tendon>'
+    motor = '<actuator><motor name="pull" tendon="t"/></actuator><sensor><actuatorfrc actuator="pull"/></sensor>'
+    _, task = written(cli, tmp_path, begin + tendon + motor + "</mujoco>")
+    assert task["actions"]["joint_position"]["joints"] == ["a", "b", "c"]
