@@ -15,7 +15,7 @@ from rlcli.training.progress import PARTS, Progress
 
 LINE_EVERY_S = 5.0
 _WORK_LINE_EVERY_S = 10.0
-_WORK_AFTER_S = 2.0
+_WORK_AFTER_S = 1.4
 """Time after which running work is shown on a terminal [s]; shorter work is not shown."""
 _REDRAW_EVERY_S = 0.25
 _MIN_SHARE, _MIN_ELAPSED_S = 0.2, 30.0
