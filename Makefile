@@ -2,7 +2,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check -q
+# on a terminal, pip and Sphinx show their progress
+QUIET := $(if $(MAKE_TERMOUT),,-q)
+PIP := $(BIN)/python -m pip --disable-pip-version-check $(QUIET)
 RUNS ?= runs
 # of `make learn-TASK`: cpu or cuda (else the device that docs/reference/zoo/zoo.yaml names), and the seed
 DEVICE ?=
@@ -83,7 +85,7 @@ zoo-pages: $(VENV)/.demo
 	$(BIN)/python benchmarks/zoo.py pages
 
 docs: $(if $(wildcard $(VENV)/.dev),,$(VENV)/.docs)
-	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
+	$(BIN)/python -m sphinx $(QUIET) -W --keep-going -b html docs docs/_build/html
 	@echo "docs/_build/html/index.html"
 
 # Every table of the CPU in docs/explanation/benchmarks.md, and the figures of the README: about half an hour on an idle machine.

@@ -5,6 +5,7 @@ Any other exception is a bug and keeps its traceback.
 
 import difflib
 import itertools
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -153,15 +154,24 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str | None:
 
 
 def pip_install(package: str) -> str:
-    """Return the command that installs a package, or an extra such as `rlcli[plot]`, in the tested versions.
+    """Return the command that installs packages, or an extra such as `rlcli[plot]`, in the tested versions.
 
-    A plugin of the repository is installed from its folder if rlcli itself runs from a checkout.
+    rlcli and the plugins of its repository are not on a package index: they are installed from their folders if rlcli
+    runs from a checkout, else from a folder with their wheels, for which the command has the word WHEELS.
+
+    Args:
+        package: arguments of `pip install`, separated by spaces.
     """
     root = Path(__file__).parents[1]
     lists = (Path(__file__).with_name("constraints.txt"), root / "constraints.txt")  # in a wheel, in a checkout
     pins = [str(file) for file in lists if file.is_file() and package not in _UNPINNED]
-    source = root / "plugins" / package
-    words = [*(["-c", pins[0]] if pins else []), *([str(source)] if source.is_dir() else package.split())]
+    words = ["-c", pins[0]] if pins else []
+    for word in package.split():
+        source = root if word == "rlcli" else root / "plugins" / word
+        if (source / "pyproject.toml").is_file():
+            words += ["-e", str(source)]
+        else:
+            words += [*(["--find-links", "WHEELS"] if re.fullmatch(r"rlcli(-[\w-]+)?", word) else []), word]
     return " ".join(["pip install", *(f'"{word}"' if set(word) & set(" []<>=*") else word for word in words)])
 
 

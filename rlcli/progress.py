@@ -1,6 +1,7 @@
 """Progress of long work: a library function reports it with `track`, and the command line shows it."""
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
@@ -27,6 +28,8 @@ class Work:
     """Whether this work shows its own progress, so that nothing else may be drawn."""
     begin: float = field(default_factory=time.monotonic)
     """Start of the work, by `time.monotonic` [s]."""
+    thread: int = field(default_factory=threading.get_ident)
+    """Thread that does the work. Works of several threads run at the same time; none is a part of another."""
 
     def advance(self, count: int = 1) -> None:
         """Add `count` to the number of parts that are done."""

@@ -246,7 +246,12 @@ def _remove_scene_elements(spec: mujoco.MjSpec) -> None:
     """Remove ground, lights and keyframes, which the task's scene has; name all bodies, joints and actuators.
 
     Welds and connections to mocap bodies are removed, too: a task does not move them, so they would hold the robot.
+    If all actuators pull at tendons, they are removed, and the task drives the joints themselves.
     """
+    if all(actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON for actuator in spec.actuators):
+        measured = [sensor for sensor in spec.sensors if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR]
+        for element in (*measured, *list(spec.actuators)):
+            spec.delete(element)
     for key in list(spec.keys):
         spec.delete(key)
     mocap = {body.name for body in spec.bodies if body.mocap}

@@ -54,7 +54,7 @@ def read_robot(file: Path, name: str) -> RobotTask:
     if not file.is_file():
         raise UsageError(f"--robot: there is no file {file}", hint="give the MJCF of a robot, as in --robot robot.xml")
     try:
-        spec = read_mjcf(file, [file.parent.resolve(), file.resolve().parent.parent])
+        spec = read_mjcf(file, _asset_roots(file.resolve()))
         robot = Robot(spec, file)
     except (BadModel, ValueError) as error:
         raise TaskError(
@@ -84,6 +84,13 @@ def read_robot(file: Path, name: str) -> RobotTask:
     return RobotTask(kind, robot.xml, robot.assets, task, robot.found)
 
 
+def _asset_roots(file: Path) -> list[Path]:
+    """Return the folders from which an MJCF may load: its own, the parent, and the repository or package of both."""
+    projects = [folder for folder in file.parents if any((folder / mark).exists() for mark in _PROJECT_MARKS)]
+    return [file.parent, file.parent.parent, *projects[-1:]]
+
+
+_PROJECT_MARKS = (".git", "pyproject.toml", "package.xml", "__init__.py")
 _SUMMARIES = {
     "velocity": "Follow velocity commands",
     "reach": "Bring the last body to goals",

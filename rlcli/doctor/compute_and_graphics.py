@@ -26,7 +26,7 @@ _OFF = ("disable", "disabled", "off", "false", "0")
 _ANSWER_BYTES = 100_000
 _LATE = "no answer within"
 BUSY = "if the machine is busy: `rlcli doctor --probe-timeout 120`"
-REINSTALL = f"pip uninstall -y {' '.join(TRIPLE)} && pip install mujoco"
+REINSTALL = f"pip uninstall -y {' '.join(TRIPLE)} && {pip_install('mujoco')}"
 """Uninstall first: the three packages share files, so upgrading one removes files that another has just written."""
 
 Answer = tuple[dict[str, Any] | None, str]
@@ -52,7 +52,7 @@ def compute_checks(answer: dict[str, Any] | None, reason: str) -> list[Check]:
         reason: why it failed.
     """
     if answer is None:
-        hint = REINSTALL if "mujoco" in reason.lower() else "pip install --upgrade --force-reinstall torch"
+        hint = REINSTALL if "mujoco" in reason.lower() else pip_install("--force-reinstall torch")
         hint = BUSY if reason.startswith(_LATE) else hint
         return [Check("torch", "broken", f"torch and mujoco do not work: {reason}", hint)]
     build = f"{answer['torch']}, built for {'CUDA ' + answer['cuda'] if answer['cuda'] else 'the CPU'}"
@@ -83,7 +83,7 @@ def gpu_checks(gpu: Answer | None) -> list[Check]:
     text, hint = f"{', '.join(answer['devices'])}; driver CUDA {driver or '?'}, torch CUDA {cuda}", None
     if cuda is None:
         text = "a driver is installed, but torch is built for the CPU"
-        hint = "pip install --force-reinstall torch, with the index of https://pytorch.org that fits the driver"
+        hint = f"{pip_install('--force-reinstall torch')}, with the index of https://pytorch.org that fits the driver"
     elif driver is not None and _major(cuda) > _major(driver):
         text = f"torch is built for CUDA {cuda}, the driver supports CUDA {driver}"
         hint = f"update the driver, or install a torch that is built for CUDA {_major(driver)} (https://pytorch.org)"
@@ -99,7 +99,7 @@ def gpu_checks(gpu: Answer | None) -> list[Check]:
     elif warp["error"] or not warp["devices"]:
         cause = f": {warp['error']}" if warp["error"] else ", its build may not fit the driver"
         text += f"; Warp {warp['version']} finds no GPU{cause}"
-        hint = "pip install --upgrade --force-reinstall warp-lang"
+        hint = pip_install("--force-reinstall warp-lang")
     else:
         text += f", Warp {warp['version']}, mujoco-warp {warp_package}"
     if hint is not None:

@@ -97,18 +97,18 @@ def violates_bounds(wanted: str, found: str) -> bool:
 
 def _dependencies_check() -> Check:
     """Check that the dependencies of rlcli are installed in versions that fit."""
-    bad, versions = [], {}
+    bad, versions = {}, {}
     for name, wanted, extra in _requirements("rlcli"):
         if extra in _NO_EXTRAS:
             continue
         versions[name] = found = version(name)
         if found is None and extra is None:
-            bad.append(f"{name} is missing")
+            bad[name] = f"{name} is missing"
         elif found is not None and violates_bounds(wanted, found):
-            bad.append(f"{name} {found} does not fit, {wanted} is needed")
+            bad[name] = f"{name} {found} does not fit, {wanted} is needed"
     details = {"versions": versions}
     if bad:
-        return Check("packages", "broken", "; ".join(bad), "pip install --upgrade rlcli", details)
+        return Check("packages", "broken", "; ".join(bad.values()), pip_install(" ".join(bad)), details)
     return Check("packages", "ok", _versions_text(versions), details=details)
 
 
@@ -131,7 +131,7 @@ def _mujoco_packages_check() -> Check:
     newest = max((found for found in first.values() if found), key=release_numbers, default=None)
     wanted = f"mujoco=={first['mujoco'] or newest}" if newest else "mujoco"
     # uninstall first: see compute_and_graphics.REINSTALL
-    hint = f'pip uninstall -y {" ".join(TRIPLE)} && pip install "{wanted}"'
+    hint = f"pip uninstall -y {' '.join(TRIPLE)} && {pip_install(wanted)}"
     return Check("mujoco packages", "broken", "; ".join(dict.fromkeys(bad)), hint, first)
 
 
@@ -198,7 +198,7 @@ def _requirements(distribution: str) -> list[tuple[str, str, str | None]]:
 def _remedy(entry: Entry, reason: str) -> str:
     """Return how to repair a plugin that cannot be loaded; `reason` is the error of the import."""
     if entry.distribution == "rlcli":
-        return "pip install --upgrade --force-reinstall rlcli"
+        return pip_install("--force-reinstall --no-deps rlcli")
     late = "; if the machine is busy: `rlcli doctor --probe-timeout 120`" if " within " in reason else ""
     return f"pip uninstall {entry.distribution}, or exclude it with RLCLI_PLUGINS; report it to its authors{late}"
 

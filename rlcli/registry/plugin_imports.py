@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from importlib import metadata
 from typing import Any, NoReturn, TypeVar
 
-from rlcli.errors import DependencyError, RlcliError, TaskError
+from rlcli.errors import DependencyError, RlcliError, TaskError, pip_install
 from rlcli.formats import FormatSpec
 from rlcli.progress import track
 from rlcli.registry.entries import Entry
@@ -46,7 +46,7 @@ def load_spec(entry: Entry, kind: type[_Spec], what: str) -> _Spec:
     if spec.api > API_VERSION:
         raise TaskError(
             f"{what} '{entry.qualified}' ({entry.version}) needs plugin API {spec.api}; this rlcli has {API_VERSION}",
-            hint="pip install --upgrade rlcli",
+            hint=f"install a newer rlcli: {pip_install('--upgrade rlcli')}",
         )
     return spec
 
@@ -172,7 +172,7 @@ def _newer_rlcli(entry: Entry) -> str | None:
     for line in requirements:
         wanted = re.match(r"rlcli\s*(?:\[[^]]*\])?\s*\(?(?:>=|==|~=|>)\s*([0-9]+(?:\.[0-9]+)*)", line)
         if wanted and release_numbers(wanted[1]) > release_numbers(rlcli.__version__):
-            return f"it needs rlcli {wanted[1]}, this is {rlcli.__version__}: pip install --upgrade rlcli"
+            return f"it needs rlcli {wanted[1]}, this is {rlcli.__version__}: {pip_install('--upgrade rlcli')}"
     return None
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from rlcli.errors import DependencyError
+from rlcli.errors import DependencyError, pip_install
 
 _VERSION = "4.0"
 """Version of MuJoCo that has all private names that this module uses."""
@@ -37,7 +37,7 @@ def _private(owner: object, name: str) -> Any:
     except AttributeError:
         raise DependencyError(
             f"MuJoCo {mujoco.__version__} has no '{name}', which rlcli uses; MuJoCo {_VERSION} has it",
-            hint=f'pip install "mujoco=={_VERSION}.*"',
+            hint=pip_install(f"mujoco=={_VERSION}.*"),
         ) from None
 
 

@@ -174,7 +174,7 @@ def _database(url: str) -> optuna.storages.BaseStorage:
         return RDBStorage(url, engine_kwargs=no_pool)
     except ImportError as error:
         driver = getattr(error.__cause__ or error, "name", None) or url.partition(":")[0]
-        raise DependencyError(f"--storage needs the driver {driver}", hint=f"pip install {driver}") from None
+        raise DependencyError(f"--storage needs the driver {driver}", hint=pip_install(driver)) from None
     except (sqlalchemy.exc.ArgumentError, sqlalchemy.exc.NoSuchModuleError, ValueError, LookupError) as error:
         message = f"--storage '{without_password(url)}' is not the URL of a database: {_first_line(error)}"
         raise UsageError(message, hint="write a URL such as postgresql+psycopg://user@host/name") from None

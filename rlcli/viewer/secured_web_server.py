@@ -22,7 +22,7 @@ from unittest import mock
 
 import mujoco
 
-from rlcli.errors import DependencyError, MachineError, one_line
+from rlcli.errors import DependencyError, MachineError, one_line, pip_install
 from rlcli.viewer.access import refusal_reason, response_headers
 
 _log = logging.getLogger(__name__)
@@ -76,7 +76,7 @@ def incompatible_viewer(why: str) -> DependencyError:
     """Return the error for a version of MuJoCo whose web viewer is not supported."""
     return DependencyError(
         f"the browser's viewer does not work with the installed mujoco {mujoco.__version__}: {' '.join(why.split())}",
-        hint='pip install "mujoco==4.0.*", or use --video FILE.mp4, or --viewer none',
+        hint=f"{pip_install('mujoco==4.0.*')}, or use --video FILE.mp4, or --viewer none",
     )
 
 

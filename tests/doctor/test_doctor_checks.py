@@ -57,7 +57,7 @@ def test_other_mujoco_core_version_is_reported(package):
     assert check.state == "broken"
     assert f"mujoco {mine} needs mujoco-core {mine}, but mujoco-core 3.13.0 is installed" in check.found
     assert "mujoco-core is installed 2 times" in check.found
-    assert check.hint == f'pip uninstall -y mujoco mujoco-core mujoco-studio && pip install "mujoco=={mine}"'
+    assert check.hint == f"pip uninstall -y mujoco mujoco-core mujoco-studio && {pip_install(f'mujoco=={mine}')}"
 
 
 def test_old_single_mujoco_package_is_reported(package):
@@ -122,7 +122,7 @@ def test_mujoco_library_and_package_versions_differ():
     ("reason", "hint"),
     [
         ("ModuleNotFoundError: No module named 'mujoco._structs'", compute_and_graphics.REINSTALL),
-        ("OSError: libtorch_cpu.so: no such file", "pip install --upgrade --force-reinstall torch"),
+        ("OSError: libtorch_cpu.so: no such file", pip_install("--force-reinstall torch")),
         ("no answer within 30 s", compute_and_graphics.BUSY),
     ],
 )

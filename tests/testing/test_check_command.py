@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from rlcli.cli.app import main
+from rlcli.errors import pip_install
 
 
 def check(capsys, *arguments):
@@ -152,7 +153,7 @@ def test_plugin_for_newer_api_is_rejected(plugin_of_the_future, tmp_path):
     assert done.returncode == 4
     assert "future-task:future" in done.stderr
     assert "needs plugin API 99; this rlcli has 1" in done.stderr
-    assert "pip install --upgrade rlcli" in done.stderr
+    assert pip_install("--upgrade rlcli") in done.stderr
 
 
 # --- the pytest plugin ---

@@ -79,6 +79,13 @@ def test_training_that_lost_its_success_has_moved():
     assert "no-progress" not in findings(lost, until=0.5)
 
 
+def test_progress_in_the_first_iterations_counts():
+    still = {name: lambda i, name=name: HEALTHY[name](1) + 1e-3 * (i % 3) for name in HEALTHY}
+    early = {**still, **FAILING, "Train/mean_reward": lambda i: -9.4 if i < 3 else -0.01}
+    assert "no-progress" in findings({**still, **FAILING}, until=0.5)
+    assert "no-progress" not in findings(early, until=0.5)
+
+
 def test_adaptive_learning_rate_at_its_floor_is_found():
     changes = {**FAILING, "Loss/learning_rate": lambda i: 1e-5}
     assert "learning-rate-floor" in findings(changes, "agent.schedule=adaptive")

@@ -7,7 +7,7 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from rlcli.errors import TaskError
+from rlcli.errors import TaskError, pip_install
 from rlcli_isaaclab.format import LIBRARIES
 
 _REASONS = {
@@ -45,7 +45,7 @@ def reason_of(name: str) -> tuple[str, str]:
     """Return (why rlcli does not have a name of Isaac Lab or Isaac Sim, what to do instead)."""
     library = LIBRARIES.get(name.partition(".")[0])
     if library is not None:
-        return "the library is not installed", f"pip install {library}"
+        return "the library is not installed", pip_install(library)
     words = name.lower()
     return next(
         (texts for part, texts in _REASONS.items() if part in words),

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlcli.errors import pip_install
 from rlcli_isaaclab.absent import absence
 
 
@@ -49,4 +50,4 @@ sample = SimpleNamespace(sample_surface=sample_surface)
 def __getattr__(name: str) -> Any:
     if name.startswith("__"):
         raise AttributeError(name)
-    raise absence(f"trimesh.{name}", hint="pip install trimesh")
+    raise absence(f"trimesh.{name}", hint=pip_install("trimesh"))

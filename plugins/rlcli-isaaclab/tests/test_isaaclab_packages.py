@@ -7,7 +7,7 @@ import torch
 from test_isaaclab_user_code import rover
 
 from rlcli.envs.make import make_env
-from rlcli.errors import ConfigError, TaskError
+from rlcli.errors import ConfigError, TaskError, pip_install
 from rlcli_isaaclab import namespace
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.convert import agent
@@ -56,7 +56,7 @@ def test_missing_library_of_isaac_lab_is_named_when_it_is_used(tmp_path, monkeyp
     monkeypatch.undo()
     with pytest.raises(TaskError) as raised:
         stepped(resolved)
-    assert raised.value.hint == f"pip install {LIBRARIES[library]}"
+    assert raised.value.hint == pip_install(LIBRARIES[library])
     assert "rover_env.py:" in raised.value.message
 
 

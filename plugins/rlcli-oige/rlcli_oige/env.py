@@ -18,7 +18,7 @@ from torch import Tensor
 from rlcli.envs.build import grid
 from rlcli.envs.direct import DirectEnv
 from rlcli.envs.layout import Layout
-from rlcli.errors import DependencyError, TaskError
+from rlcli.errors import DependencyError, TaskError, pip_install
 from rlcli.registry import import_file, is_framework
 from rlcli.scene.scene import Scene
 from rlcli.sim.device_names import on_cpu
@@ -201,7 +201,7 @@ class OigeEnv(DirectEnv):
             return getattr(import_file(path), name)
         except ModuleNotFoundError as error:
             message = f"{error_location(error) or path}: the task imports '{error.name}', which is not installed"
-            raise DependencyError(message, hint=f"pip install {str(error.name).partition('.')[0]}") from error
+            raise DependencyError(message, hint=pip_install(str(error.name).partition(".")[0])) from error
 
     def place_environments(self, spacing: float) -> Tensor:
         """Set the distance of the environments on the grid [m], and return their positions. (num_envs, 3)"""

@@ -10,7 +10,7 @@ from rlcli.cli.app import main
 from rlcli.config.load import resolve
 from rlcli.config.strict_yaml import load
 from rlcli.envs.make import make_env
-from rlcli.errors import ConfigError, DependencyError, TaskError
+from rlcli.errors import ConfigError, DependencyError, TaskError, pip_install
 from rlcli.registry import find_task
 from rlcli_oige import agent_yaml
 from rlcli_oige.task_keys import ROOT_SETTINGS
@@ -136,7 +136,7 @@ def test_calls_without_effect_are_logged_once(tmp_path, caplog):
 def test_missing_module_and_refused_task_name_file(tmp_path):
     with pytest.raises(DependencyError, match=r"arm.py:2: the task imports 'no_such_package_x'") as caught:
         build(package(tmp_path / "a", "\nimport no_such_package_x\n" + UNCHANGED))
-    assert caught.value.hint == "pip install no_such_package_x"
+    assert caught.value.hint == pip_install("no_such_package_x")
     config = package(tmp_path / "b")
     folder = config.parents[2] / "tasks"
     (folder / "factory").mkdir()

@@ -7,7 +7,7 @@ import typer
 
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import choice
-from rlcli.errors import UsageError, listing
+from rlcli.errors import UsageError, listing, pip_install
 
 
 def command(
@@ -46,7 +46,7 @@ def command(
     folder, files = create(name, flavour, output, design)
     for file in files:
         console.data(str(folder / file))
-    console.info(f"next: cd {folder} && pip install -e . && rlcli train {name}")
+    console.info(f"next: cd {folder} && {pip_install('-e .')} && rlcli train {name}")
     console.document(
         "new", task=name, flavour=flavour if design is None else design.kind, folder=str(folder), files=files
     )

@@ -96,7 +96,7 @@ def _draw(file: Path, curves: list[Curve], panels: list[Panel], x: str) -> None:
         seeds = ", ".join(map(str, curve.seeds))
         console.info(f"{curve.label}: seed{'s' * (len(curve.seeds) > 1)} {seeds}")
     if note:
-        console.info("several seeds: interquartile mean and 95 % bootstrap interval (Agarwal et al. 2021)")
+        console.info(note)
 
 
 def _default_file(runs: list[Run]) -> Path:

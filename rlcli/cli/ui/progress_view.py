@@ -15,9 +15,11 @@ from rlcli.training.progress import PARTS, Progress
 
 LINE_EVERY_S = 5.0
 _WORK_LINE_EVERY_S = 10.0
-_WORK_AFTER_S = 2.0
+_WORK_AFTER_S = 1.4
 """Time after which running work is shown on a terminal [s]; shorter work is not shown."""
 _REDRAW_EVERY_S = 0.25
+_MIN_SHARE, _MIN_ELAPSED_S = 0.2, 30.0
+"""The time left is shown when this share is done or this time [s] has passed: the first parts take longer (imports)."""
 _MAX_ROWS = 100
 """Rows of one table; an untrusted run may have any number of metrics."""
 _MAX_S = 1e10
@@ -107,15 +109,27 @@ def work_line(running: Sequence[Work]) -> str:
     works = list(running)
     counts = [f"{work.what} {work.done:,}/{work.total:,}" if work.total else work.what for work in works]
     counted = [work for work in works if work.total]
-    share = 0.0
-    for work in reversed(counted):  # the inner work is a part of one part of the outer one
-        share = max(work.fraction(), (work.done + share) / (work.total or 1))
+    threads: dict[int, list[Work]] = {}
+    for work in counted:
+        threads.setdefault(work.thread, []).append(work)
+    share = sum(_share(nested) * (nested[0].total or 1) for nested in threads.values())
+    share /= max(1, sum(nested[0].total or 1 for nested in threads.values()))
     elapsed = time.monotonic() - counted[0].begin if counted else 0.0
     title = "" if not works or works[0].total else f"{counts.pop(0)}: "
     if share > 0.0:
-        return f"{title}{', '.join(counts)}, {share:.0%}, {duration_text(elapsed * (1.0 - share) / share)} left"
+        counts.append(f"{share:.0%}")
+    if share >= _MIN_SHARE or (share > 0.0 and elapsed >= _MIN_ELAPSED_S):
+        return f"{title}{', '.join(counts)}, {duration_text(elapsed * (1.0 - share) / share)} left"
     since = f"{duration_text(time.monotonic() - works[0].begin)} so far" if works else ""
     return title + ", ".join([*counts, since])
+
+
+def _share(nested: Sequence[Work]) -> float:
+    """Return the done share of works, the outermost first: each is a part of one part of the work before it."""
+    share = 0.0
+    for work in reversed(nested):
+        share = max(work.fraction(), (work.done + share) / (work.total or 1))
+    return share
 
 
 class TrainingView(LiveView):

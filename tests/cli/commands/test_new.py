@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from rlcli.cli.app import main
+from rlcli.errors import pip_install
 from rlcli.scaffold import FLAVOURS, render
 
 
@@ -24,7 +25,7 @@ def test_new_package_is_complete_and_valid(in_process, here, flavour):
     folder = here / "my-arm-2"
     assert [path.name for path in here.iterdir()] == ["my-arm-2"]
     assert set(document["files"]) == files_of(folder)
-    assert "pip install -e . && rlcli train my-arm-2" in err
+    assert pip_install("-e .") + " && rlcli train my-arm-2" in err
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     assert project["name"] == "my-arm-2"
     assert project["entry-points"]["rlcli.tasks"] == {"my-arm-2": "my_arm_2:TASK"}

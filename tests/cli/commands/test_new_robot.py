@@ -238,3 +238,30 @@ def test_file_without_a_usable_robot_is_refused(cli, tmp_path, text, code, messa
     result = cli("new", "my-robot", "--robot", "robot.xml")
     assert (result.code, message in result.err) == (code, True), result.err
     assert not (tmp_path / "my-robot").exists()
+
+
+def test_meshes_may_lie_anywhere_in_the_package_of_the_robot(cli, tmp_path):
+    corners = [(x, y, z) for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)]
+    (tmp_path / "zoo" / "parts").mkdir(parents=True)
+    (tmp_path / "zoo" / "parts" / "cube.obj").write_text(
+        "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3\nf 1 2 5\nf 1 3 5\nf 2 4 8\nf 3 4 8\nf 5 6 8\n"
+    )
+    inner = tmp_path / "zoo" / "robots" / "arms" / "one"
+    inner.mkdir(parents=True)
+    asset = '<compiler meshdir="../../../parts"/><asset><mesh name="cube" file="cube.obj"/></asset><worldbody>'
+    robot = inner / "robot.xml"
+    robot.write_text(ARM.replace("<worldbody>", asset))
+    refused = cli("new", "my-robot", "--robot", robot, "-o", tmp_path / "out")
+    assert refused.code == 4
+    assert "lies outside of" in refused.err
+    (tmp_path / "zoo" / "__init__.py").touch()
+    assert cli("new", "my-robot", "--robot", robot, "-o", tmp_path / "out").code == 0
+    assert (tmp_path / "out" / "my_robot" / "assets" / "cube.obj").is_file()
+
+
+def test_joints_are_driven_if_all_actuators_pull_at_tendons(cli, tmp_path):
+    begin = ARM.partition("<actuator>")[0]
+    tendon = '<tendon><fixed name="t"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed></tendon>'
+    motor = '<actuator><motor name="pull" tendon="t"/></actuator><sensor><actuatorfrc actuator="pull"/></sensor>'
+    _, task = written(cli, tmp_path, begin + tendon + motor + "</mujoco>")
+    assert task["actions"]["joint_position"]["joints"] == ["a", "b", "c"]

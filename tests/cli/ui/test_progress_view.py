@@ -33,6 +33,16 @@ def test_line_has_what_how_far_and_time_left():
     assert work_line([]) == ""
 
 
+def test_works_of_threads_run_beside_each_other():
+    begin = time.monotonic() - 10.0
+    tasks, trainers = (
+        Work(name, total, done, begin=begin, thread=total) for name, total, done in (("t", 20, 3), ("r", 4, 2))
+    )
+    assert work_line([tasks, trainers]) == "t 3/20, r 2/4, 21%, 0:38 left"
+    tasks.done = 0
+    assert work_line([tasks, trainers]) == "t 0/20, r 2/4, 8%, 0:10 so far"
+
+
 def test_work_ends_with_its_context():
     with track("outer"), track("inner", 3) as work:
         work.advance(2)
