@@ -85,12 +85,18 @@ def read_robot(file: Path, name: str) -> RobotTask:
 
 
 def _asset_roots(file: Path) -> list[Path]:
-    """Return the folders from which an MJCF may load: its own, the parent, and the repository or package of both."""
-    projects = [folder for folder in file.parents if any((folder / mark).exists() for mark in _PROJECT_MARKS)]
-    return [file.parent, file.parent.parent, *projects[-1:]]
+    """Return the folders from which an MJCF may load: its own, the parent, its Python package, and its repository.
+
+    A repository that contains the home folder, such as one of dotfiles, does not count.
+    """
+    home = Path.home()
+    own = [folder for folder in file.parents if folder != home and folder not in home.parents]
+    packages = [folder for folder in own if (folder / "__init__.py").is_file()]
+    projects = [folder for folder in own if any((folder / mark).exists() for mark in _PROJECT_MARKS)]
+    return [file.parent, file.parent.parent, *packages[-1:], *projects[:1]]
 
 
-_PROJECT_MARKS = (".git", "pyproject.toml", "package.xml", "__init__.py")
+_PROJECT_MARKS = (".git", "pyproject.toml", "package.xml")
 _SUMMARIES = {
     "velocity": "Follow velocity commands",
     "reach": "Bring the last body to goals",

@@ -126,11 +126,11 @@ class Health:
         noise = max(statistics.pstdev(before), statistics.pstdev(after), 0.1 * size, 1e-9)
         return (statistics.fmean(after) - statistics.fmean(before)) / noise
 
-    def left_start(self) -> bool:
-        """Return whether the return has left its first value, also if that happened within the first iterations."""
-        before, after = self.first(RETURN), self.last(RETURN)
-        noise = max(statistics.pstdev(after), 0.1 * abs(before[0]), 1e-9)
-        return abs(statistics.fmean(after) - before[0]) > 5.0 * noise
+    def is_above_start(self) -> bool:
+        """Return whether the return is far above its first value, also if it rose within the first iterations."""
+        start, after = self.first(RETURN)[0], self.last(RETURN)
+        noise = max(statistics.pstdev(after), 0.1 * abs(start), 1e-9)
+        return statistics.fmean(after) - start > 5.0 * noise
 
     def median(self, name: str) -> float | None:
         """Return the median of a metric's newest values; None without a value."""
@@ -185,7 +185,7 @@ def no_reward(health: Health) -> Found:
 def no_progress(health: Health) -> Found:
     """Report that neither return, reward terms, episode length nor values of success conditions have changed."""
     watched = [RETURN, LENGTH, *health.names("Episode_Reward/"), *health.names("Success_Value/")]
-    solved = max(health.values(SUCCESS), default=0.0) >= _SOLVED or not health.values(RETURN) or health.left_start()
+    solved = max(health.values(SUCCESS), default=0.0) >= _SOLVED or not health.values(RETURN) or health.is_above_start()
     if not solved and health.struggles(0.15) and all(abs(health.change(name)) < 1.0 for name in watched):
         value = statistics.fmean(health.last(RETURN)) if health.values(RETURN) else 0.0
         done = f"{health.progress:.0%} of the training"
