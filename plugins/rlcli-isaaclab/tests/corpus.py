@@ -94,7 +94,7 @@ def run(
         text = " ".join(str(error).split())
         problems = getattr(error, "problems", None)
         if problems:
-            text = " || ".join(f"{p.path}: {p.message}" + (f" ({p.hint})" if p.hint else "") for p in problems[:6])
+            text = " || ".join(map(str, problems[:6]))
         frames = traceback.extract_tb(error.__traceback__)
         at = f" [{frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno}]" if frames and not problems else ""
         return stage, f"{type(error).__name__}: {text[:600]}{at}", facts
