@@ -53,6 +53,8 @@ def run(
     name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: str, steps: int
 ) -> tuple[int, str, dict[str, Any]]:
     """Return the number of stages that a task passes, the reason why it stops, and facts about it."""
+    from rlcli.errors import RlcliError
+
     stage, facts = 0, {}
     try:
         import torch
@@ -96,7 +98,9 @@ def run(
         if problems:
             text = " || ".join(map(str, problems[:6]))
         frames = traceback.extract_tb(error.__traceback__)
-        at = f" [{frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno}]" if frames and not problems else ""
+        own = [f for f in frames if f.filename.startswith(str(package))] or frames
+        is_bug = own and not isinstance(error, RlcliError)
+        at = f" [{own[-1].filename.rpartition('/')[2]}:{own[-1].lineno}]" if is_bug else ""
         return stage, f"{type(error).__name__}: {text[:600]}{at}", facts
     return stage, "", facts
 
