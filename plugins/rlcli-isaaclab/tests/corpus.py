@@ -193,7 +193,10 @@ def write_page(rows: dict[str, Any], page: Path) -> None:
     page.write_text(before + start + "\n".join(ordered) + "\n" + end + after, encoding="utf-8")
 
 
-USUAL = ("physx", "rigid_props", "articulation_props", "collision_props", "experiment_name", "run_name", "num_envs")
+USUAL = (
+    *("physx", "actuators.damping", "rigid_props", "articulation_props", "collision_props"),
+    *("experiment_name", "run_name", "num_envs"),
+)
 """Parts of keys that most tasks lose; the page names them once."""
 
 
