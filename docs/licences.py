@@ -53,6 +53,7 @@ LICENCES = {
     "rsl-rl-lib": ("BSD-3-Clause", "trainer `rsl-rl`"),
     "ruff": ("MIT", "formatting and linting"),
     "safetensors": ("Apache-2.0", "files of weights that contain no code"),
+    "scipy": ("BSD-3-Clause", "interpolation of the terrain of OmniIsaacGymEnvs' AnymalTerrain"),
     "setproctitle": ("BSD-3-Clause", "import of RSL-RL or rl_games, for tests of the trainer plugins"),
     "sphinx": ("BSD-2-Clause", "building the documentation"),
     "stable-baselines3": ("MIT", "trainer `sb3`"),
@@ -92,6 +93,10 @@ def requirements() -> Iterator[tuple[str, str]]:
     for folder in sorted((ROOT / "plugins").iterdir()):
         plugin = _project(folder)
         yield from ((f"Plugin `{plugin['name']}`", line) for line in plugin["dependencies"])
+        for extra in plugin.get("optional-dependencies", {}).keys() - {"test"}:
+            yield from (
+                (f"Plugin `{plugin['name']}[{extra}]`", line) for line in plugin["optional-dependencies"][extra]
+            )
 
 
 def _project(folder: Path) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from typing import Any
 
 from rlcli.registry.formats import Format, aliasing_formats
 
-_COMMON = ("gym", "numpy")
+_COMMON = ("gym", "hydra", "numpy", "omegaconf")
 """Libraries that files of all formats import."""
 _MOST_FILES = 200
 """Largest number of files of a task in which imports of formats are counted."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import functools
 import sys
+import traceback
 from types import ModuleType
 from typing import Any
 
 from rlcli.errors import TaskError, pip_install
+from rlcli.registry.module_aliases import TaskFileLoader
 from rlcli_isaaclab.format import LIBRARIES
 
 _REASONS = {
@@ -70,6 +72,15 @@ def user_place() -> str:
             return f"{file}:{frame.f_lineno}: "
         frame = frame.f_back  # type: ignore[assignment]
     return ""
+
+
+def place_of(error: BaseException) -> str:
+    """Return `file:line: ` of the innermost line of a task's file in an error's traceback; empty if there is none."""
+    found = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        if isinstance(frame.f_globals.get("__loader__"), TaskFileLoader):
+            found = f"{frame.f_code.co_filename}:{line}: "
+    return found
 
 
 class _AbsentMeta(type):

@@ -170,15 +170,21 @@ def merge_joint_settings(
         report: receives what is approximated.
     """
     by_joint: dict[str, dict[str, Any]] = {}
+    kept = 0.0
     for joint in model["joint"]:
         values = settings_of(joint, settings)
         has_actuator = joint in driven or joint in model["driven"]
         key = ("scene", name, "actuators", joint)
         values = _joint_config(values, driven.get(joint, ""), has_actuator, key, report)
+        if joint in driven and "damping" not in values:
+            kept = max(kept, model["damping"][joint])
         for item in ("damping", "armature", "friction_loss"):
             if item in values and model[item][joint] == values[item]:
                 del values[item]
         by_joint[joint] = {key: values[key] for key in sorted(values, key=_rank)}
+    if kept:
+        why = f"the damping of the MJCF's joints, at most {kept:g}, acts in addition"
+        report.entries["scene", name, "actuators", "damping"] = ("approximated", why)
     joints: dict[str, Any] = {}
     for pattern in dict.fromkeys([*(pattern for pattern, _, _ in settings), *map(re.escape, by_joint)]):
         matched = [joint for joint in model["joint"] if re.fullmatch(pattern, joint)]

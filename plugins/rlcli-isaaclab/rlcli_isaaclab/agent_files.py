@@ -27,7 +27,8 @@ def read_agent(file: Path, library: str, notes: list[Note]) -> dict[str, Any] | 
     if reader is None:
         return None
     try:
-        data = yaml.safe_load(read_plain(file, MAX_BYTES))
+        text = read_plain(file, MAX_BYTES)
+        data = yaml.safe_load(text)
     except (OSError, yaml.YAMLError, RecursionError) as error:
         raise ConfigError([Problem(str(file), "", f"cannot be read: {' '.join(str(error).split())}")]) from None
     if not isinstance(data, dict):
@@ -37,9 +38,24 @@ def read_agent(file: Path, library: str, notes: list[Note]) -> dict[str, Any] | 
         config = reader(Node(_numbers(data), (), report))
         report.finish(data)
     except ConfigError as error:
-        raise ConfigError([Problem(str(file), p.path, p.message, p.hint) for p in error.problems]) from None
+        tree = yaml.compose(text, yaml.SafeLoader)
+        at = [f"{file}:{_line(tree, p.path)}" for p in error.problems]
+        problems = zip(at, error.problems, strict=True)
+        raise ConfigError([Problem(where, p.path, p.message, p.hint) for where, p in problems]) from None
     notes += [Note(str(file), *_text(note)) for note in report.user_notes()]
     return {"trainer": "ppo", "algorithm": "ppo", **config}
+
+
+def _line(node: yaml.Node, path: str) -> int:
+    """Return the line of a key, `a.b.c`, below a node; of a key that does not exist, the line of the key above it."""
+    line = node.start_mark.line + 1
+    for part in path.split("."):
+        pairs = node.value if isinstance(node, yaml.MappingNode) else []
+        found = next(((key, value) for key, value in pairs if str(key.value) == part), None)
+        if found is None:
+            break
+        line, node = found[0].start_mark.line + 1, found[1]
+    return line
 
 
 def _text(note: Note) -> tuple[Any, ...]:

@@ -81,7 +81,7 @@ class DirectRLEnv(gymnasium.Env):
     def _bind(self, created: Any, index: int) -> None:
         """Connect an object that `_setup_scene` has created with its part of the simulation."""
         from rlcli_isaaclab.scene_facade import Asset
-        from rlcli_isaaclab.sensor_facade import TerrainImporter
+        from rlcli_isaaclab.sensor_facade import TerrainImporter, bound_parts
 
         name = self.cfg.rlcli_names[index]
         if isinstance(created, TerrainImporter):
@@ -90,7 +90,7 @@ class DirectRLEnv(gymnasium.Env):
             created.bind(self.managed, self.managed.entities[name])
             self.scene.articulations[name] = created
         else:
-            created.bind(self.managed.sensors[name])
+            created.bind(*bound_parts(name, self.managed.sensors))
 
     @property
     def unwrapped(self) -> Any:

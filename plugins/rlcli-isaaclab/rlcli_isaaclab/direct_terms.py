@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 
 from rlcli.config.term_signatures import Signature
+from rlcli.errors import TaskError
 from rlcli.managers.attribute_state import AttributeState
 from rlcli.sim.selection import Selection
+from rlcli_isaaclab.absent import place_of
 from rlcli_isaaclab.direct_env import DirectRLEnv, building
 from rlcli_isaaclab.observation_noise import noise_model
 from rlcli_isaaclab.substeps import Substeps
@@ -155,7 +157,12 @@ def _image_first(value: Tensor) -> Tensor:
 def runner_of(managed: Any, term: HookTerm) -> DirectRunner:
     """Return the `DirectRunner` of an environment of rlcli; the first call creates it."""
     if "_isaaclab_direct" not in vars(managed):
-        vars(managed)["_isaaclab_direct"] = DirectRunner(managed, term)
+        try:
+            vars(managed)["_isaaclab_direct"] = DirectRunner(managed, term)
+        except ValueError as error:  # a term's ValueError is reported at the term; here it belongs to the task's code
+            what = f"{place_of(error)}{type(error).__name__}: {error}"
+            hint = getattr(error, "hint", None) or "correct the task's code at this line, or the model"
+            raise TaskError(what, hint=hint) from error
     return vars(managed)["_isaaclab_direct"]
 
 

@@ -14,7 +14,7 @@ from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
-from rlcli_isaaclab.absent import NoEffect, absence
+from rlcli_isaaclab.absent import NoEffect, absence, user_place
 from rlcli_isaaclab.asset_commands import BodyWrench, JointDrive, PhysxView
 from rlcli_isaaclab.asset_data import Data
 from rlcli_isaaclab.sensor_facade import FrameTransformer, TerrainImporter, bound, camera_or_sensor, find_elements
@@ -280,13 +280,22 @@ class Scene(Mapping[str, Any]):
     def sensors(self) -> Mapping[str, Any]:
         """Sensors by name."""
         sensors = getattr(self._env, "sensors", {}).items()
-        found = {name: camera_or_sensor(sensor) for name, sensor in sensors} | self._frames
+        found = {name: camera_or_sensor(name, dict(sensors)) for name, _ in sensors} | self._frames
         for name, made in found.items():
             made.cfg = getattr(self.user_cfg, name, None)
             made.filters = []
             while filter_name(name, len(made.filters)) in found:
                 made.filters.append(found[filter_name(name, len(made.filters))])
         return found
+
+    def write_data_to_sim(self) -> None:
+        """Raise an error: a task calls this to step the simulation itself, for example in a reset.
+
+        Raises:
+            TaskError: always.
+        """
+        what = f"{user_place()}env.scene.write_data_to_sim cannot be used: a task cannot step the simulation itself"
+        raise TaskError(what, hint="rlcli steps all environments at once; set joint positions in a reset instead")
 
     def clone_environments(self, *args: Any, **options: Any) -> None:
         """Do nothing: every environment has its own simulation."""

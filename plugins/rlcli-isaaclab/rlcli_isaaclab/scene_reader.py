@@ -12,7 +12,7 @@ from rlcli_isaaclab.absent import reason_of
 from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
 from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.model_lookup import given_models, mjcf_of, model_hint
-from rlcli_isaaclab.sensor_reader import filter_name, read_filters, read_sensor
+from rlcli_isaaclab.sensor_reader import camera_kinds, filter_name, image_name, read_filters, read_sensor
 from rlcli_isaaclab.settings import Key, Node, as_float, kind_of
 from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
 
@@ -80,6 +80,9 @@ class SceneReader:
             sensor = read_sensor(kind, item, self.prims, self.frames)
             if sensor is not None:
                 self.sensors[item.key[-1]] = sensor
+            if sensor is not None and sensor["kind"] == "camera":
+                for data in camera_kinds(item.data.get("data_types", ["rgb"]))[1:]:
+                    self.sensors[image_name(item.key[-1], data)] = {**sensor, "data": data}
             if kind == "ContactSensor" and sensor is not None:
                 for index, filtered in enumerate(read_filters(item, sensor, self.prims)):
                     self.sensors[filter_name(item.key[-1], index)] = filtered

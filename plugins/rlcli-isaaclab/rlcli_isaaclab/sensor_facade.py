@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +15,7 @@ from rlcli.errors import did_you_mean, listing
 from rlcli.scene.names import match
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
 from rlcli_isaaclab.absent import absence, user_place
+from rlcli_isaaclab.sensor_reader import image_name
 from rlcli_isaaclab.setup_scene import current_setup
 
 
@@ -90,18 +91,17 @@ class CameraView:
 
     cfg: Any
 
-    def bind(self, sensor: Any) -> None:
-        """Connect the camera with a sensor of the simulation."""
-        self._sensor, self.data = sensor, self
+    def bind(self, *sensors: Any) -> None:
+        """Connect the camera with its sensors in the simulation, one for each kind of data."""
+        self._sensor, self.data = sensors[0], self
+        self._images = _Images({name: sensor for sensor in sensors for name in _IMAGE_NAMES[sensor.config.data]})
         self.body_names: list[str] = []
         self.joint_names: list[str] = []
 
     @property
     def output(self) -> Mapping[str, Tensor]:
         """Images by type of data, channels last. (num_envs, h, w, c)"""
-        kind, image = self._sensor.config.data, self._sensor.image
-        names = {"rgb": ("rgb",), "depth": ("depth", "distance_to_image_plane"), "distance": ("distance_to_camera",)}
-        return _Images(dict.fromkeys(names[kind], image))
+        return self._images
 
     @property
     def image_shape(self) -> tuple[int, int]:
@@ -109,11 +109,31 @@ class CameraView:
         return self._sensor.config.height, self._sensor.config.width
 
 
-class _Images(dict[str, Tensor]):
-    """Images by type of data, such as `rgb`; another type raises an error."""
+_IMAGE_NAMES = {"rgb": ("rgb",), "depth": ("depth", "distance_to_image_plane"), "distance": ("distance_to_camera",)}
+"""Data of rlcli's camera -> Isaac Lab's types of images."""
 
-    def __missing__(self, name: str) -> Tensor:
-        raise absence(f"Camera.data.output[{name!r}]")
+
+class _Images(Mapping[str, Tensor]):
+    """Images by type of data, such as `rgb`, rendered when they are read; another type raises an error."""
+
+    def __init__(self, sensors: Mapping[str, Any]) -> None:
+        self._sensors = sensors
+
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self._sensors:
+            hint = f"the camera has {listing(self._sensors)}; segmentation and normals have no counterpart"
+            raise absence(f"Camera.data.output[{name!r}]", hint)
+        image: Tensor = self._sensors[name].image
+        return image
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._sensors
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._sensors)
+
+    def __len__(self) -> int:
+        return len(self._sensors)
 
 
 class TerrainImporter:
@@ -168,10 +188,20 @@ class TerrainImporter:
         self._terrain.move(selection, move_up.bool(), move_down.bool())
 
 
-def camera_or_sensor(sensor: Any) -> Any:
+def camera_or_sensor(name: str, sensors: Mapping[str, Any]) -> Any:
     """Return a `CameraView` of a camera, or a `Sensor` of another sensor."""
-    is_camera = getattr(getattr(sensor, "config", None), "kind", "") == "camera"
-    return bound(CameraView if is_camera else Sensor, sensor)
+    is_camera = _kind(sensors[name]) == "camera"
+    return bound(CameraView if is_camera else Sensor, *bound_parts(name, sensors))
+
+
+def bound_parts(name: str, sensors: Mapping[str, Any]) -> list[Any]:
+    """Return a sensor of the simulation; after a camera, those for its further data."""
+    more = [image_name(name, kind) for kind in _IMAGE_NAMES] if _kind(sensors[name]) == "camera" else []
+    return [sensors[key] for key in (name, *more) if key in sensors]
+
+
+def _kind(sensor: Any) -> str:
+    return str(getattr(getattr(sensor, "config", None), "kind", ""))
 
 
 def bound(kind: Any, *parts: Any) -> Any:

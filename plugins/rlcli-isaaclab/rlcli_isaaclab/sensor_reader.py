@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rlcli.errors import listing
@@ -66,13 +66,14 @@ def _frame(entity: str, body: str | None, offset: Node) -> dict[str, Any]:
     return {"entity": entity, "body": body, "pos": [as_float(v) for v in pos], "rot": [as_float(v) for v in rot]}
 
 
-_CAMERA_DATA = {
+CAMERA_DATA = {
     "rgb": "rgb",
     "rgba": "rgb",
     "depth": "depth",
     "distance_to_image_plane": "depth",
     "distance_to_camera": "distance",
 }
+"""Isaac Lab's type of images -> data of rlcli's camera."""
 _FORWARD = {
     "world": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "ros": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
@@ -90,12 +91,15 @@ def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, 
         inside: parts of the camera's prim path below the entity.
     """
     wanted = list(item.get("data_types", ["rgb"]))
-    if len(wanted) != 1 or wanted[0] not in _CAMERA_DATA:
-        what = f"a camera has one of {listing(_CAMERA_DATA)}; found {listing(wanted)}"
-        if not wanted or wanted[0] not in _CAMERA_DATA:
-            item.report.problem((*item.key, "data_types"), what, "segmentation and normals have no counterpart")
-            return None
-        item.report.entries[(*item.key, "data_types")] = ("approximated", what)
+    kinds = camera_kinds(wanted)
+    absent = [name for name in wanted if name not in CAMERA_DATA]
+    if not kinds:
+        what = f"a camera has {listing(CAMERA_DATA)}; found {listing(wanted)}"
+        item.report.problem((*item.key, "data_types"), what, "segmentation and normals have no counterpart")
+        return None
+    if absent:
+        why = f"without {listing(absent)}, which have no counterpart: code that reads them raises an error"
+        item.report.entries[(*item.key, "data_types")] = ("approximated", why)
     offset, spawn = item.node("offset"), item.node("spawn")
     convention = offset.get("convention", "ros")
     eye = [as_float(v) for v in offset.get("pos", (0.0, 0.0, 0.0))]
@@ -108,7 +112,7 @@ def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, 
     near, far = spawn.get("clipping_range", (0.01, 1e6))
     config: dict[str, Any] = {
         "kind": "camera",
-        "data": _CAMERA_DATA[wanted[0]],
+        "data": kinds[0],
         "width": width,
         "height": height,
         "eye": eye,
@@ -144,6 +148,35 @@ def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, 
         "history_length",
     )
     return config
+
+
+def camera_kinds(wanted: Iterable[str]) -> list[str]:
+    """Return the data of rlcli's cameras for a camera's `data_types`, without those that have no counterpart."""
+    return list(dict.fromkeys(CAMERA_DATA[name] for name in wanted if name in CAMERA_DATA))
+
+
+def image_name(camera: str, kind: str) -> str:
+    """Return the name of the sensor for further data of a camera: `CAMERA__depth`."""
+    return f"{camera}__{kind}"
+
+
+def choose_image(params: Node, config: dict[str, Any], sensors: dict[str, Any]) -> None:
+    """Set the sensor of the term `image`: the camera's one for `data_type`. Report a type that the camera lacks."""
+    camera, wanted = config.get("sensor", "tiled_camera"), str(params.data.get("data_type", "rgb"))
+    base = sensors.get(camera)
+    if base is None or base["kind"] != "camera":
+        return  # the check of the term reports it
+    made = {data: name for data in CAMERA_DATA.values() if (name := image_name(camera, data)) in sensors}
+    made[base["data"]] = camera
+    data = CAMERA_DATA.get(wanted)
+    if data not in made:
+        hint = f"images of rlcli's cameras: {listing(CAMERA_DATA)}; data_types of the camera must have the type"
+        params.report.problem((*params.key, "data_type"), f"'{camera}' has no images of the type '{wanted}'", hint)
+        return
+    if data == "distance" and params.data.get("convert_perspective_to_orthogonal"):
+        data = "depth"  # the distance along the optical axis
+        sensors.setdefault(made.setdefault(data, image_name(camera, data)), {**base, "data": data})
+    config["sensor"] = made[data]
 
 
 def _rotated(quat: list[float], axis: tuple[float, float, float]) -> list[float]:

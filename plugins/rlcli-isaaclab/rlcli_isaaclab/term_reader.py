@@ -21,6 +21,7 @@ from rlcli_isaaclab.object_reader import OBJECT_KEYS, ObjectReader
 from rlcli_isaaclab.observation_reader import read_processing
 from rlcli_isaaclab.randomization import EVENTS, translate_event
 from rlcli_isaaclab.scene_reader import SceneReader
+from rlcli_isaaclab.sensor_reader import choose_image
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, equals_default, kind_of, to_plain
 from rlcli_isaaclab.table import (
     COMMANDS,
@@ -190,6 +191,8 @@ class TermReader(ObjectReader):
             config = {"func": ours} | self._read_common(section, node)
             config |= self._read_params(signature, entry, params)
             order_ranges(signature, config)
+            if ours == "image":
+                choose_image(params, config, self.scene.sensors)
             if entry.note:
                 self.report.entries[(*node.key, "func")] = ("approximated", entry.note)
             if name in HEIGHT_TERMS and self.scene.has_terrain:

@@ -109,19 +109,25 @@ def _read_generator(node: Node) -> dict[str, Any]:
     }
     if node.get("seed") is not None:
         config["seed"] = node.get("seed")
-    node.skip("class_type", "color_scheme", "use_cache", "cache_dir", "vertical_scale", "slope_threshold")
-    node.skip("border_height")
+    node.skip("class_type", "color_scheme", "use_cache", "cache_dir", "vertical_scale", "border_height")
+    node.note("approximated", "slope_threshold", "steps are slopes as wide as one cell, not vertical walls")
     for name, patch in node.node("sub_terrains").nodes():
-        config["sub_terrains"][name] = _read_sub_terrain(patch)
+        config["sub_terrains"][name] = _read_sub_terrain(patch, config["resolution"])
     return config
 
 
-def _read_sub_terrain(node: Node) -> dict[str, Any]:
-    """Return the settings of one sub-terrain. The name of its function decides its kind."""
+def _read_sub_terrain(node: Node, resolution: float) -> dict[str, Any]:
+    """Return the settings of one sub-terrain. The name of its function decides its kind.
+
+    `resolution` is the distance between two heights of the terrain [m].
+    """
     function = kind_of(node.get("function"))
     proportion = as_float(node.get("proportion", 1.0))
-    node.skip("size", "horizontal_scale", "vertical_scale", "slope_threshold", "border_width", "flat_patch_sampling")
+    node.skip("size", "horizontal_scale", "vertical_scale", "slope_threshold", "flat_patch_sampling")
     kind = _SUB_TERRAINS.get(function)
+    if kind == "flat":
+        node.skip("border_width")
+    node.note("approximated", "border_width", "the patch has no flat border: its shape begins at its edge")
     if kind is None:
         why = f"replaced by flat ground: '{function}' has no counterpart; use one of {listing(_SUB_TERRAINS)}"
         node.report.entries[node.key] = ("approximated", why)
@@ -135,8 +141,16 @@ def _read_sub_terrain(node: Node) -> dict[str, Any]:
     if their_range in node:
         config[our_range] = [as_float(v) for v in node.get(their_range)]
     for theirs, ours in _OTHER_KEYS.get(kind, {}).items():
-        if theirs in node:
-            config[ours] = to_plain(node.get(theirs))
+        value = node.get(theirs)
+        if value is not None:
+            config[ours] = to_plain(value)
+    if kind == "noise":
+        config.setdefault("spacing", resolution)
+        if "height" in config:  # the same at every difficulty
+            low, high = config["height"]
+            config["height"] = [(high - low) / 2.0] * 2
+            node.note("approximated", "noise_range", "heights are relative to the middle of the range")
+        node.note("ignored", "noise_step", "heights are not rounded")
     if kind in ("slope", "stairs") and inverted:
         config["inverted"] = True
     return config

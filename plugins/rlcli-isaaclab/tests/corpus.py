@@ -53,6 +53,8 @@ def run(
     name: str, kwargs: dict[str, Any], package: Path, folder: Path, last: str, steps: int
 ) -> tuple[int, str, dict[str, Any]]:
     """Return the number of stages that a task passes, the reason why it stops, and facts about it."""
+    from rlcli.errors import RlcliError
+
     stage, facts = 0, {}
     try:
         import torch
@@ -94,9 +96,11 @@ def run(
         text = " ".join(str(error).split())
         problems = getattr(error, "problems", None)
         if problems:
-            text = " || ".join(f"{p.path}: {p.message}" + (f" ({p.hint})" if p.hint else "") for p in problems[:6])
+            text = " || ".join(map(str, problems[:6]))
         frames = traceback.extract_tb(error.__traceback__)
-        at = f" [{frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno}]" if frames and not problems else ""
+        own = [f for f in frames if f.filename.startswith(str(package))] or frames
+        is_bug = own and not isinstance(error, RlcliError)
+        at = f" [{own[-1].filename.rpartition('/')[2]}:{own[-1].lineno}]" if is_bug else ""
         return stage, f"{type(error).__name__}: {text[:600]}{at}", facts
     return stage, "", facts
 
@@ -189,7 +193,10 @@ def write_page(rows: dict[str, Any], page: Path) -> None:
     page.write_text(before + start + "\n".join(ordered) + "\n" + end + after, encoding="utf-8")
 
 
-USUAL = ("physx", "rigid_props", "articulation_props", "collision_props", "experiment_name", "run_name", "num_envs")
+USUAL = (
+    *("physx", "actuators.damping", "rigid_props", "articulation_props", "collision_props"),
+    *("experiment_name", "run_name", "num_envs"),
+)
 """Parts of keys that most tasks lose; the page names them once."""
 
 

@@ -26,6 +26,7 @@ EXTRA_BODIES = {
     "panda": ["panda_link0", "panda_hand", "panda_leftfinger", "panda_rightfinger", "panda_link7"],
 }
 LEGS = [f"{side}_{part}" for part in ("HAA", "HFE", "KFE") for side in ("LF", "LH", "RF", "RH")]
+PANDA = [*(f"panda_joint{i}" for i in range(1, 8)), "panda_finger_joint1", "panda_finger_joint2"]
 JOINTS: dict[str, list[str]] = {
     "anymal": LEGS,
     "shadow_hand": [
@@ -38,7 +39,8 @@ JOINTS: dict[str, list[str]] = {
         "lower_waist:0", "lower_waist:1", "pelvis",
         *(f"{s}_{p}" for p in ("upper_arm:0", "upper_arm:2", "lower_arm", "thigh:0", "thigh:1", "thigh:2", "shin", "foot:0", "foot:1") for s in SIDES),
     ],
-    "panda_instanceable": [*(f"panda_joint{i}" for i in range(1, 8)), "panda_finger_joint1", "panda_finger_joint2"],
+    "panda_instanceable": PANDA,
+    "franka_mimic": PANDA,
 }  # fmt: skip
 """Part of a path -> all joints of the robot, for tasks whose code needs their number."""
 BODIES: dict[str, list[str]] = {
@@ -53,6 +55,10 @@ BODIES: dict[str, list[str]] = {
         "panda_hand",
         "panda_leftfinger",
         "panda_rightfinger",
+    ],
+    "franka_mimic": [
+        *(f"panda_link{i}" for i in range(8)),
+        *("panda_hand", "panda_leftfinger", "panda_rightfinger", "panda_fingertip_centered", "force_sensor"),
     ],
 }
 

@@ -143,6 +143,15 @@ def test_viscous_friction_is_damping_of_the_joint(tmp_path):
     assert model.dof_damping[6:].flatten().tolist()[0] == 0.8
 
 
+def test_damping_of_the_mjcf_beside_an_actuator_is_reported(tmp_path):
+    resolved = task(tmp_path, legs=implicit([".*"]))
+    model = robot(resolved)[0].engine.model
+    (note,) = [note for note in resolved.notes if note.key == "scene.robot.actuators.damping"]
+    assert note.text == f"the damping of the MJCF's joints, at most {model.dof_damping.max():g}, acts in addition"
+    without = task(tmp_path, mdp.JointEffortActionCfg, legs=implicit([".*"], stiffness=0.0))
+    assert "damping" not in notes(without)
+
+
 def test_keys_without_counterpart_are_reported(tmp_path):
     front = implicit(["hip_f."], velocity_limit_sim=9.0, dynamic_friction=0.1, friction=0.2)
     back = IdealPDActuatorCfg(joint_names_expr=["hip_b."], stiffness=5.0, damping=None, effort_limit_sim=4.0)

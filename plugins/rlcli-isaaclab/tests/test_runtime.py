@@ -209,10 +209,37 @@ def test_inverse_and_error_magnitude_equal_mujoco():
     assert torch.equal(lab.quat_unique(a), lab.quat_unique(-a))
 
 
+def test_details_that_isaac_lab_documents():
+    q = quats()
+    assert torch.allclose(lab.quat_mul(q1=lab.quat_inv(2.0 * q, eps=1e-9), q2=2.0 * q)[:, 0], torch.ones(16).double())
+    angle = torch.tensor([3.0, -3.0, 1.0, -1.0]) * torch.pi
+    assert lab.wrap_to_pi(angles=angle).tolist() == pytest.approx([math.pi, -math.pi, math.pi, -math.pi])
+    small = lab.quat_from_angle_axis(torch.full((1,), 1e-4), torch.tensor([[0.0, 0.0, 1.0]]))
+    assert lab.quat_error_magnitude(small, torch.tensor([[1.0, 0.0, 0.0, 0.0]])).item() == pytest.approx(1e-4, rel=1e-4)
+    turned = lab.quat_box_plus(-q, torch.zeros(16, 3).double())
+    assert torch.allclose(turned, lab.quat_unique(q))
+    flip = torch.tensor([-0.2, 0.1, 0.1, 0.9]).double()
+    flip = flip / flip.norm()
+    assert torch.allclose(lab.quat_from_matrix(lab.matrix_from_quat(flip)), flip)  # the largest number is positive
+    points = lab.transform_points(torch.tensor([[1.0, 0.0, 0.0]]).double(), vectors(), q)
+    assert torch.allclose(points[:, 0], lab.quat_apply(q, torch.eye(1, 3).double().expand(16, 3)) + vectors())
+    assert lab.quat_rotate(q=q, v=vectors()).equal(lab.quat_apply(q, vectors()))
+    surface = lab.sample_cylinder(2.0, (0.5, 1.0), 200, "cpu")
+    assert torch.allclose(surface[:, :2].norm(dim=1), torch.full((200,), 2.0))
+    assert surface[:, 2].min() >= 0.5
+    assert surface[:, 2].max() <= 1.0
+    ends = lab.sample_triangle(-1.0, 1.0, 4000, "cpu")
+    assert ends.square().mean().item() == pytest.approx(0.5, abs=0.03)  # of the density |x|
+
+
 def test_euler_angles_round_trip():
     q = quats()
     angles = lab.euler_xyz_from_quat(q)
-    assert all(bool(((a >= 0) & (a < 2 * torch.pi)).all()) for a in angles)
+    assert all(bool((a.abs() <= torch.pi).all()) for a in angles)
+    assert min(a.min() for a in angles) < 0.0
+    wrapped = lab.euler_xyz_from_quat(q, wrap_to_2pi=True)
+    assert all(bool(((a >= 0) & (a < 2 * torch.pi)).all()) for a in wrapped)
+    assert all(torch.allclose(a % (2 * torch.pi), b) for a, b in zip(angles, wrapped, strict=True))
     again = lab.quat_from_euler_xyz(*angles)
     assert torch.allclose(lab.quat_unique(again), lab.quat_unique(q), atol=1e-7)
     roll, pitch, yaw = (torch.tensor([x], dtype=torch.float64) for x in (0.1, -0.2, 0.3))

@@ -18,6 +18,8 @@ from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError, TaskError
 from rlcli.registry import find_task
+from rlcli_isaaclab.sensor_reader import choose_image
+from rlcli_isaaclab.settings import Node, Report
 
 
 def original(text):
@@ -196,6 +198,98 @@ def test_direct_task_saves_and_restores_its_tensors(direct):
     assert torch.equal(env.step(action).obs["policy"][:, :2], other.step(action).obs["policy"][:, :2])
 
 
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("        self.cart = self.robot.body_names.index('finger')", "ValueError: 'finger' is not in list"),
+        ("        self.robot.find_joints('finger')", "finger"),
+        ("        self.scene.write_data_to_sim()", "a task cannot step the simulation itself"),
+        (
+            "        sim_utils.retrieve_file_path('omniverse://a/grasps.json', download_dir='.')",
+            "'omniverse://a/grasps.json' is a file of NVIDIA's server, and rlcli downloads nothing",
+        ),
+    ],
+)
+def test_error_of_a_direct_task_has_the_line_of_its_code(direct, line, message):
+    start = "        self.applied = 0\n"
+    text = DIRECT.replace("sim_utils\n", "sim_utils\nimport isaaclab.utils.assets\n", 1).replace(
+        start, f"{start}{line}\n"
+    )
+    direct.write_text(text.replace("sim_utils.retrieve", "isaaclab.utils.assets.retrieve"))
+    number = 1 + direct.read_text().split(start)[0].count("\n") + 1
+    with pytest.raises(TaskError) as caught:
+        make_env(resolve(find_task(f"{direct}:PoleEnvCfg")), seed=0).reset()
+    assert str(caught.value).startswith(f"{direct}:{number}: ")
+    assert message in str(caught.value)
+
+
+def test_file_that_was_downloaded_by_hand_is_found(tmp_path):
+    from rlcli_isaaclab.utils.assets import retrieve_file_path
+
+    (tmp_path / "grasps.json").write_text("{}")
+    assert retrieve_file_path("omniverse://a/grasps.json", str(tmp_path)) == str(tmp_path / "grasps.json")
+    assert retrieve_file_path("omniverse://a/robot.usd") == "omniverse://a/robot.usd"
+
+
+CAMERA = """
+    camera_cfg: TiledCameraCfg = TiledCameraCfg(
+        prim_path="/World/envs/env_.*/Camera", data_types=["rgb", "depth", "semantic_segmentation"],
+        offset=TiledCameraCfg.OffsetCfg(pos=(-5.0, 0.0, 2.0), convention="world"),
+        spawn=sim_utils.PinholeCameraCfg(clipping_range=(0.1, 20.0)), width=16, height=12,
+    )
+"""
+
+
+def test_camera_with_several_types_of_images(direct):
+    text = DIRECT.replace("sim_utils\n", "sim_utils\nfrom isaaclab.sensors import TiledCamera, TiledCameraCfg\n", 1)
+    text = text.replace("    force = 5.0\n", f"    force = 5.0\n{CAMERA}")
+    text = text.replace(
+        "        spawn_ground", "        self.camera = TiledCamera(self.cfg.camera_cfg)\n        spawn_ground", 1
+    )
+    direct.write_text(text)
+    resolved = resolve(find_task(f"{direct}:PoleEnvCfg"))
+    note = next(note for note in resolved.notes if "data_types" in str(note))
+    assert "without semantic_segmentation, which have no counterpart" in str(note)
+    env = make_env(resolved, seed=0)
+    env.reset()
+    output = vars(env)["_isaaclab_direct"].lab.camera.data.output
+    assert set(output) == {"rgb", "depth", "distance_to_image_plane"}
+    assert (output["rgb"].shape, output["rgb"].dtype) == ((4, 12, 16, 3), torch.uint8)
+    assert output["depth"].shape == (4, 12, 16, 1)
+    assert 2.0 < output["depth"].max() < 20.0
+    assert "semantic_segmentation" not in output
+    with pytest.raises(TaskError, match="output\\['semantic_segmentation'\\] cannot be used"):
+        output["semantic_segmentation"]
+
+
+@pytest.mark.parametrize(
+    ("params", "sensor"),
+    [
+        ({}, "cam"),
+        ({"data_type": "distance_to_image_plane"}, "cam__depth"),
+        ({"data_type": "distance_to_camera"}, None),
+        ({"data_type": "normals"}, None),
+    ],
+)
+def test_image_term_reads_the_type_that_it_names(params, sensor):
+    sensors = {"cam": {"kind": "camera", "data": "rgb"}, "cam__depth": {"kind": "camera", "data": "depth"}}
+    report, config = Report(), {"sensor": "cam"}
+    choose_image(Node(params, ("observations", "policy", "picture", "params"), report), config, sensors)
+    assert [problem.path for problem in report.problems] == (
+        [] if sensor else ["observations.policy.picture.params.data_type"]
+    )
+    assert config["sensor"] == (sensor or "cam")
+
+
+def test_distance_to_camera_along_the_optical_axis_is_a_depth():
+    sensors = {"cam": {"kind": "camera", "data": "distance"}}
+    config = {"sensor": "cam"}
+    params = {"data_type": "distance_to_camera", "convert_perspective_to_orthogonal": True}
+    choose_image(Node(params, (), Report()), config, sensors)
+    assert config["sensor"] == "cam__depth"
+    assert sensors["cam__depth"]["data"] == "depth"
+
+
 def test_space_that_is_not_continuous_is_refused_with_place(direct):
     direct.write_text(DIRECT.replace("action_space = 1", "action_space = {2}"))
     with pytest.raises(ConfigError) as caught:
@@ -353,6 +447,17 @@ def test_rl_games_settings_without_counterpart_are_reported(direct):
         "params.config.lr_schedule": "unknown schedule 'cosine'",
         "params.network.cnn.convs.0.padding": "rlcli's convolutions have no padding",
     }
+
+
+def test_agent_of_another_algorithm_is_refused_with_its_line(direct):
+    registered(direct.parent, ["skrl"])
+    file = direct.parent / "skrl.yaml"
+    file.write_text(file.read_text().replace("class: PPO", "class: AMP"))
+    with pytest.raises(ConfigError) as caught:
+        resolve(find_task(str(direct.parent)))
+    (problem,) = caught.value.problems
+    assert problem.where == f"{file}:5"
+    assert problem.message == "'AMP' has no counterpart in rlcli"
 
 
 def test_registration_chooses_agent_and_file_reference_uses_the_same(direct):

@@ -322,7 +322,12 @@ def test_terrain_generator_keeps_sub_terrains(velocity):
     assert terrain.friction == 0.8
     slope, rough = terrain.sub_terrains["slope"], terrain.sub_terrains["rough"]
     assert (slope.kind, slope.proportion, slope.slope, slope.platform) == ("slope", 0.4, (0.0, 0.3), 1.5)
-    assert (rough.kind, rough.height) == ("noise", (0.01, 0.05))
+    assert (rough.kind, rough.spacing) == ("noise", 0.1)
+    assert rough.height == pytest.approx((0.02, 0.02))  # 4 cm between the extremes, at every difficulty
+    notes = {note.key: (note.status, note.text) for note in task.notes}
+    generator = "scene.terrain.terrain_generator"
+    assert notes[f"{generator}.slope_threshold"][0] == "approximated"
+    assert notes[f"{generator}.sub_terrains.rough.noise_range"][0] == "approximated"
     env = make_env(task)
     env.reset(seed=0)
     assert env.step(torch.zeros(4, 4)).reward.isfinite().all()

@@ -26,6 +26,8 @@ SPEC = FormatSpec(
         "rlcli.oige": "rlcli_oige",
         "gym": "gymnasium",
         "numpy": "rlcli_oige.modules:find_numpy",
+        "hydra": "rlcli_oige.modules:find_hydra",
+        "omegaconf": "rlcli_oige.modules:find_hydra",
         **dict.fromkeys(
             (
                 "omniisaacgymenvs.tasks.base",

@@ -1,4 +1,4 @@
-"""Modules that the unchanged import lines of task files get: `omni.*`, `pxr`, `carb`, `gym`, `omniisaacgymenvs.*`.
+"""Modules that the import lines of task files get: `omni.*`, `pxr`, `carb`, `gym`, `hydra`, `omniisaacgymenvs.*`.
 
 A name that `rlcli_oige` has is imported from there, whatever module the task names. Names whose calls have no effect in
 MuJoCo are recorded when they are called; all others can be imported and raise an error when they are used.
@@ -6,7 +6,7 @@ MuJoCo are recorded when they are called; all others can be imported and raise a
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import re
 from pathlib import Path
 from types import ModuleType
@@ -36,12 +36,13 @@ _REASONS = {
     "omni.replicator": "rlcli has no replicator; cameras are sensors of the scene",
     "omni.isaac.sensor": "cameras are sensors of the scene",
     "omni.isaac.core.utils.warp": "tasks with Warp arrays are not supported; use the task's torch version",
+    "hydra": "rlcli composes the YAML files before the task starts, and has no Hydra at run time (Factory's tasks also"
+    " read Jacobians and mass matrices, which rlcli's views do not have)",
+    "omegaconf": "it is not installed (pip install omegaconf)",
     "warp": "tasks with Warp arrays are not supported; use the task's torch version",
 }
 """Module -> why names below it have no counterpart."""
 _REFUSED = {
-    "omniisaacgymenvs.tasks.factory": "nut and bolt touch through signed distance fields of their meshes, which a rigid"
-    " body of MJCF has not; there is no counterpart of Factory's tasks",
     "omniisaacgymenvs.tasks.franka_deformable": "PhysX simulates deformable bodies on its GPU; rlcli simulates rigid"
     " bodies",
     "omniisaacgymenvs.tasks.warp": "tasks with Warp arrays are not supported; use the task's torch version",
@@ -74,6 +75,15 @@ def find_numpy(name: str, file: str = "") -> ModuleType | None:
             {**vars(numpy), "Inf": numpy.inf, "Infinity": numpy.inf, "NaN": numpy.nan, "float_": numpy.float64}
         )
     return _modules[name]
+
+
+def find_hydra(name: str, file: str = "") -> ModuleType | None:
+    """Return a module whose names raise an error when they are used, for `hydra` in a file of OmniIsaacGymEnvs.
+
+    The same for `omegaconf` if it is not installed; None in all other cases.
+    """
+    own = file and "omniisaacgymenvs" in Path(file).read_text(encoding="utf-8", errors="replace")
+    return find(name) if own and (name != "omegaconf" or importlib.util.find_spec(name) is None) else None
 
 
 def refuse(name: str, where: str) -> None:

@@ -39,7 +39,6 @@ _LOST = {
 _REFUSED = {
     "Deformable": "PhysX simulates deformable bodies on its GPU; rlcli simulates rigid bodies",
     "Particle": "PhysX simulates particles on its GPU; rlcli simulates rigid bodies",
-    "SDF": "contacts of signed distance fields have no counterpart",
     "Attachment": "attachments belong to deformable bodies, which rlcli does not simulate",
 }
 """Part of a schema's name -> why it is refused."""
@@ -94,6 +93,8 @@ class Schema(metaclass=_SchemaClass):
         for part, reason in _REFUSED.items():
             if part in name:
                 raise TaskError(f"{user_location()}{name}: {reason}")
+        if "SDF" in name:
+            self._prim.stage.note_ignored(name, 'set type="sdf" of the mesh geom in the MJCF', lost=True)
         if name in ("DriveAPI", "PhysxJointAPI") and not self._prim.is_joint() and not self._prim.kind:
             owner = self._prim.owner
             owner = next(

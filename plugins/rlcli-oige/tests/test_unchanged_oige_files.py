@@ -97,7 +97,7 @@ def test_folder_without_package_has_its_own_modules(tmp_path):
     ("line", "message"),
     [
         ("PhysxSchema.PhysxDeformableBodyAPI.Apply(arm.prim)", "deformable bodies"),
-        ("PhysxSchema.PhysxSDFMeshCollisionAPI.Apply(arm.prim)", "signed distance fields"),
+        ("hydra.compose(config_name='a')", "no counterpart of hydra.compose: rlcli composes the YAML files"),
         ("UsdPhysics.DriveAPI.Apply(get_prim_at_path(arm.prim_path + '/base/elbow'), 'angular')", "no joint 'elbow'"),
         ("omni.timeline.get_timeline_interface()", "no counterpart of omni.timeline"),
         ("carb.settings.get_settings()", "no counterpart of carb.settings"),
@@ -111,7 +111,7 @@ def test_missing_features_name_the_line(tmp_path, line, message):
     task = UNCHANGED.replace("        ball = Dyn", f"        {line}\n        ball = Dyn")
     number = task[: task.index(line)].count("\n") + 1
     with pytest.raises(TaskError) as caught:
-        build(package(tmp_path, task.replace("import carb", "import carb, omni.timeline")))
+        build(package(tmp_path, task.replace("import carb", "import carb, hydra, omni.timeline")))
     assert f"arm.py:{number}: " in str(caught.value)
     assert message in str(caught.value)
 
@@ -124,13 +124,14 @@ def test_calls_without_effect_are_logged_once(tmp_path, caplog):
             body.GetSleepThresholdAttr().Set(0.0)
             body.CreateLinearDampingAttr().Set(0.5)
             body.CreateAngularDampingAttr().Set(0.0)
+            PhysxSchema.PhysxSDFMeshCollisionAPI.Apply(arm.prim)
 """
     with caplog.at_level("INFO"):
         build(package(tmp_path, UNCHANGED.replace("        ball = Dyn", f"{lines}        ball = Dyn")))
     (ignored,) = [record.message for record in caplog.records if record.message.startswith("ignored: ")]
     (lost,) = [record.message for record in caplog.records if record.message.startswith("not simulated: ")]
     assert [ignored.count(name) for name in ("UsdLux [", "PreviewSurface [", "SleepThreshold [")] == [1, 1, 1]
-    assert [(name in lost) for name in ("LinearDamping", "AngularDamping")] == [True, False]
+    assert [(name in lost) for name in ("LinearDamping", "AngularDamping", "SDFMesh")] == [True, False, True]
 
 
 def test_missing_module_and_refused_task_name_file(tmp_path):
@@ -139,9 +140,9 @@ def test_missing_module_and_refused_task_name_file(tmp_path):
     assert caught.value.hint == pip_install("no_such_package_x")
     config = package(tmp_path / "b")
     folder = config.parents[2] / "tasks"
-    (folder / "factory").mkdir()
-    (folder / "arm.py").rename(folder / "factory" / "arm.py")
-    with pytest.raises(TaskError, match=r"factory/arm.py:1: .*signed distance fields"):
+    (folder / "warp").mkdir()
+    (folder / "arm.py").rename(folder / "warp" / "arm.py")
+    with pytest.raises(TaskError, match=r"warp/arm.py:1: .*Warp arrays are not supported"):
         build(config)
 
 

@@ -1,5 +1,12 @@
 """Folders of Isaac Lab's models. Only the ends of such paths matter: `model_lookup.py` maps them."""
 
+from __future__ import annotations
+
+from pathlib import Path
+
+from rlcli.errors import TaskError
+from rlcli_isaaclab.absent import user_place
+
 NUCLEUS_ASSET_ROOT_DIR = "nucleus"
 NVIDIA_NUCLEUS_DIR = f"{NUCLEUS_ASSET_ROOT_DIR}/NVIDIA"
 ISAAC_NUCLEUS_DIR = f"{NUCLEUS_ASSET_ROOT_DIR}/Isaac"
@@ -7,8 +14,18 @@ ISAACLAB_NUCLEUS_DIR = f"{ISAAC_NUCLEUS_DIR}/IsaacLab"
 
 
 def retrieve_file_path(path: str, download_dir: str | None = None, force_download: bool = True) -> str:
-    """Return the path: nothing is downloaded."""
-    return path
+    """Return the path; with `download_dir`, that of the file of the same name in this folder: nothing is downloaded.
+
+    Raises:
+        TaskError: if the folder does not have the file.
+    """
+    if download_dir is None or Path(path).is_file():
+        return path
+    file = Path(download_dir).resolve() / Path(path).name
+    if not file.is_file():
+        what = f"{user_place()}'{path}' is a file of NVIDIA's server, and rlcli downloads nothing"
+        raise TaskError(what, hint=f"download the file yourself, and save it as {file}")
+    return str(file)
 
 
 def check_file_path(path: str) -> int:

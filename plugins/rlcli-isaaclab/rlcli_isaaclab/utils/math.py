@@ -13,9 +13,19 @@ import torch
 from torch import Tensor
 
 from rlcli.sim.rotations import from_euler, multiply
-from rlcli.sim.rotations import wrap_to_pi as wrap_to_pi
 
-quat_from_euler_xyz, quat_mul = from_euler, multiply
+quat_from_euler_xyz = from_euler
+
+
+def quat_mul(q1: Tensor, q2: Tensor) -> Tensor:
+    """Return the rotation q2 followed by the rotation q1. (..., 4) each"""
+    return multiply(q1, q2)
+
+
+def wrap_to_pi(angles: Tensor) -> Tensor:
+    """Return the same angles in [-pi, pi] [rad]; odd multiples of pi keep their sign."""
+    turns = (angles.abs() / (2.0 * torch.pi) - 0.5).ceil()
+    return angles - (turns * (2.0 * torch.pi)).copysign(angles)
 
 
 def quat_apply(quat: Tensor, vec: Tensor) -> Tensor:
@@ -32,7 +42,14 @@ def quat_apply_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     return vec - quat[..., :1] * twice + torch.linalg.cross(axis, twice, dim=-1)
 
 
-quat_rotate, quat_rotate_inverse = quat_apply, quat_apply_inverse
+def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
+    """Rotate a vector, as `quat_apply` does. (..., 4), (..., 3) -> (..., 3)"""
+    return quat_apply(q, v)
+
+
+def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
+    """Rotate a vector, as `quat_apply_inverse` does. (..., 4), (..., 3) -> (..., 3)"""
+    return quat_apply_inverse(q, v)
 
 
 def quat_conjugate(q: Tensor) -> Tensor:
@@ -40,7 +57,9 @@ def quat_conjugate(q: Tensor) -> Tensor:
     return torch.cat([q[..., :1], -q[..., 1:]], dim=-1)
 
 
-quat_inv = quat_conjugate
+def quat_inv(q: Tensor, eps: float = 1e-9) -> Tensor:
+    """Return the inverse of a quaternion of any length. (..., 4)"""
+    return quat_conjugate(q) / q.square().sum(dim=-1, keepdim=True).clamp(min=eps)
 
 
 def yaw_quat(quat: Tensor) -> Tensor:
@@ -56,14 +75,15 @@ def quat_apply_yaw(quat: Tensor, vec: Tensor) -> Tensor:
     return quat_apply(yaw_quat(quat), vec)
 
 
-def euler_xyz_from_quat(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return roll, pitch and yaw [rad] in [0, 2 pi). (n, 4) -> (n,) each"""
+def euler_xyz_from_quat(quat: Tensor, wrap_to_2pi: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+    """Return roll, pitch and yaw [rad] in [-pi, pi], or in [0, 2 pi). (n, 4) -> (n,) each"""
     w, x, y, z = quat.unbind(-1)
     roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = torch.asin((2.0 * (w * y - z * x)).clamp(-1.0, 1.0))
     yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    turn = 2.0 * torch.pi
-    return roll % turn, pitch % turn, yaw % turn
+    if wrap_to_2pi:
+        return roll % (2.0 * torch.pi), pitch % (2.0 * torch.pi), yaw % (2.0 * torch.pi)
+    return roll, pitch, yaw
 
 
 def quat_unique(q: Tensor) -> Tensor:
@@ -73,8 +93,7 @@ def quat_unique(q: Tensor) -> Tensor:
 
 def quat_error_magnitude(q1: Tensor, q2: Tensor) -> Tensor:
     """Return the angle between two rotations [rad]. (..., 4) each -> (...)"""
-    cosine = (q1 * q2).sum(dim=-1).abs().clamp(max=1.0)
-    return 2.0 * torch.acos(cosine)
+    return quat_box_minus(q1, q2).norm(p=2, dim=-1)  # exact for small angles, unlike the arc cosine of q1 * q2
 
 
 def subtract_frame_transforms(
@@ -146,7 +165,7 @@ def matrix_from_quat(quaternions: Tensor) -> Tensor:
 
 
 def quat_from_matrix(matrix: Tensor) -> Tensor:
-    """Return the quaternions (w >= 0) of rotation matrices. (..., 3, 3) -> (..., 4)"""
+    """Return the quaternions of rotation matrices, the largest number positive. (..., 3, 3) -> (..., 4)"""
     m = matrix.reshape(-1, 3, 3)
     a, b, c = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
     squares = torch.stack([1 + a + b + c, 1 + a - b - c, 1 - a + b - c, 1 - a - b + c], dim=1)
@@ -160,7 +179,7 @@ def quat_from_matrix(matrix: Tensor) -> Tensor:
     ]
     table = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
     best = table[torch.arange(len(m), device=m.device), squares.argmax(dim=1)]  # the largest divisor is the most exact
-    return quat_unique(normalize(best)).reshape((*matrix.shape[:-2], 4))
+    return normalize(best).reshape(list(matrix.shape[:-2]) + [4])  # noqa: RUF005 (TorchScript)
 
 
 def convert_quat(quat: Any, to: str = "xyzw") -> Any:
@@ -175,8 +194,8 @@ def quat_box_minus(q1: Tensor, q2: Tensor) -> Tensor:
 
 
 def quat_box_plus(q: Tensor, delta: Tensor, eps: float = 1.0e-6) -> Tensor:
-    """Return the rotation `delta` (axis x angle) after q. (n, 4), (n, 3) -> (n, 4)"""
-    return multiply(quat_from_angle_axis(delta.norm(p=2, dim=-1), delta), q)
+    """Return the rotation `delta` (axis x angle) after q, w >= 0. (n, 4), (n, 3) -> (n, 4)"""
+    return quat_unique(multiply(quat_from_angle_axis(delta.norm(p=2, dim=-1), delta), q))
 
 
 def compute_pose_error(
@@ -194,13 +213,13 @@ def apply_delta_pose(source_pos: Tensor, source_rot: Tensor, delta_pose: Tensor,
 
 
 def transform_points(points: Tensor, pos: Tensor | None = None, quat: Tensor | None = None) -> Tensor:
-    """Rotate, then move points. (..., p, 3)"""
+    """Rotate, then move points. (n, p, 3) or (p, 3), one pose or n poses -> (n, p, 3), for one pose also (p, 3)"""
+    moved = points if points.dim() == 3 else points.unsqueeze(0)
     if quat is not None:
-        wide = quat if quat.dim() == 1 else quat.unsqueeze(-2).expand((*points.shape[:-1], 4))
-        points = quat_apply(wide.expand((*points.shape[:-1], 4)), points)
-    if pos is None:
-        return points
-    return points + (pos if pos.dim() == 1 else pos.unsqueeze(-2))
+        moved = moved @ matrix_from_quat(quat.reshape(-1, 4)).transpose(1, 2)
+    if pos is not None:
+        moved = moved + pos.reshape(-1, 1, 3)
+    return moved if points.dim() == 3 else moved.squeeze(0)
 
 
 def skew_symmetric_matrix(vec: Tensor) -> Tensor:
@@ -211,32 +230,27 @@ def skew_symmetric_matrix(vec: Tensor) -> Tensor:
     return torch.stack([first, second, torch.stack([-y, x, zero], dim=-1)], dim=-2)
 
 
-def default_orientation(num: int, device: Any) -> Tensor:
+def default_orientation(num: int, device: str) -> Tensor:
     """Return identity quaternions (1, 0, 0, 0). (num, 4)"""
     return torch.eye(1, 4, device=device).repeat(num, 1)
 
 
-def random_yaw_orientation(num: int, device: Any) -> Tensor:
+def random_yaw_orientation(num: int, device: str) -> Tensor:
     """Sample rotations around z uniformly. (num, 4)"""
     yaw = torch.rand(num, device=device) * 2.0 * torch.pi
     return from_euler(torch.zeros_like(yaw), torch.zeros_like(yaw), yaw)
 
 
 def sample_triangle(lower: float, upper: float, size: Any, device: Any) -> Tensor:
-    """Sample from a symmetric triangular distribution."""
-    shape = (size,) if isinstance(size, int) else tuple(size)
-    return (torch.rand(*shape, device=device) + torch.rand(*shape, device=device)) * 0.5 * (upper - lower) + lower
+    """Sample the ends of a range more often than its middle, as Isaac Lab does: the density is |x| in [-1, 1]."""
+    uniform = sample_uniform(-1.0, 1.0, size, device)
+    return (uniform.abs().sqrt().copysign(uniform) + 1.0) * 0.5 * (upper - lower) + lower
 
 
-def sample_cylinder(radius: float, h_range: Any, size: Any, device: Any) -> Tensor:
-    """Sample points in a cylinder around z. h_range is the range of heights, or the height from 0. (size, 3) [m]"""
-    shape = (size,) if isinstance(size, int) else tuple(size)
-    low, high = (0.0, float(h_range)) if isinstance(h_range, int | float) else h_range
-    distance = radius * torch.rand(*shape, device=device).sqrt()
-    angle = 2.0 * torch.pi * torch.rand(*shape, device=device)
-    return torch.stack(
-        [distance * angle.cos(), distance * angle.sin(), sample_uniform(low, high, shape, device)], dim=-1
-    )
+def sample_cylinder(radius: float, h_range: tuple[float, float], size: Any, device: Any) -> Tensor:
+    """Sample points on the surface of a cylinder around z, with heights in a range. (size, 3) [m]"""
+    angle = sample_uniform(-torch.pi, torch.pi, size, device)
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), sample_uniform(*h_range, size, device)], dim=-1)
 
 
 def orthogonalize_perspective_depth(depth: Tensor, intrinsics: Tensor) -> Tensor:
@@ -269,7 +283,7 @@ def sample_log_uniform(lower: Any, upper: Any, size: Any, device: Any) -> Tensor
     return sample_uniform(low, high, size, device).exp()
 
 
-def random_orientation(num: int, device: Any) -> Tensor:
+def random_orientation(num: int, device: str) -> Tensor:
     """Sample rotations uniformly. (num, 4)"""
     return normalize(torch.randn(num, 4, device=device))
 
