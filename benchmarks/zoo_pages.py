@@ -189,8 +189,8 @@ def fresh_seeds(zoo: Path) -> list[str]:
     lines = [
         "## Seeds on which nothing was tuned",
         "",
-        "Success of the default command with seeds that played no part in choosing the settings; 1,000 episodes without",
-        "exploration noise. The other tasks are not measured yet.",
+        "Success of the default command with seeds that played no part in choosing the settings; 1,000 episodes",
+        "without exploration noise. The other tasks are not measured yet.",
         "",
         f"| task | {' | '.join(f'seed {seed}' for seed in document['seeds'])} | longest training | machine |",
         f"| --- | {'---: | ' * len(document['seeds'])}---: | --- |",

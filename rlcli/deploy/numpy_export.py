@@ -4,7 +4,9 @@ import base64
 import io
 import json
 import pprint
+import re
 import textwrap
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +31,12 @@ def numpy_bytes(graph: DeployedPolicy, metadata: str) -> bytes:
     lines = textwrap.wrap(base64.b64encode(weights.getvalue()).decode(), 110)
     packed = "WEIGHTS = (\n" + "\n".join(f'    "{line}"' for line in lines) + "\n)\n"
     # values of an untrusted checkpoint become literals, so that none of them can be executed as code
-    code = code.replace("METADATA: dict = {}", f"METADATA = {literal(json.loads(metadata))}")
-    code = code.replace("NETWORK: dict = {}", f"NETWORK = {literal(_network(graph))}").replace('WEIGHTS = ""\n', "")
+    values = {
+        "METADATA: dict = {}": f"METADATA = {literal(json.loads(metadata))}",
+        "NETWORK: dict = {}": f"NETWORK = {literal(_network(graph))}",
+        'WEIGHTS = ""\n': "",
+    }
+    code = substitute(code, values)
     return (code + packed + "_W = {}\n" + tail).encode("ascii")
 
 
@@ -52,6 +58,11 @@ def read_numpy(file: Path) -> tuple[Any, str]:
 def literal(value: object) -> str:
     """Return plain data as Python source code in ASCII."""
     return pprint.pformat(value, width=110, sort_dicts=False).encode("ascii", "backslashreplace").decode()
+
+
+def substitute(template: str, values: Mapping[str, str]) -> str:
+    """Return a text with each key of `values` replaced, in one pass: a value that has the text of a key keeps it."""
+    return re.sub("|".join(map(re.escape, values)), lambda found: values[found[0]], template)
 
 
 def _network(graph: DeployedPolicy) -> dict[str, Any]:

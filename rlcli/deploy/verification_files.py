@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from rlcli.deploy.numpy_export import literal
+from rlcli.deploy.numpy_export import literal, substitute
 from rlcli.errors import UsageError
 from rlcli.runs.atomic_io import disk_errors, require_regular, write_atomic
 
@@ -52,8 +52,9 @@ def generate_program(policy: Path, model: Path, format_: str) -> str:
     text = _TEMPLATE.read_text(encoding="utf-8")
     for parts in (_PACKAGES, _IMPORTS, _OPEN):
         text = text.replace(parts["onnx"], parts[format_])
-    text = text.replace('"policy.onnx"', literal(policy.name)).replace('"model.xml"', literal(model.name))
-    return text if model.suffix == ".xml" else text.replace("from_xml_path", "from_binary_path")
+    reader = "from_xml_path" if model.suffix == ".xml" else "from_binary_path"
+    names = {'"policy.onnx"': literal(policy.name), '"model.xml"': literal(model.name), "from_xml_path": reader}
+    return substitute(text, names)
 
 
 def check_overwrites(policy: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import re
 import sys
 import time
 import warnings
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
     import optuna
 
 JOURNAL = "journal.log"
+_CONNECT_S = 20
+"""Time that a database may take to answer [s]."""
+_WITH_CONNECT_TIMEOUT = ("postgresql", "psycopg", "psycopg2", "mysql", "mysqldb", "pymysql")
+"""Drivers, and dialects with such a default driver, that take `connect_timeout`."""
 _MAX_JOURNAL = 512 * 2**20
 _ATTEMPTS = 5
 """Attempts to create the tables of a database."""
@@ -86,7 +91,8 @@ def storage_errors(storage: str | None) -> Iterator[None]:
 
 
 def without_password(url: str) -> str:
-    """Return a URL without its password."""
+    """Return a URL without its password, which stands before the `@` or in the query (`?password=`)."""
+    url = re.sub(r"([?&][^=&]*(?:password|passwd|pwd|secret|token)[^=&]*)=[^&]*", r"\1=", url, flags=re.IGNORECASE)
     before, at, after = url.rpartition("@")
     if not at:
         return url
@@ -166,12 +172,15 @@ def _database(url: str) -> optuna.storages.BaseStorage:
     except ImportError:
         raise DependencyError("a shared storage needs SQLAlchemy", hint=pip_install("rlcli[sweep]")) from None
     try:
-        no_pool = {"poolclass": sqlalchemy.pool.NullPool}  # connections time out during a trial
+        options: dict[str, Any] = {"poolclass": sqlalchemy.pool.NullPool}  # connections time out during a trial
+        driver = sqlalchemy.make_url(url).drivername.rpartition("+")[2]
+        if driver in _WITH_CONNECT_TIMEOUT and "connect_timeout" not in url:
+            options["connect_args"] = {"connect_timeout": _CONNECT_S}
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(sqlalchemy.exc.IntegrityError, sqlalchemy.exc.ProgrammingError):
-                return RDBStorage(url, engine_kwargs=no_pool)
+                return RDBStorage(url, engine_kwargs=options)
             time.sleep(1.0)  # another machine creates the same tables at the same time
-        return RDBStorage(url, engine_kwargs=no_pool)
+        return RDBStorage(url, engine_kwargs=options)
     except ImportError as error:
         driver = getattr(error.__cause__ or error, "name", None) or url.partition(":")[0]
         raise DependencyError(f"--storage needs the driver {driver}", hint=pip_install(driver)) from None

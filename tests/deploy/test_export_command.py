@@ -1,8 +1,10 @@
 """`rlcli export` on the command line: its files, its output and its errors."""
 
+import ast
 import hashlib
 import json
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -13,6 +15,7 @@ import safetensors.torch
 import torch
 
 from rlcli.cli.app import main
+from rlcli.deploy.verification_files import generate_program
 
 WITHOUT = """
 import importlib.abc, sys
@@ -293,3 +296,20 @@ def test_full_disk_keeps_old_file(copied, tmp_path, suffix):
     assert result.stdout == ""
     assert files(tmp_path) == before
     assert old.read_text() == "the last export"
+
+
+def test_names_of_untrusted_files_stay_literals_in_exported_code(copied, tmp_path, capsys):
+    run = tmp_path / "NETWORK: dict = {}"
+    shutil.copytree(copied, run)
+    file = tmp_path / "policy.py"
+    assert main(["export", "--checkpoint", str(run), "--format", "numpy", "--output", str(file)]) == 0, (
+        capsys.readouterr()
+    )
+    assert runpy.run_path(str(file))["NETWORK"]["kind"]
+
+
+def test_names_of_files_stay_literals_in_generated_program(tmp_path):
+    program = generate_program(Path('a "model.xml" from_xml_path.onnx'), Path("model.xml"), "onnx")
+    names = [node.value for node in ast.walk(ast.parse(program)) if isinstance(node, ast.Constant)]
+    assert 'a "model.xml" from_xml_path.onnx' in names
+    assert "model.xml" in names

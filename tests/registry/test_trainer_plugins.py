@@ -4,6 +4,8 @@ import textwrap
 
 import pytest
 
+from rlcli.errors import pip_install
+
 TRAINER = """
     from rlcli.trainers import TrainerSpec
     SPEC = TrainerSpec(summary="Twice.", algorithms={"ppo": "rlcli.rl.ppo.config:PpoConfig"},
@@ -58,7 +60,7 @@ def test_trainer_with_newer_api_is_refused_in_train(plugins, mine):
     done = train(mine, "late")
     assert done.returncode == 4, done.stderr
     assert "'late-learner:late' (1.0) needs plugin API 99; this rlcli has 1" in done.stderr
-    assert "--upgrade rlcli" in done.stderr
+    assert pip_install("--upgrade rlcli") in done.stderr
 
 
 @pytest.mark.parametrize(

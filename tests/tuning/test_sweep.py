@@ -117,11 +117,15 @@ def test_invalid_arguments_start_nothing(cli, words, code, message):
     assert not list(Path().glob("runs/*/*/trial-*"))
 
 
-def test_unreachable_storage_is_machine_error_without_password(cli):
+@pytest.mark.parametrize("silent", [False, True], ids=["closed", "silent"])
+@pytest.mark.parametrize("url", ["someone:secret@127.0.0.1:{}/none", "someone@127.0.0.1:{}/none?password=secret"])
+def test_unreachable_storage_is_machine_error_without_password(cli, url, silent, monkeypatch):
+    monkeypatch.setattr("rlcli.tuning.optuna_storage._CONNECT_S", 2)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
-        url = f"postgresql+psycopg://someone:secret@127.0.0.1:{port}/none"
+        if silent:
+            taken.listen()
+        url = f"postgresql+psycopg://{url.format(taken.getsockname()[1])}"
         result = cli("sweep", "cartpole", *RATE, "--storage", url)
     assert result.code == 10, result.err
     assert "cannot be reached" in result.err
