@@ -226,7 +226,7 @@ def test_importing_package_imports_nothing_else():
 def test_training_on_cpu_loads_no_gpu_engine(tmp_path):
     words = ["train", "cartpole", "--agent", "ppo", "--device", "cpu", "--num-envs", "4", "--max-iterations", "1"]
     words += ["--logger", "none", "-q", "--runs-dir", str(tmp_path)]
-    modules = [name for name in MODULES if name.startswith("rlcli.sim.warp") or name == "rlcli.sim.gpu_selection"]
+    modules = [name for name in MODULES if name.startswith("rlcli.sim.warp") or name == "rlcli.sim.gpu_env_selection"]
     assert len(modules) > 3
     program = (
         f"import sys; from rlcli.cli.app import main; code = main({words!r}); "

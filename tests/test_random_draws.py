@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from rlcli import random
-from rlcli.sim.selection import IdSelection
+from rlcli.sim.env_selection import IdSelection
 
 N = 100_000
 S = random.stream("rewards.pole")

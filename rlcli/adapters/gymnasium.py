@@ -19,7 +19,7 @@ from rlcli.config.layers import leaves
 from rlcli.config.load import Resolved, resolve
 from rlcli.config.schema import TaskConfig
 from rlcli.envs.make import make_env
-from rlcli.envs.step import StepResult
+from rlcli.envs.step_result import StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.registry import find_task
 from rlcli.viewer.offscreen import Renderer

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, python_task
 from rlcli.config.foreign_keys import foreign_keys, move_foreign_keys
-from rlcli.config.given_models import MODELS, model_path, recorded_models
 from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read, without
+from rlcli.config.model_option import MODELS, model_path, recorded_models
 from rlcli.config.older_success import upgraded
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path

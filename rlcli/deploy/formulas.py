@@ -25,7 +25,7 @@ from rlcli.managers.command import CommandTerm
 from rlcli.managers.term import BoundTerm
 from rlcli.mdp import actions, observations
 from rlcli.scene.entity import Entity
-from rlcli.sim.selection import Columns
+from rlcli.sim.env_selection import Columns
 
 Formula = Any
 

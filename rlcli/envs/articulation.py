@@ -11,8 +11,8 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.sim.column_views import as_index
+from rlcli.sim.env_selection import Columns, write_rows
 from rlcli.sim.rotations import rotate_inverse
-from rlcli.sim.selection import Columns, write_rows
 
 
 class ArticulationView:

@@ -19,8 +19,8 @@ from rlcli.scene.scene import Scene
 from rlcli.scene.sensors import Sensor, make_sensors
 from rlcli.scene.terrain import Terrain
 from rlcli.sim.engine import Engine, open_engine
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import rotate_inverse
-from rlcli.sim.selection import Selection
 from rlcli.sim.state_cache import SimData
 
 __all__ = ["grid"]

@@ -14,8 +14,8 @@ from rlcli.config.schema import SuccessConfig, bound_text
 from rlcli.envs.shard_range import Shard
 from rlcli.managers.term import BoundTerm, check_shape, first_value
 from rlcli.sim.engine import Engine
+from rlcli.sim.env_selection import Field, Selection, in_place
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Field, Selection, in_place
 
 
 class SuccessCondition:

@@ -19,8 +19,8 @@ from rlcli.managers.termination import DIVERGED
 from rlcli.random import stream
 from rlcli.registry import load_object
 from rlcli.scene.scene import Scene
+from rlcli.sim.env_selection import IdSelection, Selection
 from rlcli.sim.saved_tensors import require_matching_tensors, substate
-from rlcli.sim.selection import IdSelection, Selection
 
 _RESET = stream("direct.reset")
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rlcli.errors import DivergedError
 from rlcli.sim.divergence_report import MAX_DESCRIBED, STATE_LIMIT, Divergence, StateLayout
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.state_cache import is_finite
 
 if TYPE_CHECKING:

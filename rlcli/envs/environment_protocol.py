@@ -12,7 +12,7 @@ from rlcli.config.load import Resolved
 from rlcli.config.schema import TaskConfig
 from rlcli.envs.layout import Layout
 from rlcli.envs.observers import Observers
-from rlcli.envs.step import StepResult
+from rlcli.envs.step_result import StepResult
 from rlcli.sim.engine import EngineView
 
 if TYPE_CHECKING:

@@ -28,9 +28,9 @@ from rlcli.managers.termination import TerminationManager
 from rlcli.scene.joint_and_actuator_setup import ActuatorNeed
 from rlcli.scene.scene import Scene
 from rlcli.sim.acceleration_fields import add_body_forces
+from rlcli.sim.env_selection import Field, Selection
 from rlcli.sim.markers import Marker
 from rlcli.sim.saved_tensors import require_matching_tensors, substate
-from rlcli.sim.selection import Field, Selection
 
 _STATELESS = ("functools", "rlcli.mdp.")
 """Prefixes of the modules of terms that do not make an episode depend on earlier ones.

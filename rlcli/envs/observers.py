@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:  # the start of a training imports this module before torch
-    from rlcli.envs.step import StepRecord
+    from rlcli.envs.step_result import StepRecord
     from rlcli.sim.divergence_report import Divergence
 
 
@@ -37,7 +37,7 @@ class StepObserver:
         """Run after rewards and terminations are computed, before any reset.
 
         Args:
-            record: observations, actions, rewards and ended episodes of the step (`rlcli.envs.step.StepRecord`).
+            record: observations, actions, rewards and ended episodes of the step (`rlcli.envs.step_result.StepRecord`).
         """
 
 

@@ -21,13 +21,13 @@ from rlcli.envs.divergence import DivergenceGuard
 from rlcli.envs.observers import Observers
 from rlcli.envs.shard_range import Shard
 from rlcli.envs.state import load_state, save_state
-from rlcli.envs.step import Episodes, StepRecord, StepResult
+from rlcli.envs.step_result import Episodes, StepRecord, StepResult
 from rlcli.envs.workflow import Workflow
 from rlcli.machine import require_device
 from rlcli.managers.term import Binder
 from rlcli.sim.engine import Engine
+from rlcli.sim.env_selection import Field, Selection
 from rlcli.sim.saved_tensors import means
-from rlcli.sim.selection import Field, Selection
 
 
 class VecEnv(Workflow):

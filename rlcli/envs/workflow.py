@@ -13,8 +13,8 @@ from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.layout import Layout
 from rlcli.scene.scene import Scene
 from rlcli.scene.terrain import Terrain
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.markers import Marker
-from rlcli.sim.selection import Selection
 
 
 class Workflow(Environment):

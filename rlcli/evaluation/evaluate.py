@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.observers import StepObserver
-from rlcli.envs.step import Episodes, StepRecord, StepResult
+from rlcli.envs.step_result import Episodes, StepRecord, StepResult
 from rlcli.managers.termination import DIVERGED
 from rlcli.progress import track
 from rlcli.replay.rerun_episode import require_end

@@ -12,8 +12,8 @@ from torch import Tensor
 from rlcli.errors import ConfigError
 from rlcli.managers.observation_pipeline import Delay, make_delay
 from rlcli.managers.term import BoundTerm, EnvContext, resets
+from rlcli.sim.env_selection import Selection, in_place
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection, in_place
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from rlcli.errors import UsageError, did_you_mean, listing
 from rlcli.managers.term import BoundTerm, EnvContext, resets
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.markers import Arrow, Frame, Marker, Sphere
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection
 
 Select = Callable[[Tensor], Selection | None]
 """Returns a selection of the environments where a mask (num_envs,) is true; None if it is known to be empty."""

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from rlcli.managers.term import BoundTerm, EnvContext
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState, mean_of
-from rlcli.sim.selection import Selection
 
 
 class CurriculumManager(TensorState):

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from rlcli.managers.term import BoundTerm, EnvContext, resets
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection
 
 Select = Callable[[Tensor], Selection | None]
 """Returns a selection of the environments where a mask (num_envs,) is true; None if it is known to be empty."""

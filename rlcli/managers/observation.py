@@ -13,8 +13,8 @@ from torch import Tensor
 from rlcli.config.schema import ObservationGroupConfig
 from rlcli.managers.observation_pipeline import Draws, Pipeline
 from rlcli.managers.term import BoundTerm, EnvContext, check_shape, first_value
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection
 from rlcli.sim.state_cache import is_finite
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rlcli.config import schema
 from rlcli.managers.term import BoundTerm, EnvContext, resets
-from rlcli.sim.selection import Selection, in_place
+from rlcli.sim.env_selection import Selection, in_place
 
 Draws = Callable[[np.uint64], Selection]
 """Returns a selection of all environments with the random numbers of a stream at the current step."""

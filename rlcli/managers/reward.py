@@ -8,8 +8,8 @@ from torch import Tensor
 
 from rlcli.managers.term import BoundTerm, EnvContext, check_shape, first_value, resets
 from rlcli.managers.termination import DIVERGED
+from rlcli.sim.env_selection import Selection, in_place
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection, in_place
 
 
 class RewardManager(TensorState):

@@ -25,7 +25,7 @@ from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem
 from rlcli.scene.sensors import Sensor
 from rlcli.sim.engine import Engine
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 
 SENSORS = {"ContactSensor": "contact", "RaySensor": "rays", "CameraSensor": "camera"}
 """Type alias of `rlcli.task` -> kind of its sensors in `scene.sensors`."""

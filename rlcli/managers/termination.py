@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rlcli.managers.term import BoundTerm, EnvContext, check_shape, first_value, resets
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 
 DIVERGED = "diverged"
 """Cause that is logged for an episode whose simulation diverged."""

@@ -18,9 +18,9 @@ from rlcli.mdp.term_helpers import column_numbers
 from rlcli.scene.actuators import JointCommand
 from rlcli.scene.jacobian import Jacobian, sums_of_products
 from rlcli.scene.names import NameProblem, match_values
+from rlcli.sim.env_selection import Selection, one_column
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotation_vector
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection, one_column
 from rlcli.task import Bodies, Joints, Range
 
 

@@ -10,10 +10,10 @@ from torch import Tensor
 from rlcli.mdp.term import EntityTerm, Term
 from rlcli.mdp.term_helpers import goal_in_world, goal_quat_in_world
 from rlcli.scene.mirror import QUATERNION, VECTOR
+from rlcli.sim.env_selection import Selection, one_column
 from rlcli.sim.markers import ACTUAL, COMMANDED, Arrow, Color, Frame, Marker, Sphere
 from rlcli.sim.rotations import atan2, from_euler, heading, rotate, unique, wrap_to_pi, yaw_only
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection, one_column
 from rlcli.task import Bodies, Range
 
 _ARM = 0.5

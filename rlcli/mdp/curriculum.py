@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rlcli.mdp.parameter_types import Address, Command
 from rlcli.mdp.term import EntityTerm, Term
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 
 
 @dataclass(kw_only=True, eq=False)

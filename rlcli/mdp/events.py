@@ -17,9 +17,9 @@ from rlcli.mdp.parameter_types import Entity, ManagedEnv
 from rlcli.mdp.randomization_base import Pair, Ranges, element_names
 from rlcli.mdp.term import BodyTerm, JointTerm, Term
 from rlcli.scene.names import NameProblem
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import from_euler, multiply, random_quaternion
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection
 from rlcli.task import Bodies, Joints, Range
 
 

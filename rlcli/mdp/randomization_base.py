@@ -17,8 +17,8 @@ from rlcli.mdp.term import Term
 from rlcli.mdp.term_helpers import column_numbers
 from rlcli.scene.model_fields import ModelField
 from rlcli.scene.names import NameProblem, match
+from rlcli.sim.env_selection import Columns, Selection
 from rlcli.sim.rotations import from_euler, multiply
-from rlcli.sim.selection import Columns, Selection
 
 SMALLEST = 1e-9
 """Lower bound of quantities that must be positive."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rlcli.mdp.parameter_types import ManagedEnv
-from rlcli.sim.selection import Columns
+from rlcli.sim.env_selection import Columns
 from rlcli.task import Actuators, Bodies, Entity, Geoms, Joints, Pairs, Sites, Tendons
 
 _ELEMENT_KEYS = ("joints", "actuators", "bodies", "geoms", "sites", "tendons", "pairs")

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from rlcli.mdp.parameter_types import Command
 from rlcli.mdp.term import EntityTerm
+from rlcli.sim.env_selection import Columns
 from rlcli.sim.rotations import length, multiply, rotate, turn_between
-from rlcli.sim.selection import Columns
 from rlcli.task import ContactSensor, Entity, Sites
 
 

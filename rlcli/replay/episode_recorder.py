@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.observers import StepObserver
-from rlcli.envs.step import StepRecord
+from rlcli.envs.step_result import StepRecord
 from rlcli.envs.vec_env import VecEnv
 from rlcli.replay.resimulate import read_state
 from rlcli.replay.trajectory import STATE_FIELDS, Episode, Header, write_trajectory

@@ -25,7 +25,7 @@ from torch import Tensor
 from rlcli.config.schema import AutopsyConfig
 from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.observers import StepObserver
-from rlcli.envs.step import Episodes, StepRecord
+from rlcli.envs.step_result import Episodes, StepRecord
 from rlcli.errors import CheckpointError, MachineError, RlcliError
 from rlcli.managers.termination import DIVERGED
 from rlcli.replay.crash_dump import CallTrace, describe_traces, stop_observing_divergences, trace_calls

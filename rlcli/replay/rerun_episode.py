@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.environment_protocol import Environment
-from rlcli.envs.step import StepResult
+from rlcli.envs.step_result import StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError
 from rlcli.rl.acting import PATIENCE, Act

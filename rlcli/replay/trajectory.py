@@ -35,7 +35,7 @@ from rlcli.config.dump import to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
 from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.layout import TermLayout
-from rlcli.envs.step import Episodes
+from rlcli.envs.step_result import Episodes
 from rlcli.errors import CheckpointError
 from rlcli.registry import TaskSource
 from rlcli.runs.atomic_io import disk_errors, write_atomic

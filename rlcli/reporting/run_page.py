@@ -138,7 +138,7 @@ def _layout(checkpoint: Path | None) -> dict[str, Any] | None:
 
 
 def _add_charts(curve: Curve, page: Page) -> None:
-    from rlcli.reporting.panel_plots import legend_of, panel_svg
+    from rlcli.reporting.matplotlib_plots import legend_of, panel_svg
 
     panels = choose([curve])
     if not panels:

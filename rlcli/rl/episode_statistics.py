@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rlcli.envs.step import Episodes
+from rlcli.envs.step_result import Episodes
 from rlcli.rl.distributed import ProcessGroup
 
 _METRICS = {

@@ -16,8 +16,8 @@ from rlcli.scene.entity import Entity
 from rlcli.scene.initial_state import values_by_joint
 from rlcli.scene.names import NameProblem, match
 from rlcli.sim.column_views import as_index
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState, require_in_range
-from rlcli.sim.selection import Selection
 
 POSITION, VELOCITY, EFFORT = range(3)
 """Rows of `ActuatorModel.targets`."""

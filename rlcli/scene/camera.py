@@ -23,8 +23,8 @@ from rlcli.errors import ConfigError, MachineError, Problem
 from rlcli.scene.lazy_sensor import LazySensor
 from rlcli.scene.sensor_builder import CameraSensorSpec
 from rlcli.sim.engine import Engine, ReplayableEngine
+from rlcli.sim.env_selection import Selection, ids_of
 from rlcli.sim.gl import open_context
-from rlcli.sim.selection import Selection, ids_of
 
 _CHANNELS = {"rgb": 3, "depth": 1, "distance": 1, "segmentation": 1}
 _DISABLED_EFFECTS = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_HAZE", "mjRND_FOG")

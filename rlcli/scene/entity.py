@@ -19,8 +19,8 @@ from rlcli.scene.names import match
 from rlcli.sim.acceleration_fields import sensor_columns
 from rlcli.sim.column_views import as_index, id_tensor
 from rlcli.sim.engine import Engine
+from rlcli.sim.env_selection import ALL, Columns, Field, Selection
 from rlcli.sim.rotations import cross, rotate, rotate_inverse
-from rlcli.sim.selection import ALL, Columns, Field, Selection
 from rlcli.sim.state_cache import SimData
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from rlcli.scene.initial_state import default_joint_state, default_root_state, j
 from rlcli.scene.joint_efforts import JointEfforts
 from rlcli.sim.acceleration_fields import computes_body_forces
 from rlcli.sim.column_views import MAX_CACHED_VIEWS, CachedViews, as_index, evenly_spaced, id_tensor
+from rlcli.sim.env_selection import ALL, Columns, Field, Selection
 from rlcli.sim.rotations import atan2, axis_x, cross, length, multiply, rotate, rotate_inverse, wrap_to_pi
-from rlcli.sim.selection import ALL, Columns, Field, Selection
 from rlcli.sim.state_cache import SimData
 
 if TYPE_CHECKING:

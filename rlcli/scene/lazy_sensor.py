@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 
 
 class LazySensor(ABC):

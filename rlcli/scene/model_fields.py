@@ -13,7 +13,7 @@ from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem
 from rlcli.sim.column_views import as_index
 from rlcli.sim.engine import Engine
-from rlcli.sim.selection import Columns, Selection
+from rlcli.sim.env_selection import Columns, Selection
 
 FIELDS: dict[str, str] = {
     **dict.fromkeys(("body_mass", "body_inertia", "body_ipos", "body_iquat"), "Bodies"),

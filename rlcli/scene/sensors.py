@@ -17,9 +17,9 @@ from rlcli.scene.sensor_builder import CameraSensorSpec, ContactSensorSpec, RayS
 from rlcli.scene.terrain_heights import HeightTable
 from rlcli.sim.acceleration_fields import sensor_columns
 from rlcli.sim.column_views import as_index
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import rotate
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection
 from rlcli.sim.state_cache import SimData
 
 _TIMES = ("air_time", "contact_time", "last_air_time", "last_contact_time")

@@ -21,8 +21,8 @@ from rlcli.config import schema
 from rlcli.config.schema import TerrainConfig
 from rlcli.scene.entity import Entity
 from rlcli.scene.sub_terrains import Block, Heights, Patch, PatchSite, make_patch, ring
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import require_in_range
-from rlcli.sim.selection import Selection
 
 TERRAIN_BODY = "terrain"
 """Name of the MuJoCo body that has the geoms of the terrain."""

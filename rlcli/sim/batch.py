@@ -20,9 +20,9 @@ from rlcli.machine import available_cores
 from rlcli.sim import divergence_report as report
 from rlcli.sim.acceleration_fields import ACCELERATION_FIELDS, force_sensor_columns
 from rlcli.sim.batch_world_state import BatchWorlds, engine_call
+from rlcli.sim.env_selection import Field, Groups, IdSelection, Selection, ids_of
 from rlcli.sim.mujoco_private import STATE_FIELDS, forward_of, without_profiler
 from rlcli.sim.saved_tensors import substate
-from rlcli.sim.selection import Field, Groups, IdSelection, Selection, ids_of
 from rlcli.sim.skippable_work import FIELDS_OF_SKIPPED_WORK
 
 _MOTION_FIELDS = {"time", "qpos", "qvel", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"}

@@ -17,6 +17,7 @@ from torch import Tensor
 from rlcli.errors import DivergedError, did_you_mean, listing, one_line
 from rlcli.machine import require_memory
 from rlcli.sim.divergence_report import HISTORY_MEMORY, MORE_MEMORY, Call, StateHistory, StateLayout
+from rlcli.sim.env_selection import Selection, ids_of
 from rlcli.sim.mujoco_private import (
     STATE_FIELDS,
     expand_disable_flags,
@@ -27,7 +28,6 @@ from rlcli.sim.mujoco_private import (
 )
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 from rlcli.sim.saved_tensors import require_matching_tensors, substate
-from rlcli.sim.selection import Selection, ids_of
 from rlcli.sim.skippable_work import FIELDS_OF_FRICTION, skippable_flags
 
 INTEGRATION_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rlcli.sim.selection import Columns
+from rlcli.sim.env_selection import Columns
 
 MAX_CACHED_VIEWS = 256
 """Largest number of cached views; the terms of a configuration need far fewer."""

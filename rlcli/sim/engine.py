@@ -16,7 +16,7 @@ from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DependencyError, Problem, pip_install
 from rlcli.machine import native_stderr_discarded, require_device
 from rlcli.sim.divergence_report import HISTORY_MEMORY, Call, Divergence, StateHistory, StateLayout
-from rlcli.sim.selection import Field, Groups, Selection
+from rlcli.sim.env_selection import Field, Groups, Selection
 
 
 class EngineView(Protocol):

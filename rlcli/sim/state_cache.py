@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rlcli.sim.engine import Engine
-from rlcli.sim.selection import Columns, Selection, ids_of
+from rlcli.sim.env_selection import Columns, Selection, ids_of
 
 
 def is_finite(values: Tensor) -> bool:

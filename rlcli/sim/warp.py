@@ -19,8 +19,8 @@ from rlcli.sim import warp_kernels
 from rlcli.sim.acceleration_fields import force_sensor_columns
 from rlcli.sim.column_views import as_index
 from rlcli.sim.divergence_report import STATE_LIMIT, Divergence, StateLayout
-from rlcli.sim.gpu_selection import MaskSelection
-from rlcli.sim.selection import ALL, Field, Groups, Selection
+from rlcli.sim.env_selection import ALL, Field, Groups, Selection
+from rlcli.sim.gpu_env_selection import MaskSelection
 from rlcli.sim.warp_field_stages import FORCE, STATE
 from rlcli.sim.warp_memory import OVERFLOW_SETTINGS, overflow_error
 from rlcli.sim.warp_world_state import WarpWorlds

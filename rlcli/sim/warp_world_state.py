@@ -18,9 +18,9 @@ from torch import Tensor
 from rlcli.config.schema import SimConfig
 from rlcli.errors import did_you_mean, listing
 from rlcli.sim.capacity import required_capacity
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 from rlcli.sim.saved_tensors import require_matching_tensors, substate
-from rlcli.sim.selection import Selection
 from rlcli.sim.warp_field_stages import FORCE, INPUTS, KINEMATICS, STATE, VELOCITY, FieldStages
 from rlcli.sim.warp_memory import put_on_device
 

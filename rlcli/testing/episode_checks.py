@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.managed import ManagedEnv
-from rlcli.envs.step import StepResult
+from rlcli.envs.step_result import StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.testing.findings import Finding, NotRunError, error_at, warning_at
 from rlcli.testing.steps import (

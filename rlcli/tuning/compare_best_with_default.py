@@ -21,7 +21,7 @@ from rlcli.training.loggers import read_metrics
 from rlcli.training.signals import StopRequest
 from rlcli.training.subprocesses import POLL_S, start_training
 from rlcli.training.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
-from rlcli.tuning.sweep_record import Sweep
+from rlcli.tuning.sweep import Sweep
 
 _log = logging.getLogger(__name__)
 

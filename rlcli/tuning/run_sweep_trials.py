@@ -18,7 +18,7 @@ from rlcli.training.signals import StopRequest
 from rlcli.training.subprocesses import POLL_S, TrainingProcess, start_command, start_training
 from rlcli.training.time_to_threshold import training_s
 from rlcli.tuning.search_space import Objective, Parameter
-from rlcli.tuning.sweep_record import Sweep, Trial
+from rlcli.tuning.sweep import Sweep, Trial
 
 _log = logging.getLogger(__name__)
 

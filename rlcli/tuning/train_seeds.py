@@ -12,7 +12,7 @@ from rlcli.config.load import Resolved
 from rlcli.errors import CheckpointError, DependencyError
 from rlcli.reporting.curve_panels import choose
 from rlcli.reporting.curves import AXES, Curve, Line, gather
-from rlcli.reporting.panel_plots import check_drawing, picture
+from rlcli.reporting.matplotlib_plots import check_drawing, picture
 from rlcli.runs.atomic_io import write_atomic
 from rlcli.runs.overview import overview
 from rlcli.runs.run import open_run

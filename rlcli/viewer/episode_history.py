@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from rlcli.envs.step import StepResult
+from rlcli.envs.step_result import StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.reward import RewardManager
 

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from rlcli.config.schema import StrictModel
 from rlcli.envs.direct import DirectTask
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 
 
 class FlightTask(DirectTask):

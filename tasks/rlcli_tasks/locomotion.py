@@ -15,8 +15,8 @@ from torch import Tensor
 from rlcli.config.schema import StrictModel
 from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.direct import DirectTask
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import atan2
-from rlcli.sim.selection import Selection
 
 _WRENCH = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 

@@ -12,7 +12,7 @@ from support.small_trainings import AGENTS, Case, resolved_of, train
 from support.worlds import CRITTER_TASK, build, critter, edited
 
 from rlcli.config.schema import AutopsyConfig
-from rlcli.envs.step import Episodes
+from rlcli.envs.step_result import Episodes
 from rlcli.errors import CheckpointError, MachineError
 from rlcli.replay import failure_recorder
 from rlcli.replay.episode_recorder import EpisodeRecorder

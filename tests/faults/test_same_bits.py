@@ -13,7 +13,7 @@ import torch
 from support.fault_sizes import SIZE, amount, chosen
 from support.same_bits import ENVS, STEPS, TASKS, HashedRollout, against_plain_steps, make, other_work, rollout_hashes
 
-from rlcli.sim.selection import IdSelection
+from rlcli.sim.env_selection import IdSelection
 
 THREADS = (1, 2, 3, 4, 8) if SIZE != "long" else (1, 2, 3, 4, 5, 6, 8, 12, 16)
 NUM_ENVS = (1, 7, ENVS) if SIZE != "long" else (1, 2, 7, 13, ENVS)

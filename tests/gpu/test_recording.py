@@ -7,8 +7,8 @@ from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.registry import find_task
 from rlcli.rl.cuda_graph import Recording
-from rlcli.rl.ppo.gradient import AutogradGradient
 from rlcli.rl.ppo.loss import minibatch_loss
+from rlcli.rl.ppo.minibatch_gradient import AutogradGradient
 from rlcli.rl.ppo.trainer import PpoTrainer
 
 pytestmark = [

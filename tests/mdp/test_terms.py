@@ -9,7 +9,7 @@ from support.worlds import CRITTER_TASK, build, critter, edited
 
 from rlcli.errors import TaskError
 from rlcli.mdp import events, rewards, terminations
-from rlcli.sim.selection import IdSelection
+from rlcli.sim.env_selection import IdSelection
 
 LIMIT = pi / 3
 

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from rlcli.envs.step import Episodes
+from rlcli.envs.step_result import Episodes
 from rlcli.rl.episode_statistics import EpisodeStatistics
 
 LENGTH_S = 2.0

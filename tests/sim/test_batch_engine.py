@@ -11,7 +11,7 @@ from support.worlds import CRITTER, PENDULUM
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DeviceError
 from rlcli.sim.engine import open_engine
-from rlcli.sim.selection import IdSelection
+from rlcli.sim.env_selection import IdSelection
 from rlcli.sim.state_cache import SimData
 
 XML = CRITTER.replace("<worldbody>", '<worldbody><geom type="plane" size="5 5 1"/>').replace(

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from rlcli import random
-from rlcli.sim.gpu_selection import MaskSelection
-from rlcli.sim.selection import IdSelection
+from rlcli.sim.env_selection import IdSelection
+from rlcli.sim.gpu_env_selection import MaskSelection
 
 N = 11
 MASK = torch.tensor([i in (0, 3, 4, 9) for i in range(N)])

@@ -9,7 +9,7 @@ import torch
 
 from rlcli.envs.make import make_env
 from rlcli.envs.sharding.env import ShardedEnv
-from rlcli.envs.step import Episodes
+from rlcli.envs.step_result import Episodes
 
 
 def same(a, b):

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
-from rlcli.envs.step import StepResult
+from rlcli.envs.step_result import StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.registry import find_task
 

@@ -11,7 +11,7 @@ from rlcli.errors import CheckpointError, MachineError, UsageError
 from rlcli.registry import find_task
 from rlcli.tuning.optuna_storage import JOURNAL, storage_errors, without_password
 from rlcli.tuning.search_space import read_parameters
-from rlcli.tuning.sweep_record import open_sweep, read_sweep
+from rlcli.tuning.sweep import open_sweep, read_sweep
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.direct import DirectTask
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 
 
 class GymnasiumTask(DirectTask):

@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from rlcli.config.schema import StrictModel
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 
 from .base import GymnasiumTask
 

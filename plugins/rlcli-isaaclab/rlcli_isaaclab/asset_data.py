@@ -12,8 +12,8 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.scene.entity_data import EntityData
+from rlcli.sim.env_selection import ALL
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
-from rlcli.sim.selection import ALL
 from rlcli_isaaclab.substeps import update_state
 from rlcli_isaaclab.utils.math import quat_from_matrix
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from rlcli.config.term_signatures import Signature
 from rlcli.errors import TaskError
 from rlcli.managers.attribute_state import AttributeState
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 from rlcli_isaaclab.absent import place_of
 from rlcli_isaaclab.direct_env import DirectRLEnv, building
 from rlcli_isaaclab.observation_noise import noise_model

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 
 _STALE = "_isaaclab_stale_state"
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from rlcli.config.schema import Names, Number, StrictModel
 from rlcli.config.term_signatures import SECTIONS, Parameter, Signature, SignatureError
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 from rlcli_isaaclab.config_class import is_missing, to_dict
 from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg

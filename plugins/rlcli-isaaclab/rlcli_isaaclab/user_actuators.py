@@ -14,7 +14,7 @@ from torch import Tensor
 
 from rlcli.config.term_signatures import Signature
 from rlcli.managers.attribute_state import AttributeState
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 from rlcli_isaaclab.actuator_classes import ActuatorBase
 from rlcli_isaaclab.utils.types import ArticulationActions
 

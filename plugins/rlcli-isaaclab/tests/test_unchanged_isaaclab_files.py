@@ -13,8 +13,8 @@ import pytest
 import torch
 from cartpole_files import write
 
-from rlcli.config.given_models import MODELS, read_models
 from rlcli.config.load import resolve
+from rlcli.config.model_option import MODELS, read_models
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError, TaskError
 from rlcli.registry import find_task

@@ -22,7 +22,7 @@ from rlcli.errors import DependencyError, TaskError, pip_install
 from rlcli.registry import import_file, is_framework
 from rlcli.scene.scene import Scene
 from rlcli.sim.device_names import on_cpu
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 from rlcli_oige.articulation_view import ArticulationView
 from rlcli_oige.cameras import Replicator
 from rlcli_oige.modules import refuse

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
 from rlcli.random import stream
-from rlcli.sim.selection import IdSelection
+from rlcli.sim.env_selection import IdSelection
 from rlcli_oige.randomization_yaml import Gate, gates
 from rlcli_oige.randomized_fields import VIEW_STATE, RandomizedField, apply_operation, make_field
 

@@ -64,8 +64,8 @@ def step(name: str, config: str, models: list[str]) -> None:
 
     import torch
 
-    from rlcli.config.given_models import MODELS, read_models
     from rlcli.config.load import resolve
+    from rlcli.config.model_option import MODELS, read_models
     from rlcli.envs.make import make_env
     from rlcli.registry import task_source
 

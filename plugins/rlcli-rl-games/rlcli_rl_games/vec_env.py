@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rlcli.envs.environment_protocol import Environment
-from rlcli.envs.step import StepResult
+from rlcli.envs.step_result import StepResult
 from rlcli.rl.episode_statistics import EpisodeStatistics
 from rlcli_rl_games.library import IVecEnv, gym
 

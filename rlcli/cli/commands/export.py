@@ -13,7 +13,7 @@ from rlcli.errors import UsageError, listing
 from rlcli.registry.find import path_of
 
 if TYPE_CHECKING:
-    from rlcli.deploy.verify_export import ClosedLoopResult, ReferenceEnv
+    from rlcli.deploy.closed_loop import ClosedLoopResult, ReferenceEnv
     from rlcli.runs.checkpoint_reader import Checkpoint
     from rlcli.runs.policy_ref import Choice
     from rlcli.runs.run import Run
@@ -88,8 +88,8 @@ def _default_file(choice: Choice, format_: str) -> Path:
 
 
 def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | None) -> ReferenceEnv:
+    from rlcli.deploy.closed_loop import open_reference
     from rlcli.deploy.verification_files import check_overwrites
-    from rlcli.deploy.verify_export import open_reference
     from rlcli.runs.trusted_tasks import named_task
 
     if choice.run is None and choice.bundle is None:
@@ -103,7 +103,7 @@ def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | N
 
 def _verify(reference: ReferenceEnv, saved: Checkpoint, file: Path, format_: str, episodes: int) -> ClosedLoopResult:
     """Run the exported file in plain MuJoCo, and print the comparison with the run's evaluation."""
-    from rlcli.deploy.verify_export import verify
+    from rlcli.deploy.closed_loop import verify
 
     verdict = verify(reference, saved, file, format_, episodes)
     for source, terms in (("formulas of the metadata", verdict.by_metadata), ("the task's code", verdict.by_task)):

@@ -13,7 +13,7 @@ from rlcli.errors import UsageError
 from rlcli.viewer.protocol import VIEWERS
 
 if TYPE_CHECKING:
-    from rlcli.envs.step import StepResult
+    from rlcli.envs.step_result import StepResult
     from rlcli.evaluation.session import Session
 
 _FALLBACK_VIDEO = "play.mp4"

@@ -44,7 +44,7 @@ def command(
         rlcli plot cartpole --metrics return,Loss -o curves.svg
             Plot the return and the losses of all runs of cartpole.
     """
-    from rlcli.reporting.panel_plots import FORMATS, check_drawing
+    from rlcli.reporting.matplotlib_plots import FORMATS, check_drawing
     from rlcli.runs.run_ref import default_runs_dir, find_runs
 
     require_known(x, ("steps", "iterations", "time"), "--x", "axes")
@@ -87,7 +87,7 @@ def _choose_panels(curves: list[Curve], names: list[str] | None, x: str) -> list
 def _draw(file: Path, curves: list[Curve], panels: list[Panel], x: str) -> None:
     """Write the picture of the learning curves, and print the seeds of each curve."""
     from rlcli.reporting.curves import AXES
-    from rlcli.reporting.panel_plots import picture
+    from rlcli.reporting.matplotlib_plots import picture
     from rlcli.runs.atomic_io import write_atomic
 
     note = _note(curves)

@@ -63,7 +63,7 @@ def command(
     from rlcli.evaluation.limits import read_limits, require_success
     from rlcli.evaluation.session import PolicyRequest, baseline, find_policy, split_overrides
     from rlcli.reporting.heat_map import FORMATS, draw
-    from rlcli.reporting.panel_plots import check_drawing
+    from rlcli.reporting.matplotlib_plots import check_drawing
 
     task, words = split_overrides(subject, overrides or [])
     if task is None and checkpoint is None:

@@ -106,7 +106,7 @@ def command(
 def _show(request: TrainingRequest, storage: str | None, plot: bool) -> None:
     """Run `sweep show`: print the trials of a sweep, and plot them with --plot."""
     from rlcli.cli.ui.several_trainings import print_sweep
-    from rlcli.tuning.sweep_record import draw_sweep, find_sweep
+    from rlcli.tuning.sweep import draw_sweep, find_sweep
 
     sweep = find_sweep(request.overrides, request.runs, storage)
     if plot:
@@ -121,7 +121,7 @@ def _compare(
     from rlcli.cli.ui.several_trainings import print_comparison
     from rlcli.runs.study import read_seeds
     from rlcli.tuning.compare_best_with_default import compare
-    from rlcli.tuning.sweep_record import find_sweep
+    from rlcli.tuning.sweep import find_sweep
 
     names = [word for word in request.overrides if "=" not in word]
     request.overrides = [word for word in request.overrides if "=" in word]
@@ -142,7 +142,7 @@ def _search(
     from rlcli.tuning.optuna_storage import without_password
     from rlcli.tuning.run_sweep_trials import TrialRunner, check_parameters, write_preset
     from rlcli.tuning.search_space import read_objective, read_parameters
-    from rlcli.tuning.sweep_record import open_sweep
+    from rlcli.tuning.sweep import open_sweep
 
     require_name(settings["name"])
     objective, parameters = read_objective(settings["objective"]), read_parameters(settings["params"])

@@ -144,7 +144,7 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
                 flag = f"--{option.replace('_', '-')}"
                 raise UsageError(f"{flag} needs {what}", hint=f"add {what}, or leave out {flag}")
         if "overrides" in values and (model := values.pop("model")):
-            from rlcli.config.given_models import MODELS, read_models
+            from rlcli.config.model_option import MODELS, read_models
 
             words = [f'{MODELS}."{name}"={json.dumps(value)}' for name, value in read_models(model).items()]
             values["overrides"] = [*(values["overrides"] or []), *words]

@@ -15,7 +15,7 @@ from rlcli.errors import UsageError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from rlcli.envs.step import StepResult
+    from rlcli.envs.step_result import StepResult
     from rlcli.evaluation.session import Session
     from rlcli.replay.rerun_episode import EpisodeStart
     from rlcli.viewer.offscreen import Renderer

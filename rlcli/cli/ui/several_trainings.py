@@ -12,7 +12,7 @@ from rlcli.errors import Stopped
 from rlcli.reporting.curves import FEWEST_FOR_IQM
 from rlcli.runs.overview import Overview, overview
 from rlcli.tuning.compare_best_with_default import ARMS, Comparison, Training
-from rlcli.tuning.sweep_record import PRESET, Sweep
+from rlcli.tuning.sweep import PRESET, Sweep
 from rlcli.tuning.train_seeds import METRICS, StudyResult
 
 _LINE_EVERY_S = 10.0

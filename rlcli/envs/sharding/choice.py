@@ -6,7 +6,7 @@ import os
 
 from rlcli.config.load import Resolved
 from rlcli.config.schema import CameraSensorConfig
-from rlcli.envs.sharding.untested_code import has_untested_code
+from rlcli.envs.sharding.custom_task_code import has_untested_code
 from rlcli.errors import ConfigError
 from rlcli.machine import available_cores, available_memory
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from rlcli.envs.observers import Observers, StepObserver
 from rlcli.envs.shard_range import Shard
 from rlcli.envs.sharding.arrays import ArraySpec
-from rlcli.envs.step import Episodes, StepRecord
+from rlcli.envs.step_result import Episodes, StepRecord
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import RlcliError
 from rlcli.sim.divergence_report import Divergence

@@ -23,7 +23,7 @@ from rlcli.scene.joint_and_actuator_setup import model_actuator_kind
 from rlcli.scene.model_fields import FIELDS, ModelField
 from rlcli.scene.names import NameProblem
 from rlcli.sim.column_views import as_index
-from rlcli.sim.selection import Columns, Selection
+from rlcli.sim.env_selection import Columns, Selection
 from rlcli.task import Entity
 
 

@@ -20,7 +20,7 @@ from rlcli.mdp.randomization_base import (
 from rlcli.mdp.term import BodyTerm
 from rlcli.scene.model_fields import ModelField
 from rlcli.scene.names import NameProblem
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 
 
 @dataclass(kw_only=True, eq=False)

@@ -16,7 +16,7 @@ from rlcli.mdp.randomization_base import (
     require_supported,
 )
 from rlcli.mdp.term import GeomTerm, PairTerm, SiteTerm
-from rlcli.sim.selection import Columns
+from rlcli.sim.env_selection import Columns
 
 
 @dataclass(kw_only=True, eq=False)

@@ -11,8 +11,8 @@ from torch import Tensor
 from rlcli.mdp.randomization_base import Draw, DrawKeys, Randomization, RangeKeys, require_supported
 from rlcli.mdp.term import JointTerm, TendonTerm
 from rlcli.scene.model_fields import ModelField
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection
 
 
 @dataclass(kw_only=True, eq=False)

@@ -11,9 +11,9 @@ from rlcli.mdp.parameter_types import Command, Entity, ManagedEnv, RaySensor
 from rlcli.mdp.term import EntityTerm, Term
 from rlcli.mdp.term_helpers import commanded_speed, constant
 from rlcli.scene.names import match
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import length, roll_pitch_yaw
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection
 from rlcli.task import Bodies, Sensors, reads_body_forces
 
 # --- survival ---

@@ -10,9 +10,9 @@ from torch import Tensor
 from rlcli.mdp.parameter_types import Command, ContactSensor, Entity, ManagedEnv
 from rlcli.mdp.term import EntityTerm
 from rlcli.mdp.term_helpers import all_columns, commanded_speed, is_moving, require_one_per_body, strongest_force
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import length
 from rlcli.sim.saved_tensors import TensorState
-from rlcli.sim.selection import Selection
 from rlcli.task import Bodies, Sites
 
 

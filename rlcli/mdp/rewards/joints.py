@@ -10,8 +10,8 @@ from torch import Tensor
 from rlcli.mdp.parameter_types import Command, Entity, ManagedEnv
 from rlcli.mdp.term import JointTerm
 from rlcli.mdp.term_helpers import commanded_speed, is_moving, sum_columns
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import length
-from rlcli.sim.selection import Selection
 from rlcli.task import Joints
 
 

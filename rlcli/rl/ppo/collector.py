@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.mirror import MirrorMaps
-from rlcli.envs.step import StepResult
+from rlcli.envs.step_result import StepResult
 from rlcli.rl import distributed
 from rlcli.rl.episode_statistics import EpisodeStatistics
 from rlcli.rl.nan_check import moments, require_finite

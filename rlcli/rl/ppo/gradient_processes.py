@@ -20,7 +20,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.rl.mlp import Mlp
 from rlcli.rl.mlp_gradients import PartGradients, PartMemory
 from rlcli.rl.ppo.config import PpoConfig
-from rlcli.rl.ppo.gradient import LayerGradients, Objective
+from rlcli.rl.ppo.minibatch_gradient import LayerGradients, Objective
 from rlcli.rl.ppo.networks import ActorCritic
 from rlcli.rl.ppo.rollout_buffer import RolloutBuffer, Samples
 

@@ -14,7 +14,8 @@ from torch import Tensor
 from rlcli.rl.nan_check import require_finite, require_finite_learner
 from rlcli.rl.ppo.collector import Collector
 from rlcli.rl.ppo.compile import compile_update, tf32_matmul
-from rlcli.rl.ppo.gradient import (
+from rlcli.rl.ppo.loss import KL, METRICS, LossResult, UpdateFunctions, standardize
+from rlcli.rl.ppo.minibatch_gradient import (
     AutogradGradient,
     ClosedFormGradient,
     MakeLayerGradients,
@@ -22,7 +23,6 @@ from rlcli.rl.ppo.gradient import (
     has_closed_form,
     threaded_gradients,
 )
-from rlcli.rl.ppo.loss import KL, METRICS, LossResult, UpdateFunctions, standardize
 from rlcli.rl.ppo.networks import adam, flatten, unroll
 from rlcli.rl.ppo.rollout_buffer import Samples
 from rlcli.rl.ppo.setup import compile_mode

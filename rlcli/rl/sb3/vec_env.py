@@ -11,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv as Sb3Base
 
 from rlcli.envs.environment_protocol import Environment
-from rlcli.envs.step import StepResult
+from rlcli.envs.step_result import StepResult
 
 UNBOUNDED = 1e6
 """Action bound for unbounded actions: SB3 requires a finite bound."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from rlcli.config.schema import StrictModel
 from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.direct import DirectTask
-from rlcli.sim.selection import Selection
+from rlcli.sim.env_selection import Selection
 
 LEGS = (0, 1, 2)
 KNEES = tuple(f"knee{leg}" for leg in LEGS)

@@ -16,8 +16,8 @@ from torch import Tensor
 from rlcli.config.schema import StrictModel
 from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.direct import DirectTask
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import wrap_to_pi
-from rlcli.sim.selection import Selection
 
 CART, POLE, PENDULUM = JOINTS = ("slider_to_cart", "cart_to_pole", "pole_to_pendulum")
 

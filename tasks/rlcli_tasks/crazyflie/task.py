@@ -6,8 +6,8 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import axes, length
-from rlcli.sim.selection import Selection
 from rlcli_tasks.flight import FlightTask
 
 MOTORS = ("m1", "m2", "m3", "m4")

@@ -13,8 +13,8 @@ from torch import Tensor
 from rlcli.config.schema import StrictModel
 from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.direct import DirectTask
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import conjugate, length, multiply, random_quaternion, turn_between, unique
-from rlcli.sim.selection import Selection
 
 FINGERS = ("index", "middle", "ring", "thumb")
 JOINTS = tuple(f"{finger}_{joint}" for finger in FINGERS for joint in range(4))

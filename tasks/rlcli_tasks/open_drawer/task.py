@@ -13,8 +13,8 @@ from torch import Tensor
 from rlcli.config.schema import StrictModel
 from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.direct import DirectTask
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import axis_y, axis_z, length
-from rlcli.sim.selection import Selection
 
 JOINTS = (*(f"joint{i}" for i in range(1, 8)), "finger_left", "finger_right")
 FINGERS = slice(7, 9)

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from rlcli.config.schema import StrictModel
 from rlcli.envs.direct import DirectTask
+from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import length
-from rlcli.sim.selection import Selection
 
 ROTORS = ("fl", "bl", "br", "fr")
 JOINTS = tuple(f"{joint}_{rotor}" for rotor in ROTORS for joint in ("pitch", "roll"))

@@ -18,8 +18,8 @@ from rlcli.rl.mlp import Mlp, is_plain
 from rlcli.rl.mlp_gradients import MlpGradients
 from rlcli.rl.policy import ACTIVATIONS
 from rlcli.rl.ppo.config import PpoConfig
-from rlcli.rl.ppo.gradient import AutogradGradient, ClosedFormGradient, Objective
 from rlcli.rl.ppo.loss import minibatch_loss
+from rlcli.rl.ppo.minibatch_gradient import AutogradGradient, ClosedFormGradient, Objective
 from rlcli.rl.ppo.rollout_buffer import Samples
 from rlcli.rl.ppo.trainer import PpoTrainer
 

@@ -8,7 +8,7 @@ from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
-from rlcli.rl.ppo.gradient import AutogradGradient, ClosedFormGradient
+from rlcli.rl.ppo.minibatch_gradient import AutogradGradient, ClosedFormGradient
 from rlcli.rl.ppo.trainer import PpoTrainer
 
 LOSS_ONLY = "agent.symmetry={augment: false, mirror_coef: 10.0}"

@@ -19,7 +19,7 @@ from filelock import FileLock, Timeout
 from rlcli.config.dump import to_yaml
 from rlcli.errors import CheckpointError, MachineError, UsageError, listing
 from rlcli.random import derive
-from rlcli.reporting.panel_plots import check_drawing, scatter
+from rlcli.reporting.matplotlib_plots import check_drawing, scatter
 from rlcli.runs.atomic_io import disk_error, disk_errors, to_json, write_atomic
 from rlcli.runs.run import STUDY
 from rlcli.runs.safe_io import Count, FileModel, check_json

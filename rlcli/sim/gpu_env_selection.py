@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rlcli import random
 from rlcli.sim import warp_kernels
-from rlcli.sim.selection import ALL, DEFAULT_STREAM, Columns
+from rlcli.sim.env_selection import ALL, DEFAULT_STREAM, Columns
 
 
 @dataclass(eq=False)

@@ -8,7 +8,7 @@ import pytest
 from support.fault_sizes import amount
 
 from rlcli.cli.app import main
-from rlcli.scene.sparse_newton import avoid_sparse_newton, couples_branches
+from rlcli.scene.avoid_sparse_newton import avoid_sparse_newton, couples_branches
 from rlcli.sim.quiet_mujoco import quiet_mujoco
 
 pytestmark = pytest.mark.skipif(mujoco.__version__ != "4.0.0", reason="the bug is one of MuJoCo 4.0.0")
