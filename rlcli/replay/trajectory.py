@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import mujoco
-import safetensors.torch
 import torch
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from safetensors import SafetensorError, safe_open
@@ -42,6 +41,7 @@ from rlcli.runs.atomic_io import disk_errors, write_atomic
 from rlcli.runs.provenance import model_digest
 from rlcli.runs.restore import recorded_task
 from rlcli.runs.safe_io import check_json
+from rlcli.runs.tensor_bytes import tensor_bytes
 from rlcli.sim.divergence_report import MAX_DESCRIBED
 
 FORMAT = 2
@@ -332,7 +332,7 @@ def write_trajectory(file: Path, header: Header, tensors: Mapping[str, Tensor], 
     document["sha256"] = content_digest(copies, document)
     with disk_errors(file.parent):
         file.parent.mkdir(parents=parents, exist_ok=True)
-    write_atomic(file, safetensors.torch.save(copies, metadata={"rlcli": json.dumps(document)}))
+    write_atomic(file, tensor_bytes(copies, metadata={"rlcli": json.dumps(document)}))
 
 
 def read_trajectory(file: Path) -> Trajectory:

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import safetensors.torch
 import torch
 from pydantic import Field
 
@@ -21,6 +20,7 @@ from rlcli.runs.checkpoint_reader import FORMAT, Checkpoint, open_checkpoint, sh
 from rlcli.runs.manifest_schema import layout_of
 from rlcli.runs.run import Run, TaskRecord
 from rlcli.runs.safe_io import JSON_LIMIT, FileModel, PrintableText, check_json, parse_json, read_file
+from rlcli.runs.tensor_bytes import tensor_bytes
 
 BUNDLE = 1
 """Version of the bundle format, stored in the manifest under the key `bundle`."""
@@ -99,7 +99,7 @@ def write_bundle(
     weights = {name: value.contiguous() for name, value in sorted(policy.state_dict().items())}
     contents = {
         "policy.json": to_json(policy.spec.model_dump(mode="json")).encode(),
-        "policy.safetensors": safetensors.torch.save(weights),
+        "policy.safetensors": tensor_bytes(weights),
     }
     saved = checkpoint.manifest
     manifest = {

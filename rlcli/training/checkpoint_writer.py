@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import safetensors.torch
 from torch import Tensor
 
 from rlcli.envs.layout import Layout
@@ -28,6 +27,7 @@ from rlcli.rl.trainer import Rows, TrainerState
 from rlcli.runs.atomic_io import disk_errors, require_lock, sync_folder, to_json, write_atomic, write_synced
 from rlcli.runs.checkpoint_reader import FORMAT, LOG_FOLDER, Checkpoint, Shard, open_checkpoint, sha256, steps
 from rlcli.runs.run import Run
+from rlcli.runs.tensor_bytes import tensor_bytes
 
 _log = logging.getLogger(__name__)
 _SHARD_BYTES = 64 << 20
@@ -165,7 +165,7 @@ class CheckpointWriter:
         folder = self.checkpoints / LOG_FOLDER / name
         shards = self._shards.setdefault(name, [])
         for start, stop, columns in parts:
-            data = safetensors.torch.save({column: value.contiguous() for column, value in columns.items()})
+            data = tensor_bytes({column: value.contiguous() for column, value in columns.items()})
             shard = Shard(start=start, stop=stop, size=len(data), sha256=sha256(data))
             with disk_errors(folder):
                 for path in (folder.parent, folder):  # not `parents=True`: a deleted run must not be created again
@@ -227,7 +227,7 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
             put("state.json", to_json(state.values).encode())
             for part, tensors in state.tensors.items():
                 contiguous = {name: value.detach().contiguous() for name, value in tensors.items()}
-                put(f"{part}.safetensors", safetensors.torch.save(contiguous))
+                put(f"{part}.safetensors", tensor_bytes(contiguous))
             manifest = {"format": FORMAT, "step": step, **extra, "files": files}
             write_synced(temporary / "manifest.json", to_json(manifest).encode())
             sync_folder(temporary)

@@ -49,7 +49,10 @@ def paused(child, folder):
     started = child(folder, *TRAIN, faults=PAUSE)
     started.until(lambda: (folder / "slow").exists())
     run = run_in(folder)
-    started.until(lambda: len(list((run / "checkpoints").glob("0*"))) == 4 and not list(run.rglob("*.tmp-*")))
+    saved = run / "checkpoints"
+    started.until(lambda: len(list(saved.glob("0*"))) == 4 and not list(run.rglob("*.tmp-*")))
+    started.until(lambda: (saved / "latest").read_text().strip() == max(file.name for file in saved.glob("0*")))
+    started.until(lambda: not list(run.rglob("*.tmp-*")))
     return started, run
 
 

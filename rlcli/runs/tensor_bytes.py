@@ -1,0 +1,20 @@
+"""Tensors as bytes in the format of safetensors."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import safetensors.torch
+from torch import Tensor
+
+_COPIES = 3
+"""Copies of all tensors that safetensors holds at a time: of each tensor, of the file, and the bytes for Python."""
+
+
+def tensor_bytes(tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
+    """Return contiguous tensors in the format of safetensors.
+
+    Raises:
+        MemoryError: if memory is too small. safetensors itself would abort the process.
+    """
+    np.empty(_COPIES * sum(tensor.nbytes for tensor in tensors.values()), np.uint8)  # reserved and freed at once
+    return safetensors.torch.save(dict(tensors), metadata)
