@@ -261,7 +261,7 @@ def measure_solve(seeds):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--peer-path")
+    parser.add_argument("--peer-path", help="PYTHONPATH of mjlab's processes: its packages and their dependencies")
     parser.add_argument("--only", default="env,train,ant,features,solve")
     parser.add_argument("--output", type=Path)
     parser.add_argument("--seeds", default="1,2,3")

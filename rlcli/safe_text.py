@@ -1,4 +1,7 @@
-"""Helpers for text from files and command lines: find unsafe characters, shorten long text, read numbers."""
+"""Helpers for text from files and command lines.
+
+They find unsafe characters, shorten long text, remember long inputs so that messages shorten them, and read numbers.
+"""
 
 import math
 import re
@@ -30,13 +33,13 @@ _input_pieces: set[int] = set()
 
 
 def remember_given(words: Iterable[str]) -> None:
-    """Replace the inputs of `remember_input` by the words of a command line and of its environment variables."""
+    """Forget all inputs, then remember the long words of a command line and of its environment variables."""
     _inputs.clear()
     remember_input(words)
 
 
 def remember_input(texts: Iterable[str]) -> None:
-    """Store the long ones of these texts from a command line or a file; `message_line` shortens their parts."""
+    """Remember the long texts of a command line or a file, so that `message_line` shortens them in messages."""
     _input_pieces.clear()
     for text in texts:
         if len(text) > _MAX_ECHO or not text.isprintable():

@@ -197,14 +197,14 @@ class TaskCheck:
     def merge_agent(self, patch: object, origin: Callable[[Path], Origin], name: str | None) -> None:
         """Merge the key `agent:` of a --config file into the chosen agent."""
         if name is None:
-            self._no_agent(origin(()).where)
+            self._report_no_agent(origin(()).where)
         elif not isinstance(patch, dict):
             where = origin(()).where
             self.add(Problem(where, "agent", f"expected a mapping, found {messages.format_value(patch)}"))
         else:
             self.layers.merge(patch, origin, ("agents", name))
 
-    def _no_agent(self, where: str) -> None:
+    def _report_no_agent(self, where: str) -> None:
         """Add the problem that the change `agent.x` at location `where` applies to no agent, because none is chosen."""
         names = agent_names(self.layers)
         if not names:
@@ -229,7 +229,7 @@ class TaskCheck:
         for path, value, origin in changes:
             if path[0] == "agent":
                 if name is None:
-                    self._no_agent(origin.where)
+                    self._report_no_agent(origin.where)
                     continue
                 path = ("agents", name, *path[1:])
             if path[0] == MODELS:

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +18,8 @@ MODEL = "model.xml"
 BINARY_MODEL = "model.mjb"
 _MARK = "<!-- written by rlcli export -->\n"
 """First line of an exported model. A model file with this line may be overwritten."""
+_PROGRAM_MARK = b'"""Runs an exported policy on its robot in MuJoCo'
+"""First bytes of the program. A binary model may be overwritten if such a program beside it loads it."""
 _TEMPLATE = Path(__file__).parent / "deployed" / PROGRAM
 _OPEN = {
     "onnx": """        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
@@ -66,19 +69,24 @@ def check_overwrites(policy: Path) -> None:
     if policy.name == PROGRAM:
         message = f"--verify writes the program {PROGRAM}, which would overwrite the policy"
         raise UsageError(message, hint="give the policy another name with --output FILE")
-    for name in (MODEL, BINARY_MODEL):
-        require_regular(policy.with_name(name))
-    model = policy.with_name(MODEL)
+    for model in (policy.with_name(MODEL), policy.with_name(BINARY_MODEL)):
+        require_regular(model)
+        if os.path.lexists(model) and not _is_exported(model):
+            message = f"--verify may overwrite {model}, which is not a file of `rlcli export`"
+            raise UsageError(message, hint="give an --output in another folder")
+
+
+def _is_exported(model: Path) -> bool:
+    """Return whether export wrote this model file; a binary file cannot have a mark, so its program is read instead."""
+    is_xml = model.name == MODEL
     try:
-        with model.open("rb") as file:
-            is_exported = file.read(len(_MARK)) == _MARK.encode()
-    except FileNotFoundError:
-        return
-    except OSError:  # a folder, or no permission
-        is_exported = False
-    if not is_exported:
-        message = f"--verify would overwrite {model}, which is not a file of `rlcli export`"
-        raise UsageError(message, hint="give an --output in another folder")
+        with (model if is_xml else model.with_name(PROGRAM)).open("rb") as file:
+            text = file.read(2**20)
+    except OSError:  # no program, a folder, or no permission
+        return False
+    if is_xml:
+        return text.startswith(_MARK.encode())
+    return text.startswith(_PROGRAM_MARK) and literal(model.name).encode() in text
 
 
 def write_program(folder: Path, text: str) -> bool:

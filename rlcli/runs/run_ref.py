@@ -190,8 +190,9 @@ def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Pat
             _log.warning(f"checkpoint {folder.name} is skipped: {error.message}")
             continue
         if skipped and step == 0:
-            message = f"{run.folder} has no intact checkpoint but that of step 0, before the training"
-            raise CheckpointError(message, hint="restore a newer one from a copy; RUN@step:0 names that of step 0")
+            message = f"{run.folder} has no intact checkpoint except for step 0, before the training"
+            hint = "restore a newer checkpoint from a backup; to use the untrained policy, write RUN@step:0"
+            raise CheckpointError(message, hint=hint)
         return folder, f"{why}, its newest {'good ' if skipped else ''}checkpoint"
     raise AssertionError("a run without checkpoints came here, although find_checkpoint refuses it")
 

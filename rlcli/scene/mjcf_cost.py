@@ -49,15 +49,15 @@ class ModelCost:
         """Return the cost of a model that also reads the other one, to attach it."""
         return replace(self, loads=min(self.loads + other.size + other.loads, ENDLESS))
 
-    def times(self, copies: float, *, loaded: bool = True) -> ModelCost:
+    def times(self, copies: float, *, with_loads: bool = True) -> ModelCost:
         """Return the cost of several copies of the model.
 
         Args:
             copies: their number.
-            loaded: whether the models that it attaches are read for the copies.
+            with_loads: whether to keep `loads`, which does not grow with the copies; False if it is counted already.
         """
         scaled = {name: min(getattr(self, name) * copies, ENDLESS) for name in ("size", "elements", "keys", "assets")}
-        return replace(self, loads=self.loads if loaded else 0.0, **scaled)
+        return replace(self, loads=self.loads if with_loads else 0.0, **scaled)
 
 
 def stored_arrays(name: str, attributes: dict[str, str]) -> Iterator[tuple[str, float]]:

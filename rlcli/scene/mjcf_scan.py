@@ -176,7 +176,7 @@ class MjcfScan:
             own = ModelCost(text.cost, 0.0, text.elements, text.stored, text.keys, text.assets)
             cost = cost.beside(own.times(copies))
             for name, count in text.attached.items():
-                attached = models.get(name, any_model).times(copies * count, loaded=False)
+                attached = models.get(name, any_model).times(copies * count, with_loads=False)
                 self._note_cost(attached.size + attached.assets, f"attach of model '{name}' in {file}")
                 cost = cost.beside(attached)
         self._costs[file] = cost

@@ -122,7 +122,7 @@ class BatchWorlds:
     def write_own_model(self, env: int, model: mujoco.MjModel) -> None:
         """Write one world's values of all model fields into `model`, a copy of the engine's model.
 
-        The disable flags of `model` stay those of the engine's model.
+        The disable flags of `model` stay as in the engine's model unless they differ between worlds.
         """
         self._batch.get_model(env, model)
         if "opt.disableflags" not in self._expanded:

@@ -121,7 +121,7 @@ class StateHistory:
         """Return the state before the last call; the default state if the episode has no call yet."""
         if self._episode_start[env] == self.count:
             return self._default.copy()
-        return self._state(env, self.count - 1)
+        return self._state_before(env, self.count - 1)
 
     def calls_of(self, env: int) -> list[Call]:
         """Return the calls of an environment in its present episode, the oldest first."""
@@ -131,11 +131,12 @@ class StateHistory:
         """Return the calls number `first` to `stop` - 1 of an environment, as far as the buffer still has them."""
         first = max(first, self._oldest, self.count - self.calls)
         numbers = range(first, min(stop, self.count))
-        return [Call(self._state(env, number), self._nstep[number % self.calls]) for number in numbers]
+        return [Call(self._state_before(env, number), self._nstep[number % self.calls]) for number in numbers]
 
-    def _state(self, env: int, number: int) -> States:
+    def _state_before(self, env: int, call: int) -> States:
+        """Return a copy of the integration state of an environment before call number `call`. (nstate,)"""
         state = self._default.copy()
-        state[: self.width] = self._ring[number % self.calls, env]
+        state[: self.width] = self._ring[call % self.calls, env]
         return state
 
 

@@ -14,6 +14,7 @@ import pytest
 
 from rlcli.cli.app import main
 from rlcli.deploy import verification_files
+from rlcli.errors import UsageError
 from rlcli.runs.run_ref import find_checkpoint
 
 PUSHED = """
@@ -344,6 +345,25 @@ def test_model_with_mesh_files_is_written_as_binary(tmp_path):
     again = verification_files.open_model(file)
     assert again.joint(0).name == "turn"
     np.testing.assert_array_equal(again.mesh_vert, model.mesh_vert)
+
+
+def test_binary_model_is_overwritten_only_beside_program_that_loads_it(tmp_path):
+    policy, model, program = (tmp_path / name for name in ("policy.py", "model.mjb", "run_policy.py"))
+    model.write_bytes(b"mine")
+
+    def assert_refused():
+        with pytest.raises(UsageError, match=r"model\.mjb"):
+            verification_files.check_overwrites(policy)
+
+    assert_refused()
+    program.write_text('import mujoco\nmujoco.MjModel.from_binary_path("model.mjb")\n')
+    assert_refused()
+    program.write_text(verification_files.generate_program(policy, tmp_path / "model.xml", "numpy"))
+    assert_refused()
+    for format_ in ("numpy", "onnx", "torch"):
+        program.write_text(verification_files.generate_program(policy, model, format_))
+        verification_files.check_overwrites(policy)
+    assert model.read_bytes() == b"mine"
 
 
 @pytest.mark.slow

@@ -51,7 +51,10 @@ class ActuatorBase:
         """Return a setting of every joint: a number, a mapping from regexes, or the default. (num_envs, joints)"""
         value = default_value if cfg_value is None else cfg_value
         if value is None:
-            raise ValueError("a setting of an actuator group (such as stiffness) is None and has no default; set it")
+            raise ValueError(
+                f"actuator class {type(self).__name__}: a setting such as stiffness and the default that"
+                " _parse_joint_parameter received for it are both None; give one of them a number"
+            )
         found = torch.zeros(self._num_envs, self.num_joints, device=self._device)
         if isinstance(value, dict):
             columns, _, values = resolve_matching_names_values(value, self.joint_names)

@@ -83,7 +83,7 @@ def command(
     request = TrainingRequest(runs_dir or default_runs_dir(), None, resume, agent, device, gpus, config)
     request.overrides, request.flags = overrides or [], flags(scene__num_envs=num_envs)
     request.budget = options.budget_keys(max_iterations, max_steps) | ({} if until is None else {"agent.until": until})
-    request.seed = options.draw_seed(42 if seed is None else seed)
+    request.seed = options.random_if_minus_one(42 if seed is None else seed)
     request.loggers, request.init_from, request.video_every, request.name = logger, init_from, video_every, name
     study = _study(request, seeds, jobs, seed)
     process = process_device(device, gpus)

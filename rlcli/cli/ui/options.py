@@ -28,8 +28,8 @@ def choice(metavar: str, *names: str, help: str | None = None) -> Any:
     return typer.Option(autocompletion=words(*names), metavar=metavar, help=help)
 
 
-def draw_seed(seed: int) -> int:
-    """Return the seed; for -1, a random one."""
+def random_if_minus_one(seed: int) -> int:
+    """Return the seed; a random seed if it is -1."""
     if seed != -1:
         return seed
     import secrets
@@ -59,7 +59,7 @@ ConfigFile = Annotated[Path | None, typer.Option(metavar="FILE", help=_CONFIG)]
 Agent = Annotated[str | None, typer.Option(autocompletion=agents, metavar="NAME", help=_AGENT)]
 NumEnvs = Annotated[int | None, typer.Option(help="Sets scene.num_envs. [default: the task's]")]
 FewEnvs = Annotated[int, typer.Option("--num-envs", help=_FEW_ENVS)]
-Seed = Annotated[int, typer.Option(min=-1, max=MAX_SEED, callback=draw_seed, help=_SEED)]
+Seed = Annotated[int, typer.Option(min=-1, max=MAX_SEED, callback=random_if_minus_one, help=_SEED)]
 Device = Annotated[str, choice("DEVICE", "auto", "cpu", "cuda", help="auto, cpu, cuda or cuda:N.")]
 RunName = Annotated[str | None, typer.Option(help="Text at the end of the run folder's name.")]
 MaxIterations = Annotated[int | None, typer.Option(help="Iterations of each training. [default: the agent's]")]
