@@ -348,7 +348,7 @@ class TaskCheck:
         if isinstance(name, str):
             signature = self.vocabulary.find(section, name)
             if signature is None:
-                self._unknown_term(section, (*path, "func"), name)
+                self._report_unknown_term(section, (*path, "func"), name)
             else:
                 try:
                     model = params_model(signature, section)
@@ -362,7 +362,7 @@ class TaskCheck:
         terms = _mapping(self.layers.get(path[:-1]))
         return [name for name, term in terms.items() if isinstance(term, dict) and "func" in term]
 
-    def _unknown_term(self, section: str, path: Path, name: str) -> None:
+    def _report_unknown_term(self, section: str, path: Path, name: str) -> None:
         known = self.vocabulary.names(section)
         other = self.vocabulary.other_section(section, name)
         hint = f"'{name}' is a term of {other}" if other else did_you_mean(name, known)

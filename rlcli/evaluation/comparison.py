@@ -75,7 +75,7 @@ def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyIn
         request: the further settings, the same for all policies.
 
     Raises:
-        UsageError: for fewer than two policies, or if none of them is of a run.
+        UsageError: for fewer than two policies, or if no policy belongs to a run.
         ConfigError: if the tasks of the policies differ.
     """
     from rlcli.runs.policy_ref import SHIPPED
@@ -85,7 +85,7 @@ def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyIn
     if len(names) < 2:
         raise UsageError(f"--compare needs at least two policies, found: {listing(names)}", hint=usage)
     if len(without_run) == len(names):
-        raise UsageError("--compare needs at least one run, because its task is used for all", hint=usage)
+        raise UsageError("--compare needs at least one run; all policies are evaluated in the run's task", hint=usage)
     found: dict[str, PolicyInTask] = {}
     # `shipped` comes last: it is searched in the task of the runs
     for name in sorted(dict.fromkeys(names), key=SHIPPED.__eq__):

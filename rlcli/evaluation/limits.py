@@ -55,7 +55,7 @@ class Limit:
             full_name, stem = _find_name(summary[group], name), name.removesuffix(f".{self.end}")
             found = full_name or _find_name(summary[group], stem)
             if found is None:
-                raise self._unknown(summary[group], group, stem)
+                raise self._unknown_metric_error(summary[group], group, stem)
             entry, of_interval = summary[group][found], full_name is None
         value: float | None = entry[self.end] if of_interval else mean_or_rate(entry)
         return value
@@ -73,7 +73,7 @@ class Limit:
             return f"{self.key} is {value:.6g}, above {self.value:g}"
         return None
 
-    def _unknown(self, entries: Mapping[str, Any], group: str, name: str) -> UsageError:
+    def _unknown_metric_error(self, entries: Mapping[str, Any], group: str, name: str) -> UsageError:
         option = f"{self.flag} {self.key}={self.value:g}"
         if group != "values":
             hint = did_you_mean(name, entries) or f"allowed: {listing(entries)}"

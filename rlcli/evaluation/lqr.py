@@ -70,31 +70,31 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
         UsageError: if the task has no LQR, with the reason.
     """
     if not resolved.task.success:
-        raise _no_regulator(resolved, "the task defines no success, so its target state is unknown")
+        raise _no_regulator_error(resolved, "the task defines no success, so its target state is unknown")
     with contextlib.closing(make_env(resolved.with_num_envs(1).without_randomness())) as env:
         model = env.engine.model
         if model.nq != model.nv:
-            raise _no_regulator(
+            raise _no_regulator_error(
                 resolved, "it has a floating body or a ball joint; only hinges and slides are supported"
             )
         if model.na:
-            raise _no_regulator(resolved, "its actuators have internal states")
+            raise _no_regulator_error(resolved, "its actuators have internal states")
         count = 2 * model.nv + env.layout.action_size
     with contextlib.closing(make_env(resolved.with_num_envs(2 + 16 * count).without_randomness())) as env:
         states, after, observed, rest = _sample_steps(env, resolved)
     dynamics, residual = _fit(states, after)
     if residual.max() > _MAX_RESIDUAL:
-        raise _no_regulator(resolved, "position, velocity and action do not determine the next state linearly")
+        raise _no_regulator_error(resolved, "position, velocity and action do not determine the next state linearly")
     nx = after.shape[1]
     decoder, residual = _fit(observed, after)
     if residual.max() > _MAX_RESIDUAL:
         unseen = listing(_coordinates(env)[i] for i in (residual > _MAX_RESIDUAL).nonzero()[0])
-        raise _no_regulator(resolved, f"its observations do not determine the state: {unseen}")
+        raise _no_regulator_error(resolved, f"its observations do not determine the state: {unseen}")
     a, b = dynamics[:nx].T, dynamics[nx:].T  # x+ = a x + b u
     gain = riccati(a, b, np.eye(nx), np.eye(b.shape[1]) / (bound or 1.0) ** 2)
     poles = tuple(sorted(np.abs(np.linalg.eigvals(a - b @ gain)).tolist(), reverse=True)) if gain is not None else ()
     if gain is None or poles[0] >= 1.0:
-        raise _no_regulator(resolved, "no linear feedback stabilises its default state")
+        raise _no_regulator_error(resolved, "no linear feedback stabilises its default state")
     return Regulator(gain @ decoder.T, rest, bound, poles)
 
 
@@ -145,15 +145,15 @@ def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matr
     env.sim.forward_moved()
     step = env.step(both[:, 2 * nv :].float())
     if bool((step.terminated | step.truncated).any()):
-        raise _no_regulator(resolved, "its default state ends an episode")
+        raise _no_regulator_error(resolved, "its default state ends an episode")
     after = torch.cat([qpos - middle, qvel], dim=1).double().cpu().numpy()
     observed = step.obs["policy"].double().cpu().numpy()
     if np.abs(after[0]).max() > _MAX_DRIFT:
         moved = _coordinates(env)[int(np.abs(after[0]).argmax())]
-        raise _no_regulator(resolved, f"its default state is not an equilibrium: {moved} moves")
+        raise _no_regulator_error(resolved, f"its default state is not an equilibrium: {moved} moves")
     success = env.compute_success()
     if success is None or not bool(success[0]):
-        raise _no_regulator(resolved, "it does not succeed at its default state")
+        raise _no_regulator_error(resolved, "it does not succeed at its default state")
     half = [(values[2 : 2 + pairs] - values[2 + pairs :]) / 2 for values in (after, observed)]
     return drawn, half[0], half[1], observed[0]
 
@@ -174,7 +174,7 @@ def _coordinates(env: VecEnv) -> list[str]:
     return [*names, *(f"the velocity of {name}" for name in names)]
 
 
-def _no_regulator(resolved: Resolved, why: str) -> UsageError:
+def _no_regulator_error(resolved: Resolved, why: str) -> UsageError:
     return UsageError(
         f"there is no LQR (linear-quadratic regulator) of {resolved.source.name}: {why}",
         hint="use --policy trained, zero or random",

@@ -17,7 +17,7 @@ from rlcli.envs.layout import TermLayout
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import UsageError, listing
-from rlcli.evaluation.stress_sweeps import PHYSICAL, SIGNALS, Sweep, unknown_parameter
+from rlcli.evaluation.stress_sweeps import PHYSICAL, SIGNALS, Sweep, unknown_parameter_error
 from rlcli.scene.entity import KINDS
 from rlcli.scene.model_fields import DERIVED_FROM, FIELDS
 from rlcli.scene.names import NameProblem, match
@@ -264,7 +264,7 @@ class ModelPerturbation:
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor) -> None:
         field = PHYSICAL.get(sweep.parameter, sweep.parameter)
         if field not in FIELDS:
-            raise unknown_parameter(sweep.parameter, [name for name in FIELDS if "." not in name])
+            raise unknown_parameter_error(sweep.parameter, [name for name in FIELDS if "." not in name])
         if not env.engine.can_expand(field):
             raise NameProblem(f"'{field}' cannot differ between environments on a GPU; use --device cpu")
         self._sweep, self._values = sweep, values

@@ -132,7 +132,7 @@ def describe_point(sweeps: Sequence[Sweep], point: Point) -> str:
     return ", ".join(f"{name} {format_value(value)}" for name, value in by_name(sweeps, point).items())
 
 
-def unknown_parameter(name: str, fields: Sequence[str]) -> UsageError:
+def unknown_parameter_error(name: str, fields: Sequence[str]) -> UsageError:
     """Return the error for an unknown parameter. `fields` are the model fields that are parameters, too."""
     own = [*PHYSICAL, *SIGNALS]
     near = did_you_mean(name, [*own, *fields])

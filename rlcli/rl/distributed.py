@@ -54,7 +54,7 @@ class ProcessGroup:
         return values
 
     def broadcast_(self, values: Tensor) -> None:
-        """Replace values by those of rank 0, in place."""
+        """Replace values by the values of rank 0, in place."""
         if self.world_size > 1:
             _communicate("broadcast", values, 0)
 

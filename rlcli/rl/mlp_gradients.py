@@ -77,7 +77,7 @@ class PartMemory:
     def sum_parts(self, rows: int, out: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Add up the parts of a minibatch: write its gradients to `out`; return its statistics (`OutputGradient`).
 
-        Those of the actor are (columns,), that of the critic is ().
+        The actor's statistics have the shape (columns,), the critic's ().
         """
         parts = len(self.split(rows))
         torch.sum(self._gradients[:parts], dim=0, out=self._sum)

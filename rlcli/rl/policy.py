@@ -133,7 +133,7 @@ class WideLinear(nn.Linear):
     """Linear layer with float32 weights that computes in float64.
 
     Runtimes add products in different orders. In float64 the difference is too small to change a float32 action, also
-    for observations far from those of training. So batches of any size and exported graphs agree.
+    for observations far from the training's observations. So batches of any size and exported graphs agree.
     """
 
     def forward(self, x: Tensor) -> Tensor:

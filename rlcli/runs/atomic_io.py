@@ -71,7 +71,7 @@ def write_synced(file: Path, data: bytes) -> None:
 def remove_leftovers(folder: Path, name: str) -> None:
     """Remove the temporary files and folders `.NAME.tmp-PID...` in a folder that killed processes have left.
 
-    `name` is the NAME, that of the file or folder to which they would have been renamed.
+    `name` is the NAME of the file or folder to which the temporary ones would have been renamed.
     """
     for leftover in folder.glob(f".{glob.escape(name)}.tmp-*") if os.name == "posix" else ():
         process = re.match(r"\d+", leftover.name.rpartition(".tmp-")[2])

@@ -22,8 +22,8 @@ PARTS = ("policy", "trainer", "env", "rng")
 """Tensor files of every checkpoint: the policy; critics and optimisers; environment; random generators. A trainer may
 add parts."""
 LOG_FOLDER = "logs"
-"""Folder beside the checkpoints with logs: rows that several checkpoints share, such as those of a replay buffer. Its
-files never change."""
+"""Folder beside the checkpoints with logs: rows that several checkpoints share, such as rows of a replay buffer. Files
+in the folder never change."""
 _ROWS_AT_ONCE = 1000
 _MAX_SHARD_BYTES = 2**30
 _HEADER_LIMIT = 4 * 2**20

@@ -268,7 +268,7 @@ def deployment_of(checkpoint: Checkpoint, policy: Policy, found: object = None) 
 
 
 def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: object, randomized: bool) -> list[str]:
-    """Return the keys in which the layout and deployment record of a checkpoint differ from those of an environment.
+    """Return the keys in which the layout and deployment records of a checkpoint and an environment differ.
 
     Formulas are not compared.
 

@@ -64,7 +64,7 @@ def choose(
 ) -> Choice:
     """Return the policy that a reference names.
 
-    Without a reference it is that of the task's newest run; if the task has no run, it is the task's shipped policy.
+    Without a reference, return the policy of the task's newest run; if the task has no run, its shipped policy.
 
     Args:
         reference: RUN, RUN@best, RUN@step:N, a folder, `latest` or `shipped`.

@@ -138,7 +138,7 @@ def file_digest(file: Path) -> str | None:
 
 
 def model_digest(model: mujoco.MjModel) -> str:
-    """Return the SHA-256 of a compiled model's numbers, without those of textures, materials, skins and file paths."""
+    """Return the SHA-256 of a compiled model's numbers, except for textures, materials, skins and file paths."""
     import numpy as np
 
     digest = hashlib.sha256()
@@ -160,8 +160,8 @@ def differences(was: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[st
     """Return (dotted name, old value, new value) of each entry that two records have and that differs.
 
     Args:
-        was: a record of this module, such as that of a run.
-        now: another one.
+        was: a record of this module, such as the record of a run.
+        now: the record to compare with it.
     """
     rows = []
     for entry in ENTRIES:

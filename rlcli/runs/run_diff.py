@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rlcli.runs.checkpoint_reader import Checkpoint
 
 SECTIONS = ("configuration", "environment", "metrics", "weights", "policy")
-"""Parts of the comparison, causes before their effects: a difference may explain those of later parts."""
+"""Parts of the comparison, causes before their effects: a difference may explain differences in later parts."""
 _CLOCK = "Perf/"
 """Prefix of metrics that measure time, which are never equal."""
 _ROWS = 4096

@@ -173,11 +173,11 @@ def parse_json(data: bytes | str, file: Path) -> dict[str, Any]:
         )
         _check_depth(value)
     except _StrictError as error:
-        raise CheckpointError(f"{file} is corrupt: {error}", hint="restore it from a copy") from None
+        raise CheckpointError(f"{file} is corrupt: {error}", hint="restore the file from a backup") from None
     except (ValueError, RecursionError):
-        raise CheckpointError(f"{file} is corrupt: not JSON", hint="restore it from a copy") from None
+        raise CheckpointError(f"{file} is corrupt: not JSON", hint="restore the file from a backup") from None
     if not isinstance(value, dict):
-        raise CheckpointError(f"{file} is corrupt: not a JSON object", hint="restore it from a copy")
+        raise CheckpointError(f"{file} is corrupt: not a JSON object", hint="restore the file from a backup")
     return value
 
 

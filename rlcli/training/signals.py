@@ -14,7 +14,8 @@ from rlcli.envs.observers import StepObserver
 from rlcli.errors import INTERRUPTED, STOPPED, Stopped
 
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGHUP")
-"""Ctrl-C; a scheduler that kills or warns; a terminal that closes. Windows has only some of them."""
+"""Names of the signals that stop a training: from Ctrl-C, from a scheduler that kills or warns, from a terminal that
+closes. Windows has only some of these signals."""
 
 
 class Interrupted(KeyboardInterrupt):

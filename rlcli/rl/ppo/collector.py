@@ -239,8 +239,8 @@ class Collector:
     def complete_images(self) -> None:
         """Compute action, mean, value, ... of the samples' mirror images, after the advantages of the samples.
 
-        As in Mittal et al. 2024, the probability of a mirrored action is that of the action: a symmetric policy has
-        this probability.
+        As in Mittal et al. 2024, a mirrored action gets the probability of the original action, because both are
+        equally probable for a symmetric policy.
         """
         samples, images = self.rollout.samples, self.rollout.images
         if self.mirror is None or images is None:

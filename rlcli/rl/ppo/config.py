@@ -72,7 +72,7 @@ class SymmetryConfig(StrictModel):
     relative to the mean size of its changes."""
 
     @model_validator(mode="after")
-    def _has_effect(self) -> SymmetryConfig:
+    def _require_effect(self) -> SymmetryConfig:
         if not self.augment and not self.mirror_coef:
             raise ValueError("symmetry has no effect: set augment: true or mirror_coef above 0")
         return self

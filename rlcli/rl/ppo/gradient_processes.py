@@ -1,7 +1,7 @@
 """Gradients of the layers, computed by the processes that step the environment: between two rollouts they are idle.
 
-Python runs one thread at a time, so that more than about eight threads of one process slow each other down. The parts
-of a minibatch and their sum are those of `rlcli.rl.mlp_gradients.MlpGradients`, so the results are bit-identical.
+Python runs one thread at a time, so that more than about eight threads of one process slow each other down. A
+minibatch is split and summed as in `rlcli.rl.mlp_gradients.MlpGradients`, so the results are bit-identical.
 """
 
 from __future__ import annotations

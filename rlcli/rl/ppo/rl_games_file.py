@@ -105,7 +105,7 @@ class RlGamesReader:
         if "env" in params:
             self._env(params["env"], params["config"])
 
-    def _unknown(self, at: Path, hint: str | None = None) -> None:
+    def _report_unknown_key(self, at: Path, hint: str | None = None) -> None:
         if self._is_strict:
             self.problem(at, f"unknown key '{at[-1]}'", hint or "remove it")
         else:
@@ -145,7 +145,7 @@ class RlGamesReader:
                 else:
                     self.note(at, "mapped", "trainer ppo")
             elif key not in ("network", "config", "env"):
-                self._unknown(at, did_you_mean(key, ("seed", "algo", "model", "network", "config", *known)))
+                self._report_unknown_key(at, did_you_mean(key, ("seed", "algo", "model", "network", "config", *known)))
 
     def _network(self, network: Any) -> None:
         at = ("params", "network")
@@ -169,7 +169,7 @@ class RlGamesReader:
             elif key == "cnn":
                 self._cnn((*at, key), value, network.get("mlp"))
             else:
-                self._unknown((*at, key), "keys: name, separate, space, mlp, rnn, cnn")
+                self._report_unknown_key((*at, key), "keys: name, separate, space, mlp, rnn, cnn")
 
     def _mlp(self, at: Path, mlp: Any) -> None:
         if not isinstance(mlp, Mapping):
@@ -194,7 +194,7 @@ class RlGamesReader:
             elif key == "regularizer":
                 self.note((*at, key), "ignored", "rlcli has no regularizer of weights")
             else:
-                self._unknown((*at, key))
+                self._report_unknown_key((*at, key))
         for network in ("actor", "critic"):
             self.put((network,), dict(shape), at)
 
@@ -263,7 +263,7 @@ class RlGamesReader:
             elif key in WITHOUT_EFFECT:
                 self.note((*at, key), "ignored", WITHOUT_EFFECT[key])
             elif key not in _HANDLED:
-                self._unknown((*at, key), did_you_mean(key, [*_DIRECT, *_HANDLED, *WITHOUT_EFFECT]))
+                self._report_unknown_key((*at, key), did_you_mean(key, [*_DIRECT, *_HANDLED, *WITHOUT_EFFECT]))
         self._special(at, config)
 
     def _special(self, at: Path, config: Mapping[str, Any]) -> None:
@@ -295,7 +295,7 @@ class RlGamesReader:
         if "clip_actions" in config:
             mapped("clip_actions", "action_bound", 1.0 if config["clip_actions"] else None)
         if "central_value_config" in config:
-            text = "the critic observes the states; its network and schedule are those of the policy"
+            text = "the critic observes the states; it uses the policy's network and schedule"
             self.note((*at, "central_value_config"), "approximated", text)
 
     def _schedule(self, at: Path, config: Mapping[str, Any]) -> None:

@@ -79,7 +79,7 @@ class PpoConfig(OnPolicyConfig):
     """Number of minibatches of a rollout; the number of environments need not be a multiple."""
     desired_kl: Positive | None = None
     """For schedule adaptive: after an iteration the learning rate is divided by 1.5 if the KL divergence is above twice
-    this value, and multiplied by 1.5 if it is below half of it."""
+    this value, and multiplied by 1.5 if the divergence is below half of this value."""
     clip_range: Positive = 0.2
     """Clipping range of the probability ratio: 1 +- clip_range."""
     clip_range_vf: Positive | None = None
