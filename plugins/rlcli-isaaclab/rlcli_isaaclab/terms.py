@@ -124,7 +124,9 @@ class UserTerm:
         required = p.default is inspect.Parameter.empty
         default = None if required else p.default
         if isinstance(default, SceneEntityCfg):
-            default = EntityModel.model_validate(entity_data(vars(default)))
+            # Isaac Lab resolves no names of a default: without names it selects all, as its ids do
+            data = {key: value for key, value in entity_data(vars(default)).items() if value != []}
+            default = EntityModel.model_validate(data)
         elif kind in _PLAIN.values() and default is None and not required:
             kind = kind | None
         return Parameter(key_of(p.name), kind, default, required, None)
