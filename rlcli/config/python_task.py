@@ -328,7 +328,8 @@ def _is_entry(entry: object, module: str, attribute: str) -> bool:
     """Return whether `entry`, a reference `module:name` or an object, is the object `attribute` of a module."""
     if isinstance(entry, str):
         return entry == f"{module}:{attribute}"
-    return getattr(entry, "__module__", "") == module and getattr(entry, "__qualname__", "") == attribute
+    kind = entry if hasattr(entry, "__qualname__") else type(entry)  # the configuration's class
+    return getattr(kind, "__module__", "") == module and kind.__qualname__ == attribute
 
 
 def _module_of(entry: object) -> str:

@@ -62,7 +62,9 @@ class ManagedEnv(VecEnv):
         binder = self._binder
         # commands first: terms of other sections use them
         sections = ("commands", "actions", "events", "terminations", "rewards", "curriculum")
-        self._bound = {section: binder.bind_all(section) for section in sections}
+        self._bound: dict[str, list[BoundTerm]] = {}
+        for section in sections:  # a term of one section may look up the terms of the sections before
+            self._bound[section] = binder.bind_all(section)
         self._observations = {group: binder.bind_group(group) for group in self.config.observations}
 
     def _build_workflow(self) -> None:

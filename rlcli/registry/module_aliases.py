@@ -189,11 +189,16 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def _import_folder_above(name: str, file: Path) -> None:
-    """Import the folder `name` above a task file as a package, if there is one.
+    """Import as a package the folder `name` above a task file, or else `name/name` in one of the folders above it.
 
-    Such files import modules by their path in the repository, for example `source.robot.mdp`.
+    Such files import modules by their path in the repository, for example `source.robot.mdp`, or from another
+    distribution of the repository that is not installed, for example `source/robot_assets/robot_assets`.
     """
-    folder = next((parent for parent in file.parents if parent.name == name), None)
+    found = [parent for parent in file.parents if parent.name == name]
+    if not found:
+        beside = (parent / name / name for parent in file.parents)
+        found = [folder for folder in beside if (folder / "__init__.py").is_file()]
+    folder = found[0] if found else None
     spec = PathFinder.find_spec(name)
     if folder is None or (spec is not None and str(folder) not in (spec.submodule_search_locations or ())):
         return

@@ -183,5 +183,7 @@ def _registrations_kept() -> Iterator[None]:
     finally:
         gymnasium = sys.modules.get("gymnasium")
         registry = gymnasium.envs.registry if gymnasium is not None else {}
-        for name in [name for name, spec in registry.items() if CONFIGURATION in spec.kwargs]:
-            registrations[name] = {**registry[name].kwargs, ENVIRONMENT: registry[name].entry_point}
+        for name, spec in list(registry.items()):
+            cfg = spec.kwargs.get(CONFIGURATION, spec.kwargs.get("cfg"))  # `cfg`: an argument of the environment class
+            if CONFIGURATION in spec.kwargs or hasattr(cfg, "__rlcli_task__"):
+                registrations[name] = {**spec.kwargs, CONFIGURATION: cfg, ENVIRONMENT: spec.entry_point}

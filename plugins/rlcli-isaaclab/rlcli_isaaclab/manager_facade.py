@@ -154,7 +154,7 @@ class RewardManagerFacade(ManagerFacade):
         found = {term.name: term for term in self._manager.terms}
         if name not in found:
             raise NameProblem(f"no reward '{name}'", did_you_mean(name, found) or f"rewards: {listing(found)}")
-        return RewardSettings(found[name].config, self._tunable.get((*found[name].path, "weight")))
+        return RewardSettings(found[name].config, self._tunable, (*found[name].path, "weight"))
 
     @property
     def _episode_sums(self) -> dict[str, Tensor]:
@@ -169,20 +169,22 @@ class RewardManagerFacade(ManagerFacade):
 class RewardSettings:
     """Settings of a reward. Only the weight can change, and only in a curriculum term."""
 
-    def __init__(self, config: Any, weight: Tensor | None) -> None:
-        self._config, self._weight = config, weight
+    def __init__(self, config: Any, tunable: Any, path: tuple[Any, ...]) -> None:
+        self._config, self._tunable, self._path = config, tunable, path
         self.params: Mapping[str, Any] = MappingProxyType(config.params)
 
     @property
     def weight(self) -> float:
         """Current weight."""
-        return self._config.weight if self._weight is None else float(self._weight)
+        weight = self._tunable.get(self._path)
+        return self._config.weight if weight is None else float(weight)
 
     @weight.setter
     def weight(self, value: float) -> None:
-        if self._weight is None:
+        weight = self._tunable.get(self._path)
+        if weight is None:
             raise AttributeError("the weight of a reward can change only in a curriculum term; write one")
-        self._weight.fill_(value)
+        weight.fill_(value)
 
 
 def _find_term(terms: Any, name: str, kind: str) -> Any:

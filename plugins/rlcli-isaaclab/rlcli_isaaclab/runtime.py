@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -103,7 +104,10 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
     @property
     def reward_manager(self) -> Any:
-        """Reward manager."""
+        """Reward manager. In `__init__` of a curriculum term it has the terms only."""
+        bound = getattr(self.managed, "_bound", {})
+        if not hasattr(self.managed, "reward_manager") and "rewards" in bound:
+            return RewardManagerFacade(SimpleNamespace(terms=bound["rewards"]), self.managed._binder.tunable)
         return self._manager(
             "reward_manager", lambda manager: RewardManagerFacade(manager, self.managed._binder.tunable)
         )

@@ -320,13 +320,13 @@ class Scene(Mapping[str, Any]):
 
     @property
     def terrain(self) -> Any:
-        """Terrain, or None."""
-        terrain = getattr(self._env, "terrain", None)
-        if terrain is None:
+        """Terrain; without one None, or the origins only if the settings have a plane."""
+        terrain, cfg = getattr(self._env, "terrain", None), getattr(self.user_cfg, "terrain", None)
+        if terrain is None and cfg is None:
             return None
         made = bound(TerrainImporter, self._env, terrain)
-        if hasattr(self.user_cfg, "terrain"):
-            made.cfg = self.user_cfg.terrain
+        if cfg is not None:
+            made.cfg = cfg
         return made
 
     def __getitem__(self, name: str) -> Any:

@@ -124,7 +124,8 @@ class UserTerm:
         required = p.default is inspect.Parameter.empty
         default = None if required else p.default
         if isinstance(default, SceneEntityCfg):
-            default = EntityModel.model_validate(entity_data(vars(default)))
+            data = entity_data(vars(default)).items()  # in Isaac Lab a default with empty names selects all
+            default = EntityModel.model_validate({key: value for key, value in data if value != []})
         elif kind in _PLAIN.values() and default is None and not required:
             kind = kind | None
         return Parameter(key_of(p.name), kind, default, required, None)
@@ -425,8 +426,7 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
     values: dict[str, Any] = {key: _resolved(value, facade.scene) for key, value in term.objects.items()}
     for key, value in params.items():
         if isinstance(value, EntityModel):
-            value = SceneEntityCfg(**value.model_dump())
-            facade.scene.resolve(value)
+            facade.scene.resolve(value := SceneEntityCfg(**value.model_dump()))
         values[term.original[key]] = value
     if _CHECKS_FOR_LIST.search(file_text(term.function)):
         for chosen in values.values():

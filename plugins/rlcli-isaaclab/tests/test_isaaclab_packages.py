@@ -37,6 +37,14 @@ def test_package_in_a_folder_that_a_task_file_adds_to_sys_path(tmp_path):
     stepped(rover(tmp_path / "repository" / "tasks", code))
 
 
+def test_package_of_another_distribution_in_the_repository(tmp_path):
+    source = tmp_path / "source"
+    robots = source / "arms_of_test" / "arms_of_test"
+    robots.mkdir(parents=True)
+    (robots / "__init__.py").write_text("from isaaclab.utils import configclass\n\nSTIFFNESS = 3.0\n")
+    stepped(rover(source / "tasks_of_test", "from arms_of_test import STIFFNESS\n"))
+
+
 def test_package_at_a_root_that_pythonpath_names(tmp_path, monkeypatch):
     robots = tmp_path / "root" / "shared_robots_of_test"
     robots.mkdir(parents=True)

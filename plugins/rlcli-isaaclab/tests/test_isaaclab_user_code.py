@@ -180,6 +180,51 @@ def test_curriculum_changes_the_ranges_of_a_command(tmp_path):
     assert env.command_manager.get_command("speed")[:, 0].tolist() == [0.5] * 4
 
 
+RAMP = """
+from isaaclab.managers import ManagerTermBase
+
+class ramp(ManagerTermBase):
+    def __init__(self, cfg, env):
+        super().__init__(cfg, env)
+        self.settings = env.reward_manager.get_term_cfg("alive")
+        assert self.settings.weight == 1.0
+
+    def __call__(self, env, env_ids, weight):
+        self.settings.weight = weight
+        env.reward_manager.set_term_cfg("alive", self.settings)
+        return self.settings.weight
+"""
+
+
+def test_curriculum_class_reads_a_reward_in_its_constructor(tmp_path):
+    ramp = "CurriculumTermCfg(func=ramp, params={'weight': 3.0})"
+    env = make_env(rover(tmp_path / "rover", RAMP, curriculum={"ramp": ramp}), seed=0)
+    env.reset()
+    rewards = [env.step(torch.zeros(4, 2)).reward.tolist() for _ in range(52)]  # curricula run when an episode ends
+    assert rewards[0] == pytest.approx([0.02] * 4)
+    assert rewards[-1] == pytest.approx([0.06] * 4)
+
+
+DEFAULTS = """
+def bodies(env, asset_cfg: SceneEntityCfg = SceneEntityCfg("robot", body_names=())):
+    height = env.scene.terrain.env_origins[:, 2]
+    count = env.scene["robot"].data.body_pos_w[:, asset_cfg.body_ids].shape[1]
+    return count - height
+"""
+PLANE = """
+    from isaaclab.terrains import TerrainImporterCfg
+    terrain = TerrainImporterCfg(prim_path="/World/ground", terrain_type="plane")
+    robot ="""
+
+
+def test_default_without_names_selects_all_and_a_plane_has_origins(tmp_path):
+    reward = "RewardTermCfg(func=bodies, weight=1.0)"
+    plane = ("    robot =", PLANE)
+    env = make_env(rover(tmp_path / "rover", DEFAULTS, [plane], rewards={"bodies": reward}), seed=0)
+    env.reset()
+    assert env.step(torch.zeros(4, 2)).reward.tolist() == pytest.approx([0.06] * 4)
+
+
 def test_gains_of_joints_with_and_without_stiffness(tmp_path):
     params = """{'asset_cfg': SceneEntityCfg('robot', joint_names=['.*']), 'operation': 'scale',
         'stiffness_distribution_params': (2.0, 2.0), 'damping_distribution_params': (3.0, 3.0)}"""

@@ -428,6 +428,19 @@ def test_agent_file_of_each_library_is_read(direct, library):
         assert any("surprise" in note.key for note in resolved.notes if note.status == "ignored")
 
 
+def test_registration_that_passes_the_settings_to_the_environment_class(direct):
+    (direct.parent / "__init__.py").write_text(
+        "import gymnasium as gym\nfrom .pole_env import PoleEnvCfg\n"
+        f'gym.register(id="Pole-{uuid.uuid4().hex}-v0", entry_point=f"{{__name__}}.pole_env:PoleEnv",\n'
+        '             kwargs={"cfg": PoleEnvCfg(force=9.0)})\n'
+    )
+    env = make_env(resolve(find_task(str(direct.parent))), seed=0)
+    env.reset()
+    assert env.step(torch.ones(4, 1)).reward.tolist() == [1.0] * 4
+    assert vars(env)["_isaaclab_direct"].lab.cfg.force == 9.0
+    make_env(resolve(find_task(f"{direct}:PoleEnvCfg")), seed=0)
+
+
 def test_rl_games_settings_without_counterpart_are_reported(direct):
     registered(direct.parent, ["rl_games"])
     file = direct.parent / "rl_games.yaml"
