@@ -175,9 +175,17 @@ def pip_install(package: str) -> str:
     return " ".join(["pip install", *(f'"{word}"' if set(word) & set(" []<>=*") else word for word in words)])
 
 
+def error_text(error: BaseException) -> str:
+    """Return the message of an error; why there is none, if its `__str__` fails, as it may in the code of a task."""
+    try:
+        return str(error)
+    except BaseException as failed:
+        return f"its text cannot be made: {type(failed).__name__}"
+
+
 def one_line(error: BaseException, limit: int | None = None) -> str:
     """Return the message of an error on one line, cut to `limit` characters; its class name if it has no message."""
-    text = " ".join(str(error).split())
+    text = " ".join(error_text(error).split())
     if "set_int_max_str_digits" in text:  # Python's advice does not help users of rlcli
         text = "it has a number of more than 4300 digits"
     return text[:limit] or type(error).__name__

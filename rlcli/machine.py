@@ -18,7 +18,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
-from rlcli.errors import DependencyError, DeviceError, MachineError, RlcliError, UsageError, one_line, pip_install
+from rlcli.errors import (
+    DependencyError,
+    DeviceError,
+    MachineError,
+    RlcliError,
+    UsageError,
+    error_text,
+    one_line,
+    pip_install,
+)
 from rlcli.safe_text import read_number
 
 _log = logging.getLogger(__name__)
@@ -153,7 +162,7 @@ def memory_error(error: BaseException | None) -> MachineError | None:
     limit = address_space()
     limited = f" (the process is limited to {limit >> 20} MiB)" if limit else ""
     while error is not None:
-        text = str(error)
+        text = error_text(error)
         if isinstance(error, MemoryError) or (
             not isinstance(error, RlcliError) and (_NO_MEMORY.search(text) or (limit and _UNDER_A_LIMIT.search(text)))
         ):

@@ -169,7 +169,7 @@ def _run(arguments: list[str]) -> int:
                 console.info(line)
             return 2
         failure: RlcliError = UsageError("no command given", hint="rlcli --help lists the commands")
-    except (Exception, KeyboardInterrupt, SystemExit) as error:
+    except BaseException as error:  # the code of a task may raise any exception
         failure = _as_rlcli_error(error, arguments)
         if failure.kind == "bug" and isinstance(error, SystemExit):
             raise  # not from the code of a task or plugin: typer ends completions and closed pipes in this way
@@ -212,7 +212,7 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
         return UsageError(f"'{error.filename}' is too long: a name in a path has at most 255 bytes", hint="shorten it")
     if isinstance(error, OSError):
         file = f"{error.filename}: " if error.filename else ""
-        return MachineError(f"{file}{error.strerror or error}")
+        return MachineError(f"{file}{error.strerror or str(error) or type(error).__name__}")
 
     from rlcli.cli.ui.error_origin import error_of_task, missing_dependency
     from rlcli.sim.gl import opengl_import_error

@@ -1,0 +1,17 @@
+"""Texts of errors."""
+
+import pytest
+
+from rlcli.errors import error_text, one_line
+
+
+@pytest.mark.parametrize("failure", [RuntimeError("in str"), SystemExit(0), None], ids=["raises", "exits", "no text"])
+def test_text_of_an_error_without_text(failure):
+    class Textless(Exception):
+        def __str__(self):
+            if failure is not None:
+                raise failure
+            return 5
+
+    assert "its text cannot be made" in error_text(Textless())
+    assert "its text cannot be made" in one_line(Textless())
