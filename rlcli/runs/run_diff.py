@@ -12,6 +12,7 @@ from rlcli.runs.config_diff import Difference, Section, as_text, compare_values,
 from rlcli.runs.metric_rows import read_rows
 from rlcli.runs.provenance import differences
 from rlcli.runs.run import Run
+from rlcli.safe_text import shorten
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -140,10 +141,11 @@ def _compare_part(one: Checkpoint, other: Checkpoint, part: str) -> Iterator[Dif
 
 def _compare_tensors(left: Mapping[str, Tensor], right: Mapping[str, Tensor], prefix: str) -> Iterator[Difference]:
     for name in sorted(left.keys() | right.keys()):
+        where = f"{prefix}{shorten(name, 200)}"  # an untrusted file has names of any length
         if name in left and name in right:
-            yield from _compare_elements(left[name], right[name], f"{prefix}{name}")
+            yield from _compare_elements(left[name], right[name], where)
         else:
-            yield Difference(f"{prefix}{name}", *_presence("there", name in left, name in right))
+            yield Difference(where, *_presence("there", name in left, name in right))
 
 
 def _compare_elements(left: Tensor, right: Tensor, where: str) -> Iterator[Difference]:
