@@ -183,6 +183,13 @@ def error_text(error: BaseException) -> str:
         return f"its text cannot be made: {type(failed).__name__}"
 
 
+def error_with_type(error: BaseException) -> str:
+    """Return the message of an error of rlcli; of any other error its class name and its message."""
+    if isinstance(error, RlcliError):
+        return error.message
+    return ": ".join(filter(None, (type(error).__name__, error_text(error))))
+
+
 def one_line(error: BaseException, limit: int | None = None) -> str:
     """Return the message of an error on one line, cut to `limit` characters; its class name if it has no message."""
     text = " ".join(error_text(error).split())

@@ -2,11 +2,18 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from rlcli.config.schema import StrictModel
 
-Text = Annotated[str, Field(min_length=1, pattern=r"^[^\x00]*$")]
+
+def _require_no_null(text: str) -> str:
+    if "\0" in text:
+        raise ValueError("the text has a null character; remove it")
+    return text
+
+
+Text = Annotated[str, Field(min_length=1), AfterValidator(_require_no_null)]
 Loggers = Annotated[list[Literal["tensorboard", "wandb", "mlflow", "trackio", "none"]], Field(min_length=1)]
 
 

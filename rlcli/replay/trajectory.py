@@ -85,7 +85,7 @@ class Episode(_Strict):
     total_reward: float
     """Undiscounted sum of rewards of the whole episode."""
     truncated: bool
-    """Whether the episode ended by a time-out and no other termination."""
+    """Whether the episode ended only because of its time limit."""
     success: bool | None
     """Whether the episode met the task's conditions of success; None if the task has none."""
     causes: list[str]

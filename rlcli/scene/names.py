@@ -115,7 +115,7 @@ class _Part:
     varies: bool = False
     """Whether the part can match texts of several lengths, or has alternatives."""
     last_varies: bool = False
-    """Whether the element that was read last can match texts of several lengths."""
+    """Whether the last element of the pattern, such as `a*`, can match texts of different lengths."""
     _most: tuple[int, int] = (0, 0)
 
     def most(self) -> tuple[int, int]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
-from rlcli.errors import RlcliError
+from rlcli.errors import error_with_type
 from rlcli.machine import memory_error
 
 
@@ -40,7 +40,7 @@ class NotRunError(Exception):
     """Raised by a check that does not apply to this task or this machine; the message is the reason."""
 
 
-def error_text(error: Exception) -> str:
+def task_error_text(error: Exception) -> str:
     """Return the message of an error of the task as one line.
 
     Raises:
@@ -48,5 +48,4 @@ def error_text(error: Exception) -> str:
     """
     if too_little := memory_error(error):
         raise too_little from error
-    message = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error}"
-    return " ".join(message.split())
+    return " ".join(error_with_type(error).split())

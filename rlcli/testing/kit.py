@@ -16,7 +16,7 @@ from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError
 from rlcli.progress import tracked
 from rlcli.runs.atomic_io import write_atomic
 from rlcli.testing import episode_checks, portability_checks, step_and_file_checks
-from rlcli.testing.findings import Finding, NotRunError, error_text
+from rlcli.testing.findings import Finding, NotRunError, task_error_text
 from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, open_task
 
 Check = Callable[[TaskUnderTest], Iterable[Finding]]
@@ -147,7 +147,7 @@ def _run(name: str, subject: TaskUnderTest, before: list[Finding]) -> Iterator[F
 
 
 def _stopped(name: str, subject: TaskUnderTest, error: Exception, before: list[Finding]) -> Finding:
-    message = f"the check was stopped by {error_text(error)}"
+    message = f"the check was stopped by {task_error_text(error)}"
     earlier = next((f.check for f in before if f.message == message), None)
     advice = getattr(error, "hint", None) or "correct the code that raises it, then check again"
     hint = advice if earlier is None else f"see the check {earlier}"

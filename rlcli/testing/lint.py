@@ -19,7 +19,7 @@ import torch
 
 from rlcli.errors import ConfigError, MachineError, UsageError, require_known
 from rlcli.progress import tracked
-from rlcli.testing.findings import error_text
+from rlcli.testing.findings import task_error_text
 from rlcli.testing.fixed_policy_rollouts import RolloutEvidence
 from rlcli.testing.lint_rules import RULES, Remark
 from rlcli.testing.task_under_test import open_task
@@ -87,6 +87,6 @@ def _apply_rule(name: str, evidence: RolloutEvidence) -> Iterator[Remark]:
     except (ConfigError, MachineError):
         raise
     except Exception as error:
-        message = f"the rule was stopped by {error_text(error)}"
+        message = f"the rule was stopped by {task_error_text(error)}"
         hint = getattr(error, "hint", None) or "correct the code that raises it, then lint again"
         yield Remark(name, "error", evidence.subject.location(error), message, hint)

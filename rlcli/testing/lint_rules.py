@@ -17,7 +17,7 @@ from rlcli.config.layers import leaves
 from rlcli.config.schema import AgentConfig
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
-from rlcli.testing.findings import error_text
+from rlcli.testing.findings import task_error_text
 from rlcli.testing.fixed_policy_rollouts import FIXED_POLICIES, MAX_STEPS, RolloutEvidence, record_rollout
 from rlcli.testing.task_under_test import observation_parts
 from rlcli.testing.timestep_checks import energy_drift
@@ -61,7 +61,7 @@ def stops(evidence: RolloutEvidence) -> Iterator[Remark]:
     for rollout in evidence.rollouts:
         if rollout.error is None:
             continue
-        text = error_text(rollout.error)
+        text = task_error_text(rollout.error)
         if text not in seen:
             seen.add(text)
             step = len(rollout.reward)

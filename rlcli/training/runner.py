@@ -13,7 +13,7 @@ from rlcli.deploy.env_description import describe
 from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import DivergedError, RlcliError, Stopped, error_text
+from rlcli.errors import DivergedError, RlcliError, Stopped, error_with_type
 from rlcli.random import derive
 from rlcli.replay.crash_dump import CrashDumper
 from rlcli.replay.failure_recorder import open_failure_recorder
@@ -263,7 +263,7 @@ def _end_state(error: BaseException) -> tuple[str, str | None]:
     """Return the state of the run after an error (stopped, diverged or failed), and the reason for run.json."""
     if isinstance(error, Stopped | KeyboardInterrupt):
         return "stopped", None
-    message = error.message if isinstance(error, RlcliError) else f"{type(error).__name__}: {error_text(error)}"
+    message = error_with_type(error)
     return "diverged" if isinstance(error, DivergedError) else "failed", " ".join(message.split())[:500]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import FrameType
 
 import rlcli
-from rlcli.errors import DependencyError, TaskError, error_text, pip_install
+from rlcli.errors import DependencyError, TaskError, error_with_type, pip_install
 from rlcli.registry import OWN, TASKS, TRAINERS, catalog, is_framework
 
 
@@ -21,7 +21,7 @@ def error_of_task(error: BaseException) -> TaskError | None:
         return None
     frame, line = found[-1]
     code = frame.f_code
-    message = ": ".join(filter(None, (type(error).__name__, error_text(error))))
+    message = error_with_type(error)
     return TaskError(
         f"{code.co_filename}:{line}: {code.co_name}: {message}",
         hint="correct the task's code at this line; --debug shows the traceback",

@@ -6,7 +6,6 @@ import os
 
 from rlcli.config.load import Resolved
 from rlcli.config.schema import CameraSensorConfig
-from rlcli.envs.sharding.custom_task_code import has_untested_code
 from rlcli.errors import ConfigError
 from rlcli.machine import available_cores, available_memory
 
@@ -21,6 +20,8 @@ ONE_WORKER = "RLCLI_ONE_WORKER"
 """Environment variable of trainings that run beside others: `auto` then uses one process."""
 FEWEST_CORES = 4
 """Fewest cores with which `auto` uses several processes: on fewer, physics already takes most of a step."""
+_TESTED = ("rlcli", "rlcli-gymnasium", "rlcli-menagerie")
+"""Distributions whose tasks are tested with several workers."""
 
 
 def number_of_workers(resolved: Resolved, device: str) -> int:
@@ -63,3 +64,9 @@ def _reason_for_one(resolved: Resolved, device: str) -> str | None:
         if term is not None and term.func in resolved.vocabulary.own:
             return f"the task's own code for curriculum '{name}' may use all environments"
     return None
+
+
+def has_untested_code(resolved: Resolved) -> bool:
+    """Return whether a task has code of its own that is not tested with several workers."""
+    has_own_code = resolved.source.task is not None or bool(resolved.vocabulary.own)
+    return has_own_code and resolved.source.distribution not in _TESTED

@@ -19,7 +19,7 @@ from rlcli.envs.observers import Observers
 from rlcli.envs.shard_range import Shard, split
 from rlcli.envs.sharding import worker
 from rlcli.envs.sharding.arrays import ArraySpec, map_tensors
-from rlcli.envs.sharding.custom_task_code import has_untested_code
+from rlcli.envs.sharding.choice import has_untested_code
 from rlcli.envs.sharding.engine_view import ShardedEngine, sums
 from rlcli.envs.sharding.shard_step import (
     SLOTS,

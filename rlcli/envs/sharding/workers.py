@@ -56,7 +56,7 @@ class Worker:
             )
         self._channel = Channel(ours, SPIN_S)
         self._was_named = False
-        """Whether a warning that the worker does not answer has been logged."""
+        """Whether this process has already warned that the worker does not answer."""
 
     def send(self, kind: bytes, content: Any = None) -> None:
         """Send a message.
