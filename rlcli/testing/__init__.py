@@ -11,8 +11,8 @@ for finding in check_task("acrobot"):
 ```
 """
 
+from rlcli.testing.checks import CHECKS, check_task, record_layout
 from rlcli.testing.findings import Finding
-from rlcli.testing.kit import CHECKS, check_task, record_layout
 from rlcli.testing.lint import lint_task
 from rlcli.testing.lint_rules import RULES, Remark
 

@@ -31,9 +31,9 @@ class Finding:
 
 
 error_at = partial(Finding, "", "error")
-"""(where, message, hint) -> error of the running check; the kit adds the name of the check."""
+"""(where, message, hint) -> error of the running check; `rlcli.testing.checks` adds the name of the check."""
 warning_at = partial(Finding, "", "warning")
-"""(where, message, hint) -> warning of the running check; the kit adds the name of the check."""
+"""(where, message, hint) -> warning of the running check; `rlcli.testing.checks` adds the name of the check."""
 
 
 class NotRunError(Exception):
