@@ -29,9 +29,9 @@ from rlcli.runs.restore import require_fit
 from rlcli.runs.run_ref import default_runs_dir
 from rlcli.safe_text import MAX_SEED, shorten
 from rlcli.training.job import Job, TrainingResult
-from rlcli.training.launch import TrainingRequest, broadcast_job, process_device, setup_job
 from rlcli.training.runner import run_training
 from rlcli.training.signals import StopRequest
+from rlcli.training.start_run import TrainingRequest, broadcast_job, process_device, setup_job
 
 if TYPE_CHECKING:
     from rlcli.training.progress import Progress

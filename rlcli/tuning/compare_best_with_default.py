@@ -16,9 +16,9 @@ from rlcli.evaluation.limits import require_success
 from rlcli.runs.overview import newest_rows, overview
 from rlcli.runs.run import CONFIG, Run
 from rlcli.runs.safe_io import read_file
-from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.loggers import read_metrics
 from rlcli.training.signals import StopRequest
+from rlcli.training.start_run import TrainingRequest, prepare_run
 from rlcli.training.subprocesses import POLL_S, start_training
 from rlcli.training.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
 from rlcli.tuning.sweep import Sweep

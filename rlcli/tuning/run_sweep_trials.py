@@ -13,8 +13,8 @@ from rlcli.errors import INTERRUPTED, STOPPED, DivergedError, RlcliError, UsageE
 from rlcli.evaluation.limits import require_success
 from rlcli.runs.overview import newest_rows, overview
 from rlcli.runs.run import Run, open_run
-from rlcli.training.launch import TrainingRequest, prepare_run
 from rlcli.training.signals import StopRequest
+from rlcli.training.start_run import TrainingRequest, prepare_run
 from rlcli.training.subprocesses import POLL_S, TrainingProcess, start_command, start_training
 from rlcli.training.time_to_threshold import training_s
 from rlcli.tuning.search_space import Objective, Parameter

@@ -17,8 +17,8 @@ from rlcli.runs.atomic_io import write_atomic
 from rlcli.runs.overview import overview
 from rlcli.runs.run import open_run
 from rlcli.runs.study import create_study, read_study, runs_of
-from rlcli.training.launch import TrainingRequest, run_record
 from rlcli.training.signals import StopRequest
+from rlcli.training.start_run import TrainingRequest, run_record
 from rlcli.training.subprocesses import train_all
 
 _log = logging.getLogger(__name__)

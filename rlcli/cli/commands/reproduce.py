@@ -74,8 +74,8 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
     from rlcli.runs.reproduction import changed_entries, create_reproduction, milestones
     from rlcli.runs.restore import resolve_run
     from rlcli.training.job import Job
-    from rlcli.training.launch import setup_job
     from rlcli.training.signals import StopRequest
+    from rlcli.training.start_run import setup_job
 
     resolved = resolve_run(original, play=False)
     engine = resolved.task.sim.engine_threads or available_cores()

@@ -13,8 +13,8 @@ from rlcli.errors import Stopped, UsageError, require_known
 from rlcli.safe_text import MAX_SEED
 
 if TYPE_CHECKING:
-    from rlcli.training.launch import TrainingRequest
     from rlcli.training.signals import StopRequest
+    from rlcli.training.start_run import TrainingRequest
 
 _READ_OPTIONS = {"task", "overrides", "storage", "runs_dir", "json", "quiet", "verbose", "debug"}
 _COMPARE_OPTIONS = {"seeds", "until", "episodes", "max_iterations", "max_steps", "device"}
@@ -76,8 +76,8 @@ def command(
     """
     from rlcli.config.layers import flags
     from rlcli.runs.run_ref import default_runs_dir
-    from rlcli.training.launch import TrainingRequest
     from rlcli.training.signals import StopRequest
+    from rlcli.training.start_run import TrainingRequest
     from rlcli.tuning.optuna_storage import check_optuna, storage_errors
     from rlcli.tuning.search_space import HINT
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from rlcli.config.load import Resolved
     from rlcli.registry import TaskSource
     from rlcli.training.job import TrainingResult
-    from rlcli.training.launch import TrainingRequest
     from rlcli.training.signals import StopRequest
+    from rlcli.training.start_run import TrainingRequest
 
 
 def command(
@@ -73,8 +73,8 @@ def command(
     from rlcli.machine import limit_openmp_spinning
     from rlcli.rl import distributed
     from rlcli.runs.run_ref import default_runs_dir
-    from rlcli.training.launch import TrainingRequest, process_device
     from rlcli.training.signals import StopRequest
+    from rlcli.training.start_run import TrainingRequest, process_device
     from rlcli.training.subprocesses import stop_with_parent
 
     stop_with_parent()
@@ -156,7 +156,7 @@ def _train(request: TrainingRequest, resolved: Resolved | None, device: str, sto
     from rlcli.cli.ui.progress_view import TrainingView
     from rlcli.rl import distributed
     from rlcli.training.job import Job
-    from rlcli.training.launch import broadcast_job, setup_job
+    from rlcli.training.start_run import broadcast_job, setup_job
 
     with stop:
         try:
