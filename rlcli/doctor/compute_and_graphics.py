@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.doctor.check import Check
-from rlcli.doctor.installation import TRIPLE, version
+from rlcli.doctor.installation import MUJOCO_PACKAGES, version
 from rlcli.errors import MachineError, pip_install
 from rlcli.machine import available_cores, has_gpu_driver, python_command
 from rlcli.registry.plugin_imports import release_numbers
@@ -26,7 +26,7 @@ _OFF = ("disable", "disabled", "off", "false", "0")
 _ANSWER_BYTES = 100_000
 _LATE = "no answer within"
 BUSY = "if the machine is busy: `rlcli doctor --probe-timeout 120`"
-REINSTALL = f"pip uninstall -y {' '.join(TRIPLE)} && {pip_install('mujoco')}"
+REINSTALL = f"pip uninstall -y {' '.join(MUJOCO_PACKAGES)} && {pip_install('mujoco')}"
 """Uninstall first: the three packages share files, so upgrading one removes files that another has just written."""
 
 Answer = tuple[dict[str, Any] | None, str]

@@ -14,7 +14,7 @@ from rlcli.registry import Entry, catalog, unreadable_distributions
 from rlcli.registry.plugin_imports import release_numbers
 from rlcli.registry.probe import probe
 
-TRIPLE = ("mujoco", "mujoco-core", "mujoco-studio")
+MUJOCO_PACKAGES = ("mujoco", "mujoco-core", "mujoco-studio")
 """The three PyPI packages of MuJoCo, which must have the same version."""
 _NO_EXTRAS = ("all", "dev", "docs")
 """Extras that are not checked: lists of other extras, and the tools that develop rlcli."""
@@ -114,10 +114,10 @@ def _dependencies_check() -> Check:
 
 def _mujoco_packages_check() -> Check:
     """Check that the packages of MuJoCo have the same version and that each is installed once."""
-    copies = {name: _copies(name) for name in TRIPLE}
+    copies = {name: _copies(name) for name in MUJOCO_PACKAGES}
     first = {name: next(iter(found.values()), None) for name, found in copies.items()}
-    bad = [f"{name} is missing" for name in TRIPLE if first[name] is None]
-    for name in TRIPLE:
+    bad = [f"{name} is missing" for name in MUJOCO_PACKAGES if first[name] is None]
+    for name in MUJOCO_PACKAGES:
         own = first[name]
         for other, wanted, extra in _requirements(name):
             have = first.get(other)
@@ -131,7 +131,7 @@ def _mujoco_packages_check() -> Check:
     newest = max((found for found in first.values() if found), key=release_numbers, default=None)
     wanted = f"mujoco=={first['mujoco'] or newest}" if newest else "mujoco"
     # uninstall first: see compute_and_graphics.REINSTALL
-    hint = f"pip uninstall -y {' '.join(TRIPLE)} && {pip_install(wanted)}"
+    hint = f"pip uninstall -y {' '.join(MUJOCO_PACKAGES)} && {pip_install(wanted)}"
     return Check("mujoco packages", "broken", "; ".join(dict.fromkeys(bad)), hint, first)
 
 

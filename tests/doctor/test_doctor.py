@@ -62,7 +62,7 @@ def test_bad_runs_folder_and_graphics_are_broken(cli, tmp_path):
     found = checks(done)
     assert done.returncode == 9
     assert {name for name, check in found.items() if check["state"] == "broken"} == {"runs folder", "graphics"}
-    assert "cannot be written" in found["runs folder"]["found"]
+    assert "is not writable" in found["runs folder"]["found"]
     assert not list(tmp_path.rglob("runs"))
 
 
