@@ -28,7 +28,7 @@ def __getattr__(name: str) -> Any:
     vocabulary = importlib.import_module(f"{__name__}.vocabulary")
     if name in vocabulary.NAMES:
         return getattr(vocabulary, name)
-    neighbours = importlib.import_module(f"{__name__}.neighbours")
+    name_lookup = importlib.import_module(f"{__name__}.name_lookup")
     if name == "__all__":  # `import *` also exports the names of neighbour files that the importing file uses
-        return [*vocabulary.NAMES, *neighbours.used_names(vocabulary.NAMES)]
-    return neighbours.find(name, vocabulary.NAMES)
+        return [*vocabulary.NAMES, *name_lookup.used_names(vocabulary.NAMES)]
+    return name_lookup.find(name, vocabulary.NAMES)

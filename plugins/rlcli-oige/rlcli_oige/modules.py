@@ -13,7 +13,6 @@ from types import ModuleType
 from typing import Any
 
 from rlcli.errors import TaskError
-from rlcli_oige import neighbours
 from rlcli_oige.usd import Ignored, UsdContext, missing
 
 _REMOVED = re.compile(r"\b(?:np|numpy)\.(?:Inf|Infinity|NaN|float_)\b")
@@ -126,4 +125,4 @@ class _Neighbours(_Module):
     """A module of `omniisaacgymenvs`, for files outside of that package: its names are searched in the task's files."""
 
     def _without_counterpart(self, name: str) -> Any:
-        return neighbours.find(name, importlib.import_module("rlcli_oige.vocabulary").NAMES)
+        return name_lookup.find(name, importlib.import_module("rlcli_oige.vocabulary").NAMES)
