@@ -24,7 +24,7 @@ def __getattr__(name: str) -> Any:
     if name == "torch_utils":
         return sys.modules[__name__]
     if name == "omni":
-        return importlib.import_module(f"{__name__}.modules").find(name)
+        return importlib.import_module(f"{__name__}.replacement_modules").find(name)
     vocabulary = importlib.import_module(f"{__name__}.vocabulary")
     if name in vocabulary.NAMES:
         return getattr(vocabulary, name)

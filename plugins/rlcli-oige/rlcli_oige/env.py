@@ -25,7 +25,7 @@ from rlcli.sim.device_names import on_cpu
 from rlcli.sim.env_selection import Selection
 from rlcli_oige.articulation_view import ArticulationView
 from rlcli_oige.cameras import Replicator
-from rlcli_oige.modules import refuse
+from rlcli_oige.replacement_modules import refuse
 from rlcli_oige.stage import Stage, current_stage
 from rlcli_oige.task import EnvHandle, RLTask, SimConfig
 from rlcli_oige.task_keys import MOVED_KEYS, ROOT_SETTINGS

@@ -25,9 +25,9 @@ SPEC = FormatSpec(
     aliases={
         "rlcli.oige": "rlcli_oige",
         "gym": "gymnasium",
-        "numpy": "rlcli_oige.modules:find_numpy",
-        "hydra": "rlcli_oige.modules:find_hydra",
-        "omegaconf": "rlcli_oige.modules:find_hydra",
+        "numpy": "rlcli_oige.replacement_modules:find_numpy",
+        "hydra": "rlcli_oige.replacement_modules:find_hydra",
+        "omegaconf": "rlcli_oige.replacement_modules:find_hydra",
         **dict.fromkeys(
             (
                 "omniisaacgymenvs.tasks.base",
@@ -39,7 +39,7 @@ SPEC = FormatSpec(
                 "carb",
                 "warp",
             ),
-            "rlcli_oige.modules:find",
+            "rlcli_oige.replacement_modules:find",
         ),
     },
 )
