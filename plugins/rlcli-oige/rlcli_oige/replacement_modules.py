@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from rlcli.errors import TaskError
-from rlcli_oige.usd import Ignored, UsdContext, missing
+from rlcli_oige.usd_names import Ignored, UsdContext, missing
 
 _REMOVED = re.compile(r"\b(?:np|numpy)\.(?:Inf|Infinity|NaN|float_)\b")
 _modules: dict[str, ModuleType] = {}

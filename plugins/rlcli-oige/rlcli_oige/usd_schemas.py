@@ -175,7 +175,7 @@ class Xformable(Schema):
 
     def ComputeLocalToWorldTransform(self, time: Any = 0) -> Any:  # noqa: N802
         """Return the pose in the world, with the joints of the model at 0."""
-        from rlcli_oige.usd import Transform
+        from rlcli_oige.usd_names import Transform
 
         return Transform(self._prim)
 

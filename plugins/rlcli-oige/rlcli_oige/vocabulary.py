@@ -41,7 +41,18 @@ from rlcli_oige.stage import (
     is_prim_path_valid,
 )
 from rlcli_oige.task import RLTask, SimConfig, SimulationContext, World
-from rlcli_oige.usd import ArticulationAction, Gf, PhysxSchema, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdShade, carb
+from rlcli_oige.usd_names import (
+    ArticulationAction,
+    Gf,
+    PhysxSchema,
+    Sdf,
+    Usd,
+    UsdGeom,
+    UsdLux,
+    UsdPhysics,
+    UsdShade,
+    carb,
+)
 from rlcli_oige.views import RigidPrimView, XFormPrimView
 
 MATHS = [*TENSOR_NAMES, *ROTATION_NAMES]

@@ -13,7 +13,7 @@ from rlcli.errors import ConfigError, TaskError
 from rlcli.scene.scene import Scene
 from rlcli_oige.shapes import Cloner, DynamicCuboid, Robot, XFormPrim
 from rlcli_oige.stage import Stage, add_reference_to_stage, current_stage, get_prim_at_path
-from rlcli_oige.usd import Gf, PhysxSchema, UsdGeom, UsdPhysics
+from rlcli_oige.usd_names import Gf, PhysxSchema, UsdGeom, UsdPhysics
 
 ENV = "/World/envs/env_0"
 DT = 0.01
