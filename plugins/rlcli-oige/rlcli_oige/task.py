@@ -16,7 +16,7 @@ from rlcli_oige.articulation_view import ArticulationView
 from rlcli_oige.cameras import Writer
 from rlcli_oige.prim_paths import BASE, ZERO
 from rlcli_oige.randomization import Randomizer
-from rlcli_oige.shapes import GroundPlane
+from rlcli_oige.scene_objects import GroundPlane
 from rlcli_oige.stage import Prim, Stage
 from rlcli_oige.user_code import Counterpart
 from rlcli_oige.views import RigidPrimView, XFormPrimView

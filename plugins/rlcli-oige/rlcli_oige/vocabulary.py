@@ -8,7 +8,7 @@ from rlcli_oige.maths import TENSOR_NAMES
 from rlcli_oige.randomization import Randomizer
 from rlcli_oige.rotations import *  # noqa: F403
 from rlcli_oige.rotations import ROTATION_NAMES
-from rlcli_oige.shapes import (
+from rlcli_oige.scene_objects import (
     Ant,
     Cartpole,
     Cloner,

@@ -11,7 +11,7 @@ from stand_ins import body, geom, model
 from rlcli.config.schema import SceneConfig, SimConfig
 from rlcli.errors import ConfigError, TaskError
 from rlcli.scene.scene import Scene
-from rlcli_oige.shapes import Cloner, DynamicCuboid, Robot, XFormPrim
+from rlcli_oige.scene_objects import Cloner, DynamicCuboid, Robot, XFormPrim
 from rlcli_oige.stage import Stage, add_reference_to_stage, current_stage, get_prim_at_path
 from rlcli_oige.usd_names import Gf, PhysxSchema, UsdGeom, UsdPhysics
 
