@@ -60,7 +60,7 @@ def find(path: Path) -> TaskSource | None:
 
 def read(document: Document, source: TaskSource) -> Translation | None:
     """Return a YAML document of OmniIsaacGymEnvs as the data of a task; None for another document."""
-    from rlcli_oige.composition import compose
+    from rlcli_oige.hydra_defaults import compose
     from rlcli_oige.task_yaml import agent_file, is_oige, translate
 
     document = compose(document, source.config, source.label)

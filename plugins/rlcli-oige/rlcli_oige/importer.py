@@ -14,7 +14,7 @@ from rlcli.config.layers import read
 from rlcli.errors import ConfigError, Problem, TaskError, UsageError
 from rlcli.formats import Imported, Note
 from rlcli_oige import task_yaml
-from rlcli_oige.composition import compose
+from rlcli_oige.hydra_defaults import compose
 from rlcli_oige.task_class import find_class, parse_file
 
 _IMPORT = re.compile(r"^(\s*)from\s+(?:omni|pxr|omniisaacgymenvs)(?:\.[\w.]+)?\s+import\s+(.*)$")

@@ -9,7 +9,7 @@ from rlcli.config.layers import Origin, document_origins
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.errors import Problem
 from rlcli.formats import Note, Status
-from rlcli_oige.composition import label_at
+from rlcli_oige.hydra_defaults import label_at
 
 
 @dataclass(slots=True)
