@@ -11,7 +11,7 @@ from rlcli.config.strict_yaml import Document, Path
 from rlcli.errors import ConfigError
 from rlcli.formats import Note
 from rlcli.rl.ppo.rl_games_file import RlGamesReader
-from rlcli_oige.hydra import evaluate
+from rlcli_oige.hydra_interpolation import evaluate
 from rlcli_oige.yaml_translator import YamlTranslator
 
 

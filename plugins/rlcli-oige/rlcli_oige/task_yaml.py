@@ -18,8 +18,8 @@ from rlcli.config.strict_yaml import Document, Path
 from rlcli.errors import ConfigError, did_you_mean, listing
 from rlcli.formats import Status, Translation
 from rlcli_oige import agent_yaml, randomization_yaml
-from rlcli_oige.hydra import evaluate
 from rlcli_oige.hydra_defaults import compose
+from rlcli_oige.hydra_interpolation import evaluate
 from rlcli_oige.task_class import class_constant
 from rlcli_oige.task_keys import (
     ACTOR_KEYS,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rlcli_oige.hydra import evaluate
+from rlcli_oige.hydra_interpolation import evaluate
 
 TREE = {
     "num_envs": "",
