@@ -29,6 +29,6 @@ def __getattr__(name: str) -> Any:
     if name in vocabulary.NAMES:
         return getattr(vocabulary, name)
     name_lookup = importlib.import_module(f"{__name__}.name_lookup")
-    if name == "__all__":  # `import *` also exports the names of neighbour files that the importing file uses
+    if name == "__all__":  # `import *` also exports names of the task's other files that the importing file uses
         return [*vocabulary.NAMES, *name_lookup.used_names(vocabulary.NAMES)]
     return name_lookup.find(name, vocabulary.NAMES)

@@ -23,7 +23,7 @@ def find(name: str, known: Iterable[str]) -> Any:
         AttributeError: if no file defines it; an import statement turns this into an ImportError.
     """
     importer = _importer()
-    for file in _neighbours(importer) if importer else ():
+    for file in _other_files(importer) if importer else ():
         if name in _definitions(file):
             return getattr(load_module(str(file)), name)
     near = did_you_mean(name, known)
@@ -39,10 +39,10 @@ def used_names(known: Iterable[str]) -> list[str]:
         return []
     names = {node.id for node in ast.walk(parse_file(importer)) if isinstance(node, ast.Name)}
     missing = names - _definitions(importer) - set(known) - set(dir(builtins))
-    return sorted(missing & {name for file in _neighbours(importer) for name in _definitions(file)})
+    return sorted(missing & {name for file in _other_files(importer) for name in _definitions(file)})
 
 
-def _neighbours(importer: Path) -> Iterator[Path]:
+def _other_files(importer: Path) -> Iterator[Path]:
     """Yield the task's other Python files: those in the folders of `_search_folders` and below them.
 
     `importer` is the file whose import statement is running.

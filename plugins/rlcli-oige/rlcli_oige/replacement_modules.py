@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from rlcli.errors import TaskError
+from rlcli_oige import name_lookup
 from rlcli_oige.usd_names import Ignored, UsdContext, missing
 
 _REMOVED = re.compile(r"\b(?:np|numpy)\.(?:Inf|Infinity|NaN|float_)\b")
