@@ -22,7 +22,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import UsageError
 from rlcli.evaluation.session import PolicyRequest, open_session, run_episodes
 from rlcli.registry.find import find_task
-from rlcli.rl.acting import trained_policy
+from rlcli.rl.action_functions import trained_policy
 from rlcli.runs.checkpoint_reader import open_checkpoint
 from rlcli.runs.policy_ref import choose
 from rlcli.runs.restore import require_fit

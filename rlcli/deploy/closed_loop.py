@@ -35,7 +35,7 @@ from rlcli.errors import CheckpointError, UsageError
 from rlcli.evaluation.evaluate import Evaluation, evaluate
 from rlcli.random import derive
 from rlcli.registry import TaskSource
-from rlcli.rl.acting import trained_policy
+from rlcli.rl.action_functions import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators
 from rlcli.runs.checkpoint_reader import Checkpoint

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rlcli.envs.vec_env import VecEnv
     from rlcli.registry import TaskSource
     from rlcli.replay.episode_recorder import EpisodeRecorder
-    from rlcli.rl.acting import Act
+    from rlcli.rl.action_functions import Act
 
 _log = logging.getLogger(__name__)
 
@@ -234,7 +234,7 @@ def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
     import torch
 
     from rlcli.random import derive
-    from rlcli.rl.acting import random_policy, trained_policy, zero_policy
+    from rlcli.rl.action_functions import random_policy, trained_policy, zero_policy
     from rlcli.runs.checkpoint_reader import open_checkpoint
     from rlcli.runs.restore import require_fit
 

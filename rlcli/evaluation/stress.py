@@ -20,7 +20,7 @@ from rlcli.evaluation.session import MAX_ENVS, PolicyInTask, make_actor, one_eac
 from rlcli.evaluation.stress_sweeps import Point, Sweep, by_name, describe_point, grid
 from rlcli.progress import tracked
 from rlcli.random import derive
-from rlcli.rl.acting import Act
+from rlcli.rl.action_functions import Act
 from rlcli.rl.rng import seed_generators
 
 _log = logging.getLogger(__name__)

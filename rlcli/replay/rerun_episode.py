@@ -15,7 +15,7 @@ from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.step_result import StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError
-from rlcli.rl.acting import PATIENCE, Act
+from rlcli.rl.action_functions import PATIENCE, Act
 from rlcli.rl.rng import load_rng_state, rng_state
 
 

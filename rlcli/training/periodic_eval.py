@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rlcli.envs.environment_protocol import Environment
 from rlcli.evaluation.evaluate import evaluate
-from rlcli.rl.acting import trained_policy
+from rlcli.rl.action_functions import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators, undisturbed
 from rlcli.training.time_to_threshold import Threshold

@@ -6,7 +6,7 @@ import torch
 
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError
-from rlcli.rl.acting import Act, trained_policy
+from rlcli.rl.action_functions import Act, trained_policy
 from rlcli.runs.checkpoint_reader import open_checkpoint, steps
 from rlcli.runs.restore import require_fit
 from rlcli.runs.run import Run

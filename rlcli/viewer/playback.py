@@ -19,7 +19,7 @@ from torch import Tensor
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.managers.command import CommandManager
-from rlcli.rl.acting import Act
+from rlcli.rl.action_functions import Act
 from rlcli.viewer.checkpoints import RunCheckpoints
 from rlcli.viewer.episode_history import EpisodeHistory
 from rlcli.viewer.protocol import View

@@ -14,7 +14,7 @@ from rlcli.progress import tracked
 from rlcli.replay.failure_cases import StagedCase
 from rlcli.replay.resimulate import Replay, replay_episodes
 from rlcli.replay.trajectory import Trajectory
-from rlcli.rl.acting import PATIENCE
+from rlcli.rl.action_functions import PATIENCE
 from rlcli.viewer.env_grid import EnvGrid
 from rlcli.viewer.offscreen import Renderer
 from rlcli.viewer.video_writer import VideoWriter

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.vec_env import VecEnv
-from rlcli.rl.acting import trained_policy
+from rlcli.rl.action_functions import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators, undisturbed
 from rlcli.viewer.record_video import record_episode

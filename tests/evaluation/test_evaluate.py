@@ -5,7 +5,7 @@ import torch
 
 from rlcli.errors import ConfigError
 from rlcli.evaluation.evaluate import evaluate
-from rlcli.rl.acting import random_policy, zero_policy
+from rlcli.rl.action_functions import random_policy, zero_policy
 from rlcli.rl.episode_statistics import EpisodeStatistics
 
 

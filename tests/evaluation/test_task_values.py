@@ -10,7 +10,7 @@ from rlcli.envs.observers import StepObserver
 from rlcli.evaluation.evaluate import evaluate
 from rlcli.random import derive
 from rlcli.registry import find_task
-from rlcli.rl.acting import zero_policy
+from rlcli.rl.action_functions import zero_policy
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 

@@ -15,7 +15,7 @@ from rlcli.evaluation.evaluate import evaluate
 from rlcli.replay.episode_recorder import EpisodeRecorder
 from rlcli.replay.resimulate import replay_episodes
 from rlcli.replay.trajectory import content_digest, read_trajectory
-from rlcli.rl.acting import random_policy
+from rlcli.rl.action_functions import random_policy
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 

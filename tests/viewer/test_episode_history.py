@@ -6,7 +6,7 @@ import torch
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.registry import find_task
-from rlcli.rl.acting import zero_policy
+from rlcli.rl.action_functions import zero_policy
 from rlcli.viewer.playback import Playback
 
 

@@ -11,7 +11,7 @@ import yaml
 from support.worlds import CRITTER_TASK, build, critter, dump, run
 
 from rlcli.errors import ConfigError
-from rlcli.rl.acting import zero_policy
+from rlcli.rl.action_functions import zero_policy
 from rlcli.sim.markers import ACTUAL, COMMANDED, Arrow, Frame, Sphere
 from rlcli.sim.rotations import heading, rotate
 from rlcli.viewer import native

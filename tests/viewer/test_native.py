@@ -7,7 +7,7 @@ from support.worlds import CRITTER_TASK, build, critter
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.registry import find_task
-from rlcli.rl.acting import zero_policy
+from rlcli.rl.action_functions import zero_policy
 from rlcli.viewer.native import captions, press
 from rlcli.viewer.playback import Playback
 

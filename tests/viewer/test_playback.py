@@ -16,7 +16,7 @@ from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.registry import find_task, folder_task
-from rlcli.rl.acting import zero_policy
+from rlcli.rl.action_functions import zero_policy
 from rlcli.runs.run import open_run
 from rlcli.viewer.checkpoints import RunCheckpoints
 from rlcli.viewer.playback import SPEEDS, Playback, hold_command

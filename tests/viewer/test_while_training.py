@@ -13,7 +13,7 @@ import torch
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.registry import find_task
-from rlcli.rl.acting import zero_policy
+from rlcli.rl.action_functions import zero_policy
 from rlcli.runs.run import open_run
 from rlcli.viewer.checkpoints import RunCheckpoints
 from rlcli.viewer.playback import Playback

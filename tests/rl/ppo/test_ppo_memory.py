@@ -11,7 +11,7 @@ from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError
 from rlcli.registry import find_task
-from rlcli.rl.acting import trained_policy
+from rlcli.rl.action_functions import trained_policy
 from rlcli.rl.policy import Lstm
 from rlcli.rl.ppo.trainer import PpoTrainer
 
