@@ -42,8 +42,8 @@ class Threshold:
 
 
 @dataclass(frozen=True, slots=True)
-class Reached:
-    """Time, step and iteration at which a training reached its threshold."""
+class TimeToThreshold:
+    """Time, environment steps and iteration at which a training reached its threshold."""
 
     seconds: float
     """Sum of all rollouts and updates until then, without evaluations [s]."""
@@ -69,13 +69,13 @@ def training_s(row: Mapping[str, Any]) -> float:
     return float(row.get("Perf/collection_time", 0.0) + row.get("Perf/learning_time", 0.0))
 
 
-def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -> Reached | None:
+def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -> TimeToThreshold | None:
     """Return when a training first reached a threshold, from all rows of `metrics.jsonl`; None if it did not."""
     seconds = 0.0
     for row in rows:
         seconds += training_s(row)
         if threshold.reached_by(row):
-            return Reached(seconds, row["step"], row["iteration"])
+            return TimeToThreshold(seconds, row["step"], row["iteration"])
     return None
 
 

@@ -20,7 +20,7 @@ from rlcli.training.loggers import read_metrics
 from rlcli.training.signals import StopRequest
 from rlcli.training.start_run import TrainingRequest, prepare_run
 from rlcli.training.subprocesses import POLL_S, start_training
-from rlcli.training.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
+from rlcli.training.time_to_threshold import Threshold, TimeToThreshold, median, read_threshold, time_to_threshold
 from rlcli.tuning.sweep import Sweep
 
 _log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ class Training:
     """Which settings the training has: `default` or `best`, see `ARMS`."""
     seed: int
     folder: Path
-    reached: Reached | None = None
+    reached: TimeToThreshold | None = None
     error: RlcliError | None = None
 
     @property
@@ -197,7 +197,7 @@ def _train(
     device = prepare_run(training.folder, request, changes)
     run = overview(training.folder)
 
-    def time_of_run() -> Reached | None:
+    def time_of_run() -> TimeToThreshold | None:
         metrics = training.folder / "metrics.jsonl"
         return time_to_threshold(read_metrics(metrics), threshold) if metrics.is_file() else None
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rlcli.errors import UsageError
-from rlcli.training.time_to_threshold import Reached, Threshold, median, read_threshold, time_to_threshold
+from rlcli.training.time_to_threshold import Threshold, TimeToThreshold, median, read_threshold, time_to_threshold
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -38,8 +38,8 @@ def test_malformed_threshold_is_usage_error(text):
 def test_time_to_threshold_sums_rollouts_and_updates():
     rates = [None, 0.5, None, 0.99, 0.2]
     rows = [row(i, 2.0, **({} if rate is None else {"Eval/success_rate": rate})) for i, rate in enumerate(rates, 1)]
-    assert time_to_threshold(rows, Threshold("success", 0.99)) == Reached(8.0, 400, 4)
-    assert time_to_threshold(rows, Threshold("success", 0.5)) == Reached(4.0, 200, 2)
+    assert time_to_threshold(rows, Threshold("success", 0.99)) == TimeToThreshold(8.0, 400, 4)
+    assert time_to_threshold(rows, Threshold("success", 0.5)) == TimeToThreshold(4.0, 200, 2)
     assert time_to_threshold(rows, Threshold("success", 1.0)) is None
     assert time_to_threshold(rows, Threshold("return", 0.0)) is None, "the rows have no return"
 
