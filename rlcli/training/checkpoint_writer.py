@@ -40,7 +40,7 @@ _NewRows = list[tuple[int, int, dict[str, Tensor]]]
 
 
 @dataclass(frozen=True, slots=True)
-class Keep:
+class KeepRule:
     """Rule that says which checkpoints of a run are kept; the first, the best and the newest always are."""
 
     last: int | None = None
@@ -49,12 +49,12 @@ class Keep:
     """Keep also the checkpoint of every `every`-th iteration; None: no others."""
 
     @staticmethod
-    def from_settings(last: int | None, every: int | None, save_interval: int | None) -> Keep:
+    def from_settings(last: int | None, every: int | None, save_interval: int | None) -> KeepRule:
         """Return the rule for the agent's `keep_last`, `keep_every` and `save_interval`.
 
         Without `last`, all checkpoints are kept if there is a `save_interval`, else the newest 10.
         """
-        return Keep(_DEFAULT_LAST if last is None and save_interval is None else last, every)
+        return KeepRule(_DEFAULT_LAST if last is None and save_interval is None else last, every)
 
 
 class CheckpointWriter:
@@ -71,7 +71,7 @@ class CheckpointWriter:
     def __init__(
         self,
         checkpoints: Path,
-        keep: Keep,
+        keep: KeepRule,
         manifest: Mapping[str, Any],
         *,
         resumed: Checkpoint | None = None,
@@ -240,7 +240,7 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
     return target
 
 
-def prune(checkpoints: Path, keep: Keep, best: int | None) -> None:
+def prune(checkpoints: Path, keep: KeepRule, best: int | None) -> None:
     """Remove the checkpoints that need not be kept, and the rows of logs (replay buffers) that no other one needs.
 
     A checkpoint that cannot be removed stays whole.

@@ -23,7 +23,7 @@ from rlcli.runs.checkpoint_reader import steps
 from rlcli.runs.provenance import built_record, differences, environment_record
 from rlcli.runs.restore import resolve_run
 from rlcli.runs.run import Run
-from rlcli.training.checkpoint_writer import CheckpointWriter, Keep, manifest_entries
+from rlcli.training.checkpoint_writer import CheckpointWriter, KeepRule, manifest_entries
 from rlcli.training.health import Health
 from rlcli.training.job import Job, TrainingResult
 from rlcli.training.loggers import open_loggers, read_metrics
@@ -145,7 +145,7 @@ def _open_writer(job: Job, env: Environment) -> CheckpointWriter:
     """Open the writer of checkpoints and the recorder of failed episodes."""
     run, (agent, _) = job.run, job.resolved.require_agent()
     manifest = manifest_entries(run, agent.trainer, env.layout, describe(env.local))
-    keep = Keep() if job.stages else Keep.from_settings(agent.keep_last, agent.keep_every, agent.save_interval)
+    keep = KeepRule() if job.stages else KeepRule.from_settings(agent.keep_last, agent.keep_every, agent.save_interval)
     cases = None
     if job.writes and not job.stages:
         step = None if job.resume_from is None else job.resume_from.step

@@ -13,7 +13,7 @@ from support.small_trainings import AGENTS, ITERATIONS, Case, train
 
 from rlcli.runs.checkpoint_reader import open_checkpoint, steps
 from rlcli.training import loop
-from rlcli.training.checkpoint_writer import Keep
+from rlcli.training.checkpoint_writer import KeepRule
 
 TASKS = ("everything", "cartpole-direct")
 CUTS = (1, 3, 7, "within")
@@ -100,7 +100,7 @@ def test_resume_from_an_older_checkpoint_is_bit_identical(agent, normalize, base
 @pytest.mark.slow
 @pytest.mark.parametrize(("agent", "normalize"), chosen(SPECIAL, 1))
 def test_every_kept_checkpoint_resumes_bit_identical(agent, normalize, base_folder, uninterrupted, tmp_path):
-    case, keep = Case("cartpole-direct", agent, normalize), Keep(2, 3)
+    case, keep = Case("cartpole-direct", agent, normalize), KeepRule(2, 3)
     run = train(tmp_path / "r", case, base_folder, after=8, keep=keep).folder
     kept = [open_checkpoint(run / "checkpoints" / f"{step:012d}").iteration for step in steps(run / "checkpoints")]
     assert kept == [0, 3, 6, 7, 8]

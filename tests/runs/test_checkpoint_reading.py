@@ -14,7 +14,7 @@ from rlcli.registry import find_task
 from rlcli.rl.policy import blank_policy
 from rlcli.rl.trainer import Rows
 from rlcli.runs import checkpoint_reader
-from rlcli.training.checkpoint_writer import CheckpointWriter, Keep
+from rlcli.training.checkpoint_writer import CheckpointWriter, KeepRule
 
 DIGEST = "0" * 64
 
@@ -30,7 +30,7 @@ def good(tmp_path_factory):
     """Two checkpoints with a log of rows in files of 6, 12 and 18."""
     folder = tmp_path_factory.mktemp("run") / "checkpoints"
     folder.mkdir()
-    saver = CheckpointWriter(folder, Keep(), {"seed": 7})
+    saver = CheckpointWriter(folder, KeepRule(), {"seed": 7})
     for iteration in (1, 2, 3):
         state = state_of()
         state.values |= {"env_steps": 100 * iteration, "learning_rate": 3e-4}

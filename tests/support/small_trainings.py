@@ -21,7 +21,7 @@ from rlcli.replay.failure_recorder import open_failure_recorder
 from rlcli.runs.checkpoint_reader import open_checkpoint, steps
 from rlcli.runs.run import Run
 from rlcli.training import loop
-from rlcli.training.checkpoint_writer import CheckpointWriter, Keep, drop_after
+from rlcli.training.checkpoint_writer import CheckpointWriter, KeepRule, drop_after
 from rlcli.training.loggers import JsonLines, read_metrics
 from rlcli.training.periodic_eval import PeriodicEval
 from rlcli.training.signals import StopRequest
@@ -116,7 +116,7 @@ def train(
     within: tuple[int, int] | None = None,
     resume: int | None = None,
     threads: int = 1,
-    keep: Keep | None = None,
+    keep: KeepRule | None = None,
     save_interval: int | None = 1,
     eval_interval: int | None = None,
     autopsy: AutopsyConfig | None = None,
@@ -158,7 +158,9 @@ def train(
         trainer.load(saved.state())
         drop_after(record.checkpoints, saved.step)
     cases = open_failure_recorder(env, autopsy, run, None if saved is None else saved.step)
-    saver = CheckpointWriter(record.checkpoints, keep or Keep(None), {"case": str(case)}, resumed=saved, cases=cases)
+    saver = CheckpointWriter(
+        record.checkpoints, keep or KeepRule(None), {"case": str(case)}, resumed=saved, cases=cases
+    )
     log = JsonLines(record.metrics, resume_after=None if new else trainer.iteration)
     trials = None
     if eval_interval is not None:

@@ -11,7 +11,7 @@ from rlcli.errors import MachineError
 from rlcli.rl.trainer import Rows
 from rlcli.runs import checkpoint_reader
 from rlcli.training import checkpoint_writer
-from rlcli.training.checkpoint_writer import CheckpointWriter, Keep
+from rlcli.training.checkpoint_writer import CheckpointWriter, KeepRule
 
 
 @pytest.fixture
@@ -34,14 +34,14 @@ def save_all(folder, keep, iterations, best=None):
 @pytest.mark.parametrize(
     ("keep", "best", "remaining"),
     [
-        (Keep(), None, list(range(0, 13))),
-        (Keep(last=2), None, [0, 11, 12]),
-        (Keep(last=1), 4, [0, 4, 12]),
-        (Keep(last=2, every=5), None, [0, 5, 10, 11, 12]),
-        (Keep(last=20), None, list(range(0, 13))),
-        (Keep.from_settings(None, None, None), None, [0, *range(3, 13)]),
-        (Keep.from_settings(None, None, 1), None, list(range(0, 13))),
-        (Keep.from_settings(3, None, 1), None, [0, 10, 11, 12]),
+        (KeepRule(), None, list(range(0, 13))),
+        (KeepRule(last=2), None, [0, 11, 12]),
+        (KeepRule(last=1), 4, [0, 4, 12]),
+        (KeepRule(last=2, every=5), None, [0, 5, 10, 11, 12]),
+        (KeepRule(last=20), None, list(range(0, 13))),
+        (KeepRule.from_settings(None, None, None), None, [0, *range(3, 13)]),
+        (KeepRule.from_settings(None, None, 1), None, list(range(0, 13))),
+        (KeepRule.from_settings(3, None, 1), None, [0, 10, 11, 12]),
     ],
 )
 def test_first_best_and_newest_checkpoints_are_kept(folder, keep, best, remaining):
@@ -51,14 +51,14 @@ def test_first_best_and_newest_checkpoints_are_kept(folder, keep, best, remainin
 
 
 def test_newest_is_set_by_save_and_by_resume(folder):
-    writer = CheckpointWriter(folder, Keep(), {"seed": 1})
+    writer = CheckpointWriter(folder, KeepRule(), {"seed": 1})
     assert writer.newest is None
     writer.save(state_of(), 3, 300)
     assert writer.newest == (3, 300)
     writer.wait()
     opened = checkpoint_reader.open_checkpoint(folder / f"{300:012d}")
     assert (opened.iteration, opened.step, opened.manifest["seed"]) == (3, 300, 1)
-    assert CheckpointWriter(folder, Keep(), {}, resumed=opened).newest == (3, 300)
+    assert CheckpointWriter(folder, KeepRule(), {}, resumed=opened).newest == (3, 300)
 
 
 def test_save_does_not_block_while_a_checkpoint_is_written(folder, monkeypatch):
@@ -71,7 +71,7 @@ def test_save_does_not_block_while_a_checkpoint_is_written(folder, monkeypatch):
         return write(*arguments)
 
     monkeypatch.setattr(checkpoint_writer, "write_checkpoint", slow)
-    writer = CheckpointWriter(folder, Keep(), {})
+    writer = CheckpointWriter(folder, KeepRule(), {})
     writer.save(state_of(), 1, 100)
     assert started.wait(30)
     assert checkpoint_reader.steps(folder) == []
@@ -82,7 +82,7 @@ def test_save_does_not_block_while_a_checkpoint_is_written(folder, monkeypatch):
 
 
 def test_write_error_is_raised_once_by_check(folder):
-    writer = CheckpointWriter(folder / "gone", Keep(), {})
+    writer = CheckpointWriter(folder / "gone", KeepRule(), {})
     writer.save(state_of(), 1, 100)
     while writer._thread.is_alive():
         pass
@@ -112,7 +112,7 @@ def rows_of(folder, step):
 
 
 def test_rows_are_written_once_for_all_checkpoints(folder):
-    writer = CheckpointWriter(folder, Keep(), {})
+    writer = CheckpointWriter(folder, KeepRule(), {})
     for iteration, total in enumerate([0, 4, 4, 9, 14, 30]):
         writer.save(state_with(total), iteration, 100 * iteration)
     writer.wait()
@@ -125,7 +125,7 @@ def test_rows_are_written_once_for_all_checkpoints(folder):
 
 
 def test_pruning_removes_unneeded_rows(folder):
-    writer = CheckpointWriter(folder, Keep(last=1), {})
+    writer = CheckpointWriter(folder, KeepRule(last=1), {})
     for iteration in range(8):
         writer.save(state_with(5 * iteration), iteration, 100 * iteration)
     writer.wait()
@@ -135,14 +135,14 @@ def test_pruning_removes_unneeded_rows(folder):
 
 
 def test_resume_from_older_checkpoint_rewrites_later_rows(folder):
-    writer = CheckpointWriter(folder, Keep(), {})
+    writer = CheckpointWriter(folder, KeepRule(), {})
     for iteration in range(1, 5):
         writer.save(state_with(6 * iteration), iteration, 100 * iteration)
     writer.wait()
     resumed = checkpoint_reader.open_checkpoint(folder / f"{200:012d}")
     assert checkpoint_writer.drop_after(folder, 200) == [300, 400]
     assert sorted(file.name[:12] for file in (folder / "logs/replay").iterdir()) == [f"{n:012d}" for n in (0, 6)]
-    writer = CheckpointWriter(folder, Keep(), {}, resumed=resumed)
+    writer = CheckpointWriter(folder, KeepRule(), {}, resumed=resumed)
     writer.save(state_with(15), 3, 300)
     writer.wait()
     assert rows_of(folder, 300) == (5, 15, [float(r) for r in range(5, 15)])
@@ -150,7 +150,7 @@ def test_resume_from_older_checkpoint_rewrites_later_rows(folder):
 
 def test_large_logs_are_split_into_files(folder, monkeypatch):
     monkeypatch.setattr(checkpoint_writer, "_SHARD_BYTES", 12)
-    writer = CheckpointWriter(folder, Keep(), {})
+    writer = CheckpointWriter(folder, KeepRule(), {})
     writer.save(state_with(8), 1, 100)
     writer.wait()
     assert [file.name[:12] for file in sorted((folder / "logs/replay").iterdir())] == [f"{n:012d}" for n in (0, 3, 6)]
@@ -161,7 +161,7 @@ def test_large_logs_are_split_into_files(folder, monkeypatch):
 def test_damaged_rows_are_a_checkpoint_error(folder, damage):
     from rlcli.errors import CheckpointError
 
-    writer = CheckpointWriter(folder, Keep(), {})
+    writer = CheckpointWriter(folder, KeepRule(), {})
     for iteration in (1, 2):
         writer.save(state_with(5 * iteration), iteration, 100 * iteration)
     writer.wait()
@@ -212,7 +212,7 @@ def test_rows_can_be_read_while_new_rows_are_stored():
 
 @pytest.mark.parametrize("content", [None, "000000000100\n", ""])
 def test_drop_after_repairs_latest_file(folder, content):
-    save_all(folder, Keep(), range(3))
+    save_all(folder, KeepRule(), range(3))
     (folder / "latest").unlink() if content is None else (folder / "latest").write_text(content)
     assert checkpoint_writer.drop_after(folder, 200) == []
     assert (folder / "latest").read_text() == "000000000200\n"
@@ -220,7 +220,7 @@ def test_drop_after_repairs_latest_file(folder, content):
 
 @pytest.mark.parametrize("damage", ["format", "policy.safetensors", "rng.safetensors", "manifest.json"])
 def test_drop_after_keeps_what_it_cannot_read(folder, damage):
-    writer = CheckpointWriter(folder, Keep(), {})
+    writer = CheckpointWriter(folder, KeepRule(), {})
     for iteration in range(1, 5):
         writer.save(state_with(6 * iteration), iteration, 100 * iteration)
     writer.wait()
@@ -240,7 +240,7 @@ def test_drop_after_keeps_what_it_cannot_read(folder, damage):
 
 
 def test_pruning_keeps_what_it_cannot_read(folder):
-    save_all(folder, Keep(), range(4))
+    save_all(folder, KeepRule(), range(4))
     (folder / f"{200:012d}/manifest.json").write_text("{")
-    save_all(folder, Keep(last=1), [4])
+    save_all(folder, KeepRule(last=1), [4])
     assert checkpoint_reader.steps(folder) == [0, 200, 400]
