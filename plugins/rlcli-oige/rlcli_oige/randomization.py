@@ -17,7 +17,7 @@ from torch import Tensor
 from rlcli.errors import ConfigError, Problem, TaskError, did_you_mean, listing
 from rlcli.random import stream
 from rlcli.sim.env_selection import IdSelection
-from rlcli_oige.randomization_yaml import Gate, gates
+from rlcli_oige.randomization_yaml import Randomization, read_randomizations
 from rlcli_oige.randomized_fields import VIEW_STATE, RandomizedField, apply_operation, make_field
 
 if TYPE_CHECKING:
@@ -39,13 +39,17 @@ class Randomizer:
         block = env.settings["task"].get("domain_randomization") or {}
         self.randomize = bool(block.get("randomize", False)) and bool(block.get("randomization_params"))
         self.min_frequency = int(block.get("min_frequency", 1))
-        self.gates: list[Gate] = gates(block) if self.randomize else []
-        self.active_domain_randomizations = {(*gate.path, gate.gate): gate.parameters for gate in self.gates}
+        self.randomizations: list[Randomization] = read_randomizations(block) if self.randomize else []
+        self.active_domain_randomizations = {
+            (*entry.path, entry.trigger): entry.parameters for entry in self.randomizations
+        }
         self._parameters = dict(self.active_domain_randomizations)
         self.dr = self
         self.physics_view = self
         self._fields: dict[tuple[str, ...], RandomizedField] = {}
-        self._noise = {kind: [g for g in self.gates if g.path == (kind,)] for kind in ("observations", "actions")}
+        self._noise = {
+            kind: [g for g in self.randomizations if g.path == (kind,)] for kind in ("observations", "actions")
+        }
         self._episode_noise: dict[str, Tensor] = {}
         self._step_noise: dict[str, Tensor] = {}
         self._steps_since_reset: Tensor | None = None
@@ -84,71 +88,71 @@ class Randomizer:
         env = self._env
         self._steps_since_reset = torch.full((env.num_envs,), self.min_frequency, dtype=torch.int64, device=env.device)
         problems = []
-        for gate in self.gates:
-            if gate.path[0] in ("observations", "actions") or gate.path in self._fields:
+        for entry in self.randomizations:
+            if entry.path[0] in ("observations", "actions") or entry.path in self._fields:
                 continue
             try:
-                self._fields[gate.path] = make_field(gate.path, env)
+                self._fields[entry.path] = make_field(entry.path, env)
             except LookupError as problem:
-                at = ("oige", "domain_randomization", "randomization_params", *gate.path[:2])
+                at = ("oige", "domain_randomization", "randomization_params", *entry.path[:2])
                 problems.append(env.resolved.problem(at, str(problem.args[0])))
         if problems:
             raise ConfigError(problems)
         all_ids = torch.arange(env.num_envs, device=env.device)
-        for gate in self.gates:
-            if gate.gate == "on_startup":
-                self._apply(gate, all_ids, 0)
+        for entry in self.randomizations:
+            if entry.trigger == "on_startup":
+                self._apply(entry, all_ids, 0)
         for field in self._fields.values():
             field.store_episode_start(all_ids)
-        self._set_constants([gate for gate in self.gates if gate.gate == "on_startup"])
+        self._set_constants([entry for entry in self.randomizations if entry.trigger == "on_startup"])
 
     def before_reset(self, ids: Tensor) -> None:
         """Apply `on_reset` to the model, and sample noise for the new episodes, before the task's reset."""
-        if not self.gates or self._steps_since_reset is None or not len(ids):
+        if not self.randomizations or self._steps_since_reset is None or not len(ids):
             return
         due = ids[self._steps_since_reset[ids] >= self.min_frequency]
         self._steps_since_reset[due] = 0
-        model_gates = [g for g in self.gates if g.path in self._fields and not self._acts_on_state(g)]
-        applied = [g for g in model_gates if g.gate == "on_reset"]
-        for gate in applied:
+        model_entries = [g for g in self.randomizations if g.path in self._fields and not self._acts_on_state(g)]
+        applied = [g for g in model_entries if g.trigger == "on_reset"]
+        for entry in applied:
             if len(due):
-                self._fields[gate.path].restore(due)
-                self._apply(gate, due, None)
-                self._fields[gate.path].store_episode_start(due)
+                self._fields[entry.path].restore(due)
+                self._apply(entry, due, None)
+                self._fields[entry.path].store_episode_start(due)
         if len(due):
             self._set_constants(applied)
-        for kind, kind_gates in self._noise.items():
-            for gate in kind_gates:
-                if gate.gate == "on_reset":
-                    self._sample_noise(gate, kind, ids, None)
+        for kind, kind_entries in self._noise.items():
+            for entry in kind_entries:
+                if entry.trigger == "on_reset":
+                    self._sample_noise(entry, kind, ids, None)
 
     def after_reset(self, ids: Tensor) -> None:
         """Apply `on_reset` to attributes of the state, after the task's reset has written the initial state."""
-        for gate in self.gates:
-            if gate.gate == "on_reset" and self._acts_on_state(gate) and len(ids):
-                self._apply(gate, ids, None)
+        for entry in self.randomizations:
+            if entry.trigger == "on_reset" and self._acts_on_state(entry) and len(ids):
+                self._apply(entry, ids, None)
 
     def after_step(self) -> None:
         """Apply `on_interval` where it is due."""
-        if not self.gates or self._steps_since_reset is None:
+        if not self.randomizations or self._steps_since_reset is None:
             return
         env = self._env
         self._steps_since_reset += 1
         step = env.common_step
-        due_gates = [g for g in self.gates if g.gate == "on_interval" and not step % g.interval]
-        applied = [g for g in due_gates if g.path in self._fields]
+        due_entries = [g for g in self.randomizations if g.trigger == "on_interval" and not step % g.interval]
+        applied = [g for g in due_entries if g.path in self._fields]
         all_ids = torch.arange(env.num_envs, device=env.device)
-        for gate in applied:
-            if not self._acts_on_state(gate):
-                self._fields[gate.path].restore_episode_start(all_ids)
-            self._apply(gate, all_ids, step)
+        for entry in applied:
+            if not self._acts_on_state(entry):
+                self._fields[entry.path].restore_episode_start(all_ids)
+            self._apply(entry, all_ids, step)
         self._set_constants(applied)
-        for kind, kind_gates in self._noise.items():
-            for gate in kind_gates:
-                if gate.gate == "on_interval":
-                    self._step_noise.pop(gate.name, None)
-                    if not step % gate.interval:
-                        self._sample_noise(gate, kind, all_ids, step)
+        for kind, kind_entries in self._noise.items():
+            for entry in kind_entries:
+                if entry.trigger == "on_interval":
+                    self._step_noise.pop(entry.name, None)
+                    if not step % entry.interval:
+                        self._sample_noise(entry, kind, all_ids, step)
 
     def add_action_noise(self, action: Tensor) -> Tensor:
         """Return the action with noise."""
@@ -165,7 +169,7 @@ class Randomizer:
         found |= {f"noisy.{name}": value.clone() for name, value in self._step_noise.items()}
         for path, field in self._fields.items():
             found[f"base.{'.'.join(path)}"] = field.base.clone()
-        if self._steps_since_reset is not None and self.gates:
+        if self._steps_since_reset is not None and self.randomizations:
             found["since"] = self._steps_since_reset.clone()
         return found
 
@@ -191,15 +195,15 @@ class Randomizer:
             )
         return path
 
-    def _acts_on_state(self, gate: Gate) -> bool:
+    def _acts_on_state(self, entry: Randomization) -> bool:
         """Return whether a randomization acts on the state, which the task's reset overwrites, and not on the model."""
-        return gate.path[-1] in VIEW_STATE
+        return entry.path[-1] in VIEW_STATE
 
-    def _sample(self, gate: Gate, ids: Tensor, step: int | None, size: int, shape: tuple[int, ...]) -> Tensor:
+    def _sample(self, entry: Randomization, ids: Tensor, step: int | None, size: int, shape: tuple[int, ...]) -> Tensor:
         """Sample the values of one randomization, one row per environment.
 
         Args:
-            gate: attribute and distribution.
+            entry: attribute and distribution.
             ids: environments.
             step: environment step that keys the samples of `on_interval`; None: the episode index keys them.
             size: number of values per environment.
@@ -209,62 +213,64 @@ class Randomizer:
         numbers = ids.cpu().numpy()
         counters = env.episode_index.cpu().numpy()[numbers] if step is None else np.full(len(numbers), step)
         device = None if env.device.type == "cpu" else env.device
-        rows = IdSelection(numbers, env.seed, counters, stream(f"oige.{gate.name}"), device, env.stream_ids)
-        low, high = self._bounds(gate, size)
-        if gate.distribution == "gaussian":
+        rows = IdSelection(numbers, env.seed, counters, stream(f"oige.{entry.name}"), device, env.stream_ids)
+        low, high = self._bounds(entry, size)
+        if entry.distribution == "gaussian":
             sample = rows.normal(0.0, 1.0, (size,)) * high + low
-        elif gate.distribution == "loguniform":
+        elif entry.distribution == "loguniform":
             sample = torch.exp(rows.uniform(0.0, 1.0, (size,)) * (high.log() - low.log()) + low.log())
         else:
             sample = rows.uniform(0.0, 1.0, (size,)) * (high - low) + low
-        strength = gate.strength(env.common_step)
-        neutral = 1.0 if gate.operation == "scaling" else 0.0
-        if strength < 1.0 and gate.operation != "direct":
+        strength = entry.strength(env.common_step)
+        neutral = 1.0 if entry.operation == "scaling" else 0.0
+        if strength < 1.0 and entry.operation != "direct":
             sample = neutral + strength * (sample - neutral)
         return sample.reshape(len(numbers), *shape)
 
-    def _bounds(self, gate: Gate, size: int) -> tuple[Tensor, Tensor]:
-        rows = torch.tensor(self._parameters[(*gate.path, gate.gate)], dtype=torch.float32, device=self._env.device)
+    def _bounds(self, entry: Randomization, size: int) -> tuple[Tensor, Tensor]:
+        rows = torch.tensor(
+            self._parameters[(*entry.path, entry.trigger)], dtype=torch.float32, device=self._env.device
+        )
         if rows.dim() == 1:
             rows = rows[:, None]
         width = rows.shape[1]
         if width not in (1, size) and (width != 3 or size % 3):
-            at = ("oige", "domain_randomization", "randomization_params", *gate.path, gate.gate)
-            message = f"distribution_parameters have {width} pairs, {'.'.join(gate.path)} has {size} columns"
+            at = ("oige", "domain_randomization", "randomization_params", *entry.path, entry.trigger)
+            message = f"distribution_parameters have {width} pairs, {'.'.join(entry.path)} has {size} columns"
             where = self._env.resolved.place(at)
             hint = "give one pair for all columns, or one pair per column"
-            raise ConfigError([Problem(where, gate.name, message, hint)])
+            raise ConfigError([Problem(where, entry.name, message, hint)])
         rows = rows.repeat(1, size // width)
         return rows[0], rows[1]
 
-    def _apply(self, gate: Gate, ids: Tensor, step: int | None) -> None:
-        field = self._fields[gate.path]
+    def _apply(self, entry: Randomization, ids: Tensor, step: int | None) -> None:
+        field = self._fields[entry.path]
         current = field.read(ids)
         shape = tuple(current.shape[1:])
         if field.change is not apply_operation:  # orientations: three angles are sampled for each quaternion
             shape = (current.shape[1] // 4 * 3,)
-        sample = self._sample(gate, ids, step, math.prod(shape), shape).to(current.dtype)
-        field.write(ids, field.change(gate.operation, current, sample))
+        sample = self._sample(entry, ids, step, math.prod(shape), shape).to(current.dtype)
+        field.write(ids, field.change(entry.operation, current, sample))
 
-    def _set_constants(self, applied: list[Gate]) -> None:
-        if any(gate.path[-1] in _CONSTANTS for gate in applied):
+    def _set_constants(self, applied: list[Randomization]) -> None:
+        if any(entry.path[-1] in _CONSTANTS for entry in applied):
             self._env.engine.set_constants()
 
-    def _sample_noise(self, gate: Gate, kind: str, ids: Tensor, step: int | None) -> None:
+    def _sample_noise(self, entry: Randomization, kind: str, ids: Tensor, step: int | None) -> None:
         env, task = self._env, self._env.task
         size = task.num_observations if kind == "observations" else task.num_actions
-        store = self._episode_noise if gate.gate == "on_reset" else self._step_noise
-        if gate.name not in store:
-            neutral = 1.0 if gate.operation == "scaling" else 0.0
-            store[gate.name] = torch.full((env.num_envs, size), neutral, device=env.device)
-        store[gate.name][ids] = self._sample(gate, ids, step, size, (size,))
+        store = self._episode_noise if entry.trigger == "on_reset" else self._step_noise
+        if entry.name not in store:
+            neutral = 1.0 if entry.operation == "scaling" else 0.0
+            store[entry.name] = torch.full((env.num_envs, size), neutral, device=env.device)
+        store[entry.name][ids] = self._sample(entry, ids, step, size, (size,))
 
     def _add_noise(self, kind: str, values: Tensor) -> Tensor:
         for store, when in ((self._episode_noise, "on_reset"), (self._step_noise, "on_interval")):
-            for gate in self._noise[kind]:
-                if gate.gate == when and gate.name in store:
-                    if gate.operation == "scaling":
-                        values *= store[gate.name]
+            for entry in self._noise[kind]:
+                if entry.trigger == when and entry.name in store:
+                    if entry.operation == "scaling":
+                        values *= store[entry.name]
                     else:
-                        values += store[gate.name]
+                        values += store[entry.name]
         return values

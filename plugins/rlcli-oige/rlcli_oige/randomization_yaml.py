@@ -1,4 +1,4 @@
-"""Reader of OmniIsaacGymEnvs' `domain_randomization:`: each of its entries becomes a `Gate`."""
+"""Reader of OmniIsaacGymEnvs' `domain_randomization:`: each of its entries becomes a `Randomization`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rlcli.config.strict_yaml import Path
 from rlcli.errors import did_you_mean, listing
 from rlcli.formats import Status
 
-GATES = ("on_startup", "on_reset", "on_interval")
+TRIGGERS = ("on_startup", "on_reset", "on_interval")
 OPERATIONS = ("additive", "scaling", "direct")
 DISTRIBUTIONS = {
     "uniform": "uniform",
@@ -81,12 +81,13 @@ ATTRIBUTES: Mapping[str, Mapping[str, tuple[Status, str]]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Gate:
+class Randomization:
     """One randomization: its attribute, its key (`on_startup`, `on_reset` or `on_interval`) and its distribution."""
 
     path: tuple[str, ...]
     """(observations,), (actions,), (simulation, gravity) or (kind of view, view, attribute)"""
-    gate: str
+    trigger: str
+    """`on_startup`, `on_reset` or `on_interval`."""
     operation: str
     distribution: str
     parameters: Any
@@ -98,7 +99,7 @@ class Gate:
     @property
     def name(self) -> str:
         """Name of the randomization, unique in its task, such as `simulation.gravity.on_reset`."""
-        return ".".join((*self.path, self.gate))
+        return ".".join((*self.path, self.trigger))
 
     def strength(self, step: int) -> float:
         """Return the factor in [0, 1] that the schedule gives the randomization at a training step."""
@@ -109,7 +110,7 @@ class Gate:
         return min(1.0, step / self.schedule_steps)
 
 
-def gates(block: Mapping[str, Any]) -> list[Gate]:
+def read_randomizations(block: Mapping[str, Any]) -> list[Randomization]:
     """Return the randomizations of a block that `check` has accepted, without those that rlcli ignores."""
     found = []
     for at, params in _entries(block):
@@ -117,7 +118,7 @@ def gates(block: Mapping[str, Any]) -> list[Gate]:
         if path[0] in VIEWS and ATTRIBUTES[path[0]][path[2]][0] == "ignored":
             continue
         found.append(
-            Gate(
+            Randomization(
                 path,
                 at[-1],
                 params["operation"],
@@ -158,7 +159,7 @@ def check(
             groups = ("observations", "actions", "simulation", *VIEWS)
             problem(at, f"unknown key '{key}'", did_you_mean(key, groups) or f"keys: {listing(groups)}")
     for path, entry in _entries(block):
-        _check_gate((*base, *path), path, entry, problem, note)
+        _check_randomization((*base, *path), path, entry, problem, note)
 
 
 def _check_views(kind: str, views: Any, at: Path, problem: Callable[[Path, str, str | None], None]) -> None:
@@ -170,20 +171,20 @@ def _check_views(kind: str, views: Any, at: Path, problem: Callable[[Path, str, 
                 problem((*at, view, attribute), f"'{attribute}' cannot be randomized", near)
 
 
-def _check_gate(
+def _check_randomization(
     at: Path,
     path: tuple[str, ...],
     entry: Any,
     problem: Callable[[Path, str, str | None], None],
     note: Callable[[Path, Status, str], None],
 ) -> None:
-    gate, target = path[-1], path[1:-1]
+    trigger, target = path[-1], path[1:-1]
     if target and target[0] in VIEWS and (len(target) < 3 or target[2] not in ATTRIBUTES[target[0]]):
         return  # _check_views has reported it
-    if gate not in GATES:
-        problem(at, f"unknown key '{gate}'", did_you_mean(gate, GATES) or f"keys: {listing(GATES)}")
+    if trigger not in TRIGGERS:
+        problem(at, f"unknown key '{trigger}'", did_you_mean(trigger, TRIGGERS) or f"keys: {listing(TRIGGERS)}")
         return
-    if gate == "on_startup" and target[0] not in VIEWS:
+    if trigger == "on_startup" and target[0] not in VIEWS:
         problem(at, f"{target[0]} cannot be randomized on_startup", "use on_reset or on_interval")
     if not isinstance(entry, dict):
         problem(at, "expected a mapping", "write {operation: ..., distribution: ..., distribution_parameters: [...]}")
@@ -193,7 +194,7 @@ def _check_gate(
             problem((*at, key), f"unknown key '{key}'", did_you_mean(key, _KEYS) or f"keys: {listing(_KEYS)}")
     needed = ("operation", "distribution", "distribution_parameters")
     missing = [
-        key for key in (*needed, *(("frequency_interval",) if gate == "on_interval" else ())) if key not in entry
+        key for key in (*needed, *(("frequency_interval",) if trigger == "on_interval" else ())) if key not in entry
     ]
     if missing:
         problem(at, f"missing keys: {listing(missing)}", "add each of these keys")
