@@ -25,7 +25,7 @@ def run_checks(runs_dir: Path, timeout_s: float = TIMEOUT_S) -> list[Check]:
         timeout_s: time limit for each task, trainer and driver [s].
 
     Raises:
-        MachineError: if a limit such as `ulimit -v` leaves no room for torch.
+        MachineError: if a limit such as `ulimit -v` leaves too little memory to import torch.
     """
     require_address_space()
     stop = threading.Event()

@@ -132,7 +132,7 @@ def graphics_check(answers: dict[str, Answer]) -> Check:
     details: dict[str, Any] = {"drawn": {name: name in works for name in answers}, "used": None}
     wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
     if wanted in _OFF:
-        return Check("graphics", "ok", f"switched off by MUJOCO_GL={wanted}; {text}", details=details)
+        return Check("graphics", "ok", f"MUJOCO_GL={wanted} switches OpenGL off; {text}", details=details)
     if wanted in answers and wanted not in works:
         return Check("graphics", "broken", f"MUJOCO_GL={wanted} cannot render; {text}", "unset MUJOCO_GL", details)
     if wanted and wanted not in (*answers, *_KNOWN):

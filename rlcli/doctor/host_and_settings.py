@@ -96,14 +96,14 @@ def _settings_file() -> Check:
     """Check that the user's settings file is valid."""
     file = settings_file()
     if file is None:
-        return Check("settings", "ok", "not read, because of RLCLI_SETTINGS=none", details={"file": None})
+        return Check("settings", "ok", "no file is read, because RLCLI_SETTINGS is none", details={"file": None})
     try:
         found = read_settings()
     except ConfigError as error:
         hint = f"edit {file}, or set RLCLI_SETTINGS=none to ignore it"
         return Check("settings", "broken", "; ".join(map(str, error.problems)), hint, {"file": str(file)})
     text = ", ".join(f"{key}: {value}" for key, value in found.items()) or "sets nothing"
-    text = f"{file}: {text}" if file.exists() else f"none; the file would be {file}"
+    text = f"{file}: {text}" if file.exists() else f"no settings file; it would be {file}"
     return Check("settings", "ok", text, details={"file": str(file), "settings": found})
 
 

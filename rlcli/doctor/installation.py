@@ -47,7 +47,7 @@ def entry_checks(group: str, timeout_s: float, stop: threading.Event) -> list[Ch
     Args:
         group: `rlcli.tasks`, `rlcli.trainers` or `rlcli.formats`.
         timeout_s: time limit for each plugin [s].
-        stop: set to stop early.
+        stop: event that ends the checks before all plugins are loaded.
     """
     kind = group.rpartition(".")[2].removesuffix("s")
     entries, _ = catalog(group)

@@ -175,7 +175,7 @@ class _Push:
         }
         if sweep.element is None:
             if len(floating) != 1:
-                reason = "no entity floats" if not floating else "several entities float"
+                reason = "no entity has a floating base" if not floating else "several entities have a floating base"
                 hint = f"write push.NAME, NAME one of {listing([*floating, *joints])}"
                 raise NameProblem(f"{reason}: name the entity or joint to push", hint)
             self._root, self._joint = next(iter(floating.values()), None), None
@@ -221,7 +221,10 @@ _STEPS = 1 << 32
 
 
 def _keys(env: VecEnv, counters: Tensor) -> random.Keys:
-    """Return the key of each environment's random numbers, from its random stream and a counter. (num_envs,)"""
+    """Return the random keys of all environments: each follows from the environment's stream and a counter.
+
+    (num_envs,)
+    """
     ids = np.arange(env.num_envs) % (env.engine.shared_streams or env.num_envs)
     return random.row_keys(env.seed, ids, counters.cpu().numpy())
 

@@ -34,7 +34,7 @@ MAX_ENVS = 8192
 
 @dataclass(frozen=True, slots=True)
 class PolicyRequest:
-    """Choice of a policy and a task on a command line, before they are found and checked."""
+    """Policy and task that the user has named on a command line, before they are found and checked."""
 
     task: str | None
     overrides: Sequence[str] = ()

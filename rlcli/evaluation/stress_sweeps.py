@@ -147,7 +147,8 @@ def _read(text: str, points: int) -> Sweep:
         raise UsageError(message, hint="for example body_mass.pole=0.5:2, action_delay=0:3, gravity=0.8,1,1.2")
     name, absolute = found["name"], found["absolute"] is not None
     if name in SIGNALS and absolute:
-        raise UsageError(f"--sweep {text}: {name} is always absolute [{SIGNALS[name]}]", hint="leave out abs:")
+        message = f"--sweep {text}: values of {name} are always absolute [{SIGNALS[name]}]"
+        raise UsageError(message, hint="leave out abs:")
     if name == "actuator_gain" and absolute:
         raise UsageError(f"--sweep {text}: actuator_gain is always a factor", hint="leave out abs:")
     values = _values(text, found["values"], name, points, absolute)

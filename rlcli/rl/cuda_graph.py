@@ -1,6 +1,7 @@
 """Recording of repeated work as a CUDA graph, and its replay.
 
-A graph records kernel launches on fixed memory addresses. The work must not read a value back from the device. Tensors
+The work is a function without arguments, such as a rollout. A graph records its kernel launches on fixed memory
+addresses. The work must not read a value back from the device. Tensors
 that the work keeps from one run to the next must keep their addresses. Tensors that a task rebinds in every step are
 copied back to their first address at the end of the recording. Work that cannot be recorded runs eagerly, after a
 warning.

@@ -46,7 +46,7 @@ def require_finite(
 
 
 def moments(normalizers: Iterable[tuple[str, Normalizer | None]]) -> list[tuple[str, Tensor]]:
-    """Return the running statistics of normalisers with their names, for `require_finite`."""
+    """Return mean and variance of each normaliser, with names for the messages of `require_finite`."""
     return [
         (f"the {name} normaliser's {moment}", getattr(normalizer, moment))
         for name, normalizer in normalizers

@@ -27,22 +27,22 @@ class Rows:
 
 @dataclass(slots=True)
 class TrainerState:
-    """State of a trainer, from which training continues exactly."""
+    """State of a trainer between two iterations, as a checkpoint stores it; training continues from it exactly."""
 
     tensors: dict[str, dict[str, Tensor]] = field(default_factory=dict)
-    """File of the checkpoint, without its suffix -> name -> tensor."""
+    """Name of a file of the checkpoint without its suffix, such as `policy` -> name of a tensor -> tensor."""
     values: dict[str, Any] = field(default_factory=dict)
-    """Plain JSON."""
+    """State that is not in tensors, such as `iteration` and `env_steps`, as plain JSON."""
     logs: dict[str, Rows] = field(default_factory=dict)
-    """Name of data that only grows, such as a replay buffer -> its rows."""
+    """Name of data that only grows, such as `replay` (a replay buffer) -> its rows."""
 
 
 @dataclass(slots=True)
 class Report:
-    """Results of one iteration."""
+    """Metrics and durations of one iteration, which the training loop logs and shows."""
 
     metrics: dict[str, float]
-    """Name -> value."""
+    """Name of a metric, such as `Loss/value` -> its value in this iteration."""
     seconds: dict[str, float]
     """Part of the iteration, such as physics or update -> duration [s]."""
 

@@ -30,7 +30,7 @@ _MAX_SEARCH_BYTES = 64 * 1024**2
 _MAX_FILES = 20_000
 _STARTING_S = 5.0
 """Age up to which a run counts as running without a lock, because it may not have its lock yet [s]. A
-time stamp this far in the future is one of another clock."""
+time stamp this far in the future comes from another clock."""
 
 
 @dataclass(slots=True)

@@ -163,7 +163,7 @@ def _differing_rows(record: Mapping[str, Any], current: Mapping[str, Any]) -> li
 
 
 def _fields(record: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Return the terms and the control period of a layout, by their names in the table of differences."""
+    """Return the terms and the control period of a layout, by the names that the table of differences shows."""
     fields: dict[str, Mapping[str, Any]] = {}
     for group, terms in record.get("observations", {}).items():
         for position, term in enumerate(terms):

@@ -150,5 +150,5 @@ def _stopped(name: str, subject: TaskUnderTest, error: Exception, before: list[F
     message = f"the check was stopped by {task_error_text(error)}"
     earlier = next((f.check for f in before if f.message == message), None)
     advice = getattr(error, "hint", None) or "correct the code that raises it, then check again"
-    hint = advice if earlier is None else f"see the check {earlier}"
+    hint = advice if earlier is None else f"first correct what the check {earlier} reports: it is the same error"
     return Finding(name, "error", subject.location(error), message, hint)

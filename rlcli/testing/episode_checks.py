@@ -38,7 +38,7 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     env, other = subject.env(episode_steps=12), subject.env(episode_steps=12)
     first, second, third = (record_outputs(one, random_actions(one, subject.bound, 30)) for one in (env, other, env))
     message = "the value differs between two new environments with the same seed and actions"
-    hint = "draw from the selection (uniform, normal, choice) or self.draws(env_ids) instead of torch.rand, numpy"
+    hint = "sample with selection.uniform (normal, choice) or self.draws(env_ids), not with torch.rand or numpy"
     findings = list(compare_trajectories(env, (first, second), message, f"{hint} or time"))
     if not findings:
         message = (
@@ -146,8 +146,8 @@ def partial_reset(subject: TaskUnderTest) -> Iterator[Finding]:
             if rows:
                 later = f", {number} steps later" if number else ""
                 where = "the simulation's state" if name == "state" else name
-                message = f"values of environments {rows} changed when {_ENDING} were reset{later}"
-                hint = "write only the rows of the selection or of env_ids, and do not average over environments"
+                message = f"values of environments {rows} changed when environments {_ENDING} were reset{later}"
+                hint = "write only the rows of the environments that reset (`selection` or `env_ids`), and no averages"
                 yield error_at(where, f"{message}; they must stay bit-identical", hint)
                 return
 
@@ -219,7 +219,7 @@ def truncation(subject: TaskUnderTest) -> Iterator[Finding]:
         ends = _episode_ends(subject, limit)
         where = f"episode_length_s of {limit} steps"
         if any(end.length > limit for end in ends):
-            message = f"episodes run on after step {limit}; allowed is truncation at exactly {limit}"
+            message = f"episodes continue after step {limit}; they must be truncated at exactly step {limit}"
             yield error_at(where, message, hint)
             return
         if any(end.length == limit and not end.truncated for end in ends):
@@ -263,6 +263,7 @@ def termination(subject: TaskUnderTest) -> Iterator[Finding]:
     lengths = [n for e in ended for n, out in zip(e.lengths.tolist(), e.truncated.tolist(), strict=True) if not out]
     if len(lengths) >= subject.num_envs and len(set(lengths)) == 1 and lengths[0] > 1:
         message = f"all {len(lengths)} terminations under random actions came after exactly {lengths[0]} steps"
+        message += ", as a time-out would"
         yield warning_at("terminations", message, hint)
 
 

@@ -114,7 +114,7 @@ def silent_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 DOMINANT = 0.99
-"""Share of the reward's size from which a term is dominant."""
+"""Share of the sum of all terms' absolute values from which a term is dominant."""
 
 
 def dominant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -130,7 +130,7 @@ def dominant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     for name, found in shares.items():
         if found and min(found) >= DOMINANT:
             others = ", ".join(other for other in active if other != name)
-            message = f"the term is {min(found):.1%} or more of the reward's size under every fixed policy"
+            message = f"the term is {min(found):.1%} or more of the absolute reward under every fixed policy"
             message += f": {others} have no effect"
             hint = "lower its weight, or raise the weights of the others"
             yield warning_at(f"rewards.{name}", message, hint, {"share": min(found)})
@@ -146,7 +146,7 @@ def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
     if not ends_early or value == 0.0:  # with terminations, any other constant rewards long or short episodes
         reason = "" if ends_early else ", and no episode ends early"
         where = "rewards" if isinstance(evidence.rollouts[0].env, ManagedEnv) else "rew_buf"
-        message = f"the reward is {value:g} in every step of every simple policy{reason}: there is nothing to learn"
+        message = f"the reward is {value:g} in every step of every fixed policy{reason}: there is nothing to learn"
         yield error_at(where, message, "compute the reward from the state or the action", {"value": value})
 
 

@@ -70,7 +70,7 @@ def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
     make, reason = warning_at, ""
     if draws_globally:
         reason = "; the task draws from torch, numpy or random, whose numbers depend on the number of environments"
-        hint = "use random numbers of the selection or of self.draws(env_ids); else results depend on num_envs"
+        hint = "sample with selection.uniform or self.draws(env_ids); otherwise results depend on num_envs"
     elif subject.resolved.task.curriculum:
         reason = "; this may be intended for a curriculum that averages over episodes"
         hint = "use a schedule over steps, if the curriculum should not depend on the number of environments"
@@ -148,7 +148,8 @@ def layout(subject: TaskUnderTest) -> Iterator[Finding]:
     file = layout_file(subject)
     if not file.is_file():
         raise NotRunError(f"there is no {file.name}; `rlcli check TASK --record-layout` writes it")
-    hint = f"undo the change, or accept it with --record-layout: policies trained before no longer fit ({file.name})"
+    hint = "undo the change; or record the new columns with --record-layout: policies that were trained with those in"
+    hint += f" {file.name} no longer fit"
     try:
         recorded = _groups(json.loads(read_plain(file, JSON_LIMIT)))
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
@@ -256,7 +257,7 @@ def engines(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the task runs on the GPU engine, and that reset and step agree with the CPU engine within rounding."""
     warp = _warp_env(subject, subject.resolved.task.decimation)
     env = subject.env(episode_steps=EPISODE, flags={"scene.num_envs": FEW_WORLDS})
-    hint = "use only the selection's methods and the engine's fields; or set sim.engine: batch, if it is for CPUs only"
+    hint = "reset with methods of `selection` and tensors of the engine only; or set sim.engine: batch, for CPUs only"
     action = next(random_actions(env, subject.bound))
     outputs = []
     for one in (env, warp):

@@ -188,8 +188,8 @@ def no_progress(health: Health) -> Found:
     solved = max(health.values(SUCCESS), default=0.0) >= _SOLVED or not health.values(RETURN) or health.is_above_start()
     if not solved and health.struggles(0.15) and all(abs(health.change(name)) < 1.0 for name in watched):
         value = statistics.fmean(health.last(RETURN)) if health.values(RETURN) else 0.0
-        done = f"{health.progress:.0%} of the training"
-        message = f"return, reward terms and episode length have not moved in {done} (return {value:.4g})"
+        done = f"the first {health.progress:.0%} of the training"
+        message = f"return, reward terms and episode length have not changed in {done} (return {value:.4g})"
         yield message, "`rlcli lint TASK` (dead-action, silent-reward), a larger agent.learning_rate, or larger actions"
 
 
@@ -202,7 +202,7 @@ def one_termination(health: Health) -> Found:
             continue
         if health.change(LENGTH) < 1.0 and not _approaches(health.values(RETURN)):
             length = statistics.fmean(health.last(LENGTH))
-            message = f"{share:.0%} of the episodes end by '{name}', after {length:.0f} steps, as early as at first"
+            message = f"{share:.0%} of the episodes end by '{name}' after {length:.0f} steps, no later than at first"
             yield message, "looser limits, an easier start of episodes, or a reward for each step"
 
 
@@ -258,7 +258,7 @@ def learning_rate_floor(health: Health) -> Found:
     rate, (floor, _) = health.median("Loss/learning_rate"), health.settings.get("learning_rate_range", (1e-5, 0.0))
     adaptive = health.settings.get("schedule") == "adaptive"
     if adaptive and rate is not None and rate <= 1.01 * floor and health.struggles(0.1):
-        message = f"the adaptive learning rate is at its floor, {rate:.1g}"
+        message = f"the adaptive learning rate is at its lowest value, {rate:.1g}"
         yield message, "a larger desired_kl, or normalised observations"
 
 
@@ -281,7 +281,8 @@ def observations(health: Health) -> Found:
     for metric in health.names("Health/constant/"):
         if health.median(metric) == 1.0 and health.struggles(0.1):
             name = metric.rpartition("/")[2]
-            yield f"the observation '{name}' is the same in all environments", "another func or scale of this term"
+            message = f"the observation '{name}' has the same value in all environments"
+            yield message, "another func or scale of this term"
     for metric in [*health.names("Health/clipped/"), *health.names("Health/normalized")]:
         share = health.median(metric) or 0.0
         if share > 0.9 and health.struggles(0.1):
@@ -334,7 +335,8 @@ def reward_without_success(health: Health) -> Found:
             return
         shares.append(f"'{name}' in {now:.1%}")
     if shares and health.struggles(0.15) and health.change(RETURN) > 0.7:
-        message = f"the return rises, but conditions of success hold in as few states as at first: {', '.join(shares)}"
+        shares_text = ", ".join(shares)
+        message = f"the return rises, but conditions of success hold no more often than at the start: {shares_text}"
         yield message, "other signs or weights of the rewards, or a reward for success"
 
 

@@ -84,7 +84,7 @@ class TrainLoop:
             number = self._boundary[0] + 1
             raise self._stopped(f"stopped in iteration {number}; a resumed run repeats this iteration") from None
         except KeyboardInterrupt:
-            raise self._stopped("stopped at once; the work after the last checkpoint is lost") from None
+            raise self._stopped("stopped without a new checkpoint; the work after the last one is lost") from None
         except BaseException as error:
             with contextlib.suppress(Exception):  # the first error is the one to report
                 self.writer.wait()  # the background thread may be writing a good checkpoint

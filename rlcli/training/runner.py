@@ -63,7 +63,7 @@ def run_training(
         The result; None on a rank that does not write the run.
     """
     run, resolved = job.run, job.resolved
-    _log.debug("built in %.1f s", time.monotonic() - job.begin)
+    _log.debug("environment and trainer built in %.1f s", time.monotonic() - job.begin)
     size, actions = env.layout.size(), env.layout.action_size
     workers = f" in {env.workers} processes" if env.workers > 1 else ""
     _log.info(

@@ -79,7 +79,7 @@ def _load_state(saved: Checkpoint, state: TrainerState, trainer: Trainer, env: E
         raise CheckpointError(message, hint="choose another checkpoint: RUN@step:N")
     processes, size = state.values.get("processes", 1), distributed.current().world_size
     if processes != size:
-        change = f"saved with {processes} processes, resumed with {size}"
+        change = f"the run was saved with {processes} processes and is resumed with {size}"
         _log.info(f"{change}: every environment starts a new episode")
 
 

@@ -306,7 +306,7 @@ def test_floating_entity_is_pushed_horizontally(world):
         ("geom_size.rod=abs:1:2", "with abs: the 3 values of geom_size would become equal", "leave out abs:"),
         ("observation_noise.poss=0:1", "no observation matches 'poss'", "did you mean 'pos'"),
         ("action_delay.trun=0:1", "no action matches 'trun'", "did you mean 'turn'"),
-        ("push=0:1", "no entity floats", "push.NAME"),
+        ("push=0:1", "no entity has a floating base", "push.NAME"),
         ("push.hing=0:1", "matches 'hing'", "hinge"),
         ("push..*=0:1", "matches several names", "name one of them"),
     ],

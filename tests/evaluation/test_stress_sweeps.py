@@ -75,7 +75,7 @@ def test_share_inverts_between(text):
         ("body_mass=1,1", "appears twice"),
         ("action_delay=0.5:2", "whole numbers of steps"),
         ("action_delay=0:5000", "whole numbers of steps"),
-        ("action_noise=abs:0:1", "is always absolute"),
+        ("action_noise=abs:0:1", "are always absolute"),
         ("actuator_gain=abs:0:1", "is always a factor"),
     ],
 )

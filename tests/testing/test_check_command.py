@@ -31,7 +31,7 @@ def test_errors_exit_9_and_print_hints(managed, capsys):
     code, out, _ = check(capsys, managed.write())
     assert code == 9
     assert "truncation            error" in out
-    assert "error: truncation: episode_length_s of 6 steps: episodes run on after step 6" in out
+    assert "error: truncation: episode_length_s of 6 steps: episodes continue after step 6" in out
     assert "time_out: true" in out
 
 

@@ -250,7 +250,7 @@ def test_final_observations_finds_stale_observation(direct):
 def test_truncation_finds_missing_time_out(managed):
     managed.config["terminations"] = {}
     finding = errors(managed)["truncation"]
-    assert "run on after step 6" in finding.message
+    assert "continue after step 6" in finding.message
     assert "time_out: true" in finding.hint
 
 
@@ -346,7 +346,7 @@ def test_raising_check_is_finding_and_others_run(direct):
     found = errors(direct)
     assert "KeyError: 'partial'" in found["finite"].message
     assert "task.py:" in found["finite"].where
-    assert found["partial-reset"].hint == "see the check finite"
+    assert found["partial-reset"].hint == "first correct what the check finite reports: it is the same error"
     assert "start-states" in found
 
 

@@ -120,7 +120,7 @@ def test_rewards_that_lead_away_from_success_are_named(held, named):
     found = findings({**FAILING, "Success_Value/pole": lambda i: 1.6, "Health/held/pole": held})
     assert ("reward-without-success" in found) is named
     if named:
-        assert "as few states as at first: 'pole' in 3.0%" in found["reward-without-success"].message
+        assert "no more often than at the start: 'pole' in 3.0%" in found["reward-without-success"].message
 
 
 def test_resumed_run_drops_a_finding_of_iterations_after_its_checkpoint(tmp_path, monkeypatch):

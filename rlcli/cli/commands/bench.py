@@ -1,4 +1,4 @@
-"""`rlcli bench`: speed of a task on this machine, and the sizes and threads with the fastest iterations."""
+"""`rlcli bench`: speed of a task on this machine, and the settings with the fastest iterations."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def command(
     quick: Annotated[bool, typer.Option("--quick")] = False,
     profile: Annotated[bool, typer.Option("--profile")] = False,
 ) -> None:
-    """Measure the speed of a task on this machine, and recommend sizes and threads for its training.
+    """Measure the speed of a task on this machine, and recommend numbers of environments, threads and workers.
 
     Options:
         save_preset: Write the recommended settings to FILE.yaml, or to NAME.yaml here, for train --config.
         overwrite: Allow --save-preset to replace a file.
         quick: Measure for a shorter time; the figures are less exact.
-        profile: Instead, show the time of each stage and term of an environment step.
+        profile: Show the time of each stage and term of an environment step; recommend nothing.
 
     Examples:
         rlcli bench cartpole --save-preset fast.yaml
@@ -88,7 +88,10 @@ def command(
 def _profile(resolved: Resolved, preset: Path | None, seconds: float) -> None:
     """Print the table of `--profile`: where the time of an environment step goes."""
     if preset is not None:
-        raise UsageError("--profile finds no settings for --save-preset", hint="leave out --profile or --save-preset")
+        raise UsageError(
+            "--profile recommends no settings that --save-preset could write",
+            hint="leave out --profile or --save-preset",
+        )
     import torch
 
     from rlcli.tuning.step_profile import profile_step

@@ -52,7 +52,7 @@ def command(
     """Search for the settings with which an agent learns best; `sweep show` lists trials, `compare` tests the best one.
 
     Options:
-        task: Task to sweep; or show or compare, followed by the folder or name of a sweep (else the newest).
+        task: Task to sweep; or `show` or `compare`, followed by the folder or name of a sweep (without it: the newest).
         param: Setting to vary: KEY=LOW:HIGH, KEY=log:LOW:HIGH or KEY=A,B,C; repeatable.
         trials: Number of trials, over all processes of the sweep.
         objective: return, success, length, reward_terms.NAME or terminations.NAME of the trained policy; @30s stops

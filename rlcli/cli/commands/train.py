@@ -171,7 +171,9 @@ def _train(request: TrainingRequest, resolved: Resolved | None, device: str, sto
             if result is not None:
                 _print(result)
         except KeyboardInterrupt:  # a second signal, at any point of the training
-            raise Stopped("stopped at once; --resume continues", exit_code=stop.exit_code) from None
+            raise Stopped(
+                "stopped without a new checkpoint; --resume uses the last one", exit_code=stop.exit_code
+            ) from None
         finally:
             distributed.leave()
 

@@ -37,7 +37,7 @@ class Console:
     verbose: bool = False
     debug: bool = False
     muted: bool = False
-    """Whether rank 0 prints for this process, which prints only its own errors."""
+    """Whether this process is a rank other than 0, which prints only its own errors: rank 0 prints the rest."""
     owns_process: bool = False
     """Whether the process was started for this command and ends with it."""
     has_document: bool = False

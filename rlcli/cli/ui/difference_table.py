@@ -20,7 +20,7 @@ _WIDTH = 40
 
 
 def report_differences(command: str, sections: Sequence[Section], left: str, right: str, **entries: Any) -> bool:
-    """Print the result of comparing two sides.
+    """Print the differences between two runs or configurations (the left and the right side).
 
     Args:
         command: the command, for the JSON document.

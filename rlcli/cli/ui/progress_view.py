@@ -125,7 +125,10 @@ def work_line(running: Sequence[Work]) -> str:
 
 
 def _share(nested: Sequence[Work]) -> float:
-    """Return the done share of works, the outermost first: each is a part of one part of the work before it."""
+    """Return the share of the outermost work that is done, 0 to 1.
+
+    `nested` begins with the outermost work; each further work is one of the parts that the work before it counts.
+    """
     share = 0.0
     for work in reversed(nested):
         share = max(work.fraction(), (work.done + share) / (work.total or 1))

@@ -203,7 +203,7 @@ def test_torchrun_run_resumes_with_one_or_two_processes(tmp_path):
     assert torch.equal(policy_weights(again), policy_weights(whole))
 
     alone, err = run(tmp_path, "-m", "rlcli", "train", "--resume", done["run"], "--max-iterations", "6", "--json")
-    assert "saved with 2 processes, resumed with 1: every environment starts a new episode" in err
+    assert "saved with 2 processes and is resumed with 1: every environment starts a new episode" in err
     assert alone["run"] == done["run"]
     assert [line["step"] for line in metrics_of(alone)] == [512, 1024, 1536, 2048, 2304, 2560]
     single, _ = run(tmp_path, "-m", "rlcli", *TRAIN, "--max-iterations", "2", "--name", "single")
