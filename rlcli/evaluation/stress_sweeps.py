@@ -72,7 +72,7 @@ class Sweep:
         return "geometric" if self.neutral == 1.0 and min(self.values) > 0.0 else "linear"
 
     def between(self, share: float) -> float:
-        """Return the value at a share (0 to 1) of the way from the lowest to the highest value."""
+        """Return the value at `share` of the range: the lowest value at 0, the highest at 1."""
         low, high = min(self.values), max(self.values)
         if self.parameter in _INTEGER:
             return float(round(low + (high - low) * share))
@@ -80,7 +80,7 @@ class Sweep:
         return float(f"{value:.12g}")  # so that the middle of 0.8:1.25 is exactly 1
 
     def share(self, value: float) -> float:
-        """Return the share (0 to 1) of the way from the lowest to the highest value at which a value lies."""
+        """Return where a value lies in the range: 0 at the lowest value, 1 at the highest."""
         low, high = min(self.values), max(self.values)
         if high == low:
             return 0.0

@@ -54,7 +54,7 @@ class Recording:
         """Reason why the work cannot be recorded; None: no such reason was found so far."""
 
     def __call__(self) -> None:
-        """Run the work."""
+        """Run the work: eagerly at first, later by replaying its recording."""
         if self._graph is not None:
             self._graph.replay()
         elif self.refusal is not None:

@@ -151,7 +151,7 @@ def constant_reward(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that an early termination does not give more reward than good steps until the agent's horizon."""
+    """Check that a terminal step does not give more reward than good steps over the whole horizon of the agent."""
     running_steps, terminal_steps = [], []
     for rollout in evidence.rollouts:
         terminated = rollout.terminated.bool()

@@ -87,7 +87,7 @@ def finite(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 def shapes(subject: TaskUnderTest) -> Iterable[Finding]:
-    """Check that all tensors have the shape of the layout and the number of environments."""
+    """Check that all tensors have one row for each environment, and the columns that the layout lists."""
     return _check_outputs(subject, _check_shape)
 
 
@@ -99,7 +99,10 @@ def dtypes(subject: TaskUnderTest) -> Iterable[Finding]:
 def _check_outputs(
     subject: TaskUnderTest, check: Callable[[str, Tensor, tuple[int, ...]], Iterator[Finding]]
 ) -> list[Finding]:
-    """Apply a check of (name, tensor, expected shape) to the task's own outputs; if they pass, to those of a step."""
+    """Check the task's own outputs and, if they have no finding, the outputs of a step; return the findings.
+
+    `check` receives the name of an output, its tensor and the expected shape.
+    """
     recording = subject.recording()
     layout = recording.env.layout
     own = [(name, value, (subject.num_envs, *shape)) for name, value, shape in _task_outputs(recording.env)]

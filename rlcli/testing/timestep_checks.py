@@ -18,7 +18,7 @@ MAX_STEPS = 1000
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """Dependence of a model's energy on the time step, without actuators."""
+    """Energy error of a time step: the difference from a simulation with half the step, without actuators."""
 
     relative: float
     """Largest difference between the energy with dt and with dt / 2, relative to the energy that is exchanged between

@@ -235,7 +235,7 @@ def _health(job: Job, iterations: int) -> Health | None:
 
 
 def _report_bar(run: Run, bar: str, reached: bool) -> None:
-    """Log and record the time and the steps that the training took to the threshold `bar` of `--until`."""
+    """Log and record the time and the steps that the training needed to reach `bar`, the threshold of `--until`."""
     rows = read_metrics(run.metrics)
     seconds, step = sum(map(training_s, rows)), rows[-1]["step"] if rows else 0
     run.update(until={"bar": bar, "reached": reached, "seconds": seconds, "step": step})

@@ -52,7 +52,7 @@ class Reacher(_Arm):
     observation_units = ("", "", "", "", "m", "m", "rad/s", "rad/s", "m", "m")
 
     class Params(StrictModel):
-        """The task's settings, by Gymnasium's names."""
+        """Parameters of the task, with Gymnasium's names."""
 
         reward_dist_weight: float = Field(1.0, description="Penalty on the distance to the target [1/m].")
         reward_control_weight: float = Field(1.0, description="Penalty on the sum of squared actions.")
@@ -94,7 +94,7 @@ class Pusher(_Arm):
     observation_units = (*("rad",) * 7, *("rad/s",) * 7, *("m",) * 9)
 
     class Params(StrictModel):
-        """The task's settings, by Gymnasium's names."""
+        """Parameters of the task, with Gymnasium's names."""
 
         reward_near_weight: float = Field(0.5, description="Penalty on the distance from the arm to the puck [1/m].")
         reward_dist_weight: float = Field(1.0, description="Penalty on the distance from the puck to the goal [1/m].")

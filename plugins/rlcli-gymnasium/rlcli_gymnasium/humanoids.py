@@ -62,7 +62,7 @@ class Humanoid(_Humanoid):
     moves = True
 
     class Params(StrictModel):
-        """The task's settings, by Gymnasium's names."""
+        """Parameters of the task, with Gymnasium's names."""
 
         ctrl_cost_weight: float = Field(0.1, ge=0, description="Penalty on the sum of squared controls.")
         reset_noise_scale: float = Field(
@@ -110,7 +110,7 @@ class HumanoidStandup(_Humanoid):
     """HumanoidStandup-v5: get up."""
 
     class Params(StrictModel):
-        """The task's settings, by Gymnasium's names."""
+        """Parameters of the task, with Gymnasium's names."""
 
         ctrl_cost_weight: float = Field(0.1, ge=0, description="Penalty on the sum of squared controls.")
         reset_noise_scale: float = Field(

@@ -21,7 +21,7 @@ class InvertedPendulum(GymnasiumTask):
     observation_units = ("m", "rad", "m/s", "rad/s")
 
     class Params(StrictModel):
-        """The task's settings, by Gymnasium's names."""
+        """Parameters of the task, with Gymnasium's names."""
 
         reset_noise_scale: float = Field(
             0.01, ge=0, description="Half-width of the uniform noise on initial positions and velocities."
@@ -59,7 +59,7 @@ class InvertedDoublePendulum(GymnasiumTask):
     reads = ("site_xpos", "qfrc_constraint")
 
     class Params(StrictModel):
-        """The task's settings, by Gymnasium's names."""
+        """Parameters of the task, with Gymnasium's names."""
 
         healthy_reward: float = Field(10.0, description="Reward of a step that does not end the episode.")
         reset_noise_scale: float = Field(

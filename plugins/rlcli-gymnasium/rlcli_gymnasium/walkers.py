@@ -26,7 +26,7 @@ class Ant(GymnasiumTask):
     reads = ("xpos", "cfrc_ext")
 
     class Params(StrictModel):
-        """The task's settings, by Gymnasium's names."""
+        """Parameters of the task, with Gymnasium's names."""
 
         forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
         ctrl_cost_weight: float = Field(0.5, ge=0, description="Penalty on the sum of squared actions.")
@@ -90,7 +90,7 @@ class HalfCheetah(GymnasiumTask):
     observation_names = (*(f"qpos_{i}" for i in range(1, 9)), *(f"qvel_{i}" for i in range(9)))
 
     class Params(StrictModel):
-        """The task's settings, by Gymnasium's names."""
+        """Parameters of the task, with Gymnasium's names."""
 
         forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
         ctrl_cost_weight: float = Field(0.1, ge=0, description="Penalty on the sum of squared actions.")
@@ -122,7 +122,7 @@ class Swimmer(HalfCheetah):
     observation_names = (*(f"qpos_{i}" for i in range(2, 5)), *(f"qvel_{i}" for i in range(5)))
 
     class Params(StrictModel):
-        """The task's settings, by Gymnasium's names."""
+        """Parameters of the task, with Gymnasium's names."""
 
         forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
         ctrl_cost_weight: float = Field(1e-4, ge=0, description="Penalty on the sum of squared actions.")
@@ -150,7 +150,7 @@ class Walker2d(GymnasiumTask):
     observation_names = (*(f"qpos_{i}" for i in range(1, 9)), *(f"qvel_{i}" for i in range(9)))
 
     class Params(StrictModel):
-        """The task's settings, by Gymnasium's names."""
+        """Parameters of the task, with Gymnasium's names."""
 
         forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
         ctrl_cost_weight: float = Field(1e-3, ge=0, description="Penalty on the sum of squared actions.")
@@ -197,7 +197,7 @@ class Hopper(Walker2d):
     observation_names = (*(f"qpos_{i}" for i in range(1, 6)), *(f"qvel_{i}" for i in range(6)))
 
     class Params(StrictModel):
-        """The task's settings, by Gymnasium's names."""
+        """Parameters of the task, with Gymnasium's names."""
 
         forward_reward_weight: float = Field(1.0, description="Reward on the speed along x [s/m].")
         ctrl_cost_weight: float = Field(1e-3, ge=0, description="Penalty on the sum of squared actions.")

@@ -184,7 +184,7 @@ class OigeEnv(DirectEnv):
         self._log_ignored()
 
     def _class_sets_length(self) -> bool:
-        """Return whether the class sets the episode length: the user has not set `episode_length_s`."""
+        """Return whether the class may set the episode length, because the user has not set `episode_length_s`."""
         origin = self.resolved.layers.origin(("episode_length_s",))
         return origin is not None and origin.layer == "task" and is_oige_file(self.resolved.source.config)
 

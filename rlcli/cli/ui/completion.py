@@ -77,7 +77,7 @@ def _runs_dir(ctx: typer.Context) -> Path:
 
 
 def _runs(ctx: typer.Context) -> Iterator[Offer]:
-    """Yield the names of the newest runs with a description; new are those whose folders changed last."""
+    """Yield the names of the runs whose folders changed last, each with a description."""
     from rlcli.runs.run import RECORD
 
     runs_dir = _runs_dir(ctx)

@@ -32,7 +32,7 @@ _LINE_METRICS = (
 
 
 class LiveView:
-    """Context with a block of lines on stderr that is redrawn; without a terminal there is no block."""
+    """Context manager that redraws a block of lines on stderr; without a terminal it draws nothing."""
 
     def __init__(self, **options: Any) -> None:
         self._options = options
