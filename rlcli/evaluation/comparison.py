@@ -137,7 +137,7 @@ def _require_same_task(name: str, first: PolicyInTask, other_name: str, other: P
     for path in sorted({*left, *right}):
         ours, theirs = left.get(path, _MISSING), right.get(path, _MISSING)
         if ours != theirs:
-            message = f"the value is {shorten(theirs, 60)}, but {shorten(ours, 60)} in {name}"
+            message = f"this setting is {shorten(theirs, 60)}, but {shorten(ours, 60)} in {name}"
             problems.append(Problem(other_name, path, message))
     if problems:
         hint = "add KEY.PATH=VALUE to use the same value for both"

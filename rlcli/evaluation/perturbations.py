@@ -282,7 +282,7 @@ class ModelPerturbation:
         now = self._parts[0].now()
         if (not sweep.absolute or sweep.parameter == "gravity") and bool((now == 0).all()):
             hint = "write abs:LOW:HIGH" if field != "opt.gravity" else "add sim.gravity=[0,0,-9.81]"
-            raise NameProblem(f"the value is 0 for {listing(names)}, so a factor changes nothing", hint)
+            raise NameProblem(f"{sweep.parameter} is 0 for {listing(names)}, so a factor changes nothing", hint)
         if field == "body_mass" and bool((now == 0).any()):
             massless = [name for name, mass in zip(names, now[0].tolist(), strict=True) if mass == 0]
             raise NameProblem(f"the bodies {listing(massless)} have no mass to change", "name other bodies")

@@ -37,13 +37,11 @@ def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:
     """Check that the same seed and actions give the same trajectory, in a new environment and after reset(seed)."""
     env, other = subject.env(episode_steps=12), subject.env(episode_steps=12)
     first, second, third = (record_outputs(one, random_actions(one, subject.bound, 30)) for one in (env, other, env))
-    message = "the value differs between two new environments with the same seed and actions"
+    message = "this output of the step differs between two new environments with the same seed and actions"
     hint = "sample with selection.uniform (normal, choice) or self.draws(env_ids), not with torch.rand or numpy"
     findings = list(compare_trajectories(env, (first, second), message, f"{hint} or time"))
     if not findings:
-        message = (
-            "the value differs between a new environment and the same one after reset(seed), with the same actions"
-        )
+        message = "this output of the step differs between a new environment and the same one after reset(seed)"
         hint = "clear all state of the last episode in the term's reset(selection), or in reset_idx"
         findings = list(compare_trajectories(env, (first, third), message, hint))
     yield from findings

@@ -197,7 +197,7 @@ def constant_observation(evidence: RolloutEvidence) -> Iterator[Remark]:
     for where, values in _columns(evidence):
         if bool((values == values[:, :1]).all()):
             low = float(values.min())
-            value = f"the value is {low:g}" if len(values) == 1 else "every pixel is the same"
+            value = f"the observation is {low:g}" if len(values) == 1 else "every pixel is the same"
             hint = "leave the column out, or compute it from the state"
             yield error_at(where, f"{value} in every step of every fixed policy", hint, {"value": low})
 
@@ -211,9 +211,11 @@ def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
         usual, largest = _quantile(sizes, 0.99), float(sizes.max())
         if bool((values == values[:, :1]).all()) or (largest >= SMALL and usual <= LARGE):
             continue
-        message = f"the value is never larger than {largest:.3g}; below {SMALL:g} its effect is lost among the others"
+        message = (
+            f"the observation is never larger than {largest:.3g}; below {SMALL:g} its effect is lost among the others"
+        )
         if usual > LARGE:
-            message = f"the value is larger than {usual:.3g} in 1 % of the steps; policies learn"
+            message = f"the observation is larger than {usual:.3g} in 1 % of the steps; policies learn"
             message += f" well from sizes up to {LARGE:g}"
         factor = 10.0 ** round(math.log10(1.0 / (usual if usual > LARGE else largest)))
         hint = f"scale: {factor:g}, or let the agent normalise (normalize_observations: true)"
@@ -241,7 +243,7 @@ def saturated_actions(evidence: RolloutEvidence) -> Iterator[Remark]:
     for name, share in rollout.limited.items():
         if share >= SATURATED:
             bound = evidence.subject.bound
-            message = f"the value is at its limit in {share:.0%} of the steps under random actions within +-{bound:g}"
+            message = f"it is at its limit in {share:.0%} of the steps under random actions within +-{bound:g}"
             yield warning_at(name, message, hint, {"share": share})
 
 

@@ -49,7 +49,9 @@ def threads(subject: TaskUnderTest) -> Iterator[Finding]:
         torch.manual_seed(0)
         trajectories.append(record_outputs(env, random_actions(env, subject.bound, STEPS)))
     hint = "remove everything that depends on engine_threads or on the number of cores"
-    yield from compare_trajectories(env, trajectories, "the value differs between 1 and 3 engine threads", hint)
+    yield from compare_trajectories(
+        env, trajectories, "this output of the step differs between 1 and 3 engine threads", hint
+    )
 
 
 FEW = 3
@@ -78,7 +80,7 @@ def num_envs(subject: TaskUnderTest) -> Iterator[Finding]:
         make = error_at
         hint = "compute each row only from its environment; torch's sum over dim 0, atan2 and pow round differently for"
         hint += " other sizes (rlcli.sim.rotations has an atan2 that does not)"
-    message = f"the value differs between {subject.num_envs} and {FEW} environments{reason}"
+    message = f"this output of the step differs between {subject.num_envs} and {FEW} environments{reason}"
     yield from compare_trajectories(many, (of_many, of_few), message, hint, make)
 
 
@@ -107,7 +109,9 @@ def checkpoint(subject: TaskUnderTest) -> Iterator[Finding]:
     if unsaved := env.unsaved_state():
         hint = f"no checkpoint can hold {', '.join(unsaved)}; {hint}"
     hint += "; else a resumed run differs from an uninterrupted one"
-    yield from compare_trajectories(env, trajectories, "the value differs after saving and restoring", hint)
+    yield from compare_trajectories(
+        env, trajectories, "this output of the step differs after saving and restoring", hint
+    )
 
 
 def _continue(env: VecEnv, actions: list[Tensor]) -> list[dict[str, Tensor]]:

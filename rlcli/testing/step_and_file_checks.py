@@ -54,7 +54,7 @@ def yaml_round_trip(subject: TaskUnderTest) -> Iterator[Finding]:
             again = to_data(resolve(replace(subject.source, config=file)))
         except ConfigError as error:
             for problem in error.problems:
-                message = f"the value cannot be read back from YAML: {problem.message}"
+                message = f"this setting cannot be read back from YAML: {problem.message}"
                 hint = problem.hint or "use a value that YAML has (finite numbers, text, lists)"
                 yield error_at(problem.path or subject.source.label, message, hint)
             return
@@ -62,7 +62,7 @@ def yaml_round_trip(subject: TaskUnderTest) -> Iterator[Finding]:
     for path in {**before, **after}:
         was, now = before.get(path), after.get(path)
         if was != now and not (isinstance(was, list | tuple) and list(was) == now):  # YAML has no tuples
-            message = f"the value is {was!r}, and {now!r} after writing and reading the configuration"
+            message = f"this setting is {was!r}, and {now!r} after writing and reading the configuration"
             yield error_at(dotted(path), message, "a run stores its configuration as YAML: use a value that YAML has")
 
 
@@ -186,7 +186,7 @@ def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
         for where, columns in observation_parts(recording.env, group):
             values = obs[:, :, columns]
             if bool((values == values[0, 0]).all()) and where not in fixed:
-                value = f"the value is {float(values[0, 0]):g}" if values.shape[2] == 1 else "every pixel is the same"
+                value = f"the column is {float(values[0, 0]):g}" if values.shape[2] == 1 else "every pixel is the same"
                 message = f"{value} in {subject.num_envs} environments and {len(obs)} observations"
                 hint = "compute the column from the state, or leave it out: a policy cannot learn from it"
                 yield error_at(where, message, hint)

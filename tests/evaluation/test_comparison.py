@@ -92,8 +92,8 @@ def test_compare_refuses_tasks_with_different_settings(cli, trained):
     one, other = trained("cartpole"), trained("changed")
     done = cli("eval", "--compare", one, other)
     assert done.code == 3
-    assert "episode_length_s: the value is 2.0, but 5.0 in" in done.err
-    assert "rewards.alive.weight: the value is 3.0" in done.err
+    assert "episode_length_s: this setting is 2.0, but 5.0 in" in done.err
+    assert "rewards.alive.weight: this setting is 3.0" in done.err
     assert done.err.count("error: ") == 2
     problems = json.loads(cli("eval", "--compare", one, other, "--json").out)["error"]["problems"]
     assert [problem["path"] for problem in problems] == ["episode_length_s", "rewards.alive.weight"]

@@ -298,7 +298,7 @@ def test_floating_entity_is_pushed_horizontally(world):
         ("body_mas.arm=1:2", "there is no parameter 'body_mas'", "did you mean 'body_mass'"),
         ("body_mass.amr=1:2", "no body matches 'amr'", "did you mean 'arm'"),
         ("joint_damping.hing=1:2", "no joint matches 'hing'", "did you mean 'hinge'"),
-        ("joint_damping.hinge=1:2", "the value is 0 for hinge", "abs:"),
+        ("joint_damping.hinge=1:2", "joint_damping is 0 for hinge", "abs:"),
         ("body_mass.weightless=1:2", "0 for weightless", "abs:"),
         ("effort_limit.slide=1:2", "no actuator matches 'slide'", "hinge"),
         ("gravity.arm=1:2", "to the whole world, not to an element", "leave out 'arm'"),
