@@ -75,7 +75,7 @@ EARLY = 5
 
 
 def early_resets(evidence: RolloutEvidence) -> Iterator[Remark]:
-    """Check that few episodes end in their first steps, at least under one fixed policy."""
+    """Check that under at least one fixed policy few episodes end in their first steps."""
     shares = {}
     for rollout in evidence.rollouts:
         early = [e for e in rollout.episodes if e.length <= EARLY < rollout.env.max_episode_length]

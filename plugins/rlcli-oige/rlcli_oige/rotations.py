@@ -111,7 +111,7 @@ def quat_from_euler_xyz(roll: Tensor, pitch: Tensor, yaw: Tensor, extrinsic: boo
 def euler_angles_to_quats(
     euler_angles: Tensor, degrees: bool = False, extrinsic: bool = True, device: str = ""
 ) -> Tensor:
-    """Return the rotations of angles around x, y and z [rad or degrees]. (n, 3) -> (n, 4)"""
+    """Convert angles around x, y and z [rad or degrees] to quaternions. (n, 3) -> (n, 4)"""
     angles = euler_angles * (math.pi / 180.0) if degrees else euler_angles
     return quat_from_euler_xyz(angles[:, 0], angles[:, 1], angles[:, 2], extrinsic)
 
