@@ -17,12 +17,13 @@ from typer._click.exceptions import UsageError as ClickUsageError
 
 from rlcli.cli.ui.console import console, print_log_records, redirect_to_null
 from rlcli.cli.ui.help_text import HelpGroup
-from rlcli.cli.ui.options import CHOOSE, add_command
+from rlcli.cli.ui.options import CHOOSE, BodyError, add_command
 from rlcli.config.user_settings import read_settings
 from rlcli.errors import INTERRUPTED, CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
 from rlcli.machine import AddressSpaceCheck, MatplotlibFinder, delay_garbage_collection, memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.registry.plugin_imports import exit_refused
+from rlcli.registry.task_code import error_of_task, observe_task_code
 from rlcli.safe_text import remember_given
 from rlcli.settings import settings_file, use_settings
 from rlcli.trainers import TrainerSpec
@@ -109,7 +110,7 @@ def main(arguments: list[str] | None = None) -> int:
     remember_given([*arguments, *(value for name, value in os.environ.items() if name.startswith("RLCLI_"))])
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
     console.has_document = False  # an earlier command of this process may have printed one
-    with console.stdout_kept(), malformed_metadata_ignored(), exit_refused():
+    with console.stdout_kept(), malformed_metadata_ignored(), exit_refused(), observe_task_code():
         code = _run(_with_values(arguments))
     try:
         if sys.stdout is not None:
@@ -169,11 +170,12 @@ def _run(arguments: list[str]) -> int:
                 console.info(line)
             return 2
         failure: RlcliError = UsageError("no command given", hint="rlcli --help lists the commands")
-    except BaseException as error:  # the code of a task may raise any exception
-        failure = _as_rlcli_error(error, arguments)
-        if failure.kind == "bug" and isinstance(error, SystemExit):
+    except BaseException as raised:  # the code of a task may raise any exception
+        cause = raised.error if isinstance(raised, BodyError) else raised
+        failure = _as_rlcli_error(cause, arguments)
+        if failure.kind == "bug" and isinstance(cause, SystemExit):
             raise  # not from the code of a task or plugin: typer ends completions and closed pipes in this way
-        is_expected = isinstance(error, ClickException | KeyboardInterrupt | typer.Abort)
+        is_expected = isinstance(cause, ClickException | KeyboardInterrupt | typer.Abort)
         if failure.kind == "bug" or (console.debug and not is_expected):
             traceback.print_exc()
     console.error(failure)
@@ -208,13 +210,15 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
         return failure
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         return Stopped("interrupted", exit_code=INTERRUPTED)
+    if isinstance(error, OSError | EOFError) and (of_task := error_of_task(error)):
+        return of_task
     if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
         return UsageError(f"'{error.filename}' is too long: a name in a path has at most 255 bytes", hint="shorten it")
     if isinstance(error, OSError):
         file = f"{error.filename}: " if error.filename else ""
         return MachineError(f"{file}{error.strerror or str(error) or type(error).__name__}")
 
-    from rlcli.cli.ui.error_origin import error_of_task, missing_dependency
+    from rlcli.cli.ui.missing_dependency import missing_dependency
     from rlcli.sim.gl import opengl_import_error
 
     known = opengl_import_error(error) or missing_dependency(error) or error_of_task(error)

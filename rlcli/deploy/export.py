@@ -22,7 +22,7 @@ from rlcli.deploy.file_formats import FORMATS, PolicyFunction, require_self_cont
 from rlcli.deploy.metadata import metadata_of, mjlab_properties
 from rlcli.errors import MachineError, UsageError, VerdictError, require_known
 from rlcli.rl.policy import PolicySpec
-from rlcli.runs.atomic_io import remove_leftovers, require_regular, sync_folder, write_synced
+from rlcli.runs.atomic_io import remove_leftovers, require_writable, sync_folder, write_synced
 from rlcli.runs.checkpoint_reader import Checkpoint
 from rlcli.runs.manifest_schema import deployment_of, layout_of
 
@@ -70,7 +70,7 @@ def check_target(format_: str, output: Path | None) -> None:
         named = output.with_suffix(suffix) if output.name.strip(".") else "FILE"
         hint = f"--format {other}" if other else f"--output {named}"
         raise UsageError(f"'{output}' does not end in {suffix}, the suffix of format {format_}", hint=hint)
-    require_regular(output)
+    require_writable(output)
 
 
 def _export_obstacle(spec: PolicySpec) -> str | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rlcli.config.layers import flags
 from rlcli.errors import CheckpointError, MachineError, TaskError, UsageError, require_known
 from rlcli.registry.find import path_of
-from rlcli.runs.atomic_io import require_regular
+from rlcli.runs.atomic_io import require_regular, require_writable
 from rlcli.runs.run import RECORD, Run
 from rlcli.runs.run_ref import default_runs_dir, find_run, list_runs
 
@@ -266,16 +266,19 @@ def check_record(record: Path | None, mode: str) -> None:
 
     Raises:
         UsageError: for an unknown mode, or if the path is a folder, pipe or device.
-        MachineError: if the folder of the file does not exist.
+        MachineError: if the folder of the file does not exist or takes no files.
     """
     modes = ("all", "succeeded", "failed", "separate")
     require_known(mode, modes, "--record-mode", "modes")
     if record is None:
         return
-    for file in recording_files(record, mode).values():
+    files = recording_files(record, mode).values()
+    for file in files:
         require_regular(file)
     if not record.absolute().parent.is_dir():
         raise MachineError(f"--record: there is no folder {record.absolute().parent}; create it")
+    for file in files:
+        require_writable(file)
 
 
 def recording_files(file: Path, mode: str) -> dict[str, Path]:

@@ -2,7 +2,6 @@
 
 import contextlib
 import importlib
-import logging
 import operator
 import os
 import re
@@ -20,10 +19,6 @@ from rlcli.registry.entries import Entry
 from rlcli.task import API_VERSION, TaskSpec
 from rlcli.trainers import TrainerSpec
 
-_log = logging.getLogger(__name__)
-
-_SLOW_S = 10
-"""Time after which a warning names a plugin whose import has not ended [s]."""
 _Spec = TypeVar("_Spec", TaskSpec, TrainerSpec, FormatSpec)
 
 
@@ -83,7 +78,7 @@ def call_entry(entry: Entry, *arguments: Any) -> Any:
 
 @contextlib.contextmanager
 def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> Iterator[None]:
-    """Name a plugin in errors of the `with` block, which runs its code, and in a warning if it exceeds `_SLOW_S`.
+    """Name a plugin in errors of the `with` block, which runs its code.
 
     Args:
         entry: the plugin's entry.
@@ -94,10 +89,6 @@ def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> It
         PluginError: for any other error.
     """
     plugin = f"plugin {entry.distribution} {entry.version}: "
-    text = f"{plugin}{entry.value} takes more than {_SLOW_S} s; if it does not end, exclude it with RLCLI_PLUGINS=none"
-    timer = threading.Timer(_SLOW_S, _log.warning, [text])
-    timer.daemon = True
-    timer.start()
     try:
         with track(f"plugin {entry.qualified} ({entry.value})"):
             yield
@@ -109,9 +100,6 @@ def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> It
             f"{plugin}entry point '{entry.name}' = {entry.value} {failure}: {reason}{error_location(error)}",
             hint=_newer_rlcli(entry) or f"update or uninstall {entry.distribution}",
         ) from error
-    finally:
-        timer.cancel()
-        timer.join()  # a process with a second thread cannot be forked safely
 
 
 @contextlib.contextmanager

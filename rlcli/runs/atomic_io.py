@@ -60,6 +60,27 @@ def require_regular(file: Path) -> None:
         raise UsageError(f"cannot write {file}: it is a {kind}", hint="give the name of a new or a regular file")
 
 
+def require_writable(file: Path) -> None:
+    """Check, before any work, that a file can be written: nothing else is there, and its folder takes new files.
+
+    Access rights do not tell this for every folder, so an empty temporary file is created and removed. Of folders that
+    do not exist yet, the nearest one that exists is tested.
+
+    Raises:
+        UsageError: for a folder, a pipe, a socket or a device.
+        MachineError: if the disk reports an error.
+    """
+    require_regular(file)
+    target = file.absolute()
+    while not target.parent.exists() and target.parent != target:
+        target = target.parent
+    temporary = target.with_name(f".{target.name}.tmp-{os.getpid()}")
+    with disk_errors(file):
+        temporary.unlink(missing_ok=True)
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        temporary.unlink()
+
+
 def write_synced(file: Path, data: bytes) -> None:
     """Write a file and wait until its content is on the disk."""
     with file.open("wb") as handle:
@@ -123,7 +144,8 @@ def disk_error(path: Path, error: OSError) -> MachineError:
     """Return the error for a path that cannot be written, with a hint that fits the cause."""
     gone = [str(folder) for folder in path.parents if error.errno == errno.ENOENT and not folder.exists()]
     missing = f" (there is no folder {gone[-1]})" if gone else ""
-    return MachineError(f"cannot write {path}: {error.strerror or error}{missing}", hint=_HINTS.get(error.errno or 0))
+    hint = _HINTS.get(error.errno or 0) if gone or error.errno != errno.ENOENT else "choose another folder"
+    return MachineError(f"cannot write {path}: {error.strerror or error}{missing}", hint=hint)
 
 
 def require_lock(path: Path) -> None:

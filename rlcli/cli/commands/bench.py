@@ -161,7 +161,7 @@ def _preset_file(name: str, overwrite: bool) -> Path:
         UsageError: if the file exists and may not be replaced.
         MachineError: if the folder does not exist or cannot be written.
     """
-    from rlcli.runs.atomic_io import require_regular
+    from rlcli.runs.atomic_io import require_regular, require_writable
 
     file = Path(name)
     if not name or file.name in ("", ".."):
@@ -174,8 +174,7 @@ def _preset_file(name: str, overwrite: bool) -> Path:
         raise UsageError(f"--save-preset: {file} exists", hint="choose another name, or add --overwrite")
     if not folder.is_dir():
         raise MachineError(f"--save-preset: there is no folder {folder}; create it, or choose another")
-    if not os.access(folder, os.W_OK):
-        raise MachineError(f"--save-preset: {folder} cannot be written", hint="choose another folder")
+    require_writable(file)
     return file
 
 

@@ -106,6 +106,14 @@ _NEEDED = {
 """Option -> the parameter without which a command ignores it, and how the user writes that parameter."""
 
 
+class BodyError(Exception):
+    """Carrier of an error in the body of a command that typer would mistake for a closed pipe or for Ctrl-D."""
+
+    def __init__(self, error: OSError | EOFError) -> None:
+        self.error = error
+        super().__init__()
+
+
 def add_command(app: typer.Typer, name: str, function: Callable[..., None], **settings: Any) -> None:
     """Add a command to an app, with the common options and the help of the function's docstring.
 
@@ -150,8 +158,11 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
             values["overrides"] = [*(values["overrides"] or []), *words]
         progress.view = WorkView
         given = {option: value for option, value in values.items() if option not in _COMMON}
-        with progress.track(f"rlcli {name}"):
-            function(**given)
+        try:
+            with progress.track(f"rlcli {name}"):
+                function(**given)
+        except (OSError, EOFError) as error:
+            raise BodyError(error) from error
 
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -205,12 +216,12 @@ def video_file(video: Path | None, default: str) -> Path | None:
     """Return the file of --video, the default one if the option has no value; check that it can be written."""
     if video is None:
         return None
-    from rlcli.runs.atomic_io import require_regular
+    from rlcli.runs.atomic_io import require_writable
     from rlcli.viewer.video_writer import check_video
 
     file = Path(default) if str(video) == CHOOSE else video
     check_video(file)
-    require_regular(file)
+    require_writable(file)
     return file
 
 
@@ -219,9 +230,9 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
 
     Raises:
         UsageError: for a suffix that is not one of `suffixes`, or something else than a regular file.
-        MachineError: if its folder does not exist.
+        MachineError: if its folder does not exist or takes no files.
     """
-    from rlcli.runs.atomic_io import require_regular
+    from rlcli.runs.atomic_io import require_regular, require_writable
 
     if output is None:
         return
@@ -230,6 +241,7 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
     require_regular(output)
     if not output.absolute().parent.is_dir():
         raise MachineError(f"cannot write {output}: there is no folder {output.absolute().parent}; create it")
+    require_writable(output)
 
 
 def exit_on_failures(failures: list[str]) -> None:

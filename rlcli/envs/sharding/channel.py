@@ -6,6 +6,7 @@ import pickle
 import select
 import socket
 import struct
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -33,17 +34,19 @@ class Channel:
 
     def __init__(self, connection: socket.socket, spin_s: float) -> None:
         self._socket, self._spin_s = connection, spin_s
+        self._sending = threading.Lock()
         self._socket.setblocking(True)
 
     def send(self, kind: bytes, content: Any = None) -> None:
-        """Send a message.
+        """Send a message; any thread may do this.
 
         Raises:
             ChannelClosedError: if the other process has ended.
         """
         body = b"" if content is None else pickle.dumps(content, protocol=pickle.HIGHEST_PROTOCOL)
         try:
-            self._socket.sendall(_HEADER.pack(kind, len(body)) + body)
+            with self._sending:
+                self._socket.sendall(_HEADER.pack(kind, len(body)) + body)
         except OSError as error:
             raise ChannelClosedError from error
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import pickle
 import random
@@ -16,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
 from rlcli.errors import RlcliError, TaskError
+from rlcli.machine import memory_error
+from rlcli.registry.task_code import error_of_task, observe_task_code
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -28,8 +31,9 @@ if TYPE_CHECKING:
 
 BUILD, MAP, SHARE, STEP, RESET, LOAD, CALL, CONTINUE = b"b", b"m", b"h", b"s", b"r", b"l", b"c", b"g"
 """Kinds of the messages that the main process sends."""
-READY, STOPPED, VALUE, ERROR = b"y", b"t", b"v", b"e"
-"""Kinds of the messages that a worker sends: its shard is built; it stopped at a stage; value of a call; an error."""
+READY, STOPPED, VALUE, ERROR, WARNING = b"y", b"t", b"v", b"e", b"w"
+"""Kinds of the messages that a worker sends: its shard is built; it stopped at a stage; value of a call; an error; a
+warning, which may come at any time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,15 +67,30 @@ def main(connection: int, arrays: int) -> None:
     channel = Channel(socket.socket(fileno=connection), SPIN_S)
     # ChannelClosedError: the main process has ended or has closed the environment; other errors: too little memory to
     # report an error. The main process names the exit code of a worker that ended by itself.
+    logging.getLogger("rlcli").addHandler(_WarningSender(channel))
     with contextlib.suppress(BaseException):
         try:
-            _serve(channel, arrays)
+            with observe_task_code():
+                _serve(channel, arrays)
         except ChannelClosedError:
             raise
         except BaseException as error:  # of an import, or of a message that cannot be read
             channel.send(ERROR, _PortableError.from_exception(error))
             channel.wait_until_closed()
     os._exit(0)  # without waiting for the engine's threads
+
+
+class _WarningSender(logging.Handler):
+    """Logging handler that sends warnings to the main process, which logs them."""
+
+    def __init__(self, channel: Channel) -> None:
+        super().__init__(logging.WARNING)
+        self._channel = channel
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send one log record."""
+        with contextlib.suppress(ChannelClosedError):
+            self._channel.send(WARNING, record.getMessage())
 
 
 def _serve(channel: Channel, arrays: int) -> None:
@@ -212,8 +231,10 @@ class _PortableError:
 
     @staticmethod
     def from_exception(error: BaseException) -> _PortableError:
-        """Return the portable form of an exception; one of a task's own class becomes a RuntimeError."""
+        """Return the portable form of an exception; one that a task has raised becomes a TaskError with its line."""
         trace = "".join(traceback.format_exception(error))
+        if not isinstance(error, RlcliError):
+            error = memory_error(error) or error_of_task(error) or error
         if isinstance(error, RlcliError):
             return _PortableError(type(error), error.args, dict(error.__dict__), trace)
         if type(error).__module__ == "builtins":
@@ -221,10 +242,9 @@ class _PortableError:
         return _PortableError(RuntimeError, (f"{type(error).__name__}: {error}",), {}, trace)
 
     def rebuild(self) -> BaseException:
-        """Return the exception again; if it is a bug, the worker's traceback is added to it as a note."""
+        """Return the exception again, with the worker's traceback as a note."""
         error = self.kind.__new__(self.kind)
         error.args = self.arguments
         error.__dict__.update(self.attributes)
-        if not isinstance(error, RlcliError):
-            error.add_note(f"in a worker process:\n{self.trace}")
+        error.add_note(f"in a worker process:\n{self.trace}")
         return error

@@ -21,6 +21,7 @@ from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
 from rlcli.envs.sharding.worker import Job
 from rlcli.errors import MachineError
 from rlcli.machine import python_command, require_address_space
+from rlcli.registry.task_code import warn_once
 
 _CODE = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[3]);"
@@ -77,7 +78,11 @@ class Worker:
             BaseException: an error of the worker.
         """
         try:
-            kind, content = self._channel.receive(self._warn_if_silent)
+            while True:
+                kind, content = self._channel.receive(self._warn_if_silent)
+                if kind != worker.WARNING:
+                    break
+                warn_once(content)
         except ChannelClosedError:
             raise self._ended_error() from None
         if kind == worker.ERROR:

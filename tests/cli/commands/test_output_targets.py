@@ -43,6 +43,15 @@ def test_output_to_a_pipe_is_refused_before_any_work(cli, tmp_path, name):
     assert stat.S_ISFIFO(file.stat().st_mode)
 
 
+@pytest.mark.skipif(not os.path.isdir("/proc"), reason="Linux: nobody can write a file there, whatever its rights")
+@pytest.mark.parametrize("name", COMMANDS)
+def test_output_to_a_folder_that_takes_no_files_is_refused_before_any_work(cli, name):
+    words = [f"/proc/{word}" if word.startswith("out") else word for word in COMMANDS[name]]
+    error = expect_code(cli(*words), 10).err
+    assert error.startswith("error: cannot write /proc/out")
+    assert "hint: choose another folder" in error
+
+
 def test_output_to_a_link_to_a_socket_is_refused(cli, tmp_path):
     with socket.socket(socket.AF_UNIX) as server:
         server.bind("s")

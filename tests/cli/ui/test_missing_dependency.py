@@ -1,11 +1,11 @@
-"""Origin of an unexpected exception: which errors name a missing dependency, and the command that installs it."""
+"""Missing dependencies: which errors name a missing dependency, and the command that installs it."""
 
 import subprocess
 import sys
 
 import pytest
 
-from rlcli.cli.ui.error_origin import missing_dependency
+from rlcli.cli.ui.missing_dependency import missing_dependency
 
 WITHOUT = """
 import sys

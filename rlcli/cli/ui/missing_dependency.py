@@ -1,0 +1,28 @@
+"""Missing dependencies: which one an exception means, and the command that installs it."""
+
+import re
+from importlib import metadata
+
+from rlcli.errors import DependencyError, pip_install
+from rlcli.registry import OWN
+
+
+def missing_dependency(error: BaseException) -> DependencyError | None:
+    """Return the error for a missing dependency of rlcli, with its pip command; None for other exceptions."""
+    module = error.name if isinstance(error, ModuleNotFoundError) else None
+    if module is None:
+        return None
+    distribution = _DISTRIBUTIONS.get(module, module.lower().replace("_", "-"))
+    needed = [line for line in metadata.requires(OWN) or [] if re.split(r"[^\w.-]", line)[0].lower() == distribution]
+    if not needed:
+        return None
+    extras = [match[1] for line in needed if (match := re.search(r"extra == .(\w+)", line))]
+    extra = next((extra for extra in extras if extra not in ("all", "dev")), "all")
+    hint = pip_install(f"{OWN}[{extra}]" if len(extras) == len(needed) else distribution)
+    if distribution == "torch":
+        hint += "; on Linux without a GPU, add --index-url https://download.pytorch.org/whl/cpu"
+    return DependencyError(f"{distribution} is not installed", hint=hint)
+
+
+_DISTRIBUTIONS = {"yaml": "pyyaml", "warp": "warp-lang", "mlflow": "mlflow-skinny"}
+"""Module -> distribution, where the names differ."""

@@ -1,0 +1,249 @@
+"""What the code of tasks and plugins does while a command runs: its errors, its warnings, and calls that hang."""
+
+import contextlib
+import functools
+import logging
+import sys
+import sysconfig
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+import rlcli
+from rlcli.errors import TaskError, error_text, error_with_type
+from rlcli.registry.entries import FORMATS, OWN, TASKS, TRAINERS, Entry, catalog
+from rlcli.registry.formats import is_framework
+from rlcli.safe_text import shorten
+
+_log = logging.getLogger(__name__)
+
+SLOW_S = 10.0
+"""Time after which a warning names a call of a task's code that has not returned [s]."""
+_SAMPLE_S = 1.0
+"""Time between two looks at the running code [s]."""
+_MOST_TEXT = 200
+"""Longest text of a warning [characters]."""
+_ENTRIES = ("rlcli.cli.app", "rlcli.envs.sharding.worker")
+"""Modules that start a command or a worker: the frames that called them belong to the program that uses rlcli."""
+
+
+def error_of_task(error: BaseException) -> TaskError | None:
+    """Return a TaskError for an exception from the code of a task or plugin; None for any other.
+
+    An OSError or EOFError that rlcli's own code raised is not from a task, even if a plugin called this code: a full
+    disk is not the plugin's fault.
+    """
+    found = [each for each in _frames_of(error) if is_task_code(each[0])]
+    if not found or (isinstance(error, OSError | EOFError) and not _was_raised_by_task(error)):
+        return None
+    frame, line = found[-1]
+    code = frame.f_code
+    return TaskError(
+        f"{code.co_filename}:{line}: {code.co_name}: {error_with_type(error)}",
+        hint="correct the task's code at this line; --debug shows the traceback",
+    )
+
+
+def _frames_of(error: BaseException) -> list[tuple[FrameType, int]]:
+    """Return the frames of an error's traceback, of its causes' ones if there is no frame of a task in it."""
+    seen: set[int] = set()
+    frames: list[tuple[FrameType, int]] = []
+    cause: BaseException | None = error
+    while cause is not None and id(cause) not in seen:
+        seen.add(id(cause))
+        frames = list(traceback.walk_tb(cause.__traceback__))
+        if any(is_task_code(frame) for frame, _ in frames):
+            break
+        cause = cause.__cause__
+    return frames
+
+
+def _was_raised_by_task(error: BaseException) -> bool:
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    own = [frame for frame in frames if is_task_code(frame) or is_framework(_module(frame))]
+    return bool(own) and is_task_code(own[-1])
+
+
+def is_task_code(frame: FrameType) -> bool:
+    """Return whether a frame runs code of a task: a file outside of rlcli and libraries, or an installed plugin."""
+    return _is_task_file(frame.f_code.co_filename, _module(frame).partition(".")[0])
+
+
+@functools.cache
+def _is_task_file(file: str, package: str) -> bool:
+    entry = _plugins().get(package)
+    if file.startswith("<") or is_framework(package) or (entry is not None and entry.distribution == OWN):
+        return False
+    return entry is not None or not any(Path(file).is_relative_to(folder) for folder in _libraries())
+
+
+def _module(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__", ""))
+
+
+def _plugin(frame: FrameType) -> Entry | None:
+    """Return the entry point of the installed plugin whose package has the code of a frame; None for other code."""
+    return _plugins().get(_module(frame).partition(".")[0])
+
+
+@functools.cache
+def _plugins(groups: tuple[str, ...] = (FORMATS, TRAINERS, TASKS)) -> dict[str, Entry]:
+    """Return the top-level packages of installed plugins, each with one of its entry points."""
+    with contextlib.suppress(Exception):  # without readable metadata, installed plugins count as libraries
+        return {entry.package: entry for group in groups for entry in catalog(group, hidden=True)[0]}
+    return {}
+
+
+@functools.cache
+def _libraries() -> list[Path]:
+    """Return the folders of Python, the installed packages and rlcli."""
+    folders = [Path(path) for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib"))]
+    return [*folders, Path(rlcli.__file__).parent]
+
+
+@contextlib.contextmanager
+def observe_task_code() -> Iterator[None]:
+    """Report what the code of tasks and plugins does in the `with` block, each as one warning in rlcli's log.
+
+    These are its warnings, records of its loggers without a handler, errors in its threads and destructors, and calls
+    that have not returned after `SLOW_S`. Each line of code is reported once.
+    """
+    for function in (warn_once, _is_task_file, _plugins):  # an earlier command of this process may have called them
+        function.cache_clear()
+    places: set[str] = set()
+
+    def report(place: str, text: str) -> None:
+        if place not in places:
+            places.add(place)
+            warn_once(f"{place}: {shorten(text, _MOST_TEXT)}")
+
+    def on_warning(message: Any, category: type[Warning], filename: str, lineno: int, *_: Any) -> None:
+        report(_place(sys._getframe(1)) or f"{filename}:{lineno}", f"{category.__name__}: {error_text(message)}")
+
+    def on_error(other: Callable[[Any], Any]) -> Callable[[Any], None]:
+        def hook(found: Any) -> None:
+            frames = [each for each in traceback.walk_tb(found.exc_traceback) if is_task_code(each[0])]
+            if found.exc_value is None or not frames:
+                other(found)
+            elif not isinstance(found.exc_value, SystemExit):
+                text = f"error in a thread or destructor: {error_with_type(found.exc_value)}"
+                report(f"{frames[-1][0].f_code.co_filename}:{frames[-1][1]}", text)
+
+        return hook
+
+    hooks: list[tuple[Any, str, Any]] = [
+        (warnings, "showwarning", on_warning),
+        (logging, "lastResort", _LastResort(report)),
+        (threading, "excepthook", on_error(threading.excepthook)),
+        (sys, "unraisablehook", on_error(sys.unraisablehook)),
+    ]
+    before = [(owner, name, getattr(owner, name)) for owner, name, _ in hooks]
+    watch = _Watch(threading.get_ident())
+    for owner, name, hook in hooks:
+        setattr(owner, name, hook)
+    watch.start()
+    try:
+        yield
+    finally:
+        watch.end()
+        for owner, name, hook in before:
+            setattr(owner, name, hook)
+
+
+@functools.cache
+def warn_once(text: str) -> None:
+    """Log a warning about a task's code, unless this command has logged it already."""
+    _log.warning("%s", text)
+
+
+class _LastResort(logging.Handler):
+    """Handler of records, such as those of a task, whose logger has no handler of its own."""
+
+    def __init__(self, report: Any) -> None:
+        super().__init__(logging.WARNING)
+        self._report = report
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Report the record."""
+        try:
+            text = record.getMessage()
+        except Exception as error:  # such as `logging.warning("%d", "x")`
+            text = f"its text cannot be made: {type(error).__name__}"
+        self._report(f"{record.pathname}:{record.lineno}", text)
+
+
+def _frames_of_command(frame: FrameType | None) -> Iterator[FrameType]:
+    """Yield a frame and its callers, up to the start of the command."""
+    while frame is not None and _module(frame) not in _ENTRIES:
+        yield frame
+        frame = frame.f_back
+
+
+def _place(frame: FrameType) -> str | None:
+    """Return file and line of the innermost code of a task that runs in a frame or its callers."""
+    inner = next((each for each in _frames_of_command(frame) if is_task_code(each)), None)
+    return None if inner is None else f"{inner.f_code.co_filename}:{inner.f_lineno}"
+
+
+class _Watch(threading.Thread):
+    """Thread that looks at the running code once a second, and names calls of a task's code that do not return.
+
+    Args:
+        thread: identifier of the thread to watch.
+    """
+
+    def __init__(self, thread: int) -> None:
+        super().__init__(name="watch", daemon=True)
+        self._watched, self._ended = thread, threading.Event()
+        self._reported: set[CodeType] = set()
+
+    def end(self) -> None:
+        """End the thread."""
+        self._ended.set()
+        self.join()
+
+    def run(self) -> None:
+        """Look at the running code until `end` is called."""
+        since: dict[FrameType, float] = {}  # the keys keep the frames, so that no new one has the same identity
+        while not self._ended.wait(_SAMPLE_S):
+            frames = list(_frames_of_command(sys._current_frames().get(self._watched)))
+            now = time.monotonic()
+            since = {frame: since.get(frame, now) for frame in _calls(frames)}
+            call = next((frame for frame, begin in since.items() if now - begin >= SLOW_S - _SAMPLE_S), None)
+            if call is not None and call.f_code not in self._reported:
+                self._reported.add(call.f_code)
+                self._warn_of(call, next(each for each in frames if is_task_code(each) or each is call))
+            frames, call = [], None
+
+    @staticmethod
+    def _warn_of(call: FrameType, inner: FrameType) -> None:
+        """Warn of a call that does not return; `inner` is the innermost code of the task that runs in it."""
+        entry, advice = _plugin(call), ""
+        place = f"{call.f_code.co_filename}:{call.f_lineno}: "
+        if entry is not None:
+            place = f"plugin {entry.distribution} {entry.version}: {place}"
+            advice = "; if it does not end, exclude the plugin with RLCLI_PLUGINS=none"
+        at = "" if inner is call else f"; it is at {inner.f_code.co_filename}:{inner.f_lineno}, {inner.f_code.co_name}"
+        warn_once(f"{place}{call.f_code.co_name} has not returned for {SLOW_S:g} s{at}{advice}")
+
+
+def _calls(frames: Iterable[FrameType]) -> Iterator[FrameType]:
+    """Yield the frames in which code of a task or format runs that other code has called; the innermost first.
+
+    Frames of trainers are left out, except for their import: an iteration may take minutes.
+    """
+    inner: FrameType | None = None
+    for frame in (*frames, None):
+        plugin = None if frame is None else _plugin(frame)
+        if frame is not None and (is_task_code(frame) or (plugin is not None and plugin.distribution != OWN)):
+            inner = frame
+        elif inner is not None and (frame is None or is_framework(_module(frame))):
+            is_trainer = _module(inner).partition(".")[0] in _plugins((TRAINERS,))
+            if not is_trainer or inner.f_code.co_name == "<module>":
+                yield inner
+            inner = None

@@ -1,0 +1,142 @@
+"""Code of a task that hangs, warns, or raises errors of the system: each is reported once, with its file and line."""
+
+import time
+
+import pytest
+from support.command_line import COIN, COIN_TASK
+
+pytestmark = [pytest.mark.usefixtures("empty_folder"), pytest.mark.processes]
+
+HOOKS = {
+    "pre_physics_step": "def pre_physics_step(self, actions): ...",
+    "reset_idx": "self.fails[env_ids] =",
+    "get_observations": "self.obs_buf[:, 0] =",
+    "calculate_metrics": "self.rew_buf[:] =",
+    "is_done": "self.reset_buf[:] =",
+}
+"""Hook of a direct task -> the text before which a line of code is inserted."""
+
+
+@pytest.fixture
+def with_code(coin, tmp_path):
+    """Return a function that inserts code into a hook of the task, and returns the number of its line."""
+
+    def insert(hook, code, settings="num_envs: 32"):
+        anchor = HOOKS[hook]
+        place = COIN_TASK.index(anchor)
+        changed = COIN_TASK.replace(anchor, f"{code}; {anchor}")
+        if hook == "pre_physics_step":
+            changed = COIN_TASK.replace(
+                "pre_physics_step(self, actions): ...", f"pre_physics_step(self, actions): {code}"
+            )
+        (tmp_path / "coin" / "task.py").write_text(f"import os, time, warnings, logging, threading{changed}")
+        (tmp_path / "coin" / "task.yaml").write_text(COIN.replace("num_envs: 32", settings))
+        return COIN_TASK[:place].count("\n") + 1
+
+    return insert
+
+
+TRAIN = ("train", "./coin", "--num-envs", "4", "--logger", "none", "-q")
+EVAL = ("eval", "./coin", "--policy", "zero", "--episodes", "4")
+HANG = "[time.sleep(0.5) for _ in range(1200)]"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(200)
+@pytest.mark.parametrize(
+    ("hook", "words"),
+    [
+        ("calculate_metrics", TRAIN),
+        ("pre_physics_step", EVAL),
+        ("reset_idx", ("play", "./coin", "--policy", "zero", "--viewer", "none", "-q")),
+        ("get_observations", ("check", "./coin")),
+        ("is_done", ("lint", "./coin")),
+    ],
+)
+def test_hook_that_hangs_is_named(with_code, start, tmp_path, hook, words):
+    line = with_code(hook, HANG)
+    process = start(*words)
+    found = next(text for text in process.stderr if "has not returned" in text)
+    assert f"warning: {tmp_path}/coin/task.py:{line}: {hook} has not returned for 10 s" in found
+    time.sleep(2)
+    process.kill()
+    assert "has not returned" not in process.stderr.read()
+
+
+@pytest.mark.slow
+def test_import_of_a_task_that_hangs_is_named(coin, tmp_path, start):
+    (tmp_path / "coin" / "task.py").write_text("import time\ntime.sleep(600)\n")
+    process = start("validate", "./coin", "--deep", "-q")
+    assert "coin/task.py:2: <module> has not returned for 10 s" in process.stderr.readline()
+
+
+@pytest.mark.slow
+def test_hook_that_hangs_in_a_worker_process_is_named(with_code, start):
+    line = with_code("calculate_metrics", "self.env.shard.first and time.sleep(20)", "num_envs: 32, workers: 2")
+    process = start(*TRAIN)
+    assert f"coin/task.py:{line}: calculate_metrics has not returned for 10 s" in process.stderr.readline()
+
+
+LOUD = "warnings.warn(chr(27) + '[31m' + 'x y ' * 900 + str(self.progress_buf[0]))"
+LOGS = "logging.getLogger('task').warning(chr(27) + '[2J%s', 'x y ' * 900)"
+
+
+def stderr_of(process):
+    """Return what a successful command prints on stderr. Warnings in this process would go to pytest."""
+    _, err = process.communicate()
+    assert process.returncode == 0, err
+    return err
+
+
+@pytest.mark.parametrize(
+    "code", [LOUD, LOGS, "logging.getLogger('task').warning('%d', 'x y')"], ids=["warn", "log", "bad log"]
+)
+def test_warning_of_a_task_is_one_short_line(with_code, start, code):
+    line = with_code("calculate_metrics", code)
+    err = stderr_of(start(*EVAL))
+    (warning,) = [text for text in err.splitlines() if "coin/task.py:" in text]
+    assert warning.startswith("warning: ")
+    assert f"coin/task.py:{line}: " in warning
+    assert len(warning.partition("task.py:")[2]) < 220
+    assert "\x1b" not in err
+    assert "x y " * 60 not in err
+
+
+def test_warning_of_a_task_in_workers_is_printed_once(with_code, start):
+    line = with_code("calculate_metrics", "warnings.warn('mind the gap')", "num_envs: 32, workers: 2")
+    err = stderr_of(start(*TRAIN[:2], *TRAIN[4:]))
+    assert err.count("mind the gap") == 1
+    assert f"coin/task.py:{line}: UserWarning: mind the gap" in err
+
+
+def test_error_in_a_thread_of_a_task_is_one_line(with_code, cli):
+    line = with_code("calculate_metrics", "t = threading.Thread(target=lambda: 1 / 0); t.start(); t.join()")
+    found = cli(*EVAL)
+    assert found.code == 0
+    assert f"coin/task.py:{line}: error in a thread or destructor: ZeroDivisionError: division by zero" in found.err
+
+
+ERRORS = {
+    "open('/no/such')": "FileNotFoundError: [Errno 2] No such file or directory: '/no/such'",
+    "open('x' * 300)": "OSError: [Errno 36] File name too long: ",
+    "exec('raise BrokenPipeError(32, str(32))')": "BrokenPipeError: [Errno 32] 32",
+    "exec('raise EOFError(7)')": "EOFError: 7",
+    "next(iter([]))": "StopIteration",
+}
+
+
+@pytest.mark.parametrize("code", ERRORS)
+@pytest.mark.parametrize("words", [EVAL, TRAIN], ids=["eval", "train"])
+def test_system_error_of_a_task_has_its_line(with_code, cli, words, code):
+    line = with_code("calculate_metrics", code)
+    found = cli(*words)
+    assert found.code == 4, found.err
+    assert f"coin/task.py:{line}: calculate_metrics: {ERRORS[code]}" in found.err
+
+
+@pytest.mark.parametrize("code", [*ERRORS, "1 / 0"])
+def test_error_of_a_task_in_a_worker_process_has_its_line(with_code, cli, code):
+    line = with_code("calculate_metrics", f"self.env.shard.first and {code}", "num_envs: 32, workers: 2")
+    found = cli(*TRAIN[:2], *TRAIN[4:])
+    assert found.code == 4, found.err
+    assert f"coin/task.py:{line}: calculate_metrics: {ERRORS.get(code, 'ZeroDivisionError')}" in found.err
