@@ -17,13 +17,13 @@ from typer._click.exceptions import UsageError as ClickUsageError
 
 from rlcli.cli.ui.console import console, print_log_records, redirect_to_null
 from rlcli.cli.ui.help_text import HelpGroup
-from rlcli.cli.ui.options import CHOOSE, BodyError, add_command
+from rlcli.cli.ui.options import CHOOSE, TYPER_ERRORS, BodyError, add_command
 from rlcli.config.user_settings import read_settings
 from rlcli.errors import INTERRUPTED, CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
 from rlcli.machine import AddressSpaceCheck, MatplotlibFinder, delay_garbage_collection, memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.registry.plugin_imports import exit_refused
-from rlcli.registry.task_code import error_of_task, observe_task_code
+from rlcli.registry.task_code import error_of_task, observe_task_code, raised_by_task
 from rlcli.safe_text import remember_given
 from rlcli.settings import settings_file, use_settings
 from rlcli.trainers import TrainerSpec
@@ -204,14 +204,14 @@ def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
         return too_little
     if isinstance(error, RlcliError):
         return error
+    if isinstance(error, TYPER_ERRORS) and raised_by_task(error) and (of_task := error_of_task(error)):
+        return of_task
     if isinstance(error, ClickException):
         failure = UsageError(_usage_message(error), hint=_usage_hint(error, arguments))
         failure.exit_code = error.exit_code
         return failure
     if isinstance(error, KeyboardInterrupt | typer.Abort):
         return Stopped("interrupted", exit_code=INTERRUPTED)
-    if isinstance(error, OSError | EOFError) and (of_task := error_of_task(error)):
-        return of_task
     if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
         return UsageError(f"'{error.filename}' is too long: a name in a path has at most 255 bytes", hint="shorten it")
     if isinstance(error, OSError):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rlcli.config.schema import SuccessConfig, bound_text
 from rlcli.envs.shard_range import Shard
-from rlcli.managers.term import BoundTerm, check_shape, first_value
+from rlcli.managers.term import BoundTerm, CheckedTerm, first_value
 from rlcli.sim.engine import Engine
 from rlcli.sim.env_selection import Field, Selection, in_place
 from rlcli.sim.saved_tensors import TensorState
@@ -24,7 +24,7 @@ class SuccessCondition:
     def __init__(self, term: BoundTerm, lengths: Tensor, as_field: Callable[[Tensor], Field], step_dt: float) -> None:
         config, first = term.config, first_value(term)
         assert isinstance(config, SuccessConfig)
-        check_shape(term, first, tuple(lengths.shape))
+        self._read = CheckedTerm(term, first, tuple(lengths.shape))
         self.name, self.term, self._as_field = term.name, term, as_field
         self._low, self._high = config.at_least, config.at_most
         self.bounded = (self._low, self._high) != (None, None)
@@ -40,12 +40,12 @@ class SuccessCondition:
 
     def holds(self) -> Field:
         """Return where the condition holds in the current state, and store its value. (num_envs,) bool"""
-        self.value = self._as_field(self.term.call())
+        self.value = self._as_field(self._read())
         return self._within(self.value)
 
     def holds_for_tensors(self) -> Tensor:
         """Return where the condition holds in the current state, without storing its value. (num_envs,) bool"""
-        held: Tensor = self._within(self.term.call())
+        held: Tensor = self._within(self._read())
         return held
 
     def _within(self, value: Any) -> Any:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rlcli.config.schema import ObservationGroupConfig
 from rlcli.managers.observation_pipeline import Draws, Pipeline
-from rlcli.managers.term import BoundTerm, EnvContext, check_shape, first_value
+from rlcli.managers.term import BoundTerm, EnvContext, first_value
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.state_cache import is_finite
@@ -129,10 +129,9 @@ class ObservationManager(TensorState):
         pipelines = []
         for term in terms:
             value = first_value(term)
-            dims = value.dim() if isinstance(value, Tensor) else 0
+            dims = value.dim() if isinstance(value, Tensor) and not value.is_nested else 0
             shape = tuple(value.shape[1:]) if dims in (2, 4) else (1,)  # columns, or an image
-            check_shape(term, value, (self._context.num_envs, *shape))
-            pipelines.append(Pipeline(term, shape, config, self._context))
+            pipelines.append(Pipeline(term, value, shape, config, self._context))
         size = sum(pipeline.size for pipeline in pipelines)
         buffers = [self._context.zeros(size) for _ in range(3)]
         return _Group(pipelines, buffers, [_split(buffer, pipelines) for buffer in buffers])

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from rlcli.config import schema
-from rlcli.managers.term import BoundTerm, EnvContext, resets
+from rlcli.managers.term import BoundTerm, CheckedTerm, EnvContext, resets
 from rlcli.sim.env_selection import Selection, in_place
 
 Draws = Callable[[np.uint64], Selection]
@@ -53,11 +53,17 @@ class Pipeline:
     """Operations (stages) on the value of one observation term, and its history."""
 
     def __init__(
-        self, term: BoundTerm, shape: tuple[int, ...], group: schema.ObservationGroupConfig, context: EnvContext
+        self,
+        term: BoundTerm,
+        first: object,
+        shape: tuple[int, ...],
+        group: schema.ObservationGroupConfig,
+        context: EnvContext,
     ) -> None:
         config = term.config
         assert isinstance(config, schema.ObservationConfig)
         self.term = term
+        self._read = CheckedTerm(term, first, (context.num_envs, *shape))
         self.shape = shape
         """Shape of the term's value in one environment; the columns are its elements in row-major order."""
         self.width = width = math.prod(shape)
@@ -91,7 +97,7 @@ class Pipeline:
     def write(self, view: Tensor, draws: Draws, fresh: Selection | None, advance: bool) -> None:
         """Compute the observation of the term and write it to `view`, its columns in the group. (num_envs, size)"""
         value = view if self._value is None else self._value
-        raw = self.term.call()
+        raw = self._read()
         value.copy_(raw if raw.dim() == 2 else raw.reshape(value.shape))
         for stage in self._stages:
             stage(value, draws, fresh, advance)
@@ -115,7 +121,7 @@ class Pipeline:
             salt: combined with the stream of each random operation by xor, so that final observations do not get the
                 random numbers of ordinary ones.
         """
-        value = rows.read(self.term.call().reshape(view.shape)).float()
+        value = rows.read(self._read().reshape(view.shape)).float()
         for stage in self._stages:
             stage(value, lambda stream: rows.stream(stream ^ salt), None, False)
         rows.write(view, value)

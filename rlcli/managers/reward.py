@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, EnvContext, check_shape, first_value, resets
+from rlcli.managers.term import BoundTerm, CheckedTerm, EnvContext, first_value, resets
 from rlcli.managers.termination import DIVERGED
 from rlcli.sim.env_selection import Selection, in_place
 from rlcli.sim.saved_tensors import TensorState
@@ -42,11 +42,6 @@ class RewardManager(TensorState):
             for factor, weight in zip(self._factors.flatten().unbind(0), weights, strict=True)
             if _is_tunable(weight)
         ]
-        self._active = [
-            (term.call, row)
-            for term, row, weight in zip(terms, self._rows, weights, strict=True)
-            if _is_tunable(weight) or weight * dt != 0.0
-        ]
         totals = [torch.zeros(table.shape[1], device=device) for _ in range(3)]
         self._totals = [total[:num_envs] for total in totals]
         self._next = 0
@@ -54,9 +49,11 @@ class RewardManager(TensorState):
         self._step_terms, self._episode_terms = in_place(self._values), in_place(self._sums)
         self._sums_by_env = as_field(self._sums.t())
         self._added, self._added_to = in_place(table), [in_place(total) for total in totals]
-        for term, weight in zip(terms, weights, strict=True):
-            if _is_tunable(weight) or weight != 0.0:
-                check_shape(term, first_value(term), (num_envs,))
+        self._active = [
+            (CheckedTerm(term, first_value(term), (num_envs,)), row)
+            for term, row, weight in zip(terms, self._rows, weights, strict=True)
+            if _is_tunable(weight) or weight * dt != 0.0
+        ]
 
     def compute(self, diverged: Tensor | None = None, terminated: Tensor | None = None) -> Tensor:
         """Return the reward of this step; `add_to_episodes` adds it to the sums of the episodes. (num_envs,)

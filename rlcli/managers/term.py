@@ -290,14 +290,56 @@ def first_value(term: BoundTerm) -> Any:
         raise term.error(str(error)) from None
 
 
-def check_shape(term: BoundTerm, value: object, expected: tuple[int, ...]) -> None:
-    """Check that a term's first value is a tensor of the expected shape.
+_DTYPES = (torch.float32, torch.float64, torch.float16)
+"""Types of real numbers that numpy has."""
+
+
+class CheckedTerm:
+    """Callable that returns a term's value in each step, and checks it: a wrong shape would be broadcast in silence.
+
+    Args:
+        term: the term.
+        value: its first value.
+        shape: the shape that each value must have.
+        is_mask: whether the values are truth values, as those of terminations are.
 
     Raises:
-        ShapeError: with the term's path in the configuration, the value found and the shape expected.
+        ShapeError: if the first value is wrong; calls raise it for later ones.
     """
-    shape = tuple(value.shape) if isinstance(value, Tensor) else None
-    if shape == expected:
-        return
-    found = f"a tensor of shape {shape}" if shape is not None else f"a value of type {type(value).__name__}"
-    raise term.error(f"'{term.config.func}' returned {found}; return a tensor of shape {expected}")
+
+    __slots__ = ("_call", "_dtype", "_is_mask", "_shape", "_term")
+
+    def __init__(self, term: BoundTerm, value: object, shape: tuple[int, ...], *, is_mask: bool = False) -> None:
+        self._term, self._call, self._shape, self._is_mask = term, term.call, shape, is_mask
+        self._dtype = self._require(value).dtype
+
+    def __call__(self) -> Tensor:
+        """Return the value of the current step."""
+        value = self._call()
+        try:
+            plain = value.dtype is self._dtype and not (value.requires_grad or value.is_neg())
+            if plain and value.shape == self._shape:
+                return value  # type: ignore[no-any-return]
+        except (AttributeError, RuntimeError):  # no tensor, or a nested one
+            pass
+        return self._require(value)
+
+    def _require(self, value: object) -> Tensor:
+        """Return a value that is right, without a gradient, and of a type that numpy has."""
+        found = None
+        if not isinstance(value, Tensor):
+            found = f"a value of type {type(value).__name__}"
+        elif value.is_nested or value.is_meta or value.is_quantized or value.layout is not torch.strided:
+            found = "a tensor that is not dense"
+        elif value.shape != self._shape:
+            found = f"a tensor of shape {tuple(value.shape)}"
+        elif value.is_complex() or (self._is_mask and value.is_floating_point()):
+            found = f"a tensor of type {value.dtype}"
+        if found is None:
+            assert isinstance(value, Tensor)
+            value = value.detach().resolve_neg()
+            if self._is_mask:
+                return value.bool()
+            return value.float() if value.is_floating_point() and value.dtype not in _DTYPES else value
+        wanted = f"a tensor of shape {self._shape}{' of truth values' if self._is_mask else ''}"
+        raise self._term.error(f"'{self._term.config.func}' returned {found}; return {wanted}")

@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, EnvContext, check_shape, first_value, resets
+from rlcli.managers.term import BoundTerm, CheckedTerm, EnvContext, first_value, resets
 from rlcli.sim.env_selection import Selection
 
 DIVERGED = "diverged"
@@ -27,17 +27,18 @@ class TerminationManager:
         self.fired: dict[str, Tensor] = {term.name: self._none for term in terms}
         """Term -> where it fired in this step. (num_envs,) bool each"""
         self._term_resets = resets(terms)
-        self._calls = [(term, bool(term.config.time_out)) for term in terms]  # type: ignore[attr-defined]
-        for term in terms:
-            check_shape(term, first_value(term), (context.num_envs,))
+        self._calls = [
+            (term.name, CheckedTerm(term, first_value(term), (context.num_envs,), is_mask=True), _is_time_out(term))
+            for term in terms
+        ]
 
     def compute(self, diverged: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return where this step terminates episodes, and where they time out. (num_envs,) bool each"""
         self.fired = {} if diverged is None else {DIVERGED: diverged}
         failed: list[Tensor] = list(self.fired.values())
         timed_out: list[Tensor] = []
-        for term, is_time_out in self._calls:
-            fired = self.fired[term.name] = term.call()
+        for name, call, is_time_out in self._calls:
+            fired = self.fired[name] = call()
             (timed_out if is_time_out else failed).append(fired)
         self.terminated, self.time_outs = self._any(failed), self._any(timed_out)
         return self.terminated, self.time_outs
@@ -55,3 +56,7 @@ class TerminationManager:
         """Reset the terms that keep values from step to step."""
         for reset in self._term_resets:
             reset(selection)
+
+
+def _is_time_out(term: BoundTerm) -> bool:
+    return bool(term.config.time_out)  # type: ignore[attr-defined]

@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import logging
 import operator
 import os
 import re
@@ -19,6 +20,7 @@ from rlcli.registry.entries import Entry
 from rlcli.task import API_VERSION, TaskSpec
 from rlcli.trainers import TrainerSpec
 
+_log = logging.getLogger(__name__)
 _Spec = TypeVar("_Spec", TaskSpec, TrainerSpec, FormatSpec)
 
 
@@ -132,14 +134,42 @@ def import_object(reference: str) -> Any:
 
 @contextlib.contextmanager
 def contain_side_effects() -> Iterator[None]:
-    """Send what the `with` block prints to stderr, also from C code, and undo its changes of the current folder."""
+    """Send what the `with` block prints to stderr, also from C code, and undo its changes of the current folder.
+
+    Changes of torch's default type, default device and gradient mode are undone, too, with a warning: rlcli's own
+    tensors would change with them.
+    """
     folder = _current_folder()
+    settings = _torch_settings() or _TORCH_DEFAULTS
     with contextlib.redirect_stdout(sys.stderr), _descriptor_to_stderr():
         try:
             yield
         finally:
             if folder is not None and _current_folder() != folder:
                 os.chdir(folder)
+            if (_torch_settings() or settings) != settings:
+                _restore_torch(*settings)
+
+
+_TORCH_DEFAULTS = ("torch.float32", "cpu", True)
+"""torch's default type, its default device and whether it records gradients, after its import."""
+
+
+def _torch_settings() -> tuple[str, str, bool] | None:
+    """Return torch's present settings, in the order of `_TORCH_DEFAULTS`; None if it is not imported."""
+    torch = sys.modules.get("torch")
+    if torch is None or not hasattr(torch, "get_default_device"):  # its import may have failed
+        return None
+    return str(torch.get_default_dtype()), str(torch.get_default_device()), torch.is_grad_enabled()
+
+
+def _restore_torch(dtype: str, device: str, records: bool) -> None:
+    import torch
+
+    torch.set_default_dtype(getattr(torch, dtype.removeprefix("torch.")))
+    torch.set_default_device(None if device == "cpu" else device)
+    torch.set_grad_enabled(records)
+    _log.warning("code that was imported has changed torch's default type, default device or gradient mode; undone")
 
 
 def error_location(error: BaseException) -> str:

@@ -39,7 +39,7 @@ def error_of_task(error: BaseException) -> TaskError | None:
     disk is not the plugin's fault.
     """
     found = [each for each in _frames_of(error) if is_task_code(each[0])]
-    if not found or (isinstance(error, OSError | EOFError) and not _was_raised_by_task(error)):
+    if not found or (isinstance(error, OSError | EOFError) and not raised_by_task(error)):
         return None
     frame, line = found[-1]
     code = frame.f_code
@@ -63,7 +63,8 @@ def _frames_of(error: BaseException) -> list[tuple[FrameType, int]]:
     return frames
 
 
-def _was_raised_by_task(error: BaseException) -> bool:
+def raised_by_task(error: BaseException) -> bool:
+    """Return whether code of a task, or a library that it called, raised an exception."""
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
     own = [frame for frame in frames if is_task_code(frame) or is_framework(_module(frame))]
     return bool(own) and is_task_code(own[-1])

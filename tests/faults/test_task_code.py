@@ -122,6 +122,8 @@ ERRORS = {
     "exec('raise BrokenPipeError(32, str(32))')": "BrokenPipeError: [Errno 32] 32",
     "exec('raise EOFError(7)')": "EOFError: 7",
     "next(iter([]))": "StopIteration",
+    "exec('import typer; raise typer.Exit(0)')": "Exit: 0",
+    "exec('import typer; raise typer.Abort')": "Abort",
 }
 
 

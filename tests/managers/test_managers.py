@@ -172,6 +172,75 @@ def test_shape_error_names_term_and_expected_shape(tmp_path, changes, message):
         build(pendulum(tmp_path, edited(PENDULUM_TASK, **changes), terms_py=SHAPES))
 
 
+BAD = {
+    "torch.zeros(1)": "a tensor of shape (1,)",
+    "torch.zeros(())": "a tensor of shape ()",
+    "torch.zeros(3, 2, 2)": "a tensor of shape (3, 2, 2)",
+    "None": "a value of type NoneType",
+    "torch.nested.nested_tensor([torch.zeros(1)] * 3)": "a tensor that is not dense",
+    "torch.zeros({}, dtype=torch.complex64)": "a tensor of type torch.complex64",
+}
+"""Expression of a wrong value -> how the message names it."""
+DENSE = {
+    "torch.zeros({}).to_sparse()": "a tensor that is not dense",
+    "torch.zeros({}, device='meta')": "a tensor that is not dense",
+}
+WANTED = {"rewards": "3", "terminations": "3", "observations": "3, 1", "success": "3"}
+"""Section -> the shape of its terms."""
+
+
+def with_value(tmp_path, section, first, later, steps):
+    """Build a task with a term that returns one value, and another one after some calls; step it."""
+    text = "import torch\ncalls = [0]\ndef evil(env):\n    calls[0] += 1\n    return {} if calls[0] < 4 else {}\n"
+    term = {"func": "evil", **{"rewards": {"weight": 1.0}, "success": {"at_least": 0.0}}.get(section, {})}
+    terms = {"policy": {"bad": term}} if section == "observations" else {"bad": term}
+    terms_py = text.format(first.format(WANTED[section]), later.format(WANTED[section]))
+    env = build(pendulum(tmp_path, edited(PENDULUM_TASK, **{section: terms}), terms_py=terms_py))
+    obs = env.reset()
+    for _ in range(steps):
+        obs = env.step(torch.zeros(env.num_envs, 1)).obs
+    return obs
+
+
+@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors")
+@pytest.mark.parametrize("section", WANTED)
+@pytest.mark.parametrize("value", [*BAD, *DENSE])
+def test_bad_first_value_of_a_term_is_named(tmp_path, section, value):
+    with pytest.raises(ConfigError, match=re.escape(f"bad: 'evil' returned {(BAD | DENSE)[value]}; return a tensor")):
+        with_value(tmp_path, section, value, value, 0)
+
+
+@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors")
+@pytest.mark.parametrize("section", WANTED)
+@pytest.mark.parametrize("value", BAD)
+def test_bad_value_of_a_later_step_is_named(tmp_path, section, value):
+    good = "torch.zeros({})" if section != "terminations" else "torch.zeros({}, dtype=torch.bool)"
+    with pytest.raises(ConfigError, match=re.escape(f"bad: 'evil' returned {BAD[value]}; return a tensor")):
+        with_value(tmp_path, section, good, value, 8)
+
+
+@pytest.mark.parametrize("kind", ["float32", "float64", "float16", "bfloat16", "int64", "uint8", "bool"])
+@pytest.mark.parametrize("section", WANTED)
+def test_terms_may_return_numbers_of_any_type(tmp_path, section, kind):
+    value = f"torch.ones({{}}, dtype=torch.{kind})"
+    if section == "terminations" and "float" in kind:
+        with pytest.raises(ConfigError, match=f"type torch.{kind}; return a tensor of shape .3,. of truth values"):
+            with_value(tmp_path, section, value, value, 0)
+    elif section != "success" or kind != "bool":
+        obs = with_value(tmp_path, section, value, value, 8)
+        assert obs["policy"].dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    "value", ["torch.ones({}, requires_grad=True) * 2", "torch.ones({}, dtype=torch.cfloat).conj().imag"]
+)
+@pytest.mark.parametrize("section", ["rewards", "observations", "success"])
+def test_gradients_and_views_of_terms_are_resolved(tmp_path, section, value):
+    with torch.enable_grad():
+        obs = with_value(tmp_path, section, value, value, 210)
+    assert not obs["policy"].requires_grad
+
+
 def test_parameter_error_names_its_path(tmp_path):
     task = edited(PENDULUM_TASK, rewards={"bad": {"func": "fussy", "weight": 1.0, "size": 5}})
     with pytest.raises(ConfigError, match=r"task.yaml:\d+:\d+: rewards.bad: size 5 is more than 3"):

@@ -9,6 +9,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+import torch
 from support.broken_plugins import BROKEN, FILES
 
 from rlcli.registry import catalog
@@ -224,6 +225,26 @@ def test_probe_of_many_hanging_plugins_takes_little_more_than_one(plugins):
     assert time.monotonic() - before < 40
     reasons = [rows[entry.qualified].broken for entry in entries if entry.distribution == "slow0"]
     assert reasons == ["did not load within 5 s"] * 2 + ["not loaded, because 2 others did not load within 5 s"] * 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "torch.set_default_dtype(torch.float64)",
+        "torch.set_default_dtype(torch.float16)",
+        "torch.set_default_device('meta')",
+        "torch.set_grad_enabled(False)",
+    ],
+)
+def test_plugin_that_changes_settings_of_torch_changes_no_training(plugins, command, change):
+    from support.broken_plugins import FILES, SPEC
+
+    plugins("sets", f"import torch\n{change}\n{SPEC}", files=FILES)
+    done = command("train", "sets-task", "--num-envs", "2", "--max-iterations", "1", "--logger", "none", "--json")
+    assert "has changed torch's default type, default device or gradient mode; undone" in done.stderr
+    assert document(done)["state"] == "finished"
+    assert (torch.get_default_dtype(), str(torch.get_default_device())) == (torch.float32, "cpu")
+    assert torch.is_grad_enabled()
 
 
 ENDS = {

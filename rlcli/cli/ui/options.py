@@ -17,6 +17,7 @@ from rlcli.cli.ui.completion import agents, checkpoints, runs, tasks, words
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.help_text import METAVARS, HelpCommand, read_docstring
 from rlcli.errors import MachineError, UsageError
+from rlcli.registry.task_code import raised_by_task
 from rlcli.safe_text import MAX_SEED, read_number
 
 CHOOSE = "auto"
@@ -106,10 +107,14 @@ _NEEDED = {
 """Option -> the parameter without which a command ignores it, and how the user writes that parameter."""
 
 
-class BodyError(Exception):
-    """Carrier of an error in the body of a command that typer would mistake for a closed pipe or for Ctrl-D."""
+TYPER_ERRORS = (OSError, EOFError, typer.Exit, typer.Abort, typer.BadParameter)
+"""Exceptions that typer takes for its own; code of a task may raise them, too."""
 
-    def __init__(self, error: OSError | EOFError) -> None:
+
+class BodyError(Exception):
+    """Carrier of an error in the body of a command that typer would take for its own, such as that of a closed pipe."""
+
+    def __init__(self, error: Exception) -> None:
         self.error = error
         super().__init__()
 
@@ -161,8 +166,10 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
         try:
             with progress.track(f"rlcli {name}"):
                 function(**given)
-        except (OSError, EOFError) as error:
-            raise BodyError(error) from error
+        except TYPER_ERRORS as error:
+            if isinstance(error, OSError | EOFError) or raised_by_task(error):
+                raise BodyError(error) from error
+            raise
 
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
