@@ -3,6 +3,9 @@
 `python benchmarks/sabotage.py --seed 7 --jobs 2` runs the twelve sabotages, each with the trainers `ppo` and `sb3`, on
 tasks drawn by lot. It prints a Markdown table: sabotage, task, trainer, the checks that name it with the share of the
 budget, and the success rate at a quarter of the budget.
+
+`python benchmarks/sabotage.py --seed 7 --healthy 20` runs healthy trainings instead: those of the pages, and trainings
+of built-in tasks with agents, lengths and seeds drawn by lot. It prints the findings of each.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import argparse
 import concurrent.futures
 import json
 import random
+import re
 import subprocess
 import sys
 import tempfile
@@ -29,6 +33,28 @@ WEIGHTS = (1.0, -2.0, -1.0, -0.01, -0.005)
 SPEED = "joints: [slider_to_cart]"
 
 Patch = Callable[[], None]
+Words = list[str]
+"""Arguments of `rlcli train`."""
+
+REPOSITORY = Path(__file__).parents[1]
+PAGES = {
+    "README.md": ["./my_task"],
+    "docs/tutorials/first-task.md": ["./my_task"],
+    "docs/tutorials/direct-task.md": ["./my_arm"],
+    "docs/tutorials/first-plugin.md": ["./my-arm/my_arm"],
+    "docs/guides/gymnasium-and-sb3.md": ["./pole"],
+    "docs/guides/isaac-lab.md": ["./swing/swing_env_cfg.py:SwingEnvCfg", "--max-iterations", "50"],
+    "docs/tutorials/quickstart.md": ["cartpole"],
+}
+"""Page -> the training that it shows."""
+BUILT_IN = (
+    *[("cartpole", agent) for agent in ("sb3-ppo", "ppo", "sac", "td3", "rsl-rl")],
+    *[("cartpole-direct", agent) for agent in ("sb3-ppo", "ppo", "sac", "rl-games")],
+    *[("cart-double-pendulum", "ppo-1024"), ("ball-balance", "ppo-cpu"), ("quadcopter", "ppo-512")],
+    *[("crazyflie", "ppo-512"), ("ingenuity", "ppo-1024"), ("reach", "ppo-512"), ("reach-ik", "ppo-512")],
+    *[("ant", "sb3-ppo"), ("ant-direct", "sb3-ppo"), ("quadruped-flat", "ppo"), ("humanoid", "ppo")],
+)
+"""Built-in tasks and their agents."""
 
 
 def overrides(name: str, task: str, trainer: str) -> list[str]:
@@ -164,6 +190,48 @@ def table(seed: int, jobs: int, until: float) -> None:
             print(f"| {name} | {task} | {trainer} | {result.get('error') or named} | {success} |", flush=True)
 
 
+def draw_healthy(draw: random.Random, count: int) -> list[tuple[str, Words]]:
+    """Return the trainings of the pages, then trainings of built-in tasks: the page or task, and the arguments."""
+    cases = [(page, [*words, "--seed", str(draw.randrange(10**6))]) for page, words in PAGES.items()]
+    for task, agent in draw.sample(BUILT_IN, count - len(cases)):
+        words = [task, "--agent", agent, "--seed", str(draw.randrange(10**6))]
+        if agent == "rsl-rl" or task in ("quadruped-flat", "humanoid"):
+            words += ["--num-envs", "256"]
+        steps = round(10 ** draw.uniform(5.0, 6.2), -3)
+        short = task not in TASKS or agent in ("sac", "td3") or draw.random() < 0.5
+        cases.append((task, words + (["--max-steps", f"{steps:.0f}"] if short else [])))
+    return cases
+
+
+def train_healthy(page: str, words: Words) -> tuple[str, str]:
+    """Train in a folder with the files of a page; return the findings and the success rate at the end."""
+    with tempfile.TemporaryDirectory() as folder:
+        text = (REPOSITORY / page).read_text() if page.endswith(".md") else ""
+        for name, content in re.findall(r"^```\w+ file=(\S+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+            (Path(folder) / name).parent.mkdir(parents=True, exist_ok=True)
+            (Path(folder) / name).write_text(content)
+        command = [sys.executable, "-m", "rlcli", "train", *words, "--device", "cpu", "--logger", "none", "-q"]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        run = next(Path(folder).glob("runs/*/*/run.json"), None)
+        if done.returncode or run is None:
+            return f"error: {done.stderr[-300:]}", "-"
+        last = json.loads((run.parent / "metrics.jsonl").read_text().splitlines()[-1])
+        findings = json.loads(run.read_text()).get("health", [])
+        success = last.get("Train/success_rate")
+        named = "; ".join(f"{each['check']} at {each['iteration']}: {each['message']}" for each in findings)
+        return named or "-", "-" if success is None else f"{success:.1%}"
+
+
+def healthy_table(seed: int, jobs: int, count: int) -> None:
+    """Run healthy trainings and print what the checks report."""
+    cases = draw_healthy(random.Random(seed), count)
+    print(f"| healthy training (seed {seed}) | arguments | findings | success |\n|---|---|---|---|", flush=True)
+    with concurrent.futures.ThreadPoolExecutor(jobs) as pool:
+        futures = [pool.submit(train_healthy, *case) for case in cases]
+        for (page, words), future in zip(cases, futures, strict=True):
+            print(f"| {page} | `{' '.join(words)}` | {' | '.join(future.result())} |", flush=True)
+
+
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--child"]:
         child(*sys.argv[2:])
@@ -172,5 +240,9 @@ if __name__ == "__main__":
         parser.add_argument("--seed", type=int, default=7, help="seed of the lot and of the trainings")
         parser.add_argument("--jobs", type=int, default=2, help="trainings at a time")
         parser.add_argument("--until", type=float, default=QUARTER, help="share of the budget")
+        parser.add_argument("--healthy", type=int, default=0, metavar="N", help="run N healthy trainings instead")
         arguments = parser.parse_args()
-        table(arguments.seed, arguments.jobs, arguments.until)
+        if arguments.healthy:
+            healthy_table(arguments.seed, arguments.jobs, arguments.healthy)
+        else:
+            table(arguments.seed, arguments.jobs, arguments.until)

@@ -22,6 +22,8 @@ _TIMES = 40
 """Number of times in a training at which the checks run."""
 _MIN_ITERATIONS = 8
 """Number of iterations before the first check."""
+_MIN_VALUES = 6
+"""Number of a metric's values from which on its change is known: the first three and the last three differ."""
 _SOLVED = 0.3
 """Success rate above which only defects are reported, not signs of slow learning."""
 _AT = 1e-3
@@ -184,8 +186,10 @@ def no_reward(health: Health) -> Found:
 
 def no_progress(health: Health) -> Found:
     """Report that neither return, reward terms, episode length nor values of success conditions have changed."""
+    if len(health.values(RETURN)) < _MIN_VALUES:  # few iterations end episodes if all of them end by time-out
+        return
     watched = [RETURN, LENGTH, *health.names("Episode_Reward/"), *health.names("Success_Value/")]
-    solved = max(health.values(SUCCESS), default=0.0) >= _SOLVED or not health.values(RETURN) or health.is_above_start()
+    solved = max(health.values(SUCCESS), default=0.0) >= _SOLVED or health.is_above_start()
     if not solved and health.struggles(0.15) and all(abs(health.change(name)) < 1.0 for name in watched):
         value = statistics.fmean(health.last(RETURN)) if health.values(RETURN) else 0.0
         done = f"the first {health.progress:.0%} of the training"

@@ -86,6 +86,18 @@ def test_progress_in_the_first_iterations_counts():
     assert "no-progress" not in findings(early, until=0.5)
 
 
+@pytest.mark.parametrize(("every", "named"), [(19, False), (10, True)])
+def test_progress_is_unknown_while_few_iterations_end_episodes(every, named):
+    """All episodes end by time-out at the same time: 80 iterations have 4 or 8 values of the return."""
+    resolved = resolve(find_task("cartpole"), agent="ppo")
+    health = Health(resolved.task, resolved.agent, ITERATIONS)
+    for iteration in range(1, ITERATIONS + 1):
+        metrics = {"Train/mean_reward": 0.01 + 1e-6 * iteration, "Train/mean_episode_length": 300.0}
+        ended = {"Episode_Termination/time_out": 1.0} if iteration % every == 0 else {}
+        health.add(iteration, {**metrics, **ended})
+    assert ("no-progress" in [finding.check for finding in health.findings]) is named
+
+
 def test_adaptive_learning_rate_at_its_floor_is_found():
     changes = {**FAILING, "Loss/learning_rate": lambda i: 1e-5}
     assert "learning-rate-floor" in findings(changes, "agent.schedule=adaptive")
