@@ -10,11 +10,17 @@ import functools
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
 cross: Callable[..., Tensor] = torch.linalg.cross
 """Cross product; this annotation adds the types that torch lacks. (..., 3), (..., 3) -> (..., 3)"""
+
+# Numbers as tensors: torch makes a tensor of a Python number at each use, which takes longer than the product. As with
+# Python numbers, the result has the type of the other operand, and may be on any device.
+_TURNS_PER_RAD = torch.tensor(0.5 / math.pi, dtype=torch.float64)
+_RAD_PER_TURN = torch.tensor(2.0 * math.pi, dtype=torch.float64)
 
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:
@@ -42,9 +48,9 @@ def _product(left: Tensor, right: Tensor, signs: Tensor) -> Tensor:
     All 16 products are computed at once and added in order: the time of a small tensor is that of its operations.
     """
     if left.dim() != 2 or left.shape != right.shape:
-        shape = torch.broadcast_shapes(left.shape, right.shape)
-        rows = (quat.expand(shape).reshape(-1, 4) for quat in (left, right))
-        return _product(*rows, signs).reshape(shape)
+        shape = np.broadcast_shapes(left.shape, right.shape)
+        left, right = left.expand(shape).reshape(-1, 4), right.expand(shape).reshape(-1, 4)
+        return _product(left, right, signs).reshape(shape)
     first, second = _product_tables(left.device)[:2]
     factors = left.mT.contiguous().index_select(0, first), right.mT.contiguous().index_select(0, second)
     w, x, y, z = torch.mul(*factors).mul_(signs).chunk(4)
@@ -209,5 +215,5 @@ def yaw_only(quat: Tensor) -> Tensor:
 
 def wrap_to_pi(angle: Tensor) -> Tensor:
     """Return the same angle in [-pi, pi] [rad]; an angle in this range is returned unchanged."""
-    turns = (angle * (0.5 / math.pi)).round_()
-    return torch.sub(angle, turns.mul_(2.0 * math.pi))
+    turns = (angle * _TURNS_PER_RAD).round_()
+    return torch.sub(angle, turns.mul_(_RAD_PER_TURN))
