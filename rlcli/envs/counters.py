@@ -120,7 +120,7 @@ class EpisodeCounters(TensorState):
         """
         if not self.conditions:
             return {"success": None}
-        held = {each.name: ended.read_view(each.field) >= each.hold_steps for each in self.conditions}
+        held = {each.name: ended.read(each.field >= each.hold_steps) for each in self.conditions}
         values = {each.name: ended.read(each.value) for each in self.conditions if each.bounded}
         success = functools.reduce(torch.logical_and, held.values(), timed_out)
         return {"success": success, "conditions": held, "condition_values": values}

@@ -316,7 +316,8 @@ class DirectEnv(VecEnv):
 
     def _compute_final_obs(self) -> dict[str, Tensor]:
         self._final_obs.copy_(self.task.obs_buf)
-        self._final_states.copy_(self.task.states_buf)
+        if self.task.num_states:
+            self._final_states.copy_(self.task.states_buf)
         return self._checked_group(self._final_obs, self._final_states, "last ")
 
     def _episode_returns_and_causes(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:

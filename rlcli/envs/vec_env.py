@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Mapping
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -132,6 +133,7 @@ class VecEnv(Workflow):
         self._reset_envs(self._select_all())
         return self._observe()
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a simulation that diverges; the guard finds it
     def step(self, action: Tensor, restart: Tensor | None = None) -> StepResult:
         """Apply one action for `decimation` physics steps; for arguments and errors see `Environment.step`.
 

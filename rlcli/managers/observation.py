@@ -75,7 +75,7 @@ class ObservationManager(TensorState):
         draws = self._draws(_FINAL)
         for name, group in self.groups.items():
             for pipeline, view in zip(group.pipelines, self._final_views[name], strict=True):
-                if rows is None or pipeline.has_memory:
+                if rows is None or pipeline.has_memory or pipeline.is_plain:
                     pipeline.write(view, draws, self._fresh, False)
                 else:
                     pipeline.write_rows(view, rows, _FINAL)

@@ -26,6 +26,9 @@ Sampler = Callable[[Selection], Tensor]
 _BIAS, _LAG, _REDRAW, _REDRAWN = (np.uint64(0x4F42_5330 + i) for i in range(4))
 """Salts of a term's further random streams, for its bias and its delay; a salt is combined with the stream by xor."""
 
+_FEW_COLUMNS = 64
+"""Largest size of a plain observation: to copy 512 environments takes less time than to select a few of them."""
+
 
 class Stage:
     """Base class of the operations on an observation term's value: noise, scale, delay ..."""
@@ -88,6 +91,11 @@ class Pipeline:
     def size(self) -> int:
         """Number of columns that the term has in its observation group."""
         return self.width * self.history
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the observation is a few columns that are only copied: faster for all environments than for some."""
+        return not self._stages and self.size <= _FEW_COLUMNS
 
     @property
     def has_memory(self) -> bool:

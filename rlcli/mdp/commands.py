@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rlcli.mdp.term import EntityTerm, Term
-from rlcli.mdp.term_helpers import goal_in_world, goal_quat_in_world
+from rlcli.mdp.term_helpers import distance_to_goal, goal_in_world, goal_quat_in_world
 from rlcli.scene.mirror import QUATERNION, VECTOR
 from rlcli.sim.env_selection import Selection, one_column
 from rlcli.sim.markers import ACTUAL, COMMANDED, Arrow, Color, Frame, Marker, Sphere
@@ -235,13 +235,11 @@ class UniformPose(EntityTerm):
 
     def metrics(self) -> dict[str, Tensor]:
         """Return the distance [m] and the angle [rad] between the body and its goal. (num_envs,) each"""
-        (target, target_quat), (position, quat) = self.pose_w, self.body_pose_w
-        dx, dy, dz = (target - position).unbind(1)
-        alike = (target_quat * quat).unbind(1)
-        cosine = (alike[0] + alike[1] + alike[2] + alike[3]).abs().clamp(max=1.0)
+        w, x, y, z = (goal_quat_in_world(self.entity, self) * self.body_pose_w[1]).unbind(1)
+        cosine = (w + x).add_(y).add_(z).abs_().clamp_(max=1.0)
         return {
-            "position_error": (dx.square() + dy.square() + dz.square()).sqrt(),
-            "orientation_error": 2.0 * torch.acos(cosine),
+            "position_error": distance_to_goal(self.entity, self.bodies, self),  # rewards read the same distance
+            "orientation_error": cosine.acos_().mul_(2.0),
         }
 
     def markers(self) -> list[Marker]:

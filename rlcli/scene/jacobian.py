@@ -62,7 +62,9 @@ def sums_of_products(left: Tensor, right: Tensor) -> Tensor:
     For each environment, which is the last dimension, this is a matrix product. On a CPU it takes a third of the time
     of `torch.bmm`, and rounds like it: the products are added to 0 in order.
     """
-    total = (left[0, :, None] * right[0]).add_(0.0)
-    for one, other in zip(left[1:].unbind(), right[1:].unbind(), strict=True):
-        total += one[:, None] * other
+    columns, rows = left[:, :, None].unbind(), right[:, None].unbind()
+    total = (columns[0] * rows[0]).add_(0.0)
+    product = torch.empty_like(total)
+    for column, row in zip(columns[1:], rows[1:], strict=True):
+        total += torch.mul(column, row, out=product)
     return total

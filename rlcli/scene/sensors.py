@@ -50,6 +50,7 @@ class ContactSensor(TensorState):
         self._times = torch.zeros(n, len(_TIMES), k, device=device)
         self._flags = torch.zeros(n, len(_FLAGS), k, dtype=torch.bool, device=device)
         times, flags = self._times.unbind(1), self._flags.unbind(1)
+        self._running_times = self._times[:, :2]
         self.force_history = torch.zeros(n, spec.config.history, k, 3, device=device)
         """Net contact force on each body over the last steps, newest first, world frame. (num_envs, h, k, 3) [N]"""
         self.force = self.force_history[:, 0]
@@ -76,12 +77,13 @@ class ContactSensor(TensorState):
         force, found = self._measure(self._sim.derived_field("sensordata"))
         self.force.copy_(force)
         self.found.copy_(found)
-        torch.logical_and(found, self.air_time > 0.0, out=self.first_contact)
-        torch.logical_and(~found, self.contact_time > 0.0, out=self.first_air)
-        self._times[:, :2] += dt
+        in_air = ~found
+        torch.logical_and(found, self.air_time, out=self.first_contact)  # a time that is not 0 counts as true
+        torch.logical_and(in_air, self.contact_time, out=self.first_air)
+        self._running_times.add_(dt)
         torch.where(self.first_contact, self.air_time, self.last_air_time, out=self.last_air_time)
         torch.where(self.first_air, self.contact_time, self.last_contact_time, out=self.last_contact_time)
-        self.air_time *= ~found
+        self.air_time *= in_air
         self.contact_time *= found
 
     def reset(self, selection: Selection) -> None:

@@ -68,5 +68,5 @@ class FlightTask(DirectTask):
     def move_target(self) -> None:
         """Set the target of the next step."""
         phase = (self.progress_buf // self.params.target_period).clamp_(max=self.targets.shape[1] - 1)
-        self.target.copy_(self.targets.gather(1, phase[:, None, None].expand(-1, 1, 3)).squeeze(1))
+        torch.gather(self.targets, 1, phase.view(-1, 1, 1).expand(-1, 1, 3), out=self.target.unsqueeze(1))
         self.env.engine.field("mocap_pos")[:, self.goal.mocap].copy_(self.target)
