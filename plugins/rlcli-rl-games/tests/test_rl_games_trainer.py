@@ -159,10 +159,10 @@ def test_oige_settings_reach_rl_games():
     assert resolved.agent.params.config.minibatch_size == 8192
 
 
-def test_agent_with_a_separate_critic_differs_from_oige_in_three_numbers():
-    oige, separate = (
-        resolve(find_task("cartpole-direct"), agent=name).agent.params for name in ("rl-games", "rl-games-separate")
-    )
+def test_agent_with_a_separate_critic_differs_from_oige_in_four_settings():
+    agents = [resolve(find_task("cartpole-direct"), agent=name).agent for name in ("rl-games", "rl-games-separate")]
+    assert [agent.max_iterations for agent in agents] == [100, 150]
+    oige, separate = (agent.params for agent in agents)
     assert (oige.network.separate, separate.network.separate) == (False, True)
     changed = {"lr_schedule": "linear", "learning_rate": 1e-2}
     assert separate.config.model_dump() == {**oige.config.model_dump(), **changed}
