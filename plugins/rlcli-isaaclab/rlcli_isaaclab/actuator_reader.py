@@ -54,6 +54,9 @@ def read_actuators(
         elif is_user_actuator(item.data.get("class_type")):
             own[entity, group] = item.data
             item.skip(*item.data)
+            if item.data["class_type"].is_implicit_model:
+                why = "rlcli computes efforts before each physics step; PhysX integrates the drive implicitly"
+                item.note("approximated", "class_type", why)
             config = {"joints": order_joints(patterns, item), "kind": "pd"}
             models[group] = to_plain(config | {key: value for key, value in gains.items() if value is not None})
             settings = {**passive, "velocity_limit": item.get("velocity_limit")}

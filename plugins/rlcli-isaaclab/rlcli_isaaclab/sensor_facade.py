@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
-from rlcli.scene.names import match
+from rlcli.scene.names import NameProblem, match
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
 from rlcli_isaaclab.absent import absence, user_place
 from rlcli_isaaclab.sensor_reader import image_name
@@ -285,6 +285,9 @@ def find_elements(
     wanted: Any, candidates: Any, names: list[str], kind: str, preserve_order: bool
 ) -> tuple[list[int], list[str]]:
     """Return indices into `names`, and the names, of the candidates that names or regexes match."""
-    indices = [names.index(candidates[i]) for i in match(wanted, list(candidates), kind)]
+    try:
+        indices = [names.index(candidates[i]) for i in match(wanted, list(candidates), kind)]
+    except NameProblem as problem:
+        raise NameProblem(f"{user_place()}{problem}", problem.hint) from None
     indices = indices if preserve_order else sorted(indices)
     return indices, [names[i] for i in indices]

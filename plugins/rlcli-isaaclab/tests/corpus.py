@@ -32,6 +32,7 @@ OUTSIDE = ("pick_place",)
 
 def tasks(package: Path) -> dict[str, dict[str, Any]]:
     """Return ID -> arguments of every task that a package registers."""
+    from rlcli.registry.failed_imports import take_failures
     from rlcli.registry.task_imports import import_file, registrations
 
     import_file(package / "__init__.py")
@@ -41,6 +42,7 @@ def tasks(package: Path) -> dict[str, dict[str, Any]]:
                 import_file(file)
             except Exception as error:
                 print(f"{file}: {type(error).__name__}: {error}")
+    print(*take_failures(), sep="\n", flush=True)
     return dict(sorted(registrations.items()))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli_isaaclab import mdp
-from rlcli_isaaclab.config_class import MISSING, configclass, to_dict
+from rlcli_isaaclab.config_class import MISSING, configclass, fill_missing, to_dict
 from rlcli_isaaclab.runtime import ManagerBasedRLEnv
 from rlcli_isaaclab.sim import SimulationCfg
 
@@ -49,6 +49,8 @@ class ManagerBasedEnvCfg:
     teleop_devices: Any = None
     export_io_descriptors: bool = False
     log_dir: Any = None
+
+    __rlcli_fill__ = fill_missing
 
     def __rlcli_environment__(self, entry: Any) -> None:
         """Store the environment class that the task's Gymnasium registration names, as a class or `module:Class`."""
