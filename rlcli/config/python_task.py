@@ -294,6 +294,11 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     """
     module = import_file(source.root / "__init__.py")
     wanted = str(source.python).removeprefix(str(source.root)).removeprefix(":")
+    if wanted and wanted not in registrations:  # a package need not import those below it that register tasks
+        for file in sorted(source.root.rglob("__init__.py")):
+            text = file.read_bytes()
+            if b"register(" in text and wanted.encode() in text:
+                import_file(file)
     found = {
         name: kwargs
         for name, kwargs in registrations.items()

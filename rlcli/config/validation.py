@@ -74,8 +74,7 @@ class TaskCheck:
     functions: dict[str, Signature] = field(default_factory=dict)
     """Own terms of a configuration in Python, by name."""
     notes: list[Note] = field(default_factory=list)
-    filled: list[Path] = field(default_factory=list)
-    """Changes that the configuration in Python has received."""
+    filled: list[Path] = field(default_factory=list)  # paths of the changes that the configuration has received
     format: formats.Format | None = None
     place: str = ""
     """File and line of a configuration's class in another framework's form; empty for others."""
@@ -201,8 +200,7 @@ class TaskCheck:
         if name is None:
             self._report_no_agent(origin(()).where)
         elif not isinstance(patch, dict):
-            where = origin(()).where
-            self.add(Problem(where, "agent", f"expected a mapping, found {messages.format_value(patch)}"))
+            self.add(Problem(origin(()).where, "agent", f"expected a mapping, found {messages.format_value(patch)}"))
         else:
             self.layers.merge(patch, origin, ("agents", name))
 

@@ -232,6 +232,14 @@ def test_file_that_its_package_imports_under_another_name_is_imported_once(tmp_p
     assert len({id(sys.modules[name]) for name in names}) == 1
 
 
+def test_task_that_only_a_package_below_registers(tmp_path):
+    (tmp_path / "carts" / "tasks").mkdir(parents=True)
+    write(tmp_path / "carts" / "tasks" / "balance")
+    for folder in ("carts", "carts/tasks"):
+        (tmp_path / folder / "__init__.py").write_text("")
+    assert resolve(find_task(f"{tmp_path / 'carts'}:Template-Cartpole-v0")).task.rewards
+
+
 MOTION = """
 from dataclasses import MISSING
 
