@@ -53,6 +53,8 @@ def task(
     terms.record_driven_joints(top.node("actions"))
     config["actions"] = {name: terms.read_action(node) for name, node in top.node("actions").nodes()}
     config["observations"] = {name: terms.read_group(node) for name, node in top.node("observations").nodes()}
+    if "policy" not in config["observations"] and "actor" in config["observations"]:
+        config["observations"]["policy"] = config["observations"].pop("actor")  # the name in RSL-RL 5
     for section in ("events", "rewards", "terminations", "curriculum"):
         terms_of_section = (terms.read_terms(section, *member) for member in top.node(section).nodes())
         config[section] = {name: term for pairs in terms_of_section for name, term in pairs}
@@ -143,7 +145,7 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         }
     groups = top.get("obs_groups")
     if isinstance(groups, Mapping):
-        if list(groups.get("policy", ["policy"])) != ["policy"]:
+        if list(groups.get("policy", groups.get("actor", ["policy"]))) not in (["policy"], ["actor"]):
             top.note("ignored", "obs_groups", "the actor observes the group 'policy'; other groups are left out")
         if groups.get("critic"):
             config["critic_obs"] = list(groups["critic"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from rlcli.config.python_task import source_of
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
+from rlcli.registry import is_framework, load_object
 from rlcli_isaaclab.manager_facade import (
     ActionManagerFacade,
     CommandManagerFacade,
@@ -38,8 +40,6 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
     def __init__(self, cfg: Any = None, render_mode: str | None = None, **kwargs: Any) -> None:
         if cfg is None:
-            from rlcli.registry import load_object
-
             entry = kwargs["env_cfg_entry_point"]
             cfg = load_object(entry) if isinstance(entry, str) else entry
         cfg = cfg() if isinstance(cfg, type) else cfg
@@ -71,6 +71,10 @@ class ManagerBasedRLEnv(gymnasium.Env):
         if name.startswith("_") or name in ("managed", "cfg"):
             raise AttributeError(name)
         if not hasattr(self.managed, name):
+            for kind in _own_classes(getattr(self.cfg, "_rlcli_class", None)):
+                if name in vars(kind):
+                    member = vars(kind)[name]
+                    return member.__get__(self, type(self)) if hasattr(member, "__get__") else member
             if name.endswith("_manager") and name in dir(type(self)):
                 raise AttributeError(
                     f"env has no '{name}' yet: use it only in reset() and __call__(), not in __init__()"
@@ -248,6 +252,19 @@ class ManagerBasedRLEnv(gymnasium.Env):
         if name not in self._manager_facades or self._manager_facades[name]._manager is not manager:
             self._manager_facades[name] = kind(manager)
         return self._manager_facades[name]
+
+
+@functools.cache
+def _own_classes(entry: Any) -> tuple[type, ...]:
+    """Return the task's own environment class and its bases, by the class or its name; empty if it has none."""
+    if entry in (None, OWN_CLASS):
+        return ()
+    found = load_object(entry) if isinstance(entry, str) else entry
+    return tuple(kind for kind in getattr(found, "__mro__", ()) if not is_framework(kind.__module__))
+
+
+OWN_CLASS = "isaaclab.envs:ManagerBasedRLEnv"
+"""Isaac Lab's environment class in a registration with Gymnasium."""
 
 
 def facade_of(managed: VecEnv) -> ManagerBasedRLEnv:

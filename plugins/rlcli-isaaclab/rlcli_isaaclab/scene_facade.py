@@ -368,4 +368,4 @@ class Scene(Mapping[str, Any]):
             # as in Isaac Lab, a regex that matches all gives their ids, and only a list of all names gives a slice
             is_slice = not isinstance(wanted, str) and list(wanted) == list(names)
             setattr(cfg, f"{kind}_names", matched)
-            setattr(cfg, f"{kind}_ids", slice(None) if is_slice else torch.tensor(ids, device=self._env.device))
+            setattr(cfg, f"{kind}_ids", slice(None) if is_slice else torch.tensor(ids, device=self._env.device).long())

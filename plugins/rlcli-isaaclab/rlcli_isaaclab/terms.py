@@ -11,9 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from rlcli.config.schema import Names, Number, StrictModel
@@ -41,15 +42,18 @@ _PLAIN: dict[Any, Any] = {float: Number, int: int | Number, bool: bool, str: str
 """Type in a function's signature -> type of the key. Isaac Lab checks no types: `int` also takes 0.5."""
 
 
+_Nothing = Annotated[list[str], Field(max_length=0)]
+
+
 class EntityModel(StrictModel):
     """`SceneEntityCfg` in the form that a YAML file has."""
 
     name: str
     """Name of an entity or sensor."""
-    joint_names: Names | None = None
-    """Names or regexes of joints; null: all."""
-    body_names: Names | None = None
-    """Names or regexes of bodies; null: all."""
+    joint_names: Names | _Nothing | None = None
+    """Names or regexes of joints; null: all; []: none."""
+    body_names: Names | _Nothing | None = None
+    """Names or regexes of bodies; null: all; []: none."""
     preserve_order: bool = False
     """Whether to keep the written order instead of the model's."""
 

@@ -246,7 +246,7 @@ def mjcf(
         or ("base" if joints else (bodies or [name])[0])
     )
     rest = [b for b in bodies if b != root]
-    owned = {joint: (rest.pop(0) if rest else f"moved_{joint}") for joint in joints}
+    owned = {joint: (rest.pop(0) if rest else f"of_{joint}_moved") for joint in joints}
     fixed = "".join(
         f'<body name="{b}" pos="{0.1 * (i % 5)} {0.1 * (i // 5)} -0.1"><geom size="0.02" mass="0.05"/></body>'
         for i, b in enumerate(rest)

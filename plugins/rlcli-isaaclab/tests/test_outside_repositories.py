@@ -145,6 +145,19 @@ def test_regex_of_all_bodies_gives_ids_and_a_list_of_all_names_gives_a_slice(tmp
     stepped(rover(tmp_path / "rover", CHOSEN, rewards={"own": term}))
 
 
+NONE = """
+def none(env, asset_cfg):
+    return env.scene["robot"].data.body_pos_w[:, asset_cfg.body_ids].sum(dim=(1, 2)) + 1.0
+"""
+
+
+def test_empty_list_of_bodies_selects_none(tmp_path):
+    entity = "SceneEntityCfg('robot', body_names=[])"
+    term = f"RewardTermCfg(func=none, weight=1.0, params={{'asset_cfg': {entity}}})"
+    _, result = stepped(rover(tmp_path / "rover", NONE, rewards={"own": term}))
+    assert result.reward.tolist() == pytest.approx([0.02] * 4)
+
+
 RAYS = """
 from isaaclab.assets import AssetBaseCfg
 from isaaclab.sensors import RayCasterCfg, patterns
@@ -240,6 +253,31 @@ def test_task_that_only_a_package_below_registers(tmp_path):
     assert resolve(find_task(f"{tmp_path / 'carts'}:Template-Cartpole-v0")).task.rewards
 
 
+PHASE = """
+from isaaclab.envs import ManagerBasedRLEnv
+
+class RoverEnv(ManagerBasedRLEnv):
+    period = 0.5
+
+    def phase(self):
+        return self.episode_length_buf * self.step_dt / self.period
+
+def in_phase(env):
+    return env.phase()
+"""
+
+
+def test_term_calls_a_method_of_the_own_environment_class(tmp_path):
+    reward = {"own": "RewardTermCfg(func=in_phase, weight=1.0)"}
+    rover(tmp_path / "rover", PHASE, rewards=reward)
+    file = tmp_path / "rover" / "rover_env.py"
+    register = "gymnasium.register('Pond-v0', entry_point=f'{__name__}:RoverEnv', kwargs={'env_cfg_entry_point': %s})"
+    file.write_text(f"{file.read_text()}\nimport gymnasium\n{register % 'RoverEnvCfg'}\n")
+    (tmp_path / "rover" / "__init__.py").write_text("from . import rover_env  # register(\n")
+    _, result = stepped(resolve(find_task(f"{tmp_path / 'rover'}:Pond-v0")))
+    assert result.reward.tolist() == pytest.approx([0.02 * 3 * 0.02 / 0.5] * 4)
+
+
 MOTION = """
 from dataclasses import MISSING
 
@@ -278,3 +316,31 @@ def test_missing_and_empty_names_of_bodies_name_key_and_line(tmp_path):
     env.reset()
     with pytest.raises(NameProblem, match=r"rover_env.py:\d+: no body matches ''"):
         env.step(torch.zeros(4, env.layout.action_size))
+
+
+RUNNER = """
+from isaaclab.utils import configclass
+from isaaclab_rl.rsl_rl import RslRlMLPModelCfg, RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
+
+@configclass
+class RunnerCfg(RslRlOnPolicyRunnerCfg):
+    num_steps_per_env, max_iterations, save_interval, experiment_name = 8, 1, 1, "rover"
+    obs_groups = {"actor": ["actor"], "critic": ["actor"]}
+    distribution = RslRlMLPModelCfg.GaussianDistributionCfg(init_std=0.5)
+    actor = RslRlMLPModelCfg(hidden_dims=[8], activation="elu", distribution_cfg=distribution)
+    critic = RslRlMLPModelCfg(hidden_dims=[16], activation="elu")
+    algorithm = RslRlPpoAlgorithmCfg(
+        value_loss_coef=1.0, use_clipped_value_loss=True, clip_param=0.2, entropy_coef=0.01, num_learning_epochs=2,
+        num_mini_batches=2, learning_rate=1e-3, schedule="adaptive", gamma=0.99, lam=0.95, desired_kl=0.01,
+        max_grad_norm=1.0,
+    )
+"""
+
+
+def test_runner_of_rsl_rl_5_with_its_observation_group(tmp_path):
+    rover(tmp_path / "rover", "", [("policy: Policy = Policy()", "actor: Policy = Policy()")])
+    (tmp_path / "rover" / "agents").mkdir()
+    (tmp_path / "rover" / "agents" / "rsl_rl_cfg.py").write_text(RUNNER)
+    resolved = resolve(find_task(f"{tmp_path / 'rover' / 'rover_env.py'}:RoverEnvCfg"))
+    assert list(resolved.task.observations) == ["policy"]
+    assert (resolved.agent.init_std, resolved.agent.critic.hidden) == (0.5, (16,))
