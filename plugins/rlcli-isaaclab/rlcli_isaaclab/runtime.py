@@ -39,6 +39,8 @@ class ManagerBasedRLEnv(gymnasium.Env):
     metadata = {"render_modes": [None]}  # noqa: RUF012  (gymnasium's)
 
     def __init__(self, cfg: Any = None, render_mode: str | None = None, **kwargs: Any) -> None:
+        if "managed" in self.__dict__:  # `__init__` of the task's own class, called when a term uses the class
+            return
         if cfg is None:
             entry = kwargs["env_cfg_entry_point"]
             cfg = load_object(entry) if isinstance(entry, str) else entry
@@ -59,6 +61,8 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
     managed: Any
     cfg: Any
+    _own: Any
+    """Object of the task's own environment class; it is created when a term first uses a member of the class."""
     extras: dict[str, Any]
     selection: Any = None
     """The environments for which a term is called; None outside of such a call."""
@@ -71,10 +75,13 @@ class ManagerBasedRLEnv(gymnasium.Env):
         if name.startswith("_") or name in ("managed", "cfg"):
             raise AttributeError(name)
         if not hasattr(self.managed, name):
-            for kind in _own_classes(getattr(self.cfg, "_rlcli_class", None)):
-                if name in vars(kind):
-                    member = vars(kind)[name]
-                    return member.__get__(self, type(self)) if hasattr(member, "__get__") else member
+            own = _own_class(getattr(self.cfg, "_rlcli_class", None))
+            if own is not None and "_own" not in self.__dict__:
+                self.__dict__["_own"] = own.__new__(own)
+                self._own.__dict__ = self.__dict__  # the object has the attributes of the environment
+                self._own.__init__(self.cfg)
+            if own is not None and (name in self.__dict__ or hasattr(own, name)):
+                return getattr(self._own, name)
             if name.endswith("_manager") and name in dir(type(self)):
                 raise AttributeError(
                     f"env has no '{name}' yet: use it only in reset() and __call__(), not in __init__()"
@@ -255,12 +262,11 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
 
 @functools.cache
-def _own_classes(entry: Any) -> tuple[type, ...]:
-    """Return the task's own environment class and its bases, by the class or its name; empty if it has none."""
-    if entry in (None, OWN_CLASS):
-        return ()
-    found = load_object(entry) if isinstance(entry, str) else entry
-    return tuple(kind for kind in getattr(found, "__mro__", ()) if not is_framework(kind.__module__))
+def _own_class(entry: Any) -> type | None:
+    """Return the task's own environment class, by the class or its name; None if it is not ours or not known."""
+    found = load_object(entry) if isinstance(entry, str) and entry != OWN_CLASS else entry
+    own = isinstance(found, type) and issubclass(found, ManagerBasedRLEnv) and not is_framework(found.__module__)
+    return found if own else None
 
 
 OWN_CLASS = "isaaclab.envs:ManagerBasedRLEnv"

@@ -1,6 +1,7 @@
 """Code of repositories that are built on Isaac Lab: their packages, term objects, actuators and sensors."""
 
 import logging
+import shutil
 import sys
 import warnings
 
@@ -257,10 +258,13 @@ PHASE = """
 from isaaclab.envs import ManagerBasedRLEnv
 
 class RoverEnv(ManagerBasedRLEnv):
-    period = 0.5
+    def __init__(self, cfg, render_mode=None, **kwargs):
+        self.period = 0.5
+        super().__init__(cfg, render_mode, **kwargs)
+        self.offset = torch.ones(self.num_envs)
 
     def phase(self):
-        return self.episode_length_buf * self.step_dt / self.period
+        return self.offset + self.episode_length_buf * self.step_dt / self.period
 
 def in_phase(env):
     return env.phase()
@@ -270,12 +274,13 @@ def in_phase(env):
 def test_term_calls_a_method_of_the_own_environment_class(tmp_path):
     reward = {"own": "RewardTermCfg(func=in_phase, weight=1.0)"}
     rover(tmp_path / "rover", PHASE, rewards=reward)
-    file = tmp_path / "rover" / "rover_env.py"
+    package = shutil.copytree(tmp_path / "rover", tmp_path / "pond")
+    file = package / "rover_env.py"
     register = "gymnasium.register('Pond-v0', entry_point=f'{__name__}:RoverEnv', kwargs={'env_cfg_entry_point': %s})"
     file.write_text(f"{file.read_text()}\nimport gymnasium\n{register % 'RoverEnvCfg'}\n")
-    (tmp_path / "rover" / "__init__.py").write_text("from . import rover_env  # register(\n")
-    _, result = stepped(resolve(find_task(f"{tmp_path / 'rover'}:Pond-v0")))
-    assert result.reward.tolist() == pytest.approx([0.02 * 3 * 0.02 / 0.5] * 4)
+    (package / "__init__.py").write_text("from . import rover_env\n")
+    _, result = stepped(resolve(find_task(f"{package}:Pond-v0")))
+    assert result.reward.tolist() == pytest.approx([0.02 * (1.0 + 3 * 0.02 / 0.5)] * 4)
 
 
 MOTION = """
