@@ -212,6 +212,8 @@ def _joint_config(
         key: key of the joint in the report.
         report: receives what is approximated.
     """
+    if values.get("effort_limit") == 0.0:  # the drive of a passive joint has no effort
+        values = {name: value for name, value in values.items() if name not in ("effort_limit", "stiffness", "damping")}
     stiffness, viscous = values.pop("stiffness", 0.0), values.pop("viscous_friction", 0.0)
     if stiffness and command in ("effort", "motor"):
         values = {"stiffness": stiffness, **values}

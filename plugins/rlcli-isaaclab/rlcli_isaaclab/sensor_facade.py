@@ -219,7 +219,6 @@ class Sensor:
         "net_forces_w_history": "force_history",
         "current_air_time": "air_time",
         "current_contact_time": "contact_time",
-        "ray_hits_w": "hits",
         "pos_w": "position",
     }
 
@@ -251,6 +250,11 @@ class Sensor:
             known = sorted({n for n in (*dir(self._sensor), *self._NAMES) if not n.startswith("_")})
             hint = did_you_mean(name, known) or f"its attributes: {listing(known, 40)}"
             raise AttributeError(f"{user_place()}a sensor of rlcli has no '{name}'; {hint}") from None
+
+    @property
+    def ray_hits_w(self) -> Tensor:
+        """End points of the rays, world frame, contiguous as in Isaac Lab. (num_envs, rays, 3) [m]"""
+        return self._sensor.hits.contiguous()
 
     @property
     def num_rays(self) -> int:

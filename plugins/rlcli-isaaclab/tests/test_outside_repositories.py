@@ -89,6 +89,14 @@ def test_subclass_of_the_implicit_actuator_computes_the_efforts(tmp_path):
     assert env.entities["robot"].data.joint_pos[:, 0].mean() == pytest.approx(0.25, abs=0.03)
 
 
+def test_drive_without_effort_does_nothing(tmp_path):
+    own = ("stiffness=0.0, damping=2.0", "stiffness=0.0, damping=2.0, effort_limit=0.0")
+    action = ('    wheel = mdp.JointVelocityActionCfg(asset_name="robot", joint_names=["wheel"])\n', "")
+    resolved = rover(tmp_path / "rover", "", [own, action])
+    assert "wheel" not in (resolved.task.scene.entities["robot"].joints or {})
+    stepped(resolved)
+
+
 SHAPES = """
 def shapes(env):
     asset = env.scene["robot"]
@@ -175,6 +183,7 @@ class FanCfg:
 
 def distances(env):
     hits = env.scene["rays"].data.ray_hits_w
+    assert hits.clone().view(env.num_envs, -1).shape == (env.num_envs, 3 * env.scene["rays"].num_rays)
     return (hits - env.scene["rays"].data.pos_w[:, None]).norm(dim=-1).sum(dim=1)
 """
 LIDAR = (
