@@ -247,7 +247,7 @@ class Sensor:
         try:
             return getattr(self._sensor, self._NAMES.get(name, name))
         except AttributeError:
-            known = sorted({n for n in (*dir(self._sensor), *self._NAMES) if not n.startswith("_")})
+            known = sorted({n for n in (*dir(type(self)), *dir(self._sensor), *self._NAMES) if not n.startswith("_")})
             hint = did_you_mean(name, known) or f"its attributes: {listing(known, 40)}"
             raise AttributeError(f"{user_place()}a sensor of rlcli has no '{name}'; {hint}") from None
 
