@@ -116,6 +116,7 @@ def resolve(
     check = TaskCheck(source)
     changes = check.changes(overrides, flags or {})
     document = check.document(changes)
+    changes = [change for change in changes if change[0] not in check.filled]
     extra = read(config_file, pipe=True) if config_file else Document({})
     origin = document_origins(extra, str(config_file), "config")
 

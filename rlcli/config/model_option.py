@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path as FilePath
 from typing import Any
 
-from rlcli.config.layers import read
+from rlcli.config.layers import leaves, read
 from rlcli.config.strict_yaml import Path
 from rlcli.errors import Problem, TaskError, UsageError
 from rlcli.registry.formats import Format
@@ -43,6 +43,17 @@ def read_models(words: Iterable[str]) -> dict[str, Any]:
             path = str(file.resolve())
             found[key] = {**settings, "model": path} if "gains" in settings else path
     return found
+
+
+def given_settings(recorded: Mapping[str, Any], changes: Mapping[Path, Any]) -> tuple[dict[str, Any], dict[Path, Any]]:
+    """Return the models, by name, and the values, by path, that a configuration in Python receives.
+
+    Args:
+        recorded: the configuration that a run has stored; empty without a run.
+        changes: path -> value of the changes from the command line.
+    """
+    models = recorded_models(recorded) | {str(path[-1]): value for path, value in changes.items() if path[0] == MODELS}
+    return models, {path: value for path, value in leaves(recorded) if path} | dict(changes)
 
 
 def recorded_models(task: Mapping[str, Any]) -> dict[str, Any]:

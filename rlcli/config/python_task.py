@@ -1,15 +1,15 @@
 """Conversion of a configuration in Python to the plain data that a YAML file would contain.
 
 The configuration is a `TaskConfig`, a mapping with its keys, or a function that returns one. Or it is a configuration
-of another framework with a method `__rlcli_task__(root, models) -> PythonTask`. Terms are names or functions. A
-function that is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
+of another framework with a method `__rlcli_task__(root, models) -> PythonTask`; its optional method
+`__rlcli_fill__(values)` sets the settings that the file leaves open, and returns their paths. Terms are names or
+functions. A function that is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
 """
 
+import copy
 import functools
 import inspect
 import logging
-import sysconfig
-import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -19,10 +19,12 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from rlcli.config.schema import AgentConfig, TaskConfig
+from rlcli.config.strict_yaml import Path
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
 from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing
 from rlcli.formats import Note
 from rlcli.registry import TaskSource, import_file, is_framework, load_module, load_object
+from rlcli.registry.failed_imports import FailedImport, error_location, report_failures, take_failures
 from rlcli.registry.formats import Format, call_usable, format_of_module, require_module
 from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registrations
 
@@ -45,6 +47,8 @@ class PythonTask:
     """The other framework's format to whose classes the configuration belongs; None: rlcli's own."""
     place: str = ""
     """File and line of the configuration's class; empty if unknown."""
+    filled: list[Path] = field(default_factory=list)
+    """Paths of the settings that the file leaves open and the command line gives."""
 
 
 def source_of(value: object, root: FilePath | None = None, name: str = "task") -> TaskSource:
@@ -59,25 +63,29 @@ def source_of(value: object, root: FilePath | None = None, name: str = "task") -
     return TaskSource(name, root, root / "task.py", value=value)
 
 
-def load(source: TaskSource, models: Mapping[str, Any] | None = None) -> PythonTask:
+def load(
+    source: TaskSource, models: Mapping[str, Any] | None = None, values: Mapping[Path, Any] | None = None
+) -> PythonTask:
     """Import the configuration of a task in Python and convert it to plain data.
 
     Args:
         source: the task.
         models: name of a robot or object -> its MJCF file, from `--model`.
+        values: path -> value of a setting, for settings that the configuration of another framework leaves open.
 
     Raises:
         TaskError: if the code of the task raises an error, or the configuration's object does not exist.
         ConfigError: if the object is not a configuration.
     """
     if source.value is not None:
-        return to_task(source.value, source.label, source.root, models)
+        return to_task(source.value, source.label, source.root, models, values)
     assert source.python is not None
     place = ""
     try:
         value, agents = _import_configuration(source)
+        report_failures()
         place = _place_of(value)
-        task = to_task(value, source.label, source.root, models)
+        task = to_task(value, source.label, source.root, models, values)
         task.place = place
         _add_agents(task, agents)
     except ValidationError as error:
@@ -97,7 +105,13 @@ def load(source: TaskSource, models: Mapping[str, Any] | None = None) -> PythonT
     return task
 
 
-def to_task(value: Any, label: str, root: FilePath, models: Mapping[str, Any] | None = None) -> PythonTask:
+def to_task(
+    value: Any,
+    label: str,
+    root: FilePath,
+    models: Mapping[str, Any] | None = None,
+    values: Mapping[Path, Any] | None = None,
+) -> PythonTask:
     """Convert a configuration object to plain data.
 
     Args:
@@ -105,18 +119,24 @@ def to_task(value: Any, label: str, root: FilePath, models: Mapping[str, Any] | 
         label: name of the configuration in messages.
         root: the folder of the task.
         models: name of a robot or object -> its MJCF file, from `--model`.
+        values: path -> value of a setting, for settings that the configuration of another framework leaves open.
 
     Raises:
         ConfigError: if the object is not a configuration.
     """
     if hasattr(value, "__rlcli_task__"):
         value = value() if isinstance(value, type) else value
+        filled = []
+        if values and hasattr(value, "__rlcli_fill__"):
+            value = copy.deepcopy(value)
+            filled = value.__rlcli_fill__(values)
         made = value.__rlcli_task__(root, models or {})
         task = made if isinstance(made, PythonTask) else PythonTask(made)
+        task.filled = filled
         task.format = format_of_module(value.__rlcli_task__.__module__)
     else:
         if callable(value) and not isinstance(value, BaseModel):
-            return to_task(value(), label, root, models)
+            return to_task(value(), label, root, models, values)
         task = PythonTask(value)
     if not isinstance(task.data, TaskConfig | Mapping):
         found = f"expected a TaskConfig, found a value of type {type(task.data).__name__}"
@@ -274,6 +294,11 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     """
     module = import_file(source.root / "__init__.py")
     wanted = str(source.python).removeprefix(str(source.root)).removeprefix(":")
+    if wanted and wanted not in registrations:  # a package need not import those below it that register tasks
+        for file in sorted(source.root.rglob("__init__.py")):
+            text = file.read_bytes()
+            if b"register(" in text and wanted.encode() in text:
+                import_file(file)
     found = {
         name: kwargs
         for name, kwargs in registrations.items()
@@ -283,6 +308,7 @@ def _registered(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         found[wanted] = registrations[wanted]
     if wanted and wanted not in found:
         known = did_you_mean(wanted, found) or f"it registers {listing(found)}"
+        known = "; ".join(take_failures()) or known
         raise TaskError(f"{source.root} does not register a task '{wanted}'", hint=known)
     if not wanted and len(found) != 1:
         hint = f"name one: {listing(f'{source.root}:{name}' for name in found)}" if found else None
@@ -342,6 +368,8 @@ def _object(entry: object) -> Any:
     For `module:name` this is the imported object, and for `module:file.yaml` the path of the file. An argument that is
     not a string is returned unchanged.
     """
+    if isinstance(entry, FailedImport):
+        return entry()  # raises the error of the import
     if not isinstance(entry, str):
         return entry
     if not entry.endswith((".yaml", ".yml", ".json")):
@@ -400,22 +428,6 @@ def _read_agent(task: PythonTask, name: str, agent: object) -> dict[str, Any] | 
 @functools.cache
 def _report_choice(message: str) -> None:
     _log.info(message)
-
-
-_LIBRARIES = tuple(path for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib")))
-"""Folders of Python's and of installed libraries."""
-
-
-def error_location(error: BaseException) -> str:
-    """Return ` (file:line)` of the code that raised an error, if possible of the task's own code."""
-    frames = [
-        (frame.f_code.co_filename, line, is_framework(str(frame.f_globals.get("__name__", ""))))
-        for frame, line in traceback.walk_tb(error.__traceback__)
-        if not frame.f_code.co_filename.startswith("<")
-    ]
-    other = [frame for frame in frames if not frame[2]] or frames
-    own = [frame for frame in other if not frame[0].startswith(_LIBRARIES)] or other
-    return f" ({own[-1][0]}:{own[-1][1]})" if own else ""
 
 
 def _hint(error: BaseException) -> str | None:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from rlcli.config import messages, python_task
 from rlcli.config.foreign_keys import foreign_keys, move_foreign_keys
 from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read, without
-from rlcli.config.model_option import MODELS, model_path, recorded_models
+from rlcli.config.model_option import MODELS, given_settings, model_path
 from rlcli.config.older_success import upgraded
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
@@ -74,6 +74,7 @@ class TaskCheck:
     functions: dict[str, Signature] = field(default_factory=dict)
     """Own terms of a configuration in Python, by name."""
     notes: list[Note] = field(default_factory=list)
+    filled: list[Path] = field(default_factory=list)  # paths of the changes that the configuration has received
     format: formats.Format | None = None
     place: str = ""
     """File and line of a configuration's class in another framework's form; empty for others."""
@@ -84,10 +85,10 @@ class TaskCheck:
         recorded = upgraded(read(file, self.source.label), file) if file.suffix != ".py" else None
         if recorded is not None and self.source.python is None and self.source.value is None:
             return recorded
-        models = recorded_models(recorded.data) if recorded is not None else {}
-        models |= {str(path[-1]): value for path, value, _ in changes if path[0] == MODELS}
-        task = python_task.load(self.source, models)
+        known = recorded.data if recorded is not None else {}
+        task = python_task.load(self.source, *given_settings(known, {path: value for path, value, _ in changes}))
         self.functions, self.notes, self.format, self.place = task.terms, task.notes, task.format, task.place
+        self.filled = task.filled if recorded is None else []
         return recorded or Document(task.data)
 
     def add(self, *problems: Problem) -> None:
@@ -199,8 +200,7 @@ class TaskCheck:
         if name is None:
             self._report_no_agent(origin(()).where)
         elif not isinstance(patch, dict):
-            where = origin(()).where
-            self.add(Problem(where, "agent", f"expected a mapping, found {messages.format_value(patch)}"))
+            self.add(Problem(origin(()).where, "agent", f"expected a mapping, found {messages.format_value(patch)}"))
         else:
             self.layers.merge(patch, origin, ("agents", name))
 

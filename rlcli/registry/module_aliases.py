@@ -14,12 +14,13 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.abc import MetaPathFinder
+from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from rlcli.registry.failed_imports import can_be_left_out, failed_import
 from rlcli.registry.formats import Format, aliasing_formats
 
 _COMMON = ("gym", "hydra", "numpy", "omegaconf")
@@ -31,6 +32,8 @@ _trees: dict[str, str] = {}
 """Module name of an imported package or folder -> name under which its own files import it."""
 _roots: list[Path] = []
 """Folders whose modules are executed as files of a task."""
+_by_file: dict[str, ModuleType] = {}
+"""Path of a task file -> the module that was imported from it."""
 _known_paths: list[frozenset[str]] = []
 """`sys.path` before the task file that is being executed; empty if none is."""
 
@@ -40,6 +43,7 @@ class TaskFileLoader(SourceFileLoader):
 
     def exec_module(self, module: ModuleType) -> None:
         """Execute the file with the `__import__` of task files."""
+        _by_file[self.path] = module
         vars(module)["__builtins__"] = {**vars(builtins), "__import__": _import}
         outermost = not _known_paths
         if outermost:
@@ -50,6 +54,21 @@ class TaskFileLoader(SourceFileLoader):
             if outermost:
                 _add_own_paths()
                 _known_paths.clear()
+
+
+class _KnownFileLoader(Loader):
+    """Loader of a file of a task that was already imported under another name: it gives the same module."""
+
+    def __init__(self, known: ModuleType) -> None:
+        self._known, self._spec = known, known.__spec__
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        """Return the known module."""
+        return self._known
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Execute nothing; undo the change of the module's spec by the import system."""
+        module.__spec__ = self._spec
 
 
 def register_package(module: str, folder: Path, own_name: str) -> None:
@@ -110,7 +129,11 @@ class _TaskFinder(MetaPathFinder):
             return None
         if path is None:
             _trees.setdefault(name, name)  # its modules are files of the task, too
-        spec.loader = TaskFileLoader(spec.loader.name, spec.loader.path)
+        known = _by_file.get(spec.origin)
+        if known is not None and sys.modules.get(known.__name__) is known:
+            spec.loader = _KnownFileLoader(known)
+        else:
+            spec.loader = TaskFileLoader(spec.loader.name, spec.loader.path)
         return spec
 
 
@@ -136,7 +159,34 @@ def _import(
     fromlist: Sequence[str] | None = (),
     level: int = 0,
 ) -> Any:
-    """Import a module for a file of a task, as the built-in `__import__` does."""
+    """Import a module for a file of a task, as the built-in `__import__` does.
+
+    If the import of a task fails in the `__init__.py` of a package, the package's other tasks can still be used.
+    """
+    try:
+        return _import_module(name, module_globals, module_locals, fromlist, level)
+    except Exception as error:
+        scope = module_globals or {}
+        package, file = str(scope.get("__package__")), Path(str(scope.get("__file__", "")))
+        own = level > 0 or name.partition(".")[0] in (package.partition(".")[0], _trees.get(package.partition(".")[0]))
+        if level and not name and fromlist and len(fromlist) > 1:
+            members = {part: getattr(_import(name, scope, {}, (part,), level), part) for part in fromlist}
+            return _with_members(sys.modules[package], members)
+        part = name or "".join(fromlist or ())
+        if not own or not can_be_left_out(part, level, file):
+            raise
+        failed = failed_import(f"{package}.{part}" if level else name, error)
+        return failed if name else _with_members(sys.modules[package], {part: failed})
+
+
+def _import_module(
+    name: str,
+    module_globals: Mapping[str, Any] | None = None,
+    module_locals: Mapping[str, Any] | None = None,
+    fromlist: Sequence[str] | None = (),
+    level: int = 0,
+) -> Any:
+    """Import a module for a file of a task."""
     scope = module_globals or {}
     module, top = _resolve(name, scope) if level == 0 else (None, None)
     if module is None:
@@ -189,14 +239,15 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def _import_folder_above(name: str, file: Path) -> None:
-    """Import as a package the folder `name` above a task file, or else `name/name` in one of the folders above it.
+    """Import as a package the folder `name` above a task file, or a package in one of the folders above the file.
 
-    Such files import modules by their path in the repository, for example `source.robot.mdp`, or from another
-    distribution of the repository that is not installed, for example `source/robot_assets/robot_assets`.
+    Such files import modules by their path in the repository, for example `source.robot.mdp`, from another
+    distribution of the repository that is not installed, for example `source/robot_assets/robot_assets`, or from a
+    package beside their own.
     """
     found = [parent for parent in file.parents if parent.name == name]
     if not found:
-        beside = (parent / name / name for parent in file.parents)
+        beside = (folder for parent in file.parents for folder in (parent / name / name, parent / name))
         found = [folder for folder in beside if (folder / "__init__.py").is_file()]
     folder = found[0] if found else None
     spec = PathFinder.find_spec(name)

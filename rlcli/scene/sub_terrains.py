@@ -7,7 +7,7 @@ are 0, so that any two patches fit together.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -69,6 +69,9 @@ class Patch:
 
 def make_patch(config: schema.PatchConfig, site: PatchSite) -> Patch:
     """Return a patch of terrain: the kind of ground that `config` describes, with the size and difficulty of `site`."""
+    cells = round(config.border / site.resolution)
+    if cells:
+        return _with_border(config, site, cells)
     heights_or_blocks = _MAKERS[type(config)](config, site)
     if isinstance(heights_or_blocks, np.ndarray):
         return Patch(_with_zero_edges(heights_or_blocks))
@@ -76,6 +79,26 @@ def make_patch(config: schema.PatchConfig, site: PatchSite) -> Patch:
     for block in heights_or_blocks:
         _cover_with_block(heights, site, block)
     return Patch(_with_zero_edges(heights), tuple(heights_or_blocks) if config.boxes else ())  # type: ignore[attr-defined]
+
+
+def _with_border(config: schema.PatchConfig, site: PatchSite, cells: int) -> Patch:
+    """Return a patch with a flat edge, which is `cells` cells wide."""
+    width = cells * site.resolution
+    size = (site.size[0] - 2.0 * width, site.size[1] - 2.0 * width)
+    inner = make_patch(config.model_copy(update={"border": 0.0}), replace(site, size=size))
+    heights = site.flat()
+    heights[cells:-cells, cells:-cells] = inner.heights
+    if not inner.blocks:
+        return Patch(heights)
+    blocks = [shifted(block, (width, width)) for block in inner.blocks]
+    edge = ring(Block((0.0, 0.0), site.size, 0.0), Block((width, width), (width + size[0], width + size[1]), 0.0))
+    return Patch(heights, (*edge, *blocks))
+
+
+def shifted(block: Block, offset: tuple[float, float]) -> Block:
+    """Return a block at another place."""
+    x, y = offset
+    return Block((block.low[0] + x, block.low[1] + y), (block.high[0] + x, block.high[1] + y), block.top)
 
 
 def ring(outer: Block, inner: Block) -> list[Block]:

@@ -20,7 +20,7 @@ from rlcli import random
 from rlcli.config import schema
 from rlcli.config.schema import TerrainConfig
 from rlcli.scene.entity import Entity
-from rlcli.scene.sub_terrains import Block, Heights, Patch, PatchSite, make_patch, ring
+from rlcli.scene.sub_terrains import Block, Heights, Patch, PatchSite, make_patch, ring, shifted
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import require_in_range
 
@@ -82,7 +82,13 @@ def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProbl
     if config.max_start_level is not None and config.max_start_level >= config.rows:
         yield ("max_start_level",), f"level {config.max_start_level} does not exist", f"levels: 0 to {config.rows - 1}"
     for name, patch in config.sub_terrains.items():
-        for key, text, advice in _patch_problems(patch, min(config.patch), config.resolution):
+        edge = min(config.patch) - 2.0 * round(patch.border / config.resolution) * config.resolution
+        if edge < 2.0 * config.resolution - 1e-6:
+            where = ("sub_terrains", name, "border")
+            message = f"a border of {patch.border:g} m leaves no ground inside"
+            yield where, message, f"set less than {min(config.patch) / 2:g}"
+            continue
+        for key, text, advice in _patch_problems(patch, edge, config.resolution):
             yield ("sub_terrains", name, key), text, advice
 
 
@@ -108,7 +114,7 @@ def make_ground(config: TerrainConfig, root: Path) -> Ground:
             low = corner + np.array([row * size[0], column * size[1]])
             surface = patch.heights if not patch.blocks else _heights_below_blocks(patch)
             heights[row * nx : (row + 1) * nx + 1, column * ny : (column + 1) * ny + 1] = surface
-            blocks += [_shifted(block, low) for block in patch.blocks]
+            blocks += [shifted(block, (float(low[0]), float(low[1]))) for block in patch.blocks]
             origins[row, column] = (*(low + np.array(size) / 2), _spawn_height(patch.heights, config.resolution))
     return Ground(heights, config.resolution, config.border, config.friction, tuple(blocks), origins, size)
 
@@ -242,11 +248,6 @@ def _heights_below_blocks(patch: Patch) -> Heights:
     inside = np.zeros_like(patch.heights)
     inside[1:-1, 1:-1] = lowest - 0.05 if lowest < 0.0 else 0.0  # 5 cm lower, so that no two surfaces coincide
     return inside
-
-
-def _shifted(block: Block, offset: NDArray[np.float64]) -> Block:
-    x, y = offset.tolist()
-    return Block((block.low[0] + x, block.low[1] + y), (block.high[0] + x, block.high[1] + y), block.top)
 
 
 def _border(half: list[float], width: float) -> list[Block]:

@@ -103,6 +103,17 @@ def test_grid_has_bounded_cells_of_configured_edge():
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_patch_with_border_is_the_smaller_patch_in_flat_ground(kind):
+    level = (1.0, 1.0)
+    size = {"rows": 1, "columns": 1, "difficulty": level, "sub_terrains": {"it": {"kind": kind, "border": 0.54}}}
+    heights = ground(patch=(6.0, 6.0), **size).heights
+    inner = ground(patch=(5.0, 5.0), **{**size, "sub_terrains": {"it": {"kind": kind}}}).heights
+    assert np.array_equal(heights[5:-5, 5:-5], inner)
+    heights[5:-5, 5:-5] = 0.0
+    assert not heights.any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_patch_has_zero_edges_and_grows_with_difficulty(kind):
     heights = ground(sub_terrains={"it": {"kind": kind}}, rows=4, difficulty=[0.1, 1.0]).heights
     assert not heights[::40].any()
@@ -184,6 +195,7 @@ def test_boxes_equal_height_field_with_upright_faces(tmp_path, kind, inverted):
     else:
         turned = {"inverted": inverted} if kind == "stairs" else {}
         patch = {"it": {"kind": kind, **({"step_width": 0.5} if kind == "stairs" else {"cell": 0.5}), **turned}}
+    patch["it"]["border"] = 0.5
     boxes = {"it": {**patch["it"], "boxes": True}}
     model = on_terrain(tmp_path, generator(sub_terrains=boxes, rows=1, columns=1), 1).engine.model
     terrain = [g for g in range(model.ngeom) if model.body(model.geom_bodyid[g]).name == "terrain"]
@@ -455,6 +467,7 @@ def test_origins_without_terrain_are_0(tmp_path):
             "a.step_width: a step of 0.1 m needs",
             "boxes: true",
         ),
+        ({"sub_terrains": {"a": {"kind": "noise", "border": 1.95}}}, "a.border: a border of 1.95 m leaves", "than 2"),
         ({"sub_terrains": {"a": {"kind": "grid", "cell": 0.1}}}, "a.cell: a cell of 0.1 m needs", "boxes: true"),
         (
             {"sub_terrains": {"a": {"kind": "stones", "width": [0.5, 5.0]}}},

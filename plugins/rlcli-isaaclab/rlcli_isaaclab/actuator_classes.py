@@ -89,6 +89,15 @@ class IdealPDActuator(ActuatorBase):
         return ArticulationActions(joint_efforts=self.applied_effort, joint_indices=control_action.joint_indices)
 
 
+class ImplicitActuator(IdealPDActuator):
+    """A PD controller for subclasses of Isaac Lab's implicit actuator, whose drive PhysX integrates.
+
+    The subclass changes the targets in `compute`; rlcli computes the effort before each physics step.
+    """
+
+    is_implicit_model = True
+
+
 class DCMotor(IdealPDActuator):
     """A PD controller whose effort is limited by the motor's torque-speed curve."""
 
@@ -139,4 +148,4 @@ class DelayedPDActuator(IdealPDActuator):
         return super().compute(ArticulationActions(*late), joint_pos, joint_vel)
 
 
-__all__ = ["ActuatorBase", "DCMotor", "DelayedPDActuator", "IdealPDActuator"]
+__all__ = ["ActuatorBase", "DCMotor", "DelayedPDActuator", "IdealPDActuator", "ImplicitActuator"]

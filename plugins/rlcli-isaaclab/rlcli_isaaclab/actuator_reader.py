@@ -54,6 +54,9 @@ def read_actuators(
         elif is_user_actuator(item.data.get("class_type")):
             own[entity, group] = item.data
             item.skip(*item.data)
+            if item.data["class_type"].is_implicit_model:
+                why = "rlcli computes efforts before each physics step; PhysX integrates the drive implicitly"
+                item.note("approximated", "class_type", why)
             config = {"joints": order_joints(patterns, item), "kind": "pd"}
             models[group] = to_plain(config | {key: value for key, value in gains.items() if value is not None})
             settings = {**passive, "velocity_limit": item.get("velocity_limit")}
@@ -209,6 +212,8 @@ def _joint_config(
         key: key of the joint in the report.
         report: receives what is approximated.
     """
+    if values.get("effort_limit") == 0.0:  # the drive of a passive joint has no effort
+        values = {name: value for name, value in values.items() if name not in ("effort_limit", "stiffness", "damping")}
     stiffness, viscous = values.pop("stiffness", 0.0), values.pop("viscous_friction", 0.0)
     if stiffness and command in ("effort", "motor"):
         values = {"stiffness": stiffness, **values}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -206,6 +207,19 @@ class PhysxView:
             raise TaskError(what, hint=hint)
         self._write_model("body_ipos", coms[..., :3], indices)
         self._write_model("body_iquat", coms[..., 3:].roll(1, dims=-1), indices)
+
+    @property
+    def link_paths(self) -> list[list[str]]:
+        """Paths of the bodies of each environment, for `create_rigid_body_view`."""
+        names = self._entity.names["Bodies"]
+        start = [f"/World/envs/env_{env}/{self._entity.name}" for env in range(self._env.num_envs)]
+        return [[f"{path}/{name}" for name in names] for path in start]
+
+    def create_rigid_body_view(self, path: str) -> SimpleNamespace:
+        """Return the number of geoms, `max_shapes`, of the body at the end of a path. (`asset._physics_sim_view`)"""
+        names = list(self._entity.names["Bodies"])
+        body = self._entity.body_ids[names.index(path.rpartition("/")[2])]
+        return SimpleNamespace(max_shapes=int(self._env.engine.model.body_geomnum[int(body)]))
 
     @property
     def max_shapes(self) -> int:

@@ -56,6 +56,24 @@ def is_missing(value: Any) -> bool:
     return isinstance(value, type(MISSING))
 
 
+def fill_missing(cfg: Any, values: Mapping[tuple[str, ...], Any]) -> list[tuple[str, ...]]:
+    """Set those settings that are missing and have a value in `values`, by path; return their paths."""
+    filled = []
+    for path, value in values.items():
+        owner: Any = {"": cfg}
+        for part in ("", *path[:-1]):
+            owner = owner.get(part) if isinstance(owner, Mapping) else getattr(owner, part, None)
+        is_mapping = isinstance(owner, dict)
+        if not is_missing(owner.get(path[-1]) if is_mapping else getattr(owner, path[-1], None)):
+            continue
+        if is_mapping:
+            owner[path[-1]] = value
+        else:
+            setattr(owner, path[-1], value)
+        filled.append(path)
+    return filled
+
+
 def to_dict(value: Any) -> Any:
     """Return settings as nested dicts; functions, numbers and text stay unchanged."""
     if isinstance(value, type):

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rlcli_isaaclab.config_class import is_missing
+from rlcli_isaaclab.config_class import is_missing, to_dict
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.settings import Key, Node, Report, as_float
 from rlcli_isaaclab.term_reader import TermReader
@@ -37,6 +37,7 @@ def task(
     Raises:
         ConfigError: if the settings do not describe a valid task.
     """
+    data = {**data, **{name: _own_members(data[name], name, report) for name in _OPTIONAL if name in data}}
     top = Node(data, (), report)
     for section in _SECTIONS:
         _check_members(data.get(section), (section,), report)
@@ -52,6 +53,8 @@ def task(
     terms.record_driven_joints(top.node("actions"))
     config["actions"] = {name: terms.read_action(node) for name, node in top.node("actions").nodes()}
     config["observations"] = {name: terms.read_group(node) for name, node in top.node("observations").nodes()}
+    if "policy" not in config["observations"] and "actor" in config["observations"]:
+        config["observations"]["policy"] = config["observations"].pop("actor")  # the name in RSL-RL 5
     for section in ("events", "rewards", "terminations", "curriculum"):
         terms_of_section = (terms.read_terms(section, *member) for member in top.node(section).nodes())
         config[section] = {name: term for pairs in terms_of_section for name, term in pairs}
@@ -73,6 +76,19 @@ def task(
     report.stubs = terms.stubs
     report.finish(data, defaults)
     return {key: value for key, value in config.items() if value is not None}
+
+
+_OPTIONAL = ("events", "terminations", "curriculum", "commands")
+"""Sections that may be empty."""
+
+
+def _own_members(value: Any, section: str, report: Report) -> Any:
+    """Return the settings of a section. As in Isaac Lab, an object without @configclass has only its own attributes."""
+    if not hasattr(value, "__dict__") or isinstance(value, type) or is_missing(value):
+        return value
+    kind = type(value).__name__
+    report.entries[(section,)] = ("ignored", f"the class {kind} has no @configclass: Isaac Lab reads no terms of it")
+    return to_dict(vars(value))
 
 
 _SECTIONS = ("actions", "observations", "events", "rewards", "terminations", "curriculum")
@@ -129,7 +145,7 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         }
     groups = top.get("obs_groups")
     if isinstance(groups, Mapping):
-        if list(groups.get("policy", ["policy"])) != ["policy"]:
+        if list(groups.get("policy", groups.get("actor", ["policy"]))) not in (["policy"], ["actor"]):
             top.note("ignored", "obs_groups", "the actor observes the group 'policy'; other groups are left out")
         if groups.get("critic"):
             config["critic_obs"] = list(groups["critic"])

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import ConfigError, Problem, TaskError
-from rlcli_isaaclab.config_class import MISSING, configclass
+from rlcli_isaaclab.config_class import MISSING, configclass, fill_missing
 from rlcli_isaaclab.setup_scene import Setup, running
 from rlcli_isaaclab.sim import SimulationCfg
 from rlcli_isaaclab.user_files import placed
@@ -228,6 +228,8 @@ class DirectRLEnvCfg:
     wait_for_textures: bool = True
     xr: Any = None
     log_dir: Any = None
+
+    __rlcli_fill__ = fill_missing
 
     def __rlcli_environment__(self, entry: Any) -> None:
         """Store the environment class that the task's Gymnasium registration names, as a class or `module:Class`."""

@@ -15,6 +15,7 @@ _RUNNER = b"RslRlOnPolicyRunnerCfg"
 
 LIBRARIES = {
     **{name: name for name in ("torchvision", "prettytable", "einops", "transformers", "numba", "warp", "psutil")},
+    **{name: name for name in ("scipy", "matplotlib", "pandas", "h5py", "tqdm", "imageio", "networkx", "shapely")},
     **{"hid": "hidapi", "sklearn": "scikit-learn", "cv2": "opencv-python", "PIL": "pillow", "warp": "warp-lang"},
 }
 """Libraries that come with Isaac Lab -> their name for pip. A missing one raises an error when it is used."""

@@ -30,16 +30,51 @@ _EXTRA = {
     "isaaclab_tasks": ("mdp", "task_utils"),
     "isaaclab_contrib": ("multirotor", "action_terms"),
     "isaaclab.envs.mdp": ("mdp", "action_terms", "command_terms"),
-    "isaaclab.sim": ("usd_stage", "usd_geometry"),
+    "isaaclab.sim": ("usd_stage", "usd_geometry", "setup_scene"),
     "isaaclab.utils.math": ("utils.poses",),
     "isaaclab.actuators": ("actuator_classes",),
+    "isaaclab.sensors": ("sensors.patterns",),
 }
 """Module of Isaac Lab -> modules of this package that define further names of it."""
+_STAR_NAMES = {
+    "isaaclab.envs.mdp": (
+        *("ActionTerm", "ActionTermCfg", "CommandTerm", "CommandTermCfg", "CurriculumTermCfg", "EventTermCfg"),
+        *(
+            "ManagerTermBase",
+            "ObservationTermCfg",
+            "RewardTermCfg",
+            "RecorderTerm",
+            "RecorderTermCfg",
+            "SceneEntityCfg",
+        ),
+        *(
+            "Articulation",
+            "DeformableObject",
+            "RigidObject",
+            "TerrainImporter",
+            "ImplicitActuator",
+            "VisualizationMarkers",
+        ),
+        *("Camera", "ContactSensor", "FrameTransformer", "Imu", "RayCaster", "RayCasterCamera", "TiledCamera"),
+        *("ContactSensorCfg", "FrameTransformerCfg", "DifferentialIKControllerCfg", "OperationalSpaceControllerCfg"),
+        *("MISSING", "configclass", "sim_utils", "math_utils", "string_utils", "math", "re", "torch", "Literal"),
+        *("combine_frame_transforms", "compute_pose_error", "euler_xyz_from_quat", "quat_apply_inverse"),
+        *("quat_from_euler_xyz", "quat_unique", "wrap_to_pi", "yaw_quat", "generic_io_descriptor", "Sequence"),
+    )
+}
+"""Module -> names that its files import, and that `from MODULE import *` imports as well."""
+_LIBRARY_NAMES = {
+    **{"math_utils": "isaaclab.utils.math", "string_utils": "isaaclab.utils.string", "sim_utils": "isaaclab.sim"},
+    **{"math": "math", "re": "re", "torch": "torch", "Literal": "typing", "Sequence": "collections.abc"},
+}
+"""Name in `_STAR_NAMES` -> the module that it is, or that defines it."""
 _SOURCE_PACKAGES = ("isaaclab_tasks", "isaaclab_assets")
 """Packages whose original files are imported if they are found: they only use other modules of Isaac Lab."""
-_SIM = {"isaacsim.core.utils.torch": "isaacsim_torch", "isaacsim.core.utils.torch.rotations": "isaacsim_torch",
-        "isaacsim.core.utils.torch.maths": "isaacsim_torch",
-    "isaacsim.core.utils.torch.transformations": "isaacsim_torch"}  # fmt: skip
+_TORCH = "isaacsim.core.utils.torch"
+_SIM = {
+    **dict.fromkeys((_TORCH, *(f"{_TORCH}.{n}" for n in ("rotations", "maths", "transformations"))), "isaacsim_torch"),
+    "isaacsim.core.version": "utils.version",
+}
 """Module of Isaac Sim -> module of this package with its functions."""
 
 
@@ -132,6 +167,10 @@ def _lab_module(name: str) -> LabModule:
 
 def _member(module: str, name: str) -> Any:
     path = f"{module}.{name}"
+    if name in _LIBRARY_NAMES and name in _STAR_NAMES.get(module, ()):
+        home = _LIBRARY_NAMES[name]
+        found = _lab_module(home) if home.startswith("isaaclab") else importlib.import_module(home)
+        return getattr(found, name, found)
     if path not in _modules() and name not in _definitions():  # a module that its package imports from further below
         below = (found for found in sorted(_modules()) if found.startswith(f"{module}.") and found.endswith(f".{name}"))
         path = next(below, path)
@@ -255,4 +294,5 @@ def _definitions() -> dict[str, tuple[str, Any]]:
 def public_names(module: str) -> list[str]:
     """Return the names that `from module import *` imports: those of the module and the modules below it."""
     below = [names for name, names in _table().items() if f"{name}.".startswith(f"{module}.")]
-    return sorted({name for names in below for name in names if name != "logger" and not name.startswith("_")})
+    own = {name for names in below for name in names if name != "logger" and not name.startswith("_")}
+    return sorted(own.union(_STAR_NAMES.get(module, ())))

@@ -34,6 +34,25 @@ class RslRlPpoActorCriticRecurrentCfg(RslRlPpoActorCriticCfg):
 
 
 @configclass
+class RslRlMLPModelCfg:
+    """One network, the actor or the critic, of RSL-RL 5."""
+
+    @configclass
+    class GaussianDistributionCfg:
+        """Distribution of the actions."""
+
+        class_name: str = "GaussianDistribution"
+        init_std: float = 1.0
+        std_type: str = "scalar"
+
+    class_name: str = "MLPModel"
+    hidden_dims: Any = MISSING
+    activation: str = MISSING
+    obs_normalization: bool = False
+    distribution_cfg: Any = None
+
+
+@configclass
 class RslRlSymmetryCfg:
     """Symmetry of the robot in the PPO update."""
 
@@ -95,6 +114,8 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
 
     class_name: str = "OnPolicyRunner"
     policy: Any = MISSING
+    actor: Any = MISSING
+    critic: Any = MISSING
     algorithm: Any = MISSING
 
     def __rlcli_agent__(self, notes: list[Note] | None = None) -> dict[str, Any]:

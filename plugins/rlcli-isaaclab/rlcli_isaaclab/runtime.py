@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from rlcli.config.python_task import source_of
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
+from rlcli.registry import is_framework, load_object
 from rlcli_isaaclab.manager_facade import (
     ActionManagerFacade,
     CommandManagerFacade,
@@ -37,9 +39,9 @@ class ManagerBasedRLEnv(gymnasium.Env):
     metadata = {"render_modes": [None]}  # noqa: RUF012  (gymnasium's)
 
     def __init__(self, cfg: Any = None, render_mode: str | None = None, **kwargs: Any) -> None:
+        if "managed" in self.__dict__:  # `__init__` of the task's own class, called when a term uses the class
+            return
         if cfg is None:
-            from rlcli.registry import load_object
-
             entry = kwargs["env_cfg_entry_point"]
             cfg = load_object(entry) if isinstance(entry, str) else entry
         cfg = cfg() if isinstance(cfg, type) else cfg
@@ -59,6 +61,8 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
     managed: Any
     cfg: Any
+    _own: Any
+    """Object of the task's own environment class; it is created when a term first uses a member of the class."""
     extras: dict[str, Any]
     selection: Any = None
     """The environments for which a term is called; None outside of such a call."""
@@ -71,6 +75,13 @@ class ManagerBasedRLEnv(gymnasium.Env):
         if name.startswith("_") or name in ("managed", "cfg"):
             raise AttributeError(name)
         if not hasattr(self.managed, name):
+            own = _own_class(getattr(self.cfg, "_rlcli_class", None))
+            if own is not None and "_own" not in self.__dict__:
+                self.__dict__["_own"] = own.__new__(own)
+                self._own.__dict__ = self.__dict__  # the object has the attributes of the environment
+                self._own.__init__(self.cfg)
+            if own is not None and (name in self.__dict__ or hasattr(own, name)):
+                return getattr(self._own, name)
             if name.endswith("_manager") and name in dir(type(self)):
                 raise AttributeError(
                     f"env has no '{name}' yet: use it only in reset() and __call__(), not in __init__()"
@@ -248,6 +259,18 @@ class ManagerBasedRLEnv(gymnasium.Env):
         if name not in self._manager_facades or self._manager_facades[name]._manager is not manager:
             self._manager_facades[name] = kind(manager)
         return self._manager_facades[name]
+
+
+@functools.cache
+def _own_class(entry: Any) -> type | None:
+    """Return the task's own environment class, by the class or its name; None if it is not ours or not known."""
+    found = load_object(entry) if isinstance(entry, str) and entry != OWN_CLASS else entry
+    own = isinstance(found, type) and issubclass(found, ManagerBasedRLEnv) and not is_framework(found.__module__)
+    return found if own else None
+
+
+OWN_CLASS = "isaaclab.envs:ManagerBasedRLEnv"
+"""Isaac Lab's environment class in a registration with Gymnasium."""
 
 
 def facade_of(managed: VecEnv) -> ManagerBasedRLEnv:

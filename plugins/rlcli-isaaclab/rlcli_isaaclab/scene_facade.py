@@ -49,7 +49,7 @@ class Asset:
         self.num_instances, self.device = env.num_envs, env.device
         self.is_fixed_base = not entity.is_floating
         self._ALL_INDICES = torch.arange(env.num_envs, device=env.device)
-        self.root_physx_view = PhysxView(env, entity)
+        self.root_physx_view = self._physics_sim_view = PhysxView(env, entity)
 
     @property
     def permanent_wrench_composer(self) -> BodyWrench:
@@ -365,6 +365,7 @@ class Scene(Mapping[str, Any]):
                 continue
             names = getattr(element, f"{kind}_names")
             ids, matched = find_elements(wanted, names, names, kind, cfg.preserve_order)
-            all_selected = ids == list(range(len(names)))
+            # as in Isaac Lab, a regex that matches all gives their ids, and only a list of all names gives a slice
+            is_slice = not isinstance(wanted, str) and list(wanted) == list(names)
             setattr(cfg, f"{kind}_names", matched)
-            setattr(cfg, f"{kind}_ids", slice(None) if all_selected else torch.tensor(ids, device=self._env.device))
+            setattr(cfg, f"{kind}_ids", slice(None) if is_slice else torch.tensor(ids, device=self._env.device).long())

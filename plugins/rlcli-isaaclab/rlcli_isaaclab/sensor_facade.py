@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
-from rlcli.scene.names import match
+from rlcli.scene.names import NameProblem, match
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
 from rlcli_isaaclab.absent import absence, user_place
 from rlcli_isaaclab.sensor_reader import image_name
@@ -219,7 +219,6 @@ class Sensor:
         "net_forces_w_history": "force_history",
         "current_air_time": "air_time",
         "current_contact_time": "contact_time",
-        "ray_hits_w": "hits",
         "pos_w": "position",
     }
 
@@ -248,9 +247,14 @@ class Sensor:
         try:
             return getattr(self._sensor, self._NAMES.get(name, name))
         except AttributeError:
-            known = sorted({n for n in (*dir(self._sensor), *self._NAMES) if not n.startswith("_")})
+            known = sorted({n for n in (*dir(type(self)), *dir(self._sensor), *self._NAMES) if not n.startswith("_")})
             hint = did_you_mean(name, known) or f"its attributes: {listing(known, 40)}"
             raise AttributeError(f"{user_place()}a sensor of rlcli has no '{name}'; {hint}") from None
+
+    @property
+    def ray_hits_w(self) -> Tensor:
+        """End points of the rays, world frame, contiguous as in Isaac Lab. (num_envs, rays, 3) [m]"""
+        return self._sensor.hits.contiguous()
 
     @property
     def num_rays(self) -> int:
@@ -285,6 +289,9 @@ def find_elements(
     wanted: Any, candidates: Any, names: list[str], kind: str, preserve_order: bool
 ) -> tuple[list[int], list[str]]:
     """Return indices into `names`, and the names, of the candidates that names or regexes match."""
-    indices = [names.index(candidates[i]) for i in match(wanted, list(candidates), kind)]
+    try:
+        indices = [names.index(candidates[i]) for i in match(wanted, list(candidates), kind)]
+    except NameProblem as problem:
+        raise NameProblem(f"{user_place()}{problem}", problem.hint) from None
     indices = indices if preserve_order else sorted(indices)
     return indices, [names[i] for i in indices]

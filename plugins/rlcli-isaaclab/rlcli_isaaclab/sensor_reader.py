@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 from rlcli.errors import listing
@@ -179,7 +181,7 @@ def choose_image(params: Node, config: dict[str, Any], sensors: dict[str, Any]) 
     config["sensor"] = made[data]
 
 
-def _rotated(quat: list[float], axis: tuple[float, float, float]) -> list[float]:
+def _rotated(quat: Sequence[float], axis: Sequence[float]) -> list[float]:
     w, x, y, z = quat
     a, b, c = axis
     return [
@@ -222,23 +224,46 @@ def filter_name(sensor: str, index: int) -> str:
     return f"{sensor}_filter_{index}"
 
 
+def _read_pattern(pattern: Node) -> Any:
+    """Return the rays of a ray sensor: a grid, or a list of directions."""
+    function = pattern.get("func")
+    if kind_of(function) == "grid_pattern":
+        pattern.skip("ordering")
+        grid = {
+            "size": list(pattern.get("size", (1.0, 1.0))),
+            "resolution": pattern.get("resolution", 0.1),
+            "direction": list(pattern.get("direction", (0.0, 0.0, -1.0))),
+        }
+        return to_plain(grid)
+    if isinstance(function, str):  # a YAML file has only the name
+        from rlcli_isaaclab.sensors import patterns
+
+        function = getattr(patterns, kind_of(function), None)
+    if not inspect.isfunction(function):
+        hint = "use GridPatternCfg, LidarPatternCfg, BpearlPatternCfg or your own function"
+        pattern.report.problem(pattern.key, "this pattern of rays has no counterpart in rlcli", hint)
+        return [[0.0, 0.0, -1.0]]
+    cfg = SimpleNamespace(**{key: pattern.get(key) for key in pattern.data})
+    starts, directions = function(cfg, "cpu")
+    if bool(starts.any()):
+        what = "rays that start in several points have no counterpart in rlcli"
+        pattern.report.problem(pattern.key, what, "use GridPatternCfg, or rays from one point")
+    return [[round(value, 9) for value in ray] for ray in directions.tolist()]
+
+
 def _read_ray_sensor(item: Node, entity: str, body: str | None) -> dict[str, Any]:
     item.skip("mesh_prim_paths", "history_length", "attach_yaw_only", "drift_range", "ray_cast_drift_range")
     pattern, offset = item.node("pattern_cfg"), item.node("offset")
     config: dict[str, Any] = {"kind": "rays", "entity": entity}
     if body is not None:
         config["body"] = body
-    if kind_of(pattern.get("func")) != "grid_pattern":
-        item.report.problem(pattern.key, "only patterns.GridPatternCfg has a counterpart in rlcli; use it")
-    pattern.skip("ordering")
-    grid = {
-        "size": list(pattern.get("size", (1.0, 1.0))),
-        "resolution": pattern.get("resolution", 0.1),
-        "direction": list(pattern.get("direction", (0.0, 0.0, -1.0))),
-    }
-    config["pattern"] = to_plain(grid)
+    config["pattern"] = _read_pattern(pattern)
     config["offset"] = [as_float(v) for v in offset.get("pos", (0.0, 0.0, 0.0))]
-    if list(offset.data.get("rot", (1, 0, 0, 0))) != [1, 0, 0, 0]:
+    rot = [as_float(value) for value in offset.data.get("rot", (1, 0, 0, 0))]
+    if isinstance(config["pattern"], list):
+        config["pattern"] = [_rotated(rot, ray) for ray in config["pattern"]]
+        offset.skip("rot")
+    elif rot != [1, 0, 0, 0]:
         offset.note("ignored", "rot", "set the pattern's direction instead")
     else:
         offset.skip("rot")

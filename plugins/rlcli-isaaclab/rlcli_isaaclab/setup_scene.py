@@ -80,4 +80,10 @@ class Spawn:
         current_setup().spawned.append((prim_path, cfg, pose))
 
 
+def clone(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function itself: it decorates spawners, whose objects every environment of rlcli has."""
+    return function
+
+
+apply_nested = clone
 spawn_ground_plane, spawn_light, spawn_from_usd = map(Spawn, ("spawn_ground_plane", "spawn_light", "spawn_from_usd"))

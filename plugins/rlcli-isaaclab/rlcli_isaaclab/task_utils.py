@@ -6,22 +6,21 @@ import importlib
 import pkgutil
 from typing import Any
 
-from rlcli.config.python_task import error_location
-from rlcli_isaaclab.absent import report_once
+from rlcli.registry.failed_imports import failed_import
 
 
 def import_packages(package_name: str, blacklist_pkgs: list[str] | None = None) -> None:
     """Import a package and all packages below it, except those whose name contains a word of the blacklist.
 
-    A package below it that needs a library which is not installed is left out, with a warning.
+    A package below it whose import fails is left out, with a warning.
     """
     package = importlib.import_module(package_name)
     for found in pkgutil.iter_modules(getattr(package, "__path__", []), f"{package_name}."):
         if found.ispkg and not any(word in found.name for word in blacklist_pkgs or ()):
             try:
                 import_packages(found.name, blacklist_pkgs)
-            except ModuleNotFoundError as error:
-                report_once(f"{found.name} is left out: {error}{error_location(error)}")
+            except Exception as error:
+                failed_import(found.name, error)
 
 
 def load_cfg_from_registry(task_name: str, entry_point_key: str) -> Any:

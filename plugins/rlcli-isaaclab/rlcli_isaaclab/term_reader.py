@@ -324,6 +324,11 @@ class TermReader(ObjectReader):
         stem = key.removesuffix("_cfg")
         config: dict[str, Any] = {}
         name = settings["name"]
+        missing = [member for member in ("name", "joint_names", "body_names") if is_missing(settings.get(member))]
+        for member in missing:
+            self.report.problem((*at, member), f"missing '{member}'; give it a value")
+        if missing:
+            return config
         sensor = next((by_alias[a] for a in ("ContactSensor", "RaySensor", "CameraSensor") if a in by_alias), None)
         preserve = bool(settings.get("preserve_order"))
         if sensor is not None and (name in self.scene.sensors or key == "sensor_cfg"):

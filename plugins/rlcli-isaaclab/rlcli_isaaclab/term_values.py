@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from typing import Any, get_args
 
@@ -26,6 +27,20 @@ def is_entity(value: Any) -> bool:
     if isinstance(value, SceneEntityCfg):
         return True
     return isinstance(value, Mapping) and "name" in value and ("joint_names" in value or "body_names" in value)
+
+
+def resolved(value: Any, scene: Any) -> Any:
+    """Return a parameter with every `SceneEntityCfg` in it resolved."""
+    if isinstance(value, list | tuple):
+        return type(value)(resolved(item, scene) for item in value)
+    if isinstance(value, Mapping) and {"name", "joint_names", "body_names"} <= set(value):
+        value = SceneEntityCfg(**value)
+    elif isinstance(value, Mapping):
+        return {key: resolved(item, scene) for key, item in value.items()}
+    if isinstance(value, SceneEntityCfg):
+        value = copy.deepcopy(value)
+        scene.resolve(value)
+    return value
 
 
 def builtin_name(function: Any) -> str | None:

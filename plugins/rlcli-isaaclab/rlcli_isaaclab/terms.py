@@ -11,9 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from rlcli.config.schema import Names, Number, StrictModel
@@ -24,11 +25,24 @@ from rlcli_isaaclab.direct_env import building
 from rlcli_isaaclab.managers import ManagerTermBaseCfg, SceneEntityCfg
 from rlcli_isaaclab.settings import to_plain
 from rlcli_isaaclab.substeps import Substeps
-from rlcli_isaaclab.user_files import file_text, placed, source_text, term_reads_body_forces, unset_simple
+from rlcli_isaaclab.term_values import resolved
+from rlcli_isaaclab.user_files import (
+    code_of,
+    file_text,
+    place_of_code,
+    placed,
+    source_text,
+    term_reads_body_forces,
+    unset_simple,
+)
 from rlcli_isaaclab.utils.buffers import set_tensors, tensors_of
 
 _RESERVED = {name for model in SECTIONS.values() for name in model.model_fields} | {"params"}
-_PLAIN: dict[Any, Any] = {float: Number, int: int, bool: bool, str: str}
+_PLAIN: dict[Any, Any] = {float: Number, int: int | Number, bool: bool, str: str}
+"""Type in a function's signature -> type of the key. Isaac Lab checks no types: `int` also takes 0.5."""
+
+
+_Nothing = Annotated[list[str], Field(max_length=0)]
 
 
 class EntityModel(StrictModel):
@@ -36,10 +50,10 @@ class EntityModel(StrictModel):
 
     name: str
     """Name of an entity or sensor."""
-    joint_names: Names | None = None
-    """Names or regexes of joints; null: all."""
-    body_names: Names | None = None
-    """Names or regexes of bodies; null: all."""
+    joint_names: Names | _Nothing | None = None
+    """Names or regexes of joints; null: all; []: none."""
+    body_names: Names | _Nothing | None = None
+    """Names or regexes of bodies; null: all; []: none."""
     preserve_order: bool = False
     """Whether to keep the written order instead of the model's."""
 
@@ -78,7 +92,8 @@ class UserTerm:
         self.context = context or TermContext()
         self.function, self.section, self.objects = function, section, dict(objects or {})
         self.is_class = isinstance(function, type)
-        self.__name__, self.__module__ = function.__name__, function.__module__
+        self.__name__ = getattr(function, "__name__", code_of(function).__name__)
+        self.__module__ = code_of(function).__module__
         self.target = functools.partial(_bind_term, self)
         if section == "events" and "set_coms(" in file_text(function):
             self.target.prepare = unset_simple  # type: ignore[attr-defined]
@@ -112,10 +127,8 @@ class UserTerm:
 
     def __rlcli_term__(self, name: str) -> Signature:
         """Return the signature of the term; `name` is the term's key in the task."""
-        code = getattr(self.function, "__code__", None)
-        file = Path(inspect.getsourcefile(self.function) or "?")
+        file, line = place_of_code(self.function)
         summary = (inspect.getdoc(self.function) or "").split("\n")[0]
-        line = code.co_firstlineno if code else 1
         return Signature(name, self.__name__, True, file, line, summary, tuple(self.parameters), target=self.target)
 
     def _parameter(self, p: inspect.Parameter, hint: Any, entities: frozenset[str]) -> Parameter:
@@ -392,20 +405,6 @@ def _set_members(target: Any, values: Mapping[str, Any]) -> None:
             setattr(target, name, tuple(value) if isinstance(now, tuple) and isinstance(value, list) else value)
 
 
-def _resolved(value: Any, scene: Any) -> Any:
-    """Return a parameter with every `SceneEntityCfg` in it resolved."""
-    if isinstance(value, list | tuple):
-        return type(value)(_resolved(item, scene) for item in value)
-    if isinstance(value, Mapping) and {"name", "joint_names", "body_names"} <= set(value):
-        value = SceneEntityCfg(**value)
-    elif isinstance(value, Mapping):
-        return {key: _resolved(item, scene) for key, item in value.items()}
-    if isinstance(value, SceneEntityCfg):
-        value = copy.deepcopy(value)
-        scene.resolve(value)
-    return value
-
-
 def _to_namespace(value: Any) -> Any:
     """Return nested mappings as objects with attributes, where all keys are identifiers; other values unchanged."""
     if isinstance(value, dict) and all(str(key).isidentifier() for key in value):
@@ -423,7 +422,7 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
     if any(word in file_text(term.function) for word in ("external_force", "wrench_composer")):
         for asset in facade.scene.articulations.values():
             asset.start_wrenches()
-    values: dict[str, Any] = {key: _resolved(value, facade.scene) for key, value in term.objects.items()}
+    values: dict[str, Any] = {key: resolved(value, facade.scene) for key, value in term.objects.items()}
     for key, value in params.items():
         if isinstance(value, EntityModel):
             facade.scene.resolve(value := SceneEntityCfg(**value.model_dump()))

@@ -125,9 +125,7 @@ def _read_sub_terrain(node: Node, resolution: float) -> dict[str, Any]:
     proportion = as_float(node.get("proportion", 1.0))
     node.skip("size", "horizontal_scale", "vertical_scale", "slope_threshold", "flat_patch_sampling")
     kind = _SUB_TERRAINS.get(function)
-    if kind == "flat":
-        node.skip("border_width")
-    node.note("approximated", "border_width", "the patch has no flat border: its shape begins at its edge")
+    border = as_float(node.get("border_width", 0.0))
     if kind is None:
         why = f"replaced by flat ground: '{function}' has no counterpart; use one of {listing(_SUB_TERRAINS)}"
         node.report.entries[node.key] = ("approximated", why)
@@ -135,6 +133,8 @@ def _read_sub_terrain(node: Node, resolution: float) -> dict[str, Any]:
     inverted = "inverted" in function or bool(node.data.get("inverted"))
     node.skip("inverted")
     config: dict[str, Any] = {"proportion": proportion, "kind": kind}
+    if kind != "flat" and border:
+        config["border"] = border
     if kind not in ("flat", "noise", "waves") and "platform_width" in node:
         config["platform"] = as_float(node.get("platform_width"))
     their_range, our_range = _HEIGHT_RANGES.get(kind, ("", ""))

@@ -97,6 +97,10 @@ MeshRepeatedBoxesTerrainCfg = _sub_terrain(
     platform_width=1.0, object_type=None, max_height_noise=None, abs_height_noise=(0.0, 0.0),
     rel_height_noise=(1.0, 1.0), platform_height=-1.0,
 )  # fmt: skip
+MeshRepeatedBoxesTerrainCfg.ObjectCfg = make_config_class(
+    "ObjectCfg", "Size and number of the boxes.", num_objects=MISSING, height=MISSING, size=MISSING, max_yx_angle=0.0,
+    degrees=True,
+)  # fmt: skip
 
 
 def height_field_to_mesh(function: Any) -> Any:

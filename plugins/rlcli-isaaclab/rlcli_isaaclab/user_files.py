@@ -15,8 +15,24 @@ from rlcli.registry import is_framework
 from rlcli.sim.device_names import on_cpu
 
 
+def code_of(function: Any) -> Any:
+    """Return the function or class that has the code of a term, which may be a partial function or an object."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    return function if inspect.isfunction(function) or inspect.isclass(function) else type(function)
+
+
+def place_of_code(function: Any) -> tuple[Path, int]:
+    """Return the file and the first line of the code of a term; `?` if it has no file."""
+    try:
+        return Path(inspect.getsourcefile(code_of(function)) or "?"), inspect.getsourcelines(code_of(function))[1]
+    except (OSError, TypeError):
+        return Path("?"), 1
+
+
 def file_text(function: Any) -> str:
     """Return the text of the file that defines a function; empty if the file does not belong to the user."""
+    function = code_of(function)
     file = getattr(sys.modules.get(function.__module__), "__file__", None)
     return _text(file) if file and file.endswith(".py") and not is_framework(function.__module__) else ""
 
@@ -37,6 +53,7 @@ def term_reads_body_forces(function: Any) -> bool:
     waiting = [function]
     while waiting:
         item = waiting.pop()
+        item = code_of(item)
         if item in found or is_framework(str(getattr(item, "__module__", ""))):
             continue
         found[item] = source_text(item)
@@ -62,8 +79,10 @@ def placed(target: Any, device: Any) -> Any:
     kinds = [kind for kind in reversed(getattr(target, "__mro__", (target,))) if not is_framework(kind.__module__)]
     if str(device) != "cpu" or not any("cuda" in file_text(kind) for kind in kinds):
         return target
-    if not inspect.isclass(target):
+    if inspect.isfunction(target):
         return on_cpu(target)
+    if not inspect.isclass(target):
+        return target
     members = {name: on_cpu(f) for kind in kinds for name, f in vars(kind).items() if inspect.isfunction(f)}
     return type(target.__name__, (target,), {**members, "__module__": target.__module__})
 
@@ -71,7 +90,7 @@ def placed(target: Any, device: Any) -> Any:
 def source_text(function: Any) -> str:
     """Return the source code of a function; empty if it is not known."""
     try:
-        return inspect.getsource(function)
+        return inspect.getsource(code_of(function))
     except (OSError, TypeError):
         return ""
 

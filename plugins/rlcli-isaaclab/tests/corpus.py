@@ -32,6 +32,7 @@ OUTSIDE = ("pick_place",)
 
 def tasks(package: Path) -> dict[str, dict[str, Any]]:
     """Return ID -> arguments of every task that a package registers."""
+    from rlcli.registry.failed_imports import take_failures
     from rlcli.registry.task_imports import import_file, registrations
 
     import_file(package / "__init__.py")
@@ -41,6 +42,7 @@ def tasks(package: Path) -> dict[str, dict[str, Any]]:
                 import_file(file)
             except Exception as error:
                 print(f"{file}: {type(error).__name__}: {error}")
+    print(*take_failures(), sep="\n", flush=True)
     return dict(sorted(registrations.items()))
 
 
@@ -90,7 +92,8 @@ def run(
         stage = 3
         if last == "steps" or not facts["agents"]:
             return stage, "no agent" if last != "steps" else "", facts
-        train(f"{package}:{name}", folder)
+        is_symmetric = getattr(resolved.agent, "symmetry", None) is None
+        train(f"{package}:{name}", folder, [] if is_symmetric else ["agent.symmetry=null"])
         stage = 4
     except BaseException as error:
         text = " ".join(str(error).split())
@@ -122,14 +125,14 @@ def settings_of(value: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
     return {"scene": scene, "rest": to_dict(value)}
 
 
-def train(reference: str, folder: Path) -> None:
-    """Train a few iterations with the command line."""
+def train(reference: str, folder: Path, overrides: Sequence[str]) -> None:
+    """Train a few iterations with the command line. Stand-ins have no symmetry that an agent could use."""
     from rlcli.cli.app import main
 
     words = ["train", reference, "--num-envs", str(ENVS), "--max-iterations", str(ITERATIONS), "--name", "t"]
     (folder / "here").mkdir()
     os.chdir(folder / "here")
-    sys.argv = ["rlcli", *words, "--quiet", "--device", "cpu"]
+    sys.argv = ["rlcli", *words, *overrides, "--quiet", "--device", "cpu"]
     log = folder / "train.log"
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(descriptor, 1)

@@ -246,7 +246,7 @@ def mjcf(
         or ("base" if joints else (bodies or [name])[0])
     )
     rest = [b for b in bodies if b != root]
-    owned = {joint: (rest.pop(0) if rest else f"{joint}_moved") for joint in joints}
+    owned = {joint: (rest.pop(0) if rest else f"of_{joint}_moved") for joint in joints}
     fixed = "".join(
         f'<body name="{b}" pos="{0.1 * (i % 5)} {0.1 * (i // 5)} -0.1"><geom size="0.02" mass="0.05"/></body>'
         for i, b in enumerate(rest)
@@ -268,7 +268,7 @@ def mjcf(
     motors = f"<actuator>{drives}</actuator>" if driven else ""
     free = "<freejoint/>" if floating else ""
     mocap = ' mocap="true"' if moved and not floating else ""
-    if "shadow" in path.lower():
+    if "shadow" in path.lower() and len(joints) > 1:
         motors += f'<tendon><fixed name="tendon"><joint joint="{joints[0]}" coef="1"/><joint joint="{joints[1]}" coef="-1"/></fixed></tendon>'
     return (
         f'<mujoco model="{name}"><compiler angle="radian"/><worldbody><body name="{root}"{mocap}>{free}'

@@ -340,7 +340,7 @@ def test_environment_class_of_the_task_is_reported(unchanged):
     for name in [name for name in sys.modules if name.partition(".")[0] == "balance_own"]:
         del sys.modules[name]
     gymnasium.registry.pop("Template-Cartpole-v0", None)
-    why = "rlcli runs the configuration, without the methods of the task's own environment class"
+    why = "terms can call methods of the task's own environment class; rlcli itself calls none of them"
     assert notes() == [f"entry_point: ignored: {why}"]
 
 

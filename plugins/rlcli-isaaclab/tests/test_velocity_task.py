@@ -312,7 +312,8 @@ def test_terrain_generator_keeps_sub_terrains(velocity):
         'terrain_type="generator", max_init_terrain_level=1, terrain_generator=TerrainGeneratorCfg(size=(4.0, 4.0),'
         ' border_width=2.0, num_rows=3, num_cols=2, curriculum=True, sub_terrains={"slope":'
         " terrains.HfPyramidSlopedTerrainCfg(proportion=0.4, slope_range=(0.0, 0.3), platform_width=1.5),"
-        ' "rough": terrains.HfRandomUniformTerrainCfg(proportion=0.6, noise_range=(0.01, 0.05), noise_step=0.01)})'
+        ' "rough": terrains.HfRandomUniformTerrainCfg(proportion=0.6, noise_range=(0.01, 0.05), noise_step=0.01,'
+        " border_width=0.25)})"
     )
     imports = ("TerrainImporterCfg,\n", "TerrainGeneratorCfg, TerrainImporterCfg, terrains,\n")
     task = resolve(velocity(imports, ('terrain_type="plane"', generator)))
@@ -322,7 +323,7 @@ def test_terrain_generator_keeps_sub_terrains(velocity):
     assert terrain.friction == 0.8
     slope, rough = terrain.sub_terrains["slope"], terrain.sub_terrains["rough"]
     assert (slope.kind, slope.proportion, slope.slope, slope.platform) == ("slope", 0.4, (0.0, 0.3), 1.5)
-    assert (rough.kind, rough.spacing) == ("noise", 0.1)
+    assert (rough.kind, rough.spacing, rough.border, slope.border) == ("noise", 0.1, 0.25, 0.0)
     assert rough.height == pytest.approx((0.02, 0.02))  # 4 cm between the extremes, at every difficulty
     notes = {note.key: (note.status, note.text) for note in task.notes}
     generator = "scene.terrain.terrain_generator"

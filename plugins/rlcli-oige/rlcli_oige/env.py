@@ -194,7 +194,7 @@ class OigeEnv(DirectEnv):
         path = Path(file)
         top = next((folder for folder in path.parents if folder.name == "omniisaacgymenvs"), None)
         if top is not None:
-            refuse(".".join((top.name, *path.relative_to(top).with_suffix("").parts)), f"{path}:1: ")
+            refuse(".".join((top.name, *path.relative_to(top).with_suffix("").parts)), path)
         if not (path.parent / "__init__.py").is_file():
             return super()._import_task(reference)
         try:

@@ -6,6 +6,7 @@ MuJoCo are recorded when they are called; all others can be imported and raise a
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import re
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 from rlcli.errors import TaskError
 from rlcli_oige import name_lookup
+from rlcli_oige.task_class import parse_file
 from rlcli_oige.usd_names import Ignored, UsdContext, missing
 
 _REMOVED = re.compile(r"\b(?:np|numpy)\.(?:Inf|Infinity|NaN|float_)\b")
@@ -86,15 +88,25 @@ def find_hydra(name: str, file: str = "") -> ModuleType | None:
     return find(name) if own and (name != "omegaconf" or importlib.util.find_spec(name) is None) else None
 
 
-def refuse(name: str, where: str) -> None:
+def refuse(name: str, file: Path) -> None:
     """Check that a module of the user's package can be imported.
 
     Raises:
-        TaskError: with the reason.
+        TaskError: with the reason, and the line of the first import that has no counterpart.
     """
     reason = next((text for module, text in _REFUSED.items() if f"{name}.".startswith(f"{module}.")), None)
     if reason is not None:
-        raise TaskError(f"{where}{name}: {reason}")
+        raise TaskError(f"{file}:{_line_without_counterpart(file)}: {name}: {reason}")
+
+
+def _line_without_counterpart(file: Path) -> int:
+    """Return the line of the first import of a module of `_REASONS`; 1 if a file has none."""
+    for node in ast.walk(parse_file(file)):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        if any(f"{name}.".startswith(f"{module}.") for name in names for module in _REASONS):
+            return node.lineno  # type: ignore[attr-defined,no-any-return]
+    return 1
 
 
 class _Module(ModuleType):

@@ -141,8 +141,9 @@ def test_missing_module_and_refused_task_name_file(tmp_path):
     config = package(tmp_path / "b")
     folder = config.parents[2] / "tasks"
     (folder / "warp").mkdir()
-    (folder / "arm.py").rename(folder / "warp" / "arm.py")
-    with pytest.raises(TaskError, match=r"warp/arm.py:1: .*Warp arrays are not supported"):
+    (folder / "warp" / "arm.py").write_text(f"# a comment\n\nimport warp as wp\n{(folder / 'arm.py').read_text()}")
+    (folder / "arm.py").unlink()
+    with pytest.raises(TaskError, match=r"warp/arm.py:3: .*Warp arrays are not supported"):
         build(config)
 
 

@@ -12,6 +12,8 @@ class PatchConfig(StrictModel):
 
     proportion: NotNegative = 1.0
     """Share of the columns (without curriculum: of the patches), relative to the other sub-terrains."""
+    border: NotNegative = 0.0
+    """Width of the flat edge of the patch [m], rounded to whole cells."""
 
 
 class FlatPatchConfig(PatchConfig):

@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from rlcli_isaaclab import mdp
-from rlcli_isaaclab.config_class import MISSING, configclass, to_dict
-from rlcli_isaaclab.runtime import ManagerBasedRLEnv
+from rlcli_isaaclab.config_class import MISSING, configclass, fill_missing, to_dict
+from rlcli_isaaclab.runtime import OWN_CLASS, ManagerBasedRLEnv
 from rlcli_isaaclab.sim import SimulationCfg
-
-_OWN_CLASS = "isaaclab.envs:ManagerBasedRLEnv"
 
 
 @configclass
@@ -50,6 +48,8 @@ class ManagerBasedEnvCfg:
     export_io_descriptors: bool = False
     log_dir: Any = None
 
+    __rlcli_fill__ = fill_missing
+
     def __rlcli_environment__(self, entry: Any) -> None:
         """Store the environment class that the task's Gymnasium registration names, as a class or `module:Class`."""
         self._rlcli_class = entry
@@ -61,9 +61,9 @@ class ManagerBasedEnvCfg:
         from rlcli_isaaclab.settings import Report
 
         report = Report()
-        entry = getattr(self, "_rlcli_class", _OWN_CLASS)
-        if entry not in (_OWN_CLASS, ManagerBasedRLEnv):
-            why = "rlcli runs the configuration, without the methods of the task's own environment class"
+        entry = getattr(self, "_rlcli_class", OWN_CLASS)
+        if entry not in (OWN_CLASS, ManagerBasedRLEnv):
+            why = "terms can call methods of the task's own environment class; rlcli itself calls none of them"
             report.entries[("entry_point",)] = ("ignored", why)
         data = task(to_dict(self), report, root, models=models, cfg=self)
         return PythonTask(data, notes=report.user_notes())

@@ -1,0 +1,27 @@
+"""Versions of Isaac Lab and Isaac Sim, which task files compare. Names as in `isaaclab.utils.version`."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+_ISAAC_SIM = ("5.1.0", "", "5", "1", "0", "", "", "")
+"""Version of Isaac Sim for which Isaac Lab 2.3.2 was written: text, build, major, minor, patch and three more texts."""
+
+
+def get_version() -> tuple[str, ...]:
+    """Return the version of Isaac Sim as `isaacsim.core.version.get_version` does."""
+    return _ISAAC_SIM
+
+
+def get_isaac_sim_version() -> Any:
+    """Return the version of Isaac Sim as a `packaging.version.Version`."""
+    from packaging.version import Version  # task files that compare versions import this library themselves
+
+    return Version(_ISAAC_SIM[0])
+
+
+def compare_versions(v1: str, v2: str) -> int:
+    """Return 1 if the first version is newer, -1 if it is older, 0 if both are equal."""
+    first, second = ([int(number) for number in re.findall(r"\d+", text)] for text in (v1, v2))
+    return (first > second) - (first < second)

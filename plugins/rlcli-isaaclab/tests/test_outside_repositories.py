@@ -1,0 +1,360 @@
+"""Code of repositories that are built on Isaac Lab: their packages, term objects, actuators and sensors."""
+
+import logging
+import shutil
+import sys
+import warnings
+
+import gymnasium
+import pytest
+import torch
+from cartpole_files import write
+from test_isaaclab_packages import stepped
+from test_isaaclab_user_code import rover
+
+from rlcli.config.load import resolve
+from rlcli.envs.make import make_env
+from rlcli.errors import ConfigError, TaskError
+from rlcli.registry import find_task
+from rlcli.scene.names import NameProblem
+
+torch.set_num_threads(1)
+ROBOT = "    robot = ArticulationCfg("
+
+
+@pytest.fixture(autouse=True)
+def forget_modules():
+    known = set(sys.modules)
+    yield
+    for name in set(sys.modules) - known:
+        if name.partition(".")[0] in ("farm", "carts", "pond", "balance_own"):
+            del sys.modules[name]
+    for task in ("Template-Cartpole-v0", "Pond-v0"):
+        gymnasium.registry.pop(task, None)
+
+
+def test_package_beside_the_package_of_the_task(tmp_path):
+    tools = tmp_path / "tools_of_test"
+    tools.mkdir()
+    (tools / "__init__.py").write_text("from isaaclab.utils import configclass\n\nSTIFFNESS = 3.0\n")
+    stepped(rover(tmp_path / "tasks", "from tools_of_test import STIFFNESS\n"))
+
+
+OBJECTS = """
+import functools
+
+class Speed:
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, env, scale):
+        self.calls += 1
+        return scale * env.scene["robot"].data.joint_vel.abs().sum(dim=1) + self.calls
+
+speed = Speed()
+doubled = functools.partial(speed, scale=2.0)
+"""
+
+
+def test_terms_that_are_objects_and_partial_functions(tmp_path):
+    rewards = {
+        "speed": "RewardTermCfg(func=speed, weight=1.0, params={'scale': 1.0})",
+        "doubled": "RewardTermCfg(func=doubled, weight=1.0)",
+    }
+    _, result = stepped(rover(tmp_path / "rover", OBJECTS, rewards=rewards))
+    assert float(result.reward.min()) > 0.0
+
+
+LATE = """
+from isaaclab.actuators import ImplicitActuator
+
+class HalfActuator(ImplicitActuator):
+    def compute(self, control_action, joint_pos, joint_vel):
+        control_action.joint_positions = 0.5 * control_action.joint_positions
+        return super().compute(control_action, joint_pos, joint_vel)
+
+@configclass
+class HalfActuatorCfg(ImplicitActuatorCfg):
+    class_type: type = HalfActuator
+"""
+
+
+def test_subclass_of_the_implicit_actuator_computes_the_efforts(tmp_path):
+    own = ('"arm": ImplicitActuatorCfg(joint_names_expr=["arm"]', '"arm": HalfActuatorCfg(joint_names_expr=["arm"]')
+    resolved = rover(tmp_path / "rover", LATE, [own])
+    (note,) = [note for note in resolved.notes if note.key == "scene.robot.actuators.arm.class_type"]
+    assert note.status == "approximated"
+    env, _ = stepped(resolved, steps=60)
+    # the target 0.5 is halved by the user's class
+    assert env.entities["robot"].data.joint_pos[:, 0].mean() == pytest.approx(0.25, abs=0.03)
+
+
+def test_drive_without_effort_does_nothing(tmp_path):
+    own = ("stiffness=0.0, damping=2.0", "stiffness=0.0, damping=2.0, effort_limit=0.0")
+    action = ('    wheel = mdp.JointVelocityActionCfg(asset_name="robot", joint_names=["wheel"])\n', "")
+    resolved = rover(tmp_path / "rover", "", [own, action])
+    assert "wheel" not in (resolved.task.scene.entities["robot"].joints or {})
+    stepped(resolved)
+
+
+SHAPES = """
+def shapes(env):
+    asset = env.scene["robot"]
+    paths = asset.root_physx_view.link_paths[0]
+    counts = [asset._physics_sim_view.create_rigid_body_view(path).max_shapes for path in paths]
+    assert paths[1].endswith("/upper") and counts == [1, 1, 1] and sum(counts) == asset.root_physx_view.max_shapes
+    return torch.ones(env.num_envs)
+"""
+
+
+def test_number_of_shapes_of_each_body(tmp_path):
+    stepped(rover(tmp_path / "rover", SHAPES, rewards={"own": "RewardTermCfg(func=shapes, weight=1.0)"}))
+
+
+def test_names_that_files_use_while_they_are_imported(tmp_path):
+    code = """
+from isaaclab.envs.mdp import *
+from isaaclab.sim.utils import apply_nested, clone
+from isaaclab.utils.version import compare_versions, get_isaac_sim_version
+from isaacsim.core.version import get_version
+from isaaclab.terrains import MeshRepeatedBoxesTerrainCfg
+
+@clone
+@apply_nested
+def spawn_own(prim_path, cfg, *args):
+    return prim_path
+
+assert int(get_version()[2]) == get_isaac_sim_version().major and compare_versions("5.0.0", "4.10.0") == 1
+assert ActionTermCfg and Articulation and math_utils.wrap_to_pi and sim_utils.SphereCfg and math.pi and Sequence
+boxes = MeshRepeatedBoxesTerrainCfg.ObjectCfg(num_objects=3, height=0.1, size=(0.1, 0.1))
+"""
+    stepped(rover(tmp_path / "rover", code))
+
+
+def test_section_without_configclass_has_no_terms(tmp_path):
+    plain = ("    @configclass\n    class Curriculum:", "    class Curriculum:")
+    stage = "CurriculumTermCfg(func=mdp.modify_reward_weight, params={})"
+    resolved = rover(tmp_path / "rover", "", [plain], curriculum={"more": stage})
+    (note,) = [note for note in resolved.notes if note.key == "curriculum"]
+    assert (note.status, resolved.task.curriculum) == ("ignored", {})
+    assert note.text == "the class Curriculum has no @configclass: Isaac Lab reads no terms of it"
+
+
+CHOSEN = """
+def chosen(env, asset_cfg, number: int):
+    assert number == 0.5
+    assert len(asset_cfg.body_ids) == 3 and isinstance(asset_cfg.joint_ids, slice)
+    return torch.ones(env.num_envs)
+"""
+
+
+def test_regex_of_all_bodies_gives_ids_and_a_list_of_all_names_gives_a_slice(tmp_path):
+    entity = "SceneEntityCfg('robot', body_names='.*', joint_names=['arm', 'wheel'])"
+    term = f"RewardTermCfg(func=chosen, weight=1.0, params={{'asset_cfg': {entity}, 'number': 0.5}})"
+    stepped(rover(tmp_path / "rover", CHOSEN, rewards={"own": term}))
+
+
+NONE = """
+def none(env, asset_cfg):
+    return env.scene["robot"].data.body_pos_w[:, asset_cfg.body_ids].sum(dim=(1, 2)) + 1.0
+"""
+
+
+def test_empty_list_of_bodies_selects_none(tmp_path):
+    entity = "SceneEntityCfg('robot', body_names=[])"
+    term = f"RewardTermCfg(func=none, weight=1.0, params={{'asset_cfg': {entity}}})"
+    _, result = stepped(rover(tmp_path / "rover", NONE, rewards={"own": term}))
+    assert result.reward.tolist() == pytest.approx([0.02] * 4)
+
+
+RAYS = """
+from isaaclab.assets import AssetBaseCfg
+from isaaclab.sensors import RayCasterCfg, patterns
+
+def fan(cfg, device):
+    angles = torch.linspace(-0.5, 0.5, cfg.count, device=device)
+    rays = torch.stack([angles.sin(), 0.0 * angles, -angles.cos()], dim=1)
+    return torch.zeros_like(rays), rays
+
+@configclass
+class FanCfg:
+    func: object = fan
+    count: int = 5
+
+def distances(env):
+    hits = env.scene["rays"].data.ray_hits_w
+    assert hits.clone().view(env.num_envs, -1).shape == (env.num_envs, 3 * env.scene["rays"].num_rays)
+    return (hits - env.scene["rays"].data.pos_w[:, None]).norm(dim=-1).sum(dim=1)
+"""
+LIDAR = (
+    "patterns.LidarPatternCfg(channels=2, vertical_fov_range=(-30, -20), horizontal_fov_range={}, horizontal_res=90)"
+)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "count", "first"),
+    [
+        (LIDAR.format("(-180, 180)"), 8, [-0.8660254, 0.0, -0.5]),
+        (LIDAR.format("(-90, 90)"), 6, [0.0, -0.8660254, -0.5]),
+        ("patterns.BpearlPatternCfg(horizontal_res=90.0)", 4 * 32, [0.0087265, 0.0, 0.9999619]),
+        ("FanCfg()", 5, [-0.4794255, 0.0, -0.8775826]),
+    ],
+)
+def test_patterns_of_rays(tmp_path, pattern, count, first):
+    sensor = (
+        f"    rays = RayCasterCfg(prim_path='{{ENV_REGEX_NS}}/Robot/base', mesh_prim_paths=[], pattern_cfg={pattern})"
+    )
+    reward = {"far": "RewardTermCfg(func=distances, weight=1.0)"}
+    ground = "    ground = AssetBaseCfg(prim_path='/World/ground', spawn=sim_utils.GroundPlaneCfg())"
+    resolved = rover(tmp_path / "rover", RAYS, [(ROBOT, f"{ground}\n{sensor}\n{ROBOT}")], rewards=reward)
+    rays = resolved.task.scene.sensors["rays"].pattern
+    assert (len(rays), list(rays[0])) == (count, pytest.approx(first, abs=1e-6))
+    _, result = stepped(resolved)
+    assert bool(result.reward.isfinite().all())
+
+
+def test_rotation_of_rays_from_one_point(tmp_path):
+    offset = "offset=RayCasterCfg.OffsetCfg(rot=(0.7071068, 0.0, 0.0, 0.7071068))"  # 90 degrees about z
+    pattern = LIDAR.format("(0, 0)")
+    path = "prim_path='{ENV_REGEX_NS}/Robot/base', mesh_prim_paths=[]"
+    sensor = f"    rays = RayCasterCfg({path}, {offset}, pattern_cfg={pattern})"
+    resolved = rover(tmp_path / "rover", RAYS, [(ROBOT, f"{sensor}\n{ROBOT}")])
+    first = list(resolved.task.scene.sensors["rays"].pattern[0])
+    assert first == pytest.approx([0.0, 0.8660254, -0.5], abs=1e-6)
+
+
+@pytest.mark.parametrize("line", ["from . import pond", "from .pond import PondCfg", "import carts.pond as pond"])
+def test_task_is_found_beside_a_task_that_cannot_be_imported(tmp_path, caplog, line):
+    package = write(tmp_path / "carts")
+    pond = package / "pond"
+    pond.mkdir()
+    (pond / "__init__.py").write_text("import gymnasium\n\nraise ValueError('no water')\n")
+    start = package / "__init__.py"
+    more = "\ngymnasium.register('Pond-v0', entry_point='x', kwargs={'env_cfg_entry_point': %s})\n"
+    name = "PondCfg" if "PondCfg" in line else "pond.PondCfg"
+    start.write_text(f"import gymnasium\n{line}\n{start.read_text()}{more % name}")
+    with caplog.at_level(logging.WARNING):
+        assert resolve(find_task(f"{package}:Template-Cartpole-v0")).task.rewards
+    assert f"carts.pond is left out: no water ({pond}/__init__.py:3)" in [r.getMessage() for r in caplog.records]
+    with pytest.raises(TaskError, match=rf"ValueError: no water \({pond}/__init__.py:3\)"):
+        resolve(find_task(f"{package}:Pond-v0"))
+
+
+def test_file_that_its_package_imports_under_another_name_is_imported_once(tmp_path):
+    reach = tmp_path / "farm" / "tasks" / "reach"
+    write(reach)
+    (tmp_path / "farm" / "__init__.py").write_text("")
+    start = reach / "__init__.py"
+    start.write_text(f"{start.read_text()}\nimport farm.tasks.reach.cartpole_env_cfg\n")
+    file = next(file for file in reach.glob("*.py") if "class CartpoleEnvCfg" in file.read_text())
+    start.write_text(start.read_text().replace("cartpole_env_cfg\n", f"{file.stem}\n"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # Gymnasium warns if a task is registered twice
+        resolve(find_task(f"{file}:CartpoleEnvCfg"))
+    names = [name for name, module in sys.modules.items() if getattr(module, "__file__", None) == str(file)]
+    assert len({id(sys.modules[name]) for name in names}) == 1
+
+
+def test_task_that_only_a_package_below_registers(tmp_path):
+    (tmp_path / "carts" / "tasks").mkdir(parents=True)
+    write(tmp_path / "carts" / "tasks" / "balance")
+    for folder in ("carts", "carts/tasks"):
+        (tmp_path / folder / "__init__.py").write_text("")
+    assert resolve(find_task(f"{tmp_path / 'carts'}:Template-Cartpole-v0")).task.rewards
+
+
+PHASE = """
+from isaaclab.envs import ManagerBasedRLEnv
+
+class RoverEnv(ManagerBasedRLEnv):
+    def __init__(self, cfg, render_mode=None, **kwargs):
+        self.period = 0.5
+        super().__init__(cfg, render_mode, **kwargs)
+        self.offset = torch.ones(self.num_envs)
+
+    def phase(self):
+        return self.offset + self.episode_length_buf * self.step_dt / self.period
+
+def in_phase(env):
+    return env.phase()
+"""
+
+
+def test_term_calls_a_method_of_the_own_environment_class(tmp_path):
+    reward = {"own": "RewardTermCfg(func=in_phase, weight=1.0)"}
+    rover(tmp_path / "rover", PHASE, rewards=reward)
+    package = shutil.copytree(tmp_path / "rover", tmp_path / "pond")
+    file = package / "rover_env.py"
+    register = "gymnasium.register('Pond-v0', entry_point=f'{__name__}:RoverEnv', kwargs={'env_cfg_entry_point': %s})"
+    file.write_text(f"{file.read_text()}\nimport gymnasium\n{register % 'RoverEnvCfg'}\n")
+    (package / "__init__.py").write_text("from . import rover_env\n")
+    _, result = stepped(resolve(find_task(f"{package}:Pond-v0")))
+    assert result.reward.tolist() == pytest.approx([0.02 * (1.0 + 3 * 0.02 / 0.5)] * 4)
+
+
+MOTION = """
+from dataclasses import MISSING
+
+def far(env, goal, asset_cfg):
+    return torch.full((env.num_envs,), float(goal))
+
+def seeks(env):
+    return env.scene["robot"].find_bodies("")[0]
+"""
+FAR = "RewardTermCfg(func=far, weight=1.0, params={'goal': MISSING, 'asset_cfg': SceneEntityCfg('robot')})"
+
+
+def test_missing_setting_is_given_on_the_command_line(tmp_path):
+    replaced = [("self.decimation, self.episode_length_s", "self.decimation, self.other")]
+    with pytest.raises(ConfigError) as raised:
+        rover(tmp_path / "a", MOTION, replaced, rewards={"far": FAR})
+    assert "missing 'episode_length_s'" in str(raised.value)
+    assert "rewards.far.params: missing 'goal'" in str(raised.value)
+    task = find_task(f"{tmp_path / 'a' / 'rover_env.py'}:RoverEnvCfg")
+    words = ["episode_length_s=2.0", "rewards.far.params.goal=3", "rewards.far.weight=2.0"]
+    resolved = resolve(task, overrides=words)
+    assert (resolved.task.episode_length_s, resolved.task.rewards["far"].weight) == (2.0, 2.0)
+    _, result = stepped(resolved)
+    assert result.reward.tolist() == pytest.approx([6.0 * 0.02] * 4)
+
+
+def test_missing_and_empty_names_of_bodies_name_key_and_line(tmp_path):
+    touch = "    touch = ContactSensorCfg(prim_path='{ENV_REGEX_NS}/Robot/.*')"
+    replaced = [(ROBOT, f"{touch}\n{ROBOT}")]
+    entity = "SceneEntityCfg('touch', body_names=MISSING)"
+    forces = f"RewardTermCfg(func=mdp.contact_forces, weight=1.0, params={{'threshold': 1.0, 'sensor_cfg': {entity}}})"
+    code = f"from isaaclab.sensors import ContactSensorCfg\n{MOTION}"
+    with pytest.raises(ConfigError, match=r"rover_env.py:\d+: rewards.forces.params.sensor_cfg.body_names: missing"):
+        rover(tmp_path / "a", code, replaced, rewards={"forces": forces})
+    env = make_env(rover(tmp_path / "b", MOTION, rewards={"own": "RewardTermCfg(func=seeks, weight=1.0)"}), seed=0)
+    env.reset()
+    with pytest.raises(NameProblem, match=r"rover_env.py:\d+: no body matches ''"):
+        env.step(torch.zeros(4, env.layout.action_size))
+
+
+RUNNER = """
+from isaaclab.utils import configclass
+from isaaclab_rl.rsl_rl import RslRlMLPModelCfg, RslRlOnPolicyRunnerCfg, RslRlPpoAlgorithmCfg
+
+@configclass
+class RunnerCfg(RslRlOnPolicyRunnerCfg):
+    num_steps_per_env, max_iterations, save_interval, experiment_name = 8, 1, 1, "rover"
+    obs_groups = {"actor": ["actor"], "critic": ["actor"]}
+    distribution = RslRlMLPModelCfg.GaussianDistributionCfg(init_std=0.5)
+    actor = RslRlMLPModelCfg(hidden_dims=[8], activation="elu", distribution_cfg=distribution)
+    critic = RslRlMLPModelCfg(hidden_dims=[16], activation="elu")
+    algorithm = RslRlPpoAlgorithmCfg(
+        value_loss_coef=1.0, use_clipped_value_loss=True, clip_param=0.2, entropy_coef=0.01, num_learning_epochs=2,
+        num_mini_batches=2, learning_rate=1e-3, schedule="adaptive", gamma=0.99, lam=0.95, desired_kl=0.01,
+        max_grad_norm=1.0,
+    )
+"""
+
+
+def test_runner_of_rsl_rl_5_with_its_observation_group(tmp_path):
+    rover(tmp_path / "rover", "", [("policy: Policy = Policy()", "actor: Policy = Policy()")])
+    (tmp_path / "rover" / "agents").mkdir()
+    (tmp_path / "rover" / "agents" / "rsl_rl_cfg.py").write_text(RUNNER)
+    resolved = resolve(find_task(f"{tmp_path / 'rover' / 'rover_env.py'}:RoverEnvCfg"))
+    assert list(resolved.task.observations) == ["policy"]
+    assert (resolved.agent.init_std, resolved.agent.critic.hidden) == (0.5, (16,))

@@ -1,0 +1,83 @@
+"""Imports that failed in the `__init__.py` of a package that registers tasks: another of its tasks may be wanted."""
+
+import logging
+import sysconfig
+import traceback
+from pathlib import Path
+from typing import Any
+
+from rlcli.registry.formats import is_framework
+
+_log = logging.getLogger(__name__)
+_failures: dict[str, Exception] = {}
+"""Name of a module -> the error of its import, for the imports that were not reported yet."""
+_LIBRARIES = tuple(path for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib")))
+"""Folders of Python's and of installed libraries."""
+
+
+class FailedImport:
+    """Replacement of a module whose import failed, and of its members. Its use raises the error of the import."""
+
+    __all__: tuple[str, ...] = ()
+
+    def __init__(self, name: str, error: Exception) -> None:
+        self.__name__ = self.__module__ = name
+        self._error = error
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return FailedImport(f"{self.__name__}.{name}", self._error)
+
+    def __call__(self, *args: Any, **settings: Any) -> Any:
+        """Raise the error of the import."""
+        raise self._error
+
+    __mro_entries__ = __call__
+
+
+def failed_import(name: str, error: Exception) -> FailedImport:
+    """Record that the import of a module failed, and return a replacement of the module."""
+    _failures[name] = error
+    return FailedImport(name, error)
+
+
+def take_failures() -> list[str]:
+    """Return a text for each failed import since the last call: the module, the error, and its file and line."""
+    found = [f"{name} is left out: {error}{error_location(error)}" for name, error in _failures.items()]
+    _failures.clear()
+    return found
+
+
+def report_failures() -> None:
+    """Print a warning for each failed import since the last report."""
+    for text in take_failures():
+        _log.warning("%s", text)
+
+
+def can_be_left_out(name: str, level: int, file: Path) -> bool:
+    """Return whether a task file's failing import may be left out.
+
+    The file is the `__init__.py` of a package, and it registers tasks, or imports a package that does.
+
+    Args:
+        name: name of the module in the import statement, without leading dots.
+        level: number of leading dots.
+        file: the importing file.
+    """
+    if file.name != "__init__.py":
+        return False
+    folder = file.parents[max(level - 1, 0)].joinpath(*name.split(".") if level else ())
+    return any(b"register(" in start.read_bytes() for start in (file, folder / "__init__.py") if start.is_file())
+
+
+def error_location(error: BaseException) -> str:
+    """Return ` (file:line)` of the code that raised an error, if possible of the task's own code."""
+    frames = [
+        (frame.f_code.co_filename, line, is_framework(str(frame.f_globals.get("__name__", ""))))
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if not frame.f_code.co_filename.startswith("<")
+    ]
+    other = [frame for frame in frames if not frame[2]] or frames
+    own = [frame for frame in other if not frame[0].startswith(_LIBRARIES)] or other
+    return f" ({own[-1][0]}:{own[-1][1]})" if own else ""
