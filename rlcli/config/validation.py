@@ -9,10 +9,10 @@ from typing import Any, Self
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, python_task
-from rlcli.config.foreign_keys import foreign_keys, move_foreign_keys
 from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read, without
 from rlcli.config.model_option import MODELS, given_settings, model_path
 from rlcli.config.older_success import upgraded
+from rlcli.config.other_framework_keys import foreign_keys, move_foreign_keys
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import (

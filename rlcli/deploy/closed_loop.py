@@ -27,7 +27,7 @@ from torch import Tensor
 from rlcli.config.load import resolve
 from rlcli.deploy.env_description import describe
 from rlcli.deploy.export import TOLERANCE, relative_difference
-from rlcli.deploy.verification_files import PROGRAM, generate_program, open_model, write_model, write_program
+from rlcli.deploy.run_policy_files import PROGRAM, generate_program, open_model, write_model, write_program
 from rlcli.envs.direct import DirectEnv
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
@@ -39,7 +39,7 @@ from rlcli.rl.action_functions import trained_policy
 from rlcli.rl.policy import Policy
 from rlcli.rl.rng import seed_generators
 from rlcli.runs.checkpoint_reader import Checkpoint
-from rlcli.runs.manifest_schema import deployment_differences
+from rlcli.runs.policy_interface import deployment_differences
 from rlcli.runs.policy_ref import Choice
 from rlcli.runs.restore import require_fit
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from rlcli.rl.policy import Policy
-from rlcli.runs.manifest_schema import ActionColumns
+from rlcli.runs.policy_interface import ActionColumns
 
 
 class DeployedPolicy(nn.Module):

@@ -153,8 +153,8 @@ _KNOWN = ("enable", "enabled", "on", "true", "1", "glx", "wgl", "cgl")
 
 
 def run_isolated(check_name: str, timeout_s: float) -> Answer:
-    """Run a check of `isolated_process.py` in a separate process; return (result, ""), or (None, why it failed)."""
-    command = python_command("-m", "rlcli.doctor.isolated_process", check_name)
+    """Run a check of `isolated_checks.py` in a separate process; return (result, ""), or (None, why it failed)."""
+    command = python_command("-m", "rlcli.doctor.isolated_checks", check_name)
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     try:
         done = subprocess.run(

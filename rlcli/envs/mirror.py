@@ -1,9 +1,9 @@
 """Mirror maps of a task: how its observations and actions change if the world is reflected about the x-z plane.
 
-The map of the action follows from the geometry of the entities (`rlcli.scene.mirror`). Then environments in random
-states and their mirror images take the same steps on the CPU engine, with mirrored actions. Their motions and rewards
-must stay mirror images of each other. The map of the observations follows from the observations of both: the mirror
-image of each column must equal that column or another one of the same term, or its negative.
+The map of the action follows from the geometry of the entities (`rlcli.scene.entity_mirror`). Then environments in
+random states and their mirror images take the same steps on the CPU engine, with mirrored actions. Their motions and
+rewards must stay mirror images of each other. The map of the observations follows from the observations of both: the
+mirror image of each column must equal that column or another one of the same term, or its negative.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rlcli.envs.managed import ManagedEnv
 from rlcli.errors import ConfigError, TaskError
 from rlcli.managers.observation_pipeline import Pipeline
 from rlcli.scene.entity import Entity
-from rlcli.scene.mirror import QUATERNION, EntityMirror
+from rlcli.scene.entity_mirror import QUATERNION, EntityMirror
 from rlcli.scene.sensors import RaySensor
 from rlcli.sim.rotations import from_euler
 

@@ -20,8 +20,8 @@ from rlcli.envs.build import build_simulation, grid, open_scene
 from rlcli.envs.counters import EpisodeCounters
 from rlcli.envs.divergence import DivergenceGuard
 from rlcli.envs.observers import Observers
+from rlcli.envs.saved_state import load_state, save_state
 from rlcli.envs.shard_range import Shard
-from rlcli.envs.state import load_state, save_state
 from rlcli.envs.step_result import Episodes, StepRecord, StepResult
 from rlcli.envs.workflow import Workflow
 from rlcli.machine import require_device

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rlcli.mdp.term import EntityTerm, Term
 from rlcli.mdp.term_helpers import distance_to_goal, goal_in_world, goal_quat_in_world
-from rlcli.scene.mirror import QUATERNION, VECTOR
+from rlcli.scene.entity_mirror import QUATERNION, VECTOR
 from rlcli.sim.env_selection import Selection, one_column
 from rlcli.sim.markers import ACTUAL, COMMANDED, Arrow, Color, Frame, Marker, Sphere
 from rlcli.sim.rotations import atan2, from_euler, heading, rotate, unique, wrap_to_pi, yaw_only

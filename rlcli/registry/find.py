@@ -7,9 +7,9 @@ from pathlib import Path
 from rlcli.errors import TaskError
 from rlcli.registry.entries import TASKS, catalog, find_entry
 from rlcli.registry.formats import find_in_formats, require_format
-from rlcli.registry.packages import installed_task, task_of_file
+from rlcli.registry.installed_tasks import installed_task, task_of_file
+from rlcli.registry.local_tasks import folder_task, python_task
 from rlcli.registry.task_location import TaskSource
-from rlcli.registry.uninstalled_tasks import folder_task, python_task
 
 KEYWORDS = ("latest", "shipped")
 """Words of a command line that name the newest run and the policy of a task, never a folder."""

@@ -13,10 +13,10 @@ from pydantic import ValidationError
 
 from rlcli.config import strict_yaml
 from rlcli.config.dump import origins
-from rlcli.config.foreign_keys import move_foreign_keys
 from rlcli.config.layers import leaves
 from rlcli.config.load import resolve
 from rlcli.config.messages import dotted
+from rlcli.config.other_framework_keys import move_foreign_keys
 from rlcli.config.schema import TaskConfig
 from rlcli.config.term_signatures import Vocabulary
 from rlcli.errors import CheckpointError, RlcliError
@@ -129,7 +129,7 @@ def _card(run: Run, document: strict_yaml.Document | None, checkpoint: Path | No
 
 
 def _layout(checkpoint: Path | None) -> dict[str, Any] | None:
-    from rlcli.runs.manifest_schema import LayoutRecord
+    from rlcli.runs.policy_interface import LayoutRecord
 
     if checkpoint is not None:
         with contextlib.suppress(CheckpointError, ValidationError):

@@ -12,9 +12,9 @@ from rlcli.config.schema import GridPatternConfig, RaySensorConfig
 from rlcli.errors import TaskError
 from rlcli.scene.camera import CameraSensor, make_cameras
 from rlcli.scene.entity import Entity
+from rlcli.scene.height_lookup import HeightTable
 from rlcli.scene.lazy_sensor import LazySensor
 from rlcli.scene.sensor_builder import CameraSensorSpec, ContactSensorSpec, RaySensorSpec, SensorSpec
-from rlcli.scene.terrain_heights import HeightTable
 from rlcli.sim.acceleration_fields import sensor_columns
 from rlcli.sim.column_views import as_index
 from rlcli.sim.env_selection import Selection

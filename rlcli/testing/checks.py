@@ -15,7 +15,7 @@ import torch
 from rlcli.errors import ConfigError, DependencyError, DeviceError, MachineError, ShapeError, TaskError, require_known
 from rlcli.progress import tracked
 from rlcli.runs.atomic_io import write_atomic
-from rlcli.testing import episode_checks, portability_checks, step_and_file_checks
+from rlcli.testing import episode_checks, equivalence_checks, step_and_file_checks
 from rlcli.testing.findings import Finding, NotRunError, task_error_text
 from rlcli.testing.task_under_test import NUM_ENVS, TaskUnderTest, open_task
 
@@ -25,15 +25,15 @@ OnCheck = Callable[[str, "list[Finding] | None"], None]
 OnNote = Callable[[str, str], None]
 """Function that receives the name of a check and a remark of it that is no finding."""
 
-_files, _episodes, _portability = step_and_file_checks, episode_checks, portability_checks
+_files, _episodes, _equivalence = step_and_file_checks, episode_checks, equivalence_checks
 _IN_ORDER: tuple[Check, ...] = (
     *(_files.names, _files.yaml_round_trip, _files.finite, _files.shapes, _files.dtypes),
     *(_files.random_actions, _files.extreme_actions, _episodes.same_seed, _episodes.start_states),
     *(_files.constant_columns, _files.aliasing, _episodes.partial_reset, _episodes.final_observations),
     *(_episodes.truncation, _episodes.termination, _episodes.repeated_observation),
     *(_episodes.observation_after_reset, _episodes.back_fill),
-    *(_portability.checkpoint, _portability.layout, _portability.policy, _portability.threads),
-    *(_portability.num_envs, _portability.speed, _portability.engines, _portability.captured),
+    *(_equivalence.checkpoint, _equivalence.layout, _equivalence.policy, _equivalence.threads),
+    *(_equivalence.num_envs, _equivalence.speed, _equivalence.engines, _equivalence.captured),
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in _IN_ORDER}
 """Name -> check, in the order in which they run; `docs/tutorials/first-plugin.md` lists them.
@@ -114,7 +114,7 @@ def record_layout(
         TaskError: if there is no such task, or it cannot be imported.
     """
     subject = open_task(task, agent, overrides, config, NUM_ENVS, 0)
-    record, file = subject.env().layout.record(), portability_checks.layout_file(subject)
+    record, file = subject.env().layout.record(), equivalence_checks.layout_file(subject)
     columns = {part: record[part] for part in ("observations", "actions")}
     return write_atomic(file, json.dumps(columns, indent=1) + "\n")  # a link at this path is replaced, not followed
 

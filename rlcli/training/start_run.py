@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.config.dump import explicit_values, to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
-from rlcli.envs.sharding.choice import number_of_workers
+from rlcli.envs.sharding.worker_count import number_of_workers
 from rlcli.envs.sharding.workers import close_early, start_early
 from rlcli.errors import CheckpointError, DeviceError, UsageError
 from rlcli.machine import choose_device

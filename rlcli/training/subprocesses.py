@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rlcli.envs.sharding.choice import ONE_WORKER
+from rlcli.envs.sharding.worker_count import ONE_WORKER
 from rlcli.errors import STOPPED, RlcliError
 from rlcli.machine import python_command
 from rlcli.training.signals import StopRequest

@@ -20,8 +20,8 @@ from typing import Any
 import torch
 
 from rlcli.config.load import Resolved
-from rlcli.envs.sharding.choice import number_of_workers
 from rlcli.envs.sharding.training_env import make_training_env
+from rlcli.envs.sharding.worker_count import number_of_workers
 from rlcli.errors import ConfigError
 from rlcli.machine import available_cores, available_memory, resident_memory
 from rlcli.rl.trainer import Trainer

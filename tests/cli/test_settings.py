@@ -7,7 +7,7 @@ import typing
 import pytest
 from support.pseudo_terminal import run_on_terminal
 
-from rlcli.cli.ui import viewer_choice
+from rlcli.cli.ui import open_viewer
 from rlcli.config.user_settings import read_settings
 from rlcli.config.user_settings_schema import UserSettings
 from rlcli.runs.run_ref import default_runs_dir
@@ -78,7 +78,7 @@ def test_unknown_home_folder_stays_and_null_character_is_refused(settings, in_pr
 )
 def test_verbosity_flag_overrides_settings(settings, in_process, monkeypatch, verbosity, flags, loud):
     settings(f"verbosity: {verbosity}\n")
-    monkeypatch.setattr("rlcli.cli.commands.validate.log_notes", lambda _: viewer_choice.console.detail("a detail"))
+    monkeypatch.setattr("rlcli.cli.commands.validate.log_notes", lambda _: open_viewer.console.detail("a detail"))
     code, _, err = in_process("validate", "cartpole", *flags)
     assert code == 0
     assert ("a detail" in err) == loud
@@ -88,7 +88,7 @@ def test_preferred_viewer_applies_only_without_explicit_choice(monkeypatch):
     monkeypatch.setattr("rlcli.sim.gl.has_display", lambda: False)
 
     def first(viewer, port=None, headless=False):
-        return viewer_choice.choose_viewers(viewer, port, headless=headless)[0][0]
+        return open_viewer.choose_viewers(viewer, port, headless=headless)[0][0]
 
     with use_settings({"viewer": "web"}):
         assert first(None) == "web"
@@ -97,7 +97,7 @@ def test_preferred_viewer_applies_only_without_explicit_choice(monkeypatch):
         assert first(None, headless=True) == "none", "a file is written"
     with use_settings({"viewer": "native"}):
         assert first(None) == "none", "there is no display"
-    monkeypatch.setitem(viewer_choice.VIEWERS, "another", "another.module:run")
+    monkeypatch.setitem(open_viewer.VIEWERS, "another", "another.module:run")
     with use_settings({"viewer": "another"}):
         assert first(None) == "another"
     with use_settings({"viewer": "none"}):
@@ -176,7 +176,7 @@ def test_settings_have_same_choices_as_flags():
     def choices(field):
         return set(typing.get_args(UserSettings.model_fields[field].annotation))
 
-    assert choices("viewer") == set(viewer_choice.CHOICES)
+    assert choices("viewer") == set(open_viewer.CHOICES)
     for name in (*LOGGERS, "none"):
         UserSettings(loggers=[name])
     assert not {"tasks", "agent", "device", "seed"} & set(UserSettings.model_fields)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rlcli.cli.app import main
-from rlcli.deploy import verification_files
+from rlcli.deploy import run_policy_files
 from rlcli.errors import UsageError
 from rlcli.runs.run_ref import find_checkpoint
 
@@ -339,10 +339,10 @@ def test_model_with_mesh_files_is_written_as_binary(tmp_path):
     folder = tmp_path / "written"
     folder.mkdir()
     model = spec.compile()
-    file = verification_files.write_model(spec, model, folder)
+    file = run_policy_files.write_model(spec, model, folder)
     assert list(folder.iterdir()) == [file]
     assert file.name == "model.mjb"
-    again = verification_files.open_model(file)
+    again = run_policy_files.open_model(file)
     assert again.joint(0).name == "turn"
     np.testing.assert_array_equal(again.mesh_vert, model.mesh_vert)
 
@@ -353,16 +353,16 @@ def test_binary_model_is_overwritten_only_beside_program_that_loads_it(tmp_path)
 
     def assert_refused():
         with pytest.raises(UsageError, match=r"model\.mjb"):
-            verification_files.check_overwrites(policy)
+            run_policy_files.check_overwrites(policy)
 
     assert_refused()
     program.write_text('import mujoco\nmujoco.MjModel.from_binary_path("model.mjb")\n')
     assert_refused()
-    program.write_text(verification_files.generate_program(policy, tmp_path / "model.xml", "numpy"))
+    program.write_text(run_policy_files.generate_program(policy, tmp_path / "model.xml", "numpy"))
     assert_refused()
     for format_ in ("numpy", "onnx", "torch"):
-        program.write_text(verification_files.generate_program(policy, model, format_))
-        verification_files.check_overwrites(policy)
+        program.write_text(run_policy_files.generate_program(policy, model, format_))
+        run_policy_files.check_overwrites(policy)
     assert model.read_bytes() == b"mine"
 
 

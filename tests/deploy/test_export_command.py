@@ -15,7 +15,7 @@ import safetensors.torch
 import torch
 
 from rlcli.cli.app import main
-from rlcli.deploy.verification_files import generate_program
+from rlcli.deploy.run_policy_files import generate_program
 
 WITHOUT = """
 import importlib.abc, sys

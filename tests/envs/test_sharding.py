@@ -15,10 +15,10 @@ from rlcli.config.load import resolve
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.shard_range import split
 from rlcli.envs.sharding import workers
-from rlcli.envs.sharding.choice import number_of_workers
 from rlcli.envs.sharding.env import ShardedEnv
 from rlcli.envs.sharding.state import join_states, split_state
 from rlcli.envs.sharding.training_env import make_training_env
+from rlcli.envs.sharding.worker_count import number_of_workers
 from rlcli.errors import ConfigError, DivergedError, MachineError, TaskError
 from rlcli.registry import find_task
 

@@ -8,8 +8,8 @@ from support.worlds import CRITTER_TASK, actions, build, critter, edited, result
 
 from rlcli.config.schema import TerrainGeneratorConfig
 from rlcli.errors import ConfigError
+from rlcli.scene.height_lookup import HeightTable
 from rlcli.scene.terrain import make_ground
-from rlcli.scene.terrain_heights import HeightTable
 
 torch.set_num_threads(1)
 

@@ -125,7 +125,7 @@ def _report(
         Stopped: if the user stopped the measurements.
     """
     from rlcli.runs.atomic_io import write_atomic
-    from rlcli.tuning.bench_preset import bench_preset, explanation
+    from rlcli.tuning.recommended_preset import bench_preset, explanation
 
     findings = bench.findings
     _show(findings, (bench.horizon_key or "horizon").upper())

@@ -89,7 +89,7 @@ def _default_file(choice: Choice, format_: str) -> Path:
 
 def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | None) -> ReferenceEnv:
     from rlcli.deploy.closed_loop import open_reference
-    from rlcli.deploy.verification_files import check_overwrites
+    from rlcli.deploy.run_policy_files import check_overwrites
     from rlcli.runs.trusted_tasks import named_task
 
     if choice.run is None and choice.bundle is None:

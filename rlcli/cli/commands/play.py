@@ -63,8 +63,8 @@ def command(
         rlcli play --checkpoint latest@best --video best.mp4
             Film one episode of the best checkpoint.
     """
+    from rlcli.cli.ui.open_viewer import choose_viewers, read_commands, require_viewer, show
     from rlcli.cli.ui.play_episode import check_choice, play_episode
-    from rlcli.cli.ui.viewer_choice import choose_viewers, read_commands, require_viewer, show
     from rlcli.evaluation.session import PolicyRequest, open_session
 
     to_file = video is not None or record is not None

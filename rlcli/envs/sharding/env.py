@@ -19,7 +19,6 @@ from rlcli.envs.observers import Observers
 from rlcli.envs.shard_range import Shard, split
 from rlcli.envs.sharding import worker
 from rlcli.envs.sharding.arrays import ArraySpec, map_tensors
-from rlcli.envs.sharding.choice import has_untested_code
 from rlcli.envs.sharding.engine_view import ShardedEngine, sums
 from rlcli.envs.sharding.shard_step import (
     SLOTS,
@@ -33,6 +32,7 @@ from rlcli.envs.sharding.shard_step import (
 )
 from rlcli.envs.sharding.state import join, join_states, split_state
 from rlcli.envs.sharding.worker import Job
+from rlcli.envs.sharding.worker_count import has_untested_code
 from rlcli.envs.sharding.workers import Worker, take_workers
 from rlcli.envs.step_result import Episodes, StepRecord, StepResult
 from rlcli.envs.vec_env import VecEnv

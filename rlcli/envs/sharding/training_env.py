@@ -5,7 +5,7 @@ from __future__ import annotations
 from rlcli.config.load import Resolved
 from rlcli.envs.environment_protocol import Environment
 from rlcli.envs.make import make_env
-from rlcli.envs.sharding.choice import number_of_workers
+from rlcli.envs.sharding.worker_count import number_of_workers
 
 
 def make_training_env(resolved: Resolved, *, seed: int, device: str) -> Environment:

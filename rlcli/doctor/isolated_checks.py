@@ -1,4 +1,4 @@
-"""`python -m rlcli.doctor.isolated_process CHECK`: run a check that may crash, and print its result as JSON."""
+"""`python -m rlcli.doctor.isolated_checks CHECK`: run a check that may crash, and print its result as JSON."""
 
 import contextlib
 import ctypes

@@ -17,7 +17,7 @@ from support.fenced import REPOSITORY
 from support.worlds import CRITTER, CRITTER_TASK
 
 from rlcli.cli.commands import play
-from rlcli.cli.ui import viewer_choice
+from rlcli.cli.ui import open_viewer
 from rlcli.errors import DependencyError, MachineError
 from rlcli.viewer.protocol import VIEWERS, Viewer
 
@@ -37,7 +37,7 @@ def at_a_terminal(monkeypatch):
 
 
 def names(*arguments, **settings):
-    return [name for name, _ in viewer_choice.choose_viewers(*arguments, **{"headless": False, **settings})]
+    return [name for name, _ in open_viewer.choose_viewers(*arguments, **{"headless": False, **settings})]
 
 
 def test_display_selects_native_viewer(monkeypatch):
@@ -74,7 +74,7 @@ def test_port_selects_web_viewer(monkeypatch):
 
 @pytest.mark.parametrize("viewer", [*(name for name in VIEWERS if name != "native"), "none"])
 def test_explicit_viewer_is_chosen(viewer):
-    assert viewer_choice.choose_viewers(viewer, None, headless=True) == [(viewer, "--viewer is given")]
+    assert open_viewer.choose_viewers(viewer, None, headless=True) == [(viewer, "--viewer is given")]
 
 
 @pytest.mark.parametrize("place", VIEWERS.values())
@@ -87,7 +87,7 @@ def test_viewers_have_protocol_parameters(place):
 
 def test_help_and_pages_name_every_viewer():
     guides = REPOSITORY / "docs" / "guides"
-    for name in viewer_choice.CHOICES:
+    for name in open_viewer.CHOICES:
         assert name in play.command.__doc__.partition("viewer: ")[2].partition("port: ")[0]
         assert f"| `{name}`" in (guides / "play.md").read_text(encoding="utf-8")
     assert f"auto, {', '.join(VIEWERS)}, none" in (guides / "settings.md").read_text(encoding="utf-8")
@@ -193,9 +193,7 @@ def test_macos_without_mjpython_falls_back_to_web_viewer(cli, monkeypatch):
     monkeypatch.setattr(sys, "platform", "darwin")
     monkeypatch.setattr(mujoco.viewer, "_MJPYTHON", None)
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(
-        viewer_choice, "choose_viewers", lambda *_, **__: [("native", "a"), ("web", "b"), ("none", "c")]
-    )
+    monkeypatch.setattr(open_viewer, "choose_viewers", lambda *_, **__: [("native", "a"), ("web", "b"), ("none", "c")])
     monkeypatch.setattr(web, "run", lambda player, **settings: opened.append(settings["port"]))
     assert cli(*ZERO).code == 0
     assert opened == [8080]
@@ -261,13 +259,13 @@ def test_failing_viewer_falls_back_to_next(monkeypatch, capsys):
         tried.append(name)
         raise MachineError("no window") if name == "native" else DependencyError("no browser")
 
-    monkeypatch.setattr(viewer_choice, "_open", fail)
+    monkeypatch.setattr(open_viewer, "_open", fail)
     settings = {"port": None, "drawn": 1}
     choices = [("native", "a"), ("web", "b"), ("none", "c")]
-    assert viewer_choice.show(None, choices, **settings) is False
+    assert open_viewer.show(None, choices, **settings) is False
     assert tried == ["native", "web"]
     with pytest.raises(DependencyError):
-        viewer_choice.show(None, choices[:2], **settings)
+        open_viewer.show(None, choices[:2], **settings)
 
 
 # --- drawing without a display ---
