@@ -93,6 +93,27 @@ def metadata_of(
     }
 
 
+def terms_of_task_code(metadata: dict[str, Any]) -> list[str]:
+    """Return one sentence for each term that `run_policy.py` cannot compute, because it has no formula."""
+    deployment = metadata["deployment"] or {"observations": [], "controls": []}
+    sentences = []
+    for term in deployment["observations"]:
+        if not term["closed"]:
+            width = (term["columns"][1] - term["columns"][0]) // term["history"]
+            sentences.append(
+                f"run_policy.py cannot compute observation {term['name']}, which only the task's code computes: pass"
+                f" inputs['{term['value']['given']}'] ({width} values of one step, with modifiers, clip and scale"
+                " applied)"
+            )
+    sentences += [
+        f"run_policy.py cannot compute the controls of action {term['name']}, which only the task's code computes:"
+        " compute them from Controller.command"
+        for term in deployment["controls"]
+        if not term["closed"]
+    ]
+    return sentences
+
+
 def mjlab_properties(metadata: dict[str, Any], entity: str = "robot") -> dict[str, str]:
     """Return the metadata properties of mjlab 1.6's ONNX files, which programs for mjlab can read.
 

@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -137,6 +139,63 @@ def test_verify_covers_histories_rnn_pushes_and_commands(pushed, tmp_path, capfd
     closed = ["observation pos", "observation vel", "observation before", "observation asked", "control slide"]
     assert verified["closed_by_metadata"] == closed
     assert verified["return"] == pytest.approx(verified["evaluation_return"], abs=1e-4)
+
+
+OWN = """
+import mujoco
+import numpy as np
+from run_policy import Controller
+
+controller, model = Controller("p.py"), mujoco.MjModel.from_xml_path("model.xml")
+data = mujoco.MjData(model)
+for _ in range(20):
+    inputs = {"command/wanted": np.zeros(2), "observation/own": 2.0 * data.qvel}
+    data.ctrl[:] = controller.act(data, inputs)
+    mujoco.mj_step(model, data, controller.metadata["decimation"])
+    mujoco.mj_step1(model, data)
+print(controller.steps, controller.command.shape)
+"""
+
+
+def run_python(folder, *arguments):
+    command = [sys.executable, "-B", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
+
+
+def test_program_names_observation_of_task_code_that_it_needs(pushed, tmp_path, capfd):
+    arguments = ["--output", str(tmp_path / "p.py"), "--format", "numpy", "--verify", "--episodes", "2"]
+    assert main(["export", "--checkpoint", str(pushed), *arguments]) == 0
+    assert capfd.readouterr().err.count("pass inputs['observation/own'] (1 values of one step, with modifiers") == 1
+    result = run_python(tmp_path, "run_policy.py")
+    assert (result.returncode, result.stdout, result.stderr.count("\n")) == (1, "", 1), result.stderr
+    assert "error: Controller.act needs inputs['observation/own'] (1 values); an observation" in result.stderr
+    result = run_python(tmp_path, "-c", OWN)
+    assert result.stdout == "20 (1,)\n", result.stderr
+    result = run_python(tmp_path, "-c", OWN.replace('"observation/own": 2.0', '"observation/own": [1, 2] or 2.0'))
+    assert "ValueError: Controller.act needs inputs['observation/own'] (1 values)" in result.stderr
+
+
+def test_program_names_missing_file(newest, tmp_path, capfd):
+    verify(capfd, newest("cartpole").parent.parent, tmp_path / "p.py", "--format", "numpy", "--episodes", "2")
+    for name in ("model.xml", "p.py"):
+        (tmp_path / name).unlink()
+        result = run_python(tmp_path, "run_policy.py")
+        assert result.stderr.startswith(f"error: {tmp_path / name} is missing: keep the policy"), result.stderr
+        assert result.stderr.count("\n") == 1
+
+
+def test_numpy_policy_names_its_columns_for_wrong_shape(newest, tmp_path, capfd):
+    file = tmp_path / "p.py"
+    asked = ["export", "--checkpoint", str(newest("arm").parent.parent), "--format", "numpy", "--output", str(file)]
+    assert main(asked) == 0, capfd.readouterr()
+    space = runpy.run_path(str(file))
+    needed = re.escape("with 4 columns: rates 3, angle 1")
+    with pytest.raises(ValueError, match=r"obs has the shape \(2, 3\), the policy needs \(n, columns\) " + needed):
+        space["run"]({"obs": np.zeros((2, 3))})
+    with pytest.raises(ValueError, match=r"obs has the shape \(4,\), .*" + needed):
+        space["run"]({"obs": np.zeros(4)})
+    with pytest.raises(ValueError, match=r"now has the shape \(5,\), the policy needs \(columns,\) " + needed):
+        space["Episode"]().step(np.zeros(5))
 
 
 @pytest.fixture
@@ -312,7 +371,7 @@ def test_program_is_short_and_runs_without_rlcli(newest, tmp_path, capfd, format
     run, suffix = newest("cartpole").parent.parent, {"onnx": ".onnx", "numpy": ".py"}[format_]
     verify(capfd, run, tmp_path / f"policy{suffix}", "--format", format_, "--episodes", "2")
     file = tmp_path / "run_policy.py"
-    assert len(file.read_text().splitlines()) <= 80
+    assert len(file.read_text().splitlines()) <= 102
     assert max(map(len, file.read_text().splitlines())) <= 120
     blocked = ["rlcli", "rlcli_tasks", "torch", "pydantic", *(["onnxruntime"] if format_ == "numpy" else [])]
     command = [sys.executable, "-B", "-c", PROGRAM.format(blocked=blocked), str(file), "60"]

@@ -14,6 +14,7 @@ from rlcli.registry.find import path_of
 
 if TYPE_CHECKING:
     from rlcli.deploy.closed_loop import ClosedLoopResult, ReferenceEnv
+    from rlcli.deploy.export import Exported
     from rlcli.runs.checkpoint_reader import Checkpoint
     from rlcli.runs.policy_ref import Choice
     from rlcli.runs.run import Run
@@ -64,14 +65,23 @@ def command(
         return
     reference = _open_reference(chosen, saved, file, task) if verify else None
     done = export(saved, file, format, None if reference is None else reference.deployment)
-    limit = f"difference <= {done.max_difference:.1e}"
-    console.info(f"the exported file equals the policy on {done.observations} observations: {limit}")
+    _print_exported(done)
     verdict = None if reference is None else _verify(reference, saved, done.file, format, episodes)
     entries = {"observations": done.observations, "max_difference": done.max_difference, "metadata": done.metadata}
     verified = None if verdict is None else verdict.record()
     _report(chosen.folder, format, done.file, done.file.stat().st_size, **entries, verified=verified)
     if verdict is not None and not verdict.holds:
         raise typer.Exit(9)
+
+
+def _print_exported(done: Exported) -> None:
+    """Print the check of an exported file, and the terms that a program must get from the task's code."""
+    from rlcli.deploy.metadata import terms_of_task_code
+
+    limit = f"difference <= {done.max_difference:.1e}"
+    console.info(f"the exported file equals the policy on {done.observations} observations: {limit}")
+    for sentence in terms_of_task_code(done.metadata):
+        console.warn(sentence)
 
 
 def _default_file(choice: Choice, format_: str) -> Path:

@@ -18,6 +18,7 @@ WEIGHTS = ""
 def run(inputs):
     """Compute the outputs, (n, columns) each, from observations (n, observations). Layers compute in float64."""
     x = np.asarray(inputs["obs"], np.float32)
+    _require_columns("obs", x, [(term["name"], term["size"]) for term in METADATA["observations"]])
     if NETWORK["normalize"]:
         x = (x - _W["mean"]) * _W["scale"]
         clip = NETWORK["normalize_clip"]
@@ -60,10 +61,11 @@ class Episode:
 
     def step(self, now):
         """Return action and command for the observation of this step, which has each term once, without history."""
-        start, values = 0, []
+        start, values, now = 0, [], np.asarray(now, np.float32)
+        _require_columns("now", now, [(term["name"], term["size"] // term["history"]) for term in self.terms], 1)
         for term in self.terms:
             width = term["size"] // term["history"]
-            row = np.asarray(now, np.float32)[start : start + width]
+            row = now[start : start + width]
             rows = self.rows.get(term["name"], [row] * term["history"])  # the first value fills the history
             self.rows[term["name"]] = [*rows[1:], row]
             values += self.rows[term["name"]]
@@ -71,6 +73,14 @@ class Episode:
         out = run({"obs": np.concatenate(values)[None], **self.memory})
         self.memory = {part["input"]: out[part["output"]] for part in METADATA["memory"]}
         return out["action"][0], out["command"][0]
+
+
+def _require_columns(name, x, widths, dimensions=2):
+    needed = sum(width for _, width in widths)
+    if x.ndim != dimensions or x.shape[-1] != needed:
+        shape = ("(columns,)", "(n, columns)")[dimensions - 1]
+        parts = ", ".join(f"{term} {width}" for term, width in widths)
+        raise ValueError(f"{name} has the shape {x.shape}, the policy needs {shape} with {needed} columns: {parts}")
 
 
 def _convolve_images(x):
