@@ -42,6 +42,8 @@ MODULES = {
     "rlcli.envs.articulation": "Articulations of direct tasks",
     "rlcli.envs.step_result": "Step results",
     "rlcli.envs.observers": "Observers of the step",
+    "rlcli.scene.entity": "Entities",
+    "rlcli.scene.entity_data": "State of entities",
     "rlcli.sim.markers": "Markers in viewers",
     "rlcli.sim.env_selection": "Selections of environments",
     "rlcli.sim.rotations": "Rotations",

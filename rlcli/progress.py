@@ -28,12 +28,18 @@ class Work:
     """Whether this work shows its own progress, so that nothing else may be drawn."""
     begin: float = field(default_factory=time.monotonic)
     """Start of the work, by `time.monotonic` [s]."""
+    changed: float = field(default_factory=time.monotonic)
+    """Time of the last progress, by `time.monotonic` [s]; at first the start."""
     thread: int = field(default_factory=threading.get_ident)
     """Thread that does the work. Works of several threads run at the same time; none is a part of another."""
 
     def advance(self, count: int = 1) -> None:
         """Add `count` to the number of parts that are done."""
-        self.done += count
+        self.update(self.done + count, self.share)
+
+    def update(self, done: int, share: float) -> None:
+        """Set the number of parts that are done, and the second estimate of the done share."""
+        self.done, self.share, self.changed = done, share, time.monotonic()
 
     def fraction(self) -> float:
         """Return the share of the work that is done, from 0 to 1; 0 if it is unknown."""

@@ -95,6 +95,18 @@ class Robot:
         """Return the name of the body with this id."""
         return str(self.model.body(body).name)
 
+    def is_wheel(self, joint: int) -> bool:
+        """Return whether a joint turns a wheel or flywheel: a hinge without limits, with its load balanced on its axis.
+
+        The centre of mass of what the hinge moves is nearer to the axis than a tenth of the radius of gyration.
+        """
+        model, data = self.model, self.data
+        if model.jnt_type[joint] != SCALAR[0] or model.jnt_limited[joint]:
+            return False
+        body = model.jnt_bodyid[joint]
+        offset = np.cross(data.xaxis[joint], data.subtree_com[body] - data.xanchor[joint])
+        return bool(np.square(offset).sum() < 0.01 * self.inertia[joint] / model.body_subtreemass[body])
+
     def max_effort(self, joint: int) -> float:
         """Return the largest effort of a joint [N or N m]: the limit in the file, else an estimate from carried weight.
 

@@ -220,42 +220,41 @@ def _reach(robot: Robot) -> dict[str, Any]:
 
 
 def _balance(robot: Robot) -> dict[str, Any]:
-    driven = [robot.name(j) for j in robot.driven]
-    hinges = [j for j in robot.passive if robot.model.jnt_type[j] == SCALAR[0]] or robot.passive or robot.driven
+    driven, moving = [robot.name(j) for j in robot.driven], sorted([*robot.driven, *robot.passive])
+    posed = [j for j in moving if not robot.is_wheel(j)]
+    if not posed and not robot.free:
+        posed = moving  # a wheel on a fixed axis: there is nothing else to hold
+    passive = [j for j in robot.passive if j in posed]
+    hinges = [j for j in passive if robot.model.jnt_type[j] == SCALAR[0]] or passive or posed
     held: dict[float, list[str]] = {}
     for joint in hinges:
         held.setdefault(round(float(robot.data.qpos[robot.model.jnt_qposadr[joint]]), 4), []).append(robot.name(joint))
-    every = [robot.name(j) for j in sorted([*robot.driven, *robot.passive])]
+    joints, wheels = [robot.name(j) for j in posed], [robot.name(j) for j in moving if j not in posed]
     scale = {robot.name(j): round3(abs(robot.max_effort(j))) for j in robot.driven}
-    floating: dict[str, Any] = {"projected_gravity": {"func": "projected_gravity"}} if robot.free else {}
-    start = {"root": {"func": "reset_root_state_uniform", "mode": "reset"}} if robot.free else {}
-    hold = {"at_most": 0.2, "hold_s": robot.tempo}
-    success: dict[str, Any] = {"upright": {"func": "root_tilt", **hold}}
-    ends: dict[str, Any] = {"fallen": {"func": "bad_orientation", "limit_angle": 1.0}}
-    if not robot.free:
-        success, ends = {}, {}
-        for number, (target, joints) in enumerate(held.items()):
-            name = "pose" if len(held) == 1 else f"pose_{number}"
-            success[name] = {"func": "joint_error", "joints": joints, "target": target, **hold}
-            bounds = [target - 1.0, target + 1.0]
-            ends[f"{name}_lost"] = {"func": "joint_pos_out_of_manual_limit", "joints": joints, "bounds": bounds}
+    success, ends = _balance_conditions(robot, held)
+    rewards: dict[str, Any] = {"alive": {"func": "is_alive", "weight": 1.0}}
+    if robot.free:
+        rewards["upright"] = {"func": "flat_orientation_l2", "weight": -2.0}
+    if hinges:
+        rewards["pose"] = {"func": "joint_deviation_l1", "weight": -0.5, "joints": [robot.name(j) for j in hinges]}
+        rewards["speed"] = {"func": "joint_vel_l2", "weight": -0.005, "joints": joints}
+    if wheels:  # a wheel must turn to balance the robot: its angle is free, and its speed costs little
+        rewards["wheel_speed"] = {"func": "joint_vel_l2", "weight": -2.0e-4, "joints": wheels}
     return {
         "actions": {"effort": {"func": "joint_effort", "joints": driven, "scale": scale}},
-        "observations": {"policy": {**floating, **_joint_observations(every)}},
+        "observations": {"policy": _balance_observations(robot.free, joints, wheels)},
         "events": {
-            **start,
+            **({"root": {"func": "reset_root_state_uniform", "mode": "reset", **_TILT}} if robot.free else {}),
             "joints": {
                 "func": "reset_joints_by_offset",
                 "mode": "reset",
-                "joints": every,
+                "joints": [robot.name(j) for j in moving],
                 "position": [-0.1, 0.1],
                 "velocity": [-0.1, 0.1],
             },
         },
         "rewards": {
-            "alive": {"func": "is_alive", "weight": 1.0},
-            "pose": {"func": "joint_deviation_l1", "weight": -0.5, "joints": [robot.name(j) for j in hinges]},
-            "speed": {"func": "joint_vel_l2", "weight": -0.005, "joints": every},
+            **rewards,
             "effort": {"func": "action_l2", "weight": -0.005},
             "fall": {"func": "is_terminated", "weight": -2.0},
         },
@@ -265,6 +264,31 @@ def _balance(robot: Robot) -> dict[str, Any]:
         },
         "success": success,
     }
+
+
+_TILT = {"roll": [-0.05, 0.05], "pitch": [-0.05, 0.05]}
+"""Initial tilt of a floating base [rad]."""
+
+
+def _balance_conditions(robot: Robot, held: dict[float, list[str]]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return success conditions and terminations: of the tilt of a floating base, else of the joints to hold."""
+    hold = {"at_most": 0.2, "hold_s": robot.tempo}
+    if robot.free:
+        success: dict[str, Any] = {"upright": {"func": "root_tilt", **hold}}
+        return success, {"fallen": {"func": "bad_orientation", "limit_angle": 1.0}}
+    success, ends = {}, {}
+    for number, (target, joints) in enumerate(held.items()):
+        name = "pose" if len(held) == 1 else f"pose_{number}"
+        success[name] = {"func": "joint_error", "joints": joints, "target": target, **hold}
+        bounds = [target - 1.0, target + 1.0]
+        ends[f"{name}_lost"] = {"func": "joint_pos_out_of_manual_limit", "joints": joints, "bounds": bounds}
+    return success, ends
+
+
+def _balance_observations(free: bool, joints: Sequence[str], wheels: Sequence[str]) -> dict[str, Any]:
+    base = {name: {"func": name} for name in ("base_lin_vel", "base_ang_vel", "projected_gravity") if free}
+    turning = {"wheel_vel": {"func": "joint_vel_rel", "joints": list(wheels), "scale": 0.1}} if wheels else {}
+    return {**base, **(_joint_observations(joints) if joints else {}), **turning}
 
 
 def _joint_observations(joints: Sequence[str]) -> dict[str, Any]:

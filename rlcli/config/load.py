@@ -18,13 +18,14 @@ from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import Vocabulary, term_entries
 from rlcli.config.validation import MAX_AGENTS, MAX_PROBLEMS, PATCHES, TaskCheck, agent_names
-from rlcli.errors import ConfigError, DependencyError, Problem
+from rlcli.errors import ConfigError, DependencyError, MissingModelError, Problem, TaskError
 from rlcli.formats import Note
 from rlcli.registry import TaskSource
 from rlcli.registry.formats import Format
+from rlcli.registry.models import existing_model_file
 from rlcli.trainers import TrainerSpec
 
-__all__ = ["Resolved", "agent_names", "check_all", "extensions", "resolve", "term_entries"]
+__all__ = ["Resolved", "agent_names", "check_all", "extensions", "missing_models", "resolve", "term_entries"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +177,28 @@ def check_all(source: TaskSource, *, config_file: FilePath | None = None, overri
     if problems:
         raise ConfigError(problems)
     return unchecked
+
+
+def missing_models(resolved: Resolved) -> list[str]:
+    """Return one sentence for each model that the user must provide and that is not on this machine.
+
+    Raises:
+        ConfigError: if the task's folder, or a package that the task names, does not have a model file.
+    """
+    problems, missing = [], []
+    for name, entity in resolved.task.scene.entities.items():
+        if entity is None or entity.model is None:
+            continue
+        path, root = ("scene", "entities", name, "model"), resolved.source.root
+        try:
+            existing_model_file(root, entity.model)
+        except MissingModelError as error:
+            missing.append(f"{name}: {error.message}" + (f"; {error.hint}" if error.hint else ""))
+        except TaskError as error:
+            problems.append(resolved.problem(path, error.message, error.hint))
+    if problems:
+        raise ConfigError(problems)
+    return missing
 
 
 def extensions(source: TaskSource) -> tuple[Vocabulary, type[BaseModel] | None]:

@@ -363,11 +363,11 @@ class TaskCheck:
         return [name for name, term in terms.items() if isinstance(term, dict) and "func" in term]
 
     def _report_unknown_term(self, section: str, path: Path, name: str) -> None:
-        known = self.vocabulary.names(section)
-        other = self.vocabulary.other_section(section, name)
-        hint = f"'{name}' is a term of {other}" if other else did_you_mean(name, known)
+        known, other = self.vocabulary.names(section), self.vocabulary.other_section(section, name)
+        similar = f"'{name}' is a term of {other}" if other else did_you_mean(name, known)
+        hint = similar or f"{self.source.without_terms_hint}terms: {listing(known, 60)}"
         what = section if section == "success" else section.removesuffix("s")
-        self.problem(path, f"there is no {what} term '{name}'", hint or f"terms: {listing(known, 60)}")
+        self.problem(path, f"there is no {what} term '{name}'", hint)
 
     def _params(self, data: Mapping[str, Any]) -> dict[str, Any] | None:
         """Return the parameters of a direct task, checked against `Params` in its source; None if not valid."""

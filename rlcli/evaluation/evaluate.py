@@ -142,9 +142,8 @@ def evaluate(
             on_step(step)
             if step.episodes is not None:
                 _add_episodes(result, step.episodes.ended(), quota, means)
-                work.done = len(result.returns)
             steps += 1
-            work.share = steps / longest  # environments may finish their episodes together
+            work.update(len(result.returns), steps / longest)  # environments may finish their episodes together
         env.check()
     after = {cause: count - before.get(cause, 0) for cause, count in env.causes.items()}
     result.diverged_by = {cause: count for cause, count in after.items() if count}

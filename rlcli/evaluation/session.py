@@ -50,6 +50,8 @@ class PolicyRequest:
     """Number of episodes, for one environment each; None: the task's own number of environments."""
     min_envs: int = 1
     """Smallest number of environments."""
+    usual_envs: int | None = None
+    """Number of environments if neither the user nor the task's `play:` sets it; None: that of the training."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +124,9 @@ def find_policy(request: PolicyRequest, check: Callable[[Resolved], None] = lamb
     configure = partial(resolve, source, agent=agent, play=True, config_file=request.config, overrides=overrides)
     values = flags(scene__num_envs=request.num_envs)
     resolved = configure(flags=values)
+    origin = resolved.layers.origin(("scene", "num_envs"))
+    if request.usual_envs is not None and (origin is None or origin.layer in ("task", "agent")):
+        resolved = resolved.with_num_envs(min(request.usual_envs, resolved.task.scene.num_envs))
     if resolved.task.scene.num_envs < request.min_envs:
         resolved = configure(flags={**values, "scene.num_envs": request.min_envs})
     check(resolved)

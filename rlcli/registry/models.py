@@ -47,6 +47,24 @@ def chosen_model(root: Path, model: str) -> str:
     raise MissingModelError(f"the model is not on this machine: {'; '.join(reasons)}", hint=", or ".join(hints) or None)
 
 
+def existing_model_file(root: Path, model: str) -> Path:
+    """Return the resolved path of the model file that a task in the folder `root` names by the text `model`.
+
+    Raises:
+        MissingModelError: if a model that the user must provide is not found.
+        TaskError: if there is no such file, task or package, or the file is outside of its folder.
+    """
+    file = model_file(root, model).resolve()
+    if ":" not in model and not file.is_relative_to(root):
+        raise TaskError(f"'{model}' lies outside the task's folder {root}; move it inside")
+    if file.exists() and not file.is_file():
+        raise TaskError(f"'{model}' in {root} is not a regular file; put an MJCF in its place")
+    if not file.exists():
+        files = sorted(str(path.relative_to(root)) for path in root.rglob("*.xml") if path.is_file())
+        raise TaskError(f"no file '{model}' in {root}", hint=f"MJCF files there: {', '.join(files) or 'none'}")
+    return file
+
+
 def _install_hint(model: str) -> str:
     """Return what the user can do so that the model of this name is found, as the hint of an error."""
     kind, _, file = model.partition(":")

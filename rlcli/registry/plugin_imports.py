@@ -100,7 +100,9 @@ def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> It
         reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise PluginError(
             f"{plugin}entry point '{entry.name}' = {entry.value} {failure}: {reason}{error_location(error)}",
-            hint=_newer_rlcli(entry) or f"update or uninstall {entry.distribution}",
+            hint=_newer_rlcli(entry)
+            or f"update or uninstall {entry.distribution}; as its author, correct its code or its entry point in"
+            " pyproject.toml, and install it again",
         ) from error
 
 

@@ -48,6 +48,17 @@ class TaskSource:
         except ValueError:
             return str(file)
 
+    @property
+    def without_terms_hint(self) -> str:
+        """Begin of a hint that says why a task in YAML has no own terms; empty if it has some."""
+        if self.term_files or self.python is not None or self.value is not None:
+            return ""
+        if self.distribution is None:
+            return f"the folder {self.root.name} has no terms.py; "
+        if (self.root / "terms.py").is_file():
+            return "terms.py is beside the YAML, but TaskSpec.terms does not name it: add terms=('PACKAGE.terms',); "
+        return "TaskSpec.terms names no module with own terms; "
+
     def record(self) -> dict[str, str | None]:
         """Return the data that a run stores to find the task again."""
         folder = None if self.distribution else str(self.root)

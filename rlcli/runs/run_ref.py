@@ -211,7 +211,7 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
             raise CheckpointError(message, hint=refused[0].hint)
         if not runs:
             hint = f"rlcli train {task or 'TASK'} starts one"
-            raise CheckpointError(f"there is no run{of_task} in {runs_dir}", hint=hint)
+            raise CheckpointError(f"there is no run{of_task} in {runs_dir.absolute()}", hint=hint)
         if seconds_since(runs[-1].record.get("started")) < -60:
             _log.warning(
                 f"{runs[-1].folder} started in the future by this machine's clock, so that `latest` may not be the run"
@@ -234,5 +234,5 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
         if folder.name == reference:
             raise error
     names = [run.folder.name for run in runs]
-    near = did_you_mean(reference, names)
-    raise CheckpointError(f"no run '{reference}'", hint=near or f"runs in {runs_dir}: {listing(names[-5:])}")
+    near = did_you_mean(reference, [*names, "latest", "shipped"])
+    raise CheckpointError(f"no run '{reference}'", hint=near or f"runs in {runs_dir.absolute()}: {listing(names[-5:])}")

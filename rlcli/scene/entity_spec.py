@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlcli.config.schema import EntityConfig
 from rlcli.errors import MissingModelError, TaskError, one_line
-from rlcli.registry import model_file
+from rlcli.registry.models import existing_model_file
 from rlcli.scene.mjcf_scan import BadModel
 from rlcli.scene.names import SceneProblem
 from rlcli.scene.untrusted_mjcf import CheckedModel, ModelsTogether, check_mjcf, model_roots, open_mjcf
@@ -147,19 +147,11 @@ def _product(pos: FloatArray, quat: FloatArray, pos2: FloatArray, quat2: FloatAr
 def _check_model(model: str, path: tuple[str, ...], root: Path, installed: bool) -> CheckedModel:
     """Find and check the MJCF of an entity. `path` is the key of the model in the configuration, for messages."""
     try:
-        file = model_file(root, model).resolve()
+        file = existing_model_file(root, model)
     except MissingModelError:
         raise
     except TaskError as error:
         raise SceneProblem(path, error.message, error.hint) from None
-    if ":" not in model and not file.is_relative_to(root):
-        raise SceneProblem(path, f"'{model}' lies outside the task's folder {root}; move it inside")
-    if file.exists() and not file.is_file():
-        raise SceneProblem(path, f"'{model}' in {root} is not a regular file; put an MJCF in its place")
-    if not file.exists():
-        files = sorted(str(p.relative_to(root)) for p in root.rglob("*.xml") if p.is_file())
-        hint = f"MJCF files there: {', '.join(files) or 'none'}"
-        raise SceneProblem(path, f"no file '{model}' in {root}", hint)
     try:
         return check_mjcf(file, model_roots(root, model), installed=installed or ":" in model)
     except BadModel as error:

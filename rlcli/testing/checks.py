@@ -55,7 +55,7 @@ def check_task(
     on_check: OnCheck = lambda name, findings: None,
     on_note: OnNote = lambda name, text: None,
 ) -> list[Finding]:
-    """Check a task against the contract, in a few seconds.
+    """Check a task against the contract.
 
     Args:
         task: a name from `list-tasks`, or a folder with a `task.yaml`.

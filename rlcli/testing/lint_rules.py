@@ -364,6 +364,31 @@ def horizon(evidence: RolloutEvidence) -> Iterator[Remark]:
         yield warning_at(f"agents.{name}.gamma = {gamma:g}", message, hint, numbers)
 
 
+_LARGEST_ANGLES = {"limit_angle": math.pi, **dict.fromkeys(("roll", "pitch", "yaw", "heading"), 2.0 * math.pi)}
+"""Parameter of a term -> largest usual angle [rad]: a limit of a tilt cannot be above pi."""
+
+
+def degrees(evidence: RolloutEvidence) -> Iterator[Remark]:
+    """Check that no angle is so large that it may be in degrees: a limit above pi, a rotation or tilt above 2 pi."""
+    for path, value in leaves(evidence.subject.resolved.task.model_dump()):
+        bound = _LARGEST_ANGLES.get(str(path[-1])) if path and path[0] in _SECTIONS_WITH_ANGLES else None
+        numbers = [v for v in (value if isinstance(value, list | tuple) else [value]) if isinstance(v, int | float)]
+        largest = max(map(abs, numbers), default=0.0)
+        if bound is not None and bound * 1.01 < largest < math.inf:
+            message = f"the angle {largest:g} is above {bound / math.pi:g} pi; angles are in radians"
+            hint = f"write {math.radians(largest):.4g}, if {largest:g} is in degrees"
+            yield warning_at(".".join(map(str, path)), message, hint, {"angle": largest})
+    for name, condition in evidence.subject.resolved.task.success.items():
+        bound_of_tilt = None if condition is None or condition.func != "root_tilt" else condition.at_most
+        if bound_of_tilt is not None and bound_of_tilt > math.pi:
+            message = f"the tilt {bound_of_tilt:g} is above pi, so the condition always holds; angles are in radians"
+            hint = f"write {math.radians(bound_of_tilt):.4g}, if {bound_of_tilt:g} is in degrees"
+            yield warning_at(f"success.{name}.at_most", message, hint, {"angle": bound_of_tilt})
+
+
+_SECTIONS_WITH_ANGLES = ("events", "terminations", "commands")
+
+
 def discount_of(agent: AgentConfig | None) -> float | None:
     """Return the discount factor in an agent's settings, also in nested ones; None if there is none."""
     if agent is None:
@@ -375,7 +400,7 @@ def discount_of(agent: AgentConfig | None) -> float | None:
 
 _IN_ORDER: tuple[Callable[[RolloutEvidence], Iterable[Remark]], ...] = (
     *(stops, early_resets, silent_reward, dominant_reward, constant_reward, dying_pays, constant_observation),
-    *(observation_scale, saturated_actions, dead_action, timestep, horizon),
+    *(observation_scale, saturated_actions, dead_action, timestep, horizon, degrees),
 )
 RULES = {rule.__name__.replace("_", "-"): rule for rule in _IN_ORDER}
 """Name -> rule, in the order in which they run; `docs/guides/check-and-lint.md` lists them.

@@ -94,11 +94,17 @@ class Health:
     def notes(self, metrics: Mapping[str, float]) -> list[str]:
         """Return one line of text for each success condition of the task, with its value and its bound."""
         lines = []
+        ends = [
+            f"Episode_Termination/{name}" for name, term in self.task.terminations.items() if term and term.time_out
+        ]
+        complete = sum(metrics.get(name, 0.0) for name in ends)
+        few = any(name in metrics for name in ends) and complete < 0.5
+        reached = f"; {complete:.1%} of the episodes reached the time-out" if few else ""
         for name, condition in self.task.success.items():
             if condition is not None and f"Success/{name}" in metrics:
                 value = metrics.get(f"Success_Value/{name}")
                 bound = "" if value is None else f", value {value:.3g}, {bound_text(condition.model_dump())}"
-                lines.append(f"success in training: {name} held in {metrics[f'Success/{name}']:.1%}{bound}")
+                lines.append(f"success in training: {name} held in {metrics[f'Success/{name}']:.1%}{bound}{reached}")
         return lines
 
     def names(self, prefix: str) -> list[str]:

@@ -128,6 +128,17 @@ def test_output_of_running_task_is_not_in_json(plugins, cli):
     assert "hubbub" in done.stderr
 
 
+def test_terms_that_task_spec_does_not_name_are_found_beside_the_yaml(plugins, cli):
+    from support.broken_plugins import FILES, SPEC
+
+    task = FILES["task.yaml"].replace("func: is_alive", "func: home_sweet_home")
+    terms = "def home_sweet_home(env): ...\n"
+    plugins("forgetful", SPEC, files={**FILES, "task.yaml": task, "terms.py": terms})
+    done = cli("validate", "forgetful-task")
+    assert done.returncode == 3
+    assert "terms.py is beside the YAML, but TaskSpec.terms does not name it" in done.stderr
+
+
 def test_built_in_task_wins_over_plugin_of_same_name(broken_plugins, cli):
     broken_plugins("takes-a-built-in-name")
     assert "on a cart" in cli("show", "cartpole").stdout

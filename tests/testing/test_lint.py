@@ -55,6 +55,17 @@ def test_early_resets_finds_direct_task_done_at_start(direct):
     assert rules(direct)["early-resets"].where == "terminations: task"
 
 
+def test_degrees_finds_angles_that_are_too_large_for_radians(managed):
+    managed.config["terminations"]["tilted"] = {"func": "bad_orientation", "limit_angle": 35}
+    managed.config["events"]["root"] = {"func": "reset_root_state_uniform", "mode": "reset", "pitch": [-8.0, 8.0]}
+    managed.config["events"]["legal"] = {"func": "reset_root_state_uniform", "mode": "reset", "yaw": [-6.2832, 6.2832]}
+    managed.config["success"] = {"upright": {"func": "root_tilt", "at_most": 20.0}}
+    found = [remark for remark in lint(managed, only=["degrees"]) if remark.rule == "degrees"]
+    places = ["events.root.pitch", "success.upright.at_most", "terminations.tilted.limit_angle"]
+    assert sorted(remark.where for remark in found) == places
+    assert "write 0.6109" in next(remark.hint for remark in found if "limit_angle" in remark.where)
+
+
 # --- rewards ---
 
 

@@ -39,6 +39,14 @@ def findings(changes, *overrides, until=0.25):
     return {finding.check: finding for finding in health.findings}
 
 
+def test_note_of_success_says_that_few_episodes_reached_the_time_out():
+    resolved = resolve(find_task("cartpole"), agent="ppo")
+    health = Health(resolved.task, resolved.agent, ITERATIONS)
+    metrics = {"Success/pole": 0.0, "Success_Value/pole": 0.1, "Episode_Termination/time_out": 0.0}
+    assert [note.partition("; ")[2] for note in health.notes(metrics)] == ["0.0% of the episodes reached the time-out"]
+    assert "; " not in health.notes({**metrics, "Episode_Termination/time_out": 1.0})[0]
+
+
 @pytest.mark.parametrize("until", [0.1, 0.25, 0.5, 1.0])
 def test_healthy_training_has_no_finding(until):
     assert findings({}, until=until) == {}

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from rlcli.evaluation.session import Session
 
 _FALLBACK_VIDEO = "play.mp4"
+_VIDEO_ENVS = 16
+"""Number of environments of a video, if neither the user nor the task's `play:` sets it."""
 _MIN_VIDEO_S = 5.0
 """Shortest video [s] that may end with a terminated episode; a shorter one continues with the next episode."""
 
@@ -75,9 +77,9 @@ def command(
     _check_record(record, record_mode, video, held)
     if env is not None or episode is not None:
         check_choice(env, episode, num_envs, record_mode, held)
-    words, min_envs = overrides or [], (env or 0) + 1
+    words, usual = overrides or [], max(_VIDEO_ENVS, drawn) if video is not None and env is None else None
     request = PolicyRequest(
-        task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir, None, min_envs
+        task, words, checkpoint, policy, stochastic, num_envs, seed, config, runs_dir, None, (env or 0) + 1, usual
     )
     session = open_session(request)
     file = _default_video(session) if str(video) == options.CHOOSE else video

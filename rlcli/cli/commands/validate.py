@@ -30,13 +30,14 @@ def command(
         rlcli validate cartpole rewards.alive.weight=2
             Check overrides without training.
     """
-    from rlcli.config.load import check_all, resolve
+    from rlcli.config.load import check_all, missing_models, resolve
 
     source = task_source(target)
     words = overrides or []
     unchecked = [] if agent else check_all(source, config_file=config, overrides=words)
     resolved = resolve(source, agent=agent, config_file=config, overrides=words)
     resolve(source, agent=agent, play=True, config_file=config, overrides=words)
+    missing = missing_models(resolved)
     checked = "files"
     if deep:
         from rlcli.envs.make import make_env
@@ -46,6 +47,8 @@ def command(
         checked = "files and model"
     log_notes(resolved.notes)
     console.data(f"{source.label}: valid ({checked})")
+    for sentence in missing:
+        console.warn(f"model of {sentence}")
     if unchecked:
         console.warn(f"agents not checked, because their trainer is not installed; install it: {', '.join(unchecked)}")
     console.document(

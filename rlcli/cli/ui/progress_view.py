@@ -114,13 +114,17 @@ def work_line(running: Sequence[Work]) -> str:
         threads.setdefault(work.thread, []).append(work)
     share = sum(_share(nested) * (nested[0].total or 1) for nested in threads.values())
     share /= max(1, sum(nested[0].total or 1 for nested in threads.values()))
-    elapsed = time.monotonic() - counted[0].begin if counted else 0.0
+    now, changed = time.monotonic(), max((work.changed for work in counted), default=0.0)
+    elapsed = max(0.0, changed - counted[0].begin) if counted else 0.0
     title = "" if not works or works[0].total else f"{counts.pop(0)}: "
     if share > 0.0:
         counts.append(f"{share:.0%}")
     if share >= _MIN_SHARE or (share > 0.0 and elapsed >= _MIN_ELAPSED_S):
-        return f"{title}{', '.join(counts)}, {duration_text(elapsed * (1.0 - share) / share)} left"
-    since = f"{duration_text(time.monotonic() - works[0].begin)} so far" if works else ""
+        # estimated when a part ended, and counted down since; a part that takes longer than that has no estimate
+        left = elapsed * (1.0 - share) / share - (now - changed)
+        if left >= 0.0:
+            return f"{title}{', '.join(counts)}, {duration_text(left)} left"
+    since = f"{duration_text(now - works[0].begin)} so far" if works else ""
     return title + ", ".join([*counts, since])
 
 

@@ -87,6 +87,23 @@ def test_mistake_in_config_file_names_file(in_process, here):
     assert "mine.yaml:1:19: rewards.alive.weight: expected a number, found 'x'" in err
 
 
+def test_validate_reports_missing_model(in_process, here, small):
+    code, _, err = in_process("validate", small(("model.xml", "models.xml")))
+    assert code == 3
+    assert "small/task.yaml:8:13: scene.entities.robot.model: no file 'models.xml' in" in err
+    assert "MJCF files there: model.xml" in err
+    code, _, err = in_process("validate", small(("model: model.xml", "model: 'models:nobody/robot.xml'")))
+    assert code == 0
+    assert "model of robot: RLCLI_MODELS is not set" in err
+
+
+def test_unknown_term_of_folder_without_terms_names_the_file(in_process, small):
+    code, _, err = in_process("validate", small(("func: is_alive", "func: home_sweet_home")))
+    assert code == 3
+    assert "there is no reward term 'home_sweet_home'" in err
+    assert "the folder small has no terms.py; terms: " in err
+
+
 def test_validate_does_not_import_terms(here, small):
     task = small(
         ("is_alive, weight", "mine, x: 2, weight"), terms="raise SystemExit(9)\ndef mine(env, *, x: int): ...\n"

@@ -37,6 +37,14 @@ ctrlrange="-1 1" ctrllimited="true"/><motor joint="c" gear="2" ctrlrange="-1 1" 
 """
 
 
+UNICYCLE = """<mujoco><worldbody><body name="frame" pos="0 0 0.15"><freejoint/>
+<geom type="capsule" fromto="0 0 0.15 0 0 0.5" size="0.03" mass="2"/><body><joint name="drive" axis="0 1 0"/>
+<geom type="ellipsoid" size="0.15 0.03 0.15" mass="1"/></body><body pos="0.06 0 0.5"><joint name="fly" axis="1 0 0"/>
+<geom type="cylinder" fromto="-0.01 0 0 0.01 0 0" size="0.2" mass="1.5" contype="0" conaffinity="0"/></body></body>
+</worldbody><actuator><motor joint="drive" ctrlrange="-6 6"/><motor joint="fly" ctrlrange="-8 8"/></actuator></mujoco>
+"""
+
+
 def written(cli, tmp_path, text):
     (tmp_path / "robot.xml").write_text(text)
     result = cli("new", "my-robot", "--robot", "robot.xml", "--json")
@@ -65,6 +73,25 @@ def test_other_robot_balances_about_its_keyframe(cli, tmp_path):
     assert task["actions"]["effort"]["scale"] == {"slide": 10.0}
     assert task["scene"]["entities"]["robot"]["init"] == {"joint_pos": {"slide": 0.3}}
     assert task["success"]["pose"]["joints"] == ["hinge"]
+
+
+def test_floating_base_with_wheels_is_kept_upright(cli, tmp_path):
+    _, task = written(cli, tmp_path, UNICYCLE)
+    observed = ["base_lin_vel", "base_ang_vel", "projected_gravity", "wheel_vel"]  # the angle of a wheel says nothing
+    assert list(task["observations"]["policy"]) == observed
+    assert list(task["rewards"]) == ["alive", "upright", "wheel_speed", "effort", "fall"]
+    assert task["events"]["root"]["roll"] == task["events"]["root"]["pitch"] == [-0.05, 0.05]
+    assert list(task["success"]) == ["upright"]
+
+
+def test_flywheel_on_a_fixed_base_has_no_pose_to_hold(cli, tmp_path):
+    wheel = POLE.replace("second", "fly").replace("0 0 0 0 0 0.4", "0 0 -0.2 0 0 0.2")
+    text = CART.replace("</body></body></worldbody>", wheel + "</body></body></worldbody>").replace("0.3 0", "0.3 0 0")
+    _, task = written(cli, tmp_path, text)
+    assert task["success"]["pose"]["joints"] == ["hinge"]
+    assert task["rewards"]["pose"]["joints"] == ["hinge"]
+    assert task["rewards"]["speed"]["joints"] == ["slide", "hinge"]
+    assert task["rewards"]["wheel_speed"]["joints"] == ["fly"]
 
 
 def test_joints_with_different_defaults_have_a_condition_each(cli, tmp_path):

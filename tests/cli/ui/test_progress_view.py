@@ -43,6 +43,16 @@ def test_works_of_threads_run_beside_each_other():
     assert work_line([tasks, trainers]) == "t 0/20, r 2/4, 8%, 0:10 so far"
 
 
+def test_time_left_counts_down_and_disappears_when_a_part_takes_longer():
+    now = time.monotonic()
+    work = Work("checks", 20, 15, begin=now - 30.0, changed=now - 4.0)
+    assert work_line([work]) in ("checks 15/20, 75%, 0:04 left", "checks 15/20, 75%, 0:05 left")  # 26 s / 3 - 4 s
+    work.changed = now - 20.0
+    assert work_line([work]) == "checks 15/20, 75%, 0:30 so far"
+    work.advance()
+    assert work.changed >= now
+
+
 def test_work_ends_with_its_context():
     with track("outer"), track("inner", 3) as work:
         work.advance(2)
