@@ -204,16 +204,24 @@ def no_progress(health: Health) -> Found:
 
 
 def one_termination(health: Health) -> Found:
-    """Report a termination that ends nearly all episodes, after no more steps than at the beginning of the training."""
+    """Report a termination that ends nearly all episodes, no later than at first, or no later for half the training."""
     late = {name for name, term in health.task.terminations.items() if term is not None and term.time_out}
     for metric in health.names("Episode_Termination/"):
         name, share = metric.partition("/")[2], health.median(metric)
         if name in late | {"time_out"} or share is None or share < 0.99 or not health.struggles(0.15):
             continue
-        if health.change(LENGTH) < 1.0 and not _approaches(health.values(RETURN)):
+        early = health.change(LENGTH) < 1.0
+        if (early or _stalled(health)) and not _approaches(health.values(RETURN)):
             length = statistics.fmean(health.last(LENGTH))
-            message = f"{share:.0%} of the episodes end by '{name}' after {length:.0f} steps, no later than at first"
+            since = "at first" if early else "in the middle of the training so far, and none succeeds"
+            message = f"{share:.0%} of the episodes end by '{name}' after {length:.0f} steps, no later than {since}"
             yield message, "looser limits, an easier start of episodes, or a reward for each step"
+
+
+def _stalled(health: Health) -> bool:
+    """Return whether no episode has succeeded in half of the training, and episodes no longer get longer."""
+    successes, lengths = health.values(SUCCESS), health.values(LENGTH)
+    return bool(successes) and health.struggles(0.5) and not any(successes) and not _approaches(lengths)
 
 
 def short_episodes(health: Health) -> Found:

@@ -192,6 +192,14 @@ def test_latest_names_the_refused_runs(tmp_path, caplog):
         find_run("latest", tmp_path, "other")
 
 
+def test_unknown_run_suggests_a_word_or_names_the_absolute_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for reference, hint in (("shiped", "did you mean 'shipped'?"), ("zebra", f"runs in {tmp_path / 'runs'}: (none)")):
+        with pytest.raises(CheckpointError) as caught:
+            find_run(reference, tmp_path.relative_to(tmp_path) / "runs")
+        assert caught.value.hint == hint
+
+
 def test_runs_folder_that_is_a_file_raises_machine_error(tmp_path):
     (tmp_path / "runs").touch()
     with pytest.raises(MachineError, match="cannot write"):

@@ -47,6 +47,23 @@ def test_note_of_success_says_that_few_episodes_reached_the_time_out():
     assert "; " not in health.notes({**metrics, "Episode_Termination/time_out": 1.0})[0]
 
 
+def test_termination_of_all_episodes_is_named_if_their_length_stalls_after_a_rise():
+    changes = {
+        "Train/mean_reward": lambda i: -1.0 if i < 10 else 0.9 + 0.01 * (i % 3),
+        "Train/mean_episode_length": lambda i: 20.0 if i < 10 else 55.0 + i % 3,
+        "Episode_Termination/time_out": lambda i: 0.0,
+        "Episode_Termination/cart_out_of_bounds": lambda i: 1.0,
+        **FAILING,
+        "Success_Value/pole": lambda i: 1.04,
+    }
+    found = findings(changes, until=0.6)["one-termination"]
+    assert "by 'cart_out_of_bounds' after 56 steps, no later than in the middle of the training" in found.message
+    assert "one-termination" not in findings(changes, until=0.4)
+    rising = {"Train/mean_episode_length": lambda i: 20.0 + i}
+    assert "one-termination" not in findings({**changes, **rising}, until=0.6)
+    assert "one-termination" not in findings({**changes, "Train/success_rate": lambda i: 0.01}, until=0.6)
+
+
 @pytest.mark.parametrize("until", [0.1, 0.25, 0.5, 1.0])
 def test_healthy_training_has_no_finding(until):
     assert findings({}, until=until) == {}

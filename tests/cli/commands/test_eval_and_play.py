@@ -277,6 +277,23 @@ def test_video_has_every_step_at_control_rate(cli, trained, start):
     assert sum(change > 20 for change in video["moved"]) > len(video["moved"]) / 2
 
 
+@pytest.mark.parametrize(
+    ("edits", "words", "expected"),
+    [
+        ((("num_envs: 4", "num_envs: 64"),), [], 16),
+        ((("num_envs: 4", "num_envs: 8"),), [], 8),
+        ((("num_envs: 4", "num_envs: 64"), ("agents:", "play: {scene: {num_envs: 24}}\nagents:")), [], 24),
+        ((), ["scene.num_envs=32"], 32),
+    ],
+)
+def test_usual_number_of_environments_yields_to_the_users(small, edits, words, expected, monkeypatch, here):
+    from rlcli.evaluation.session import PolicyRequest, find_policy
+
+    monkeypatch.chdir(here)
+    request = PolicyRequest(small(*edits), words, policy="zero", usual_envs=16)
+    assert find_policy(request).resolved.task.scene.num_envs == expected
+
+
 @pytest.mark.slow
 def test_video_continues_after_early_termination(cli):
     play = ("play", "cartpole-direct", "--policy", "random", "--json", "viewer.width=160", "viewer.height=120")

@@ -108,7 +108,7 @@ def test_figure_has_chosen_metrics_and_axis(cli, runs):
         (["latest", "-o", "folder.png"], 2, "is a folder"),
         (["latest", "-o", "nowhere/x.png"], 10, "cannot write nowhere/x.png"),
         (["cartpoel"], 5, "no run 'cartpoel'"),
-        (["latest", "--runs-dir", "nowhere"], 5, "there is no run in nowhere"),
+        (["latest", "--runs-dir", "nowhere"], 5, "/nowhere\nhint: rlcli train"),
         ([], 2, "Missing argument"),
     ],
 )
