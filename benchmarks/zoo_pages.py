@@ -190,14 +190,15 @@ def fresh_seeds(zoo: Path) -> list[str]:
         "## Seeds on which nothing was tuned",
         "",
         "Success of the default command with seeds that played no part in choosing the settings; 1,000 episodes",
-        "without exploration noise. The other tasks are not measured yet.",
+        "without exploration noise. An empty cell and the other tasks are not measured yet.",
         "",
         f"| task | {' | '.join(f'seed {seed}' for seed in document['seeds'])} | longest training | machine |",
         f"| --- | {'---: | ' * len(document['seeds'])}---: | --- |",
     ]
     for task, row in document["tasks"].items():
         longest = f"{row['minutes']:.1f} min" if "minutes" in row else "below 1 min"
-        values = " | ".join(f"{value:.3f}" for value in row["success"])
+        measured = [f"{value:.3f}" for value in row["success"]]
+        values = " | ".join([*measured, *["" for _ in document["seeds"][len(measured) :]]])
         lines.append(f"| [{task}]({task}.md) | {values} | {longest} | {row.get('machine', '2 CPU cores')} |")
     return [*lines, ""]
 
