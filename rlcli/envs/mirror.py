@@ -80,7 +80,7 @@ def mirror_maps(resolved: Resolved, groups: Iterable[str], *, tolerance: float) 
     try:
         return _MirrorTest(env, tolerance).run(groups)
     except TaskError as error:
-        hint = "make the task symmetric, raise symmetry.tolerance or set symmetry: null"
+        hint = error.hint or "make the task symmetric, raise symmetry.tolerance or set symmetry: null"
         raise ConfigError([resolved.problem(path, str(error), hint)]) from None
     finally:
         env.close()
@@ -135,7 +135,8 @@ class _MirrorTest:
             halves = torch.stack([obs[group] for obs in observed]).chunk(2, dim=1)
             maps[group] = self._observation_map(group, *(half.flatten(0, 1) for half in halves))
         if all(each.is_identity for each in (self._action, *maps.values())):
-            raise TaskError("the mirror changes nothing: everything moves in the x-z plane, so symmetry has no effect")
+            message = "the mirror changes nothing: everything moves in the x-z plane, so symmetry has no effect"
+            raise TaskError(message, hint="set symmetry: null")
         return MirrorMaps(maps, self._action)
 
     def _normal_samples(self, *shape: int) -> Tensor:

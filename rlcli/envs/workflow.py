@@ -1,4 +1,4 @@
-"""Hooks of the environment loop that a workflow (manager-based or direct) implements, with their defaults."""
+"""Hooks that the environment loop calls and the two workflows (manager-based and direct) implement."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from rlcli.sim.markers import Marker
 
 
 class Workflow(Environment):
-    """Base class of the environment loop, with the parts that differ between manager-based and direct tasks.
+    """Hooks that the environment loop calls and the manager-based and the direct workflow implement.
 
-    `VecEnv` calls the hooks whose names begin with an underscore; the other methods are for users of the environment.
+    `VecEnv`, the environment loop, calls the hooks whose names begin with an underscore; the other methods are for
+    users of the environment.
     """
 
     terrain: Terrain | None

@@ -60,7 +60,9 @@ class Regulator:
 
 
 def regulator(resolved: Resolved, bound: float | None) -> Regulator:
-    """Compute the LQR of a task. The weights of positions, velocities, and actions divided by the bound are 1.
+    """Compute the LQR of a task, for the cost |x|^2 + |u / bound|^2 per step.
+
+    x: deviations of positions and velocities from the default state. u: actions. Without a bound, u is divided by 1.
 
     Args:
         resolved: the task.

@@ -111,15 +111,15 @@ class AttributeState:
             holder = vars(holder).get(step)
             if not _is_helper(holder):
                 raise ValueError(
-                    f"the saved value '{attribute}' has no attribute in {type(self._owner).__name__}: restore its"
-                    " old code"
+                    f"the checkpoint has a value for '{attribute}', but class {type(self._owner).__name__} has no such"
+                    " attribute any more: restore the old code of the class"
                 )
         on_class = getattr(type(holder), name, None)  # a method or a property is not state
         allowed = name.isidentifier() and not name.startswith("__") and (bool(path) or name not in self._excluded)
         if not allowed or not _is_saved_kind(on_class) or not _is_saved_kind(vars(holder).get(name)):
             raise ValueError(
-                f"the file has a value '{attribute}', which {type(self._owner).__name__} does not save: the file is"
-                " damaged, or the code has changed; use another file, or restore the old code"
+                f"the checkpoint has a value for '{attribute}', which class {type(self._owner).__name__} does not save:"
+                " the file is damaged, or the code has changed; use another checkpoint, or restore the old code"
             )
         return holder, name
 

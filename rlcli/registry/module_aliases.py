@@ -144,7 +144,10 @@ def _folders_above() -> list[Path]:
 
 
 def _add_own_paths() -> None:
-    """Treat folders that a task's files have added to `sys.path` as folders of the task, except folders of packages."""
+    """Treat folders that a task's files have added to `sys.path` as folders of the task.
+
+    Folders of installed packages and of Python itself are excepted.
+    """
     for entry in sys.path if _known_paths else ():
         folder = Path(entry).resolve()
         installed = {"site-packages", "dist-packages"} & set(folder.parts) or Path(sys.prefix).is_relative_to(folder)

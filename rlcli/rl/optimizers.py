@@ -65,8 +65,8 @@ def _require_slots(optimizer: torch.optim.Optimizer, state: Mapping[int, Mapping
     for number, slots in state.items():
         if not 0 <= number < len(owned):
             raise ValueError(
-                f"trainer: the saved optimiser state has a parameter {number}; the agent has {len(owned)}: the file is"
-                " damaged, or the agent has changed"
+                f"trainer: the saved optimiser state has an entry for parameter {number} (counted from 0), but the"
+                f" agent has only {len(owned)} parameters: the file is damaged, or the agent has changed"
             )
         parameter = owned[number]
         missing = _SLOTS.get(type(optimizer).__name__, set()) - set(slots)

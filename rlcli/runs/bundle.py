@@ -70,7 +70,9 @@ def check_bundle_target(output: Path) -> None:
     """
     if not output.name:
         raise UsageError(f"--output {output} has no folder name", hint="give --output FOLDER")
-    if output.is_symlink() or (output.exists() and not output.is_dir()):
+    if output.is_symlink():
+        raise UsageError(f"--output {output} is a link", hint="give the folder itself, or the name of a new folder")
+    if output.exists() and not output.is_dir():
         raise UsageError(f"--output {output} is not a folder", hint="give the name of a new folder")
     if output.is_dir() and any(output.iterdir()) and not is_bundle(output):
         raise UsageError(f"--output {output} exists and is not a bundle", hint="name a new folder or an older bundle")

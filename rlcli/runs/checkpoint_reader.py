@@ -257,7 +257,8 @@ class Checkpoint:
         starts = [shard.start for shard in shards] + [stop]
         if [shard.stop for shard in shards] != starts[1:] or starts[0] > first:
             raise CheckpointError(
-                f"{self.folder}/manifest.json is corrupt: '{name}' lacks rows; use an older checkpoint: RUN@step:N"
+                f"{self.folder}/manifest.json is corrupt: rows of '{name}' are missing; use an older checkpoint:"
+                " RUN@step:N"
             )
         size, limit = sum(shard.size for shard in shards), available_memory() // 3
         if size > limit:

@@ -1,4 +1,7 @@
-"""Studies: folders with runs of one configuration and several seeds. This module imports neither torch nor mujoco."""
+"""Studies: folders with several runs, of one configuration with several seeds or of the trials of a sweep.
+
+The entry `kind` of study.json tells which. This module imports neither torch nor mujoco.
+"""
 
 import re
 from collections.abc import Mapping, Sequence

@@ -72,7 +72,7 @@ class CameraSensor(LazySensor):
         return self._image
 
     def on_moved(self, selection: Selection) -> None:
-        """Render the selected environments again after their bodies were moved, if the image has been read already."""
+        """Render again the environments whose bodies were moved, if the image has been read in this step."""
         if self._current:
             self._render(ids_of(selection))
 

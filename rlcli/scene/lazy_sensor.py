@@ -27,7 +27,7 @@ class LazySensor(ABC):
 
     @abstractmethod
     def on_moved(self, selection: Selection) -> None:
-        """Compute the values of environments whose bodies were moved again, if they have been read in this step."""
+        """Compute again the values of environments whose bodies were moved, if values have been read in this step."""
 
     def close(self) -> None:
         """Do nothing: the sensor holds no resources."""

@@ -159,7 +159,8 @@ def _require_cheap(pattern: str, length: int) -> None:
         elif token in "*+" or (token[0] == "{" and len(token) > 1):
             if part.last_varies:
                 raise NameProblem(
-                    f"the pattern '{pattern}' repeats a part that varies itself, as in (a*)*; write a simpler one"
+                    f"the pattern '{pattern}' repeats a group that itself contains * + ? {{m,n}} or |, as in (a*)* or"
+                    " (a|b)*, which can take exponential time; write it without the outer or the inner repetition"
                 )
             if token in "*+" or "," in token:
                 part.repeats, part.varies, part.last_varies = part.repeats + 1, True, True

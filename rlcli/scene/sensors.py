@@ -183,12 +183,12 @@ class RaySensor(LazySensor):
         if float(distances.max()) > 1e-4:
             ray, body = int(distances.argmax()), self._config.body
             message = f"ray {ray} of the ray sensor on body '{body}' has no mirror image"
-            raise TaskError(message, hint="make the pattern of this ray sensor symmetric about the x-z plane")
+            raise TaskError(message, hint="make its pattern symmetric about the x-z plane or set symmetry: null")
         found: list[int] = partners.tolist()
         return found
 
     def on_moved(self, selection: Selection) -> None:
-        """Cast the rays of environments whose bodies were moved again, if rays have been cast in this step."""
+        """Cast again the rays of environments whose bodies were moved, if rays have been cast in this step."""
         if not self._current:
             return
         position, quat = self._pose()

@@ -74,7 +74,10 @@ def read_sb3(
         message = "must have a policy of PPO, A2C, SAC, TD3 or DDPG with continuous actions"
         raise CheckpointError(f"{file} {message}; {_some_names(weights)}")
     if any(name.startswith(("features_extractor.", "pi_features_extractor.", "actor.features")) for name in weights):
-        raise CheckpointError(f"{file} has a custom features extractor; only MlpPolicy can be imported")
+        raise CheckpointError(
+            f"{file} has a features extractor with weights, such as a CNN;"
+            " only an MlpPolicy with SB3's default extractor can be imported"
+        )
     kind, algorithm, hidden, output, default = kinds[prefix]
     layers = _layers(weights, hidden, file)
     if output is not None:

@@ -60,8 +60,9 @@ def test_asymmetry_is_refused_by_name(tmp_path, place, old, new, named):
 def test_planar_robot_is_refused(tmp_path):
     (tmp_path / "model.xml").write_text(small_task.MODEL)
     (tmp_path / "task.yaml").write_text(small_task.TASK)
-    with pytest.raises(ConfigError, match="the mirror changes nothing"):
+    with pytest.raises(ConfigError, match="the mirror changes nothing") as error:
         mirror_maps(resolve(find_task(str(tmp_path))), ["policy"], tolerance=1e-3)
+    assert error.value.problems[0].hint == "set symmetry: null"
 
 
 def test_small_asymmetry_is_allowed_by_the_tolerance(tmp_path):

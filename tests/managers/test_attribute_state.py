@@ -129,7 +129,7 @@ def test_unsaved_lists_attributes_with_types(value, kind):
 
 
 def test_load_state_dict_rejects_state_of_other_object():
-    with pytest.raises(ValueError, match=r"the saved value 'helper\.table' has no attribute in SimpleNamespace"):
+    with pytest.raises(ValueError, match=r"'helper\.table', but class SimpleNamespace has no such"):
         AttributeState(SimpleNamespace()).load_state_dict({"helper.table": torch.zeros(2)})
 
 

@@ -1,5 +1,6 @@
 """Tests of the Adam optimiser that does not import torch's compiler."""
 
+import pytest
 import torch
 
 from rlcli.rl.optimizers import Adam, load_optimizer, optimizer_tensors
@@ -36,6 +37,13 @@ def test_step_calls_hooks():
     optimizer.register_step_post_hook(lambda *_: seen.append("after"))
     optimizer.step()
     assert seen == ["before", "after"]
+
+
+def test_state_of_more_parameters_is_refused():
+    saved = optimizer_tensors(train(Adam, 1)[1], "o.")
+    network = torch.nn.Linear(5, 7)
+    with pytest.raises(ValueError, match=r"entry for parameter 2 \(counted from 0\).* only 2 parameters"):
+        load_optimizer(Adam(network.parameters()), saved, "o.")
 
 
 def test_state_can_be_exchanged_with_torch_adam():

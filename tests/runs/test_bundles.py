@@ -113,7 +113,8 @@ def test_write_bundle_does_not_replace_other_files(saved, tmp_path, kind):
         (place / "thesis.txt").write_text("mine")
         if kind == "link":
             target.symlink_to(place)
-    with pytest.raises(UsageError, match="precious"):
+    why = {"folder": "is not a bundle", "file": "is not a folder", "link": "is a link"}[kind]
+    with pytest.raises(UsageError, match=f"precious .*{why}"):
         write_bundle(saved, target, None, None)
     kept = target if kind == "file" else target / "thesis.txt"
     assert kept.read_text() == "mine"

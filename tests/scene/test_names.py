@@ -27,10 +27,10 @@ def test_pattern_matches_names_in_full(pattern, found):
 @pytest.mark.parametrize(
     ("pattern", "said"),
     [
-        ("(h+)+x", "repeats a part that varies itself"),
-        ("(.?){300}x", "repeats a part that varies itself"),
-        ("(h|h)*x", "repeats a part that varies itself"),
-        ("((h?)h?)*x", "repeats a part that varies itself"),
+        ("(h+)+x", "repeats a group that itself contains"),
+        ("(.?){300}x", "repeats a group that itself contains"),
+        ("(h|h)*x", "repeats a group that itself contains"),
+        ("((h?)h?)*x", "repeats a group that itself contains"),
         (".*" * 9 + "x", "has 9 of the quantifiers"),
         ("h?" * 60 + "h" * 60 + "x", "has 60 of the quantifiers"),
         ("h" * 1001, "1,001 characters"),

@@ -41,8 +41,8 @@ def test_malformed_seeds_are_usage_error(text):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--seeds", "0..1", "--seed", "3"), "contradict"),
-        (("--seeds", "0..1", "--gpus", "1"), "contradict"),
+        (("--seeds", "0..1", "--seed", "3"), "--seed cannot be combined with --seeds"),
+        (("--seeds", "0..1", "--gpus", "1"), "--gpus cannot be combined with --seeds"),
         (("--jobs", "2"), "--jobs sets how many trainings run at once"),
         (("--seeds", "3..1"), "empty"),
         (("--seeds", "0..1", "agent.learning_rat=1"), "learning_rate"),
@@ -53,6 +53,24 @@ def test_invalid_arguments_create_nothing(cli, words, message):
     assert result.code in (2, 3)
     assert message in result.err
     assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(("--seed", "3"), "s is a study with its own seeds"), (("--gpus", "1"), "s is a study with one process per seed")],
+)
+def test_study_is_not_resumed_with_options_of_one_training(cli, words, message):
+    Path("s").mkdir()
+    Path("s/study.json").write_text("{}")
+    result = cli("train", "--resume", "s", *words)
+    assert (result.code, message in result.err) == (2, True)
+
+
+def test_seeds_are_not_trained_below_torchrun(cli, monkeypatch):
+    monkeypatch.setenv("RANK", "0")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    result = cli("train", "cartpole", "--seeds", "0..1")
+    assert (result.code, "start rlcli without torchrun" in result.err) == (2, True)
 
 
 @pytest.mark.slow

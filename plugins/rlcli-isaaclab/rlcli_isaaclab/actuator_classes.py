@@ -32,7 +32,11 @@ class ActuatorBase:
         self._joint_names, self._joint_indices = joint_names, joint_ids
         self._num_envs, self._device = num_envs, device
         for name, default in _DEFAULTS.items():
-            setattr(self, name, self._parse_joint_parameter(getattr(cfg, name, None), defaults.get(name, default)))
+            try:
+                value = self._parse_joint_parameter(getattr(cfg, name, None), defaults.get(name, default))
+            except ValueError as error:
+                raise ValueError(f"setting '{name}' of an actuator: {error}") from None
+            setattr(self, name, value)
         self.computed_effort = torch.zeros(num_envs, self.num_joints, device=device)
         self.applied_effort = torch.zeros_like(self.computed_effort)
 

@@ -116,6 +116,11 @@ def _mark_false(node: Node, key: str, why: str) -> None:
         node.report.entries[(*node.key, key)] = ("approximated", why)
 
 
+def _no_counterpart(value: object, why: str = "") -> str:
+    """Return the message for a value of a setting that rlcli does not have, or for a missing value."""
+    return "it has no value" if value is None else f"'{value}' has no counterpart in rlcli{why}"
+
+
 def _cnn(layers: list[tuple[int, int, int]]) -> dict[str, Any]:
     channels, kernels, strides = zip(*layers, strict=True)
     return {"channels": list(channels), "kernels": list(kernels), "strides": list(strides)}
@@ -124,11 +129,11 @@ def _cnn(layers: list[tuple[int, int, int]]) -> dict[str, Any]:
 def _read_skrl(top: Node) -> dict[str, Any]:
     agent, models = top.node("agent"), top.node("models")
     if agent.get("class") != "PPO":
-        top.report.problem(("agent", "class"), f"'{agent.get('class')}' has no counterpart in rlcli", "rlcli reads PPO")
+        top.report.problem(("agent", "class"), _no_counterpart(agent.get("class")), "rlcli reads PPO")
     policy, value = models.node("policy"), models.node("value")
     if policy.get("class") != "GaussianMixin":
-        what = f"'{policy.get('class')}' has no counterpart in rlcli, whose actions are continuous"
-        top.report.problem(policy.key, what, "write GaussianMixin")
+        why = ", whose actions are continuous"
+        top.report.problem((*policy.key, "class"), _no_counterpart(policy.get("class"), why), "write GaussianMixin")
     actor, cnn = _skrl_network(policy)
     critic, _ = _skrl_network(value)
     rollouts = agent.require("rollouts") or 1
@@ -205,7 +210,7 @@ def _skrl_network(model: Node) -> tuple[dict[str, Any], dict[str, Any]]:
 def _read_sb3(top: Node) -> dict[str, Any]:
     policy = top.node("policy_kwargs")
     if top.get("policy") != "MlpPolicy":
-        top.report.problem(("policy",), f"'{top.get('policy')}' has no counterpart in rlcli", "write MlpPolicy")
+        top.report.problem(("policy",), _no_counterpart(top.get("policy")), "write MlpPolicy")
     arch = policy.get("net_arch", [64, 64])
     shapes = arch if isinstance(arch, dict) else {"pi": arch, "vf": arch}
     activation = str(policy.get("activation_fn", "nn.Tanh")).rpartition(".")[2].lower()
@@ -229,8 +234,10 @@ def _read_sb3(top: Node) -> dict[str, Any]:
     }
     if isinstance(found["learning_rate"], str):  # `lin_3e-4`: it decreases over the training
         found["learning_rate"], found["schedule"] = float(found["learning_rate"].removeprefix("lin_")), "linear"
-    for key in ("normalize_value", "clip_obs", "target_kl", "squash_output"):
-        top.note("ignored", key, "PPO with dialect: sb3 has no such setting in rlcli")
+    why = "SB3 scales rewards; rlcli's normalize_value normalises the critic's targets, so it is not set"
+    top.note("ignored", "normalize_value", why)
+    for key in ("clip_obs", "target_kl", "squash_output"):
+        top.note("ignored", key, "rlcli's ppo has no such setting")
     policy.note("ignored", "squash_output", "actions are not squashed")
     policy.skip("ortho_init")
     top.skip("seed", "device", "policy_kwargs")

@@ -89,7 +89,13 @@ def model_hint(entity: str) -> str:
 
 
 def mjcf_of(usd: str, root: Path, given: Mapping[str, str], entity: str) -> str:
-    """Return the MJCF of an entity; an `.xml` file is returned unchanged.
+    """Return the MJCF of an entity: the given one, else the path itself if it is an `.xml` file, else a known one.
+
+    Args:
+        usd: the path of the model in the task's files.
+        root: the folder of the task, which is searched for `NAME.xml`.
+        given: the entity's name, or the end of a model's path -> the MJCF that the user gives for it.
+        entity: the entity's name.
 
     Raises:
         TaskError: if no MJCF is known for it.

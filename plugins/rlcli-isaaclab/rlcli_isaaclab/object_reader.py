@@ -27,7 +27,11 @@ class ObjectReader:
         self.driven_joints = scene.driven_joints
 
     def record_driven_joints(self, actions: Node) -> None:
-        """Record which joints the actions drive, and by what: effort, motor, velocity or position."""
+        """Record the kind of command that each joint gets.
+
+        It is position, velocity or effort for an action of Isaac Lab; motor for efforts that the user's own action
+        class sets.
+        """
         for _, item in actions.nodes():
             wanted = item.data.get("joint_names")
             entity = str(item.data.get("asset_name"))

@@ -1,6 +1,7 @@
 """Utilities of Isaac Lab that a task's own code calls: buffers, poses, interpolation."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -75,3 +76,15 @@ def test_velocities_in_another_frame():
 
 def test_settings_of_the_log_have_no_effect():
     assert SimulationCfg().logging_level == "WARNING"
+
+
+def test_two_keys_of_one_name_are_named():
+    values = {"l.*": 1.0, ".*eg": 2.0, "arm": 3.0}
+    with pytest.raises(ValueError, match=r"the keys 'l\.\*' and '\.\*eg' both match 'leg'; narrow one of them"):
+        lab("isaaclab.utils.string").resolve_matching_names_values(values, ["arm", "leg"])
+
+
+def test_actuator_setting_with_two_values_for_a_joint_is_named():
+    cfg = SimpleNamespace(stiffness={"a.*": 1.0, ".*m": 2.0})
+    with pytest.raises(ValueError, match=r"setting 'stiffness' of an actuator: the keys 'a\.\*' and '\.\*m' both"):
+        lab("isaaclab.actuators").IdealPDActuator(cfg, ["arm"], [0], 1, "cpu")

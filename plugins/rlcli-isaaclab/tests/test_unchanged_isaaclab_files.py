@@ -462,15 +462,18 @@ def test_rl_games_settings_without_counterpart_are_reported(direct):
     }
 
 
-def test_agent_of_another_algorithm_is_refused_with_its_line(direct):
+@pytest.mark.parametrize(
+    ("new", "message"), [("class: AMP", "'AMP' has no counterpart in rlcli"), ("class: null", "it has no value")]
+)
+def test_agent_of_another_algorithm_is_refused_with_its_line(direct, new, message):
     registered(direct.parent, ["skrl"])
     file = direct.parent / "skrl.yaml"
-    file.write_text(file.read_text().replace("class: PPO", "class: AMP"))
+    file.write_text(file.read_text().replace("class: PPO", new))
     with pytest.raises(ConfigError) as caught:
         resolve(find_task(str(direct.parent)))
     (problem,) = caught.value.problems
     assert problem.where == f"{file}:5"
-    assert problem.message == "'AMP' has no counterpart in rlcli"
+    assert problem.message == message
 
 
 def test_registration_chooses_agent_and_file_reference_uses_the_same(direct):

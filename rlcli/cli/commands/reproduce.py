@@ -85,9 +85,9 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
     def check_model(env: Environment) -> None:
         more = changed_entries(original, built_record(env.engine.model, "cpu"))
         rows.extend(more)
-        _require(more, force)
+        _require_no_changes(more, force)
 
-    _require(rows, force)
+    _require_no_changes(rows, force)
     if original.record.get("resumed"):
         console.warn("the run was resumed with other software or on another machine; later iterations may differ")
 
@@ -101,8 +101,8 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
     return run, trainer.env_steps, rows
 
 
-def _require(rows: list[Row], force: bool) -> None:
-    """Print the changes of software and machine, and exit with code 9 unless `force` is set."""
+def _require_no_changes(rows: list[Row], force: bool) -> None:
+    """If software or machine have changed, print the changes, and exit with code 9 unless `force` is set."""
     from rlcli.cli.ui.difference_table import cell
 
     if not rows:

@@ -118,9 +118,14 @@ def _study(request: TrainingRequest, seeds: str | None, jobs: int | None, seed: 
                 hint="add --seeds, as in --seeds 0..4 --jobs 2, or leave out --jobs",
             )
         return None
-    if seed is not None or request.gpus is not None or distributed.launched():
-        other = "--seed" if seed is not None else "--gpus"
-        raise UsageError(f"--seeds and {other} contradict each other", hint=f"leave out {other}")
+    given = "--seed" if seed is not None else None if request.gpus is None else "--gpus"
+    if given is not None and seeds is not None:
+        raise UsageError(f"{given} cannot be combined with --seeds", hint=f"leave out {given}")
+    if given is not None:
+        own = "its own seeds" if given == "--seed" else "one process per seed"
+        raise UsageError(f"{study} is a study with {own}", hint=f"leave out {given}")
+    if distributed.launched():
+        raise UsageError("several seeds train in one process each", hint="start rlcli without torchrun")
     return study if seeds is None else read_seeds(seeds)
 
 

@@ -225,7 +225,7 @@ class RandomizeModelField(DrawKeys, FieldRandomization):
         super().__post_init__()
 
     def selected(self) -> Columns | None:
-        """Return the index of the elements that match `names`."""
+        """Return the index of the elements that match `names`; None for a field without named elements."""
         kind = FIELDS.get(self.field)
         return self.entity.select(kind, self.names)[0] if kind else None
 

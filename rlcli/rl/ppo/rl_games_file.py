@@ -141,7 +141,7 @@ class RlGamesReader:
                 name = value.get("name") if isinstance(value, Mapping) else value
                 wanted = {"algo": "a2c_continuous", "model": "continuous_a2c_logstd"}[key]
                 if name != wanted:
-                    self.problem(at, f"'{name}' has no counterpart", f"expected '{wanted}'")
+                    self.problem(at, _no_counterpart(name), f"expected '{wanted}'")
                 else:
                     self.note(at, "mapped", "trainer ppo")
             elif key not in ("network", "config", "env"):
@@ -235,7 +235,7 @@ class RlGamesReader:
             self.problem(at, "expected layers of convolutions", hint)
             return
         if cnn.get("type") != "conv2d":
-            self.problem((*at, "type"), f"'{cnn.get('type')}' has no counterpart", "expected 'conv2d'")
+            self.problem((*at, "type"), _no_counterpart(cnn.get("type")), "expected 'conv2d'")
         for number, layer in enumerate(convs):
             if layer.get("padding", 0) != 0:
                 self.problem(
@@ -318,6 +318,11 @@ class RlGamesReader:
                 self.problem((*at, "schedule_type"), "unknown schedule_type", f"known: {listing(_KL_GRAINS)}")
             self.put(("kl_grain",), grain, (*at, "schedule_type"))
             self.note((*at, "schedule_type"), "mapped", "kl_grain")
+
+
+def _no_counterpart(value: object) -> str:
+    """Return the message for a value of a setting that rlcli does not have, or for a missing value."""
+    return "it has no value" if value is None else f"'{value}' has no counterpart"
 
 
 def _number(value: Any, default: float) -> float:

@@ -38,15 +38,17 @@ def resolve_matching_names_values(
     Raises:
         ValueError: if two keys match one string, or a key matches none.
     """
-    names, found = list(list_of_strings), {}
+    names, found, key_of = list(list_of_strings), {}, {}
     for pattern, value in data.items():
         matched = [index for index, name in enumerate(names) if re.fullmatch(pattern, name)]
         if not matched:
             raise ValueError(f"no name matches '{pattern}'; names: {', '.join(names)}")
         for index in matched:
             if index in found:
-                raise ValueError(f"several keys match '{names[index]}'; keys: {', '.join(data)}")
-            found[index] = value
+                raise ValueError(
+                    f"the keys '{key_of[index]}' and '{pattern}' both match '{names[index]}'; narrow one of them"
+                )
+            found[index], key_of[index] = value, pattern
     indices = list(found) if preserve_order else sorted(found)
     return indices, [names[index] for index in indices], [found[index] for index in indices]
 
