@@ -209,8 +209,8 @@ def collect(task: str, runs: list[Path], hardware: str | None, ship: bool, known
 
 
 def _ship(task: str, run: Any, checkpoint: Path, evaluation: dict[str, Any]) -> None:
-    from rlcli.runs.bundle import write_bundle
     from rlcli.runs.checkpoint_reader import open_checkpoint
+    from rlcli.runs.policy_bundle import write_bundle
 
     write_bundle(open_checkpoint(checkpoint), find_task(task).root / "policies" / task, run, evaluation)
 
@@ -225,8 +225,8 @@ def adopt(task: str, other: str) -> None:
     from rlcli.deploy.env_description import describe
     from rlcli.envs.make import make_env
     from rlcli.runs.atomic_io import to_json
-    from rlcli.runs.bundle import write_bundle
     from rlcli.runs.checkpoint_reader import open_checkpoint
+    from rlcli.runs.policy_bundle import write_bundle
 
     entry, source = entries()[task], find_task(task)
     given = open_checkpoint(find_task(other).root / "policies" / other)

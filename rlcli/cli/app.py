@@ -23,7 +23,7 @@ from rlcli.errors import INTERRUPTED, CheckpointError, ConfigError, MachineError
 from rlcli.machine import AddressSpaceCheck, MatplotlibFinder, delay_garbage_collection, memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.registry.plugin_imports import exit_refused
-from rlcli.registry.task_code import error_of_task, observe_task_code, raised_by_task
+from rlcli.registry.task_code_monitor import error_of_task, observe_task_code, raised_by_task
 from rlcli.safe_text import remember_given
 from rlcli.settings import settings_file, use_settings
 from rlcli.trainers import TrainerSpec

@@ -18,7 +18,7 @@ from rlcli.envs.direct import DirectEnv
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, Problem
-from rlcli.managers.term import BoundTerm
+from rlcli.managers.term_binding import BoundTerm
 
 _INPUT = "observation/"
 """Prefix of the inputs for observation terms without a formula."""

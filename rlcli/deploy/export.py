@@ -29,7 +29,7 @@ from rlcli.runs.policy_interface import deployment_of, layout_of
 __all__ = ["BUNDLE", "FORMATS", "TOLERANCE", "Exported", "check_target", "export", "require_self_contained"]
 
 BUNDLE = "bundle"
-"""Format that is a folder which rlcli itself reads: `rlcli.runs.bundle`."""
+"""Format that is a folder which rlcli itself reads: `rlcli.runs.policy_bundle`."""
 TOLERANCE = 1e-5
 """Largest accepted difference from the policy, relative to max(1, |value|)."""
 _RANDOM = 256

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from rlcli.envs.vec_env import VecEnv
 from rlcli.managers.command import CommandTerm
-from rlcli.managers.term import BoundTerm
+from rlcli.managers.term_binding import BoundTerm
 from rlcli.mdp import actions, observations
 from rlcli.scene.entity import Entity
 from rlcli.sim.env_selection import Columns

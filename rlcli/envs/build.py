@@ -11,7 +11,7 @@ from torch import Tensor
 from rlcli.config.load import Resolved
 from rlcli.config.schema import InitialStateConfig
 from rlcli.errors import ConfigError
-from rlcli.managers.term import Binder
+from rlcli.managers.term_binding import Binder
 from rlcli.scene.actuators import ActuatorModel
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rlcli.config.schema import SuccessConfig, bound_text
 from rlcli.envs.shard_range import Shard
-from rlcli.managers.term import BoundTerm, CheckedTerm, first_value
+from rlcli.managers.term_binding import BoundTerm, CheckedTerm, first_value
 from rlcli.sim.engine import Engine
 from rlcli.sim.env_selection import Field, Selection, in_place
 from rlcli.sim.saved_tensors import TensorState

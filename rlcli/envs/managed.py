@@ -23,7 +23,7 @@ from rlcli.managers.event import EventManager
 from rlcli.managers.observation import ObservationManager
 from rlcli.managers.observation_pipeline import Pipeline
 from rlcli.managers.reward import RewardManager
-from rlcli.managers.term import BoundTerm, EnvContext
+from rlcli.managers.term_binding import BoundTerm, EnvContext
 from rlcli.managers.termination import TerminationManager
 from rlcli.scene.joint_and_actuator_setup import ActuatorNeed
 from rlcli.scene.scene import Scene

@@ -13,7 +13,7 @@ from rlcli.envs.observers import StepObserver
 from rlcli.envs.step_result import Episodes, StepRecord, StepResult
 from rlcli.managers.termination import DIVERGED
 from rlcli.progress import track
-from rlcli.replay.rerun_episode import require_end
+from rlcli.replay.episode_from_seed import require_end
 from rlcli.rl.action_functions import Act
 from rlcli.rl.confidence import mean, proportion
 

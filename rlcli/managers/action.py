@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rlcli.errors import ConfigError
 from rlcli.managers.observation_pipeline import Delay, make_delay
-from rlcli.managers.term import BoundTerm, EnvContext, resets
+from rlcli.managers.term_binding import BoundTerm, EnvContext, resets
 from rlcli.sim.env_selection import Selection, in_place
 from rlcli.sim.saved_tensors import TensorState
 

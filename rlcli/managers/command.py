@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import UsageError, did_you_mean, listing
-from rlcli.managers.term import BoundTerm, EnvContext, resets
+from rlcli.managers.term_binding import BoundTerm, EnvContext, resets
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.markers import Arrow, Frame, Marker, Sphere
 from rlcli.sim.saved_tensors import TensorState

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, EnvContext
+from rlcli.managers.term_binding import BoundTerm, EnvContext
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState, mean_of
 

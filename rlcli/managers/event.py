@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, EnvContext, resets
+from rlcli.managers.term_binding import BoundTerm, EnvContext, resets
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rlcli.config.schema import ObservationGroupConfig
 from rlcli.managers.observation_pipeline import Draws, Pipeline
-from rlcli.managers.term import BoundTerm, EnvContext, first_value
+from rlcli.managers.term_binding import BoundTerm, EnvContext, first_value
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState
 from rlcli.sim.state_cache import is_finite

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from rlcli.config import schema
-from rlcli.managers.term import BoundTerm, CheckedTerm, EnvContext, resets
+from rlcli.managers.term_binding import BoundTerm, CheckedTerm, EnvContext, resets
 from rlcli.sim.env_selection import Selection, in_place
 
 Draws = Callable[[np.uint64], Selection]

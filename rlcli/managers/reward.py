@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, CheckedTerm, EnvContext, first_value, resets
+from rlcli.managers.term_binding import BoundTerm, CheckedTerm, EnvContext, first_value, resets
 from rlcli.managers.termination import DIVERGED
 from rlcli.sim.env_selection import Selection, in_place
 from rlcli.sim.saved_tensors import TensorState

@@ -7,7 +7,7 @@ import functools
 import torch
 from torch import Tensor
 
-from rlcli.managers.term import BoundTerm, CheckedTerm, EnvContext, first_value, resets
+from rlcli.managers.term_binding import BoundTerm, CheckedTerm, EnvContext, first_value, resets
 from rlcli.sim.env_selection import Selection
 
 DIVERGED = "diverged"

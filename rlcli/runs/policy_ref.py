@@ -7,8 +7,8 @@ from pathlib import Path
 from rlcli.errors import CheckpointError, UsageError
 from rlcli.registry import TaskSource
 from rlcli.registry.find import path_of
-from rlcli.runs.bundle import is_bundle, open_bundle
 from rlcli.runs.checkpoint_reader import Checkpoint
+from rlcli.runs.policy_bundle import is_bundle, open_bundle
 from rlcli.runs.restore import recorded_task, source_of
 from rlcli.runs.run import Run
 from rlcli.runs.run_ref import find_checkpoint, list_runs

@@ -26,7 +26,7 @@ from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DeviceError, RlcliError, pip_install
 from rlcli.machine import read_plain
 from rlcli.rl.rng import rng_state
-from rlcli.runs.bundle import open_bundle
+from rlcli.runs.policy_bundle import open_bundle
 from rlcli.runs.restore import require_fit
 from rlcli.runs.safe_io import JSON_LIMIT
 from rlcli.testing.episode_checks import compare_trajectories

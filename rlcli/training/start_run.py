@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rlcli.config.dump import explicit_values, to_data, to_yaml
 from rlcli.config.load import Resolved, resolve
 from rlcli.envs.sharding.worker_count import number_of_workers
-from rlcli.envs.sharding.workers import close_early, start_early
+from rlcli.envs.sharding.worker_pool import close_early, start_early
 from rlcli.errors import CheckpointError, DeviceError, UsageError
 from rlcli.machine import choose_device
 from rlcli.rl import distributed

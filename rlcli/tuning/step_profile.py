@@ -17,7 +17,7 @@ from rlcli.envs.direct import DirectEnv
 from rlcli.envs.make import make_env
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
-from rlcli.managers.term import BoundTerm
+from rlcli.managers.term_binding import BoundTerm
 
 _WARM_UP = 32
 """Number of steps before the measurement, and smallest number of measured steps."""

@@ -14,7 +14,7 @@ from support.sharded_runs import both, differences, same, step_differences
 from rlcli.config.load import resolve
 from rlcli.envs.observers import StepObserver
 from rlcli.envs.shard_range import split
-from rlcli.envs.sharding import workers
+from rlcli.envs.sharding import worker_pool
 from rlcli.envs.sharding.env import ShardedEnv
 from rlcli.envs.sharding.state import join_states, split_state
 from rlcli.envs.sharding.training_env import make_training_env
@@ -346,7 +346,7 @@ def three():
 
 
 def test_worker_that_does_not_answer_is_named_once(three, monkeypatch, caplog):
-    monkeypatch.setattr(workers, "_SILENT_S", 0.3)
+    monkeypatch.setattr(worker_pool, "_SILENT_S", 0.3)
     pid = [process.pid for process in three._workers][1]
     for _ in range(2):
         os.kill(pid, signal.SIGSTOP)

@@ -10,8 +10,8 @@ from safetensors import safe_open
 from support.saved_states import state_of
 
 from rlcli.errors import CheckpointError, UsageError
-from rlcli.runs.bundle import is_bundle, open_bundle, write_bundle
 from rlcli.runs.checkpoint_reader import open_checkpoint
+from rlcli.runs.policy_bundle import is_bundle, open_bundle, write_bundle
 from rlcli.runs.run import Run
 from rlcli.training.checkpoint_writer import write_checkpoint
 

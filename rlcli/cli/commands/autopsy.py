@@ -65,7 +65,7 @@ def command(
         )
     video = video_file(video, "autopsy.mp4")
     from rlcli.replay.failure_cases import list_failure_cases, why_no_cases
-    from rlcli.runs.bundle import is_bundle
+    from rlcli.runs.policy_bundle import is_bundle
     from rlcli.runs.run_ref import default_runs_dir, find_run
     from rlcli.runs.trusted_tasks import named_task
 
@@ -87,7 +87,7 @@ def command(
 
 def _refuse_bundle(folder: str, case: int | None) -> None:
     """Print that an exported bundle has no recorded episodes; raise a UsageError if a case was chosen."""
-    from rlcli.runs.bundle import open_bundle
+    from rlcli.runs.policy_bundle import open_bundle
 
     open_bundle(Path(folder))
     why = (

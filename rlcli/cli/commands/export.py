@@ -146,8 +146,8 @@ def _report(checkpoint: Path, format_: str, file: Path, size: int, **entries: An
 
 def _export_bundle(saved: Checkpoint, run: Run | None, output: Path) -> None:
     """Write a bundle: a folder with the policy for rlcli on another machine, and the checkpoint's saved evaluation."""
-    from rlcli.runs.bundle import check_bundle_target, write_bundle
     from rlcli.runs.eval_store import read_evaluation
+    from rlcli.runs.policy_bundle import check_bundle_target, write_bundle
 
     check_bundle_target(output)
     evaluation = None if run is None else read_evaluation(run, saved.folder.name)
@@ -164,7 +164,7 @@ def _find(reference: str | None, runs_dir: Path, task: str | None) -> Choice:
     The task's code is only imported if the task has no run: a trained policy is exported without it.
     """
     from rlcli.evaluation.session import named_task_or_run
-    from rlcli.runs.bundle import is_bundle
+    from rlcli.runs.policy_bundle import is_bundle
     from rlcli.runs.policy_ref import SHIPPED, Choice, choose
     from rlcli.runs.run import RECORD, open_run
     from rlcli.runs.run_ref import find_checkpoint, list_runs

@@ -17,7 +17,7 @@ from rlcli.cli.ui.completion import agents, checkpoints, runs, tasks, words
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.help_text import METAVARS, HelpCommand, read_docstring
 from rlcli.errors import MachineError, UsageError
-from rlcli.registry.task_code import raised_by_task
+from rlcli.registry.task_code_monitor import raised_by_task
 from rlcli.safe_text import MAX_SEED, read_number
 
 CHOOSE = "auto"

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from rlcli.envs.step_result import StepResult
     from rlcli.evaluation.session import Session
-    from rlcli.replay.rerun_episode import EpisodeStart
+    from rlcli.replay.episode_from_seed import EpisodeStart
     from rlcli.viewer.offscreen import Renderer
     from rlcli.viewer.video_writer import VideoWriter
 
@@ -70,8 +70,8 @@ def play_episode(
         watch: opens a viewer at the start of the episode; returns whether one could be opened.
     """
     from rlcli.evaluation.session import save_episodes
+    from rlcli.replay.episode_from_seed import run_episode, start_episode
     from rlcli.replay.episode_recorder import EpisodeRecorder
-    from rlcli.replay.rerun_episode import run_episode, start_episode
 
     policy = session.policy
     random_actions = policy.stochastic or policy.kind == "random"

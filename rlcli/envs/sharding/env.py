@@ -33,7 +33,7 @@ from rlcli.envs.sharding.shard_step import (
 from rlcli.envs.sharding.state import join, join_states, split_state
 from rlcli.envs.sharding.worker import Job
 from rlcli.envs.sharding.worker_count import has_untested_code
-from rlcli.envs.sharding.workers import Worker, take_workers
+from rlcli.envs.sharding.worker_pool import Worker, take_workers
 from rlcli.envs.step_result import Episodes, StepRecord, StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, one_line

@@ -8,9 +8,9 @@ from typing import Any
 from rlcli.envs.environment_protocol import Environment
 from rlcli.rl.optimizers import Adam
 from rlcli.rl.policy import ACTIVATIONS, PolicySpec
-from rlcli.rl.sb3.algorithms import FastA2C, FastDDPG, FastPPO, FastSAC, FastTD3
 from rlcli.rl.sb3.buffers import TorchReplayBuffer, TorchRolloutBuffer
 from rlcli.rl.sb3.config import A2cConfig, OnPolicyConfig, PpoConfig, Sb3Config
+from rlcli.rl.sb3.torch_algorithms import FastA2C, FastDDPG, FastPPO, FastSAC, FastTD3
 from rlcli.rl.sb3.vec_env import Sb3VecEnv
 from rlcli.rl.trainer_base import agent_error
 

@@ -21,7 +21,7 @@ from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
 from rlcli.envs.sharding.worker import Job
 from rlcli.errors import MachineError
 from rlcli.machine import python_command, require_address_space
-from rlcli.registry.task_code import warn_once
+from rlcli.registry.task_code_monitor import warn_once
 
 _CODE = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[3]);"

@@ -7,8 +7,8 @@ import torch
 from support.worlds import CRITTER_TASK, build, critter, edited
 
 from rlcli.evaluation.evaluate import evaluate
+from rlcli.replay.episode_from_seed import run_episode, start_episode
 from rlcli.replay.episode_recorder import EpisodeRecorder
-from rlcli.replay.rerun_episode import run_episode, start_episode
 from rlcli.replay.trajectory import read_trajectory
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
