@@ -103,8 +103,12 @@ class _AbsentMeta(type):
 class AbsentValue:
     """A constant or function that rlcli does not have. It can be copied, stored and passed on, but not called."""
 
-    def __init__(self, name: str) -> None:
-        self.__dict__["absent_name"] = name
+    absent_name: str
+    imported_at: str
+    """`file:line: ` of the import of a name of `isaaclab_assets`, else empty."""
+
+    def __init__(self, name: str, imported_at: str = "") -> None:
+        self.__dict__["absent_name"], self.__dict__["imported_at"] = name, imported_at
         self.__dict__["__name__"] = name.rpartition(".")[2]
 
     def __getattr__(self, name: str) -> Any:

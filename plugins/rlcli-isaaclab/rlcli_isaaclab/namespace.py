@@ -19,7 +19,14 @@ from typing import Any
 
 from rlcli.errors import did_you_mean
 from rlcli.registry.task_imports import import_from
-from rlcli_isaaclab.absent import absent_class, absent_function, absent_module, absent_value
+from rlcli_isaaclab.absent import (
+    AbsentValue,
+    absent_class,
+    absent_function,
+    absent_module,
+    absent_value,
+    user_place,
+)
 from rlcli_isaaclab.config_class import configclass
 from rlcli_isaaclab.format import LIBRARIES
 
@@ -87,6 +94,8 @@ class LabModule(ModuleType):
         if name.startswith("__"):
             raise AttributeError(name)
         value = _member(self.__name__, name)
+        if self.__name__.startswith("isaaclab_assets") and isinstance(value, AbsentValue):
+            return AbsentValue(value.absent_name, user_place())  # not stored: each file has its own place
         setattr(self, name, value)
         return value
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import TaskError, did_you_mean, listing
-from rlcli_isaaclab.absent import reason_of
+from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
 from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.model_lookup import given_models, mjcf_of, model_hint
@@ -50,6 +50,7 @@ class SceneReader:
         ground: Any = None
         lights: dict[str, Any] = {}
         sensors: list[tuple[str, Node]] = []
+        self._report_missing_assets()
         for name, item in node.nodes():
             kind = kind_of(item.data.get("class_type"))
             spawn = item.node("spawn") if "spawn" in item else None
@@ -100,6 +101,15 @@ class SceneReader:
             config["sensors"] = self.sensors
         self.has_terrain = "terrain" in config
         return config
+
+    def _report_missing_assets(self) -> None:
+        """Report the entities whose settings are names of `isaaclab_assets`, of which no folder was found."""
+        for name, value in self.node.data.items():
+            if isinstance(value, AbsentValue) and value.imported_at:
+                file, asset = value.imported_at.rsplit(":", 2)[0], value.__name__
+                message = f"no folder has isaaclab_assets, from which {file} imports {asset}"
+                hint = "unzip it beside isaaclab_tasks, or set RLCLI_ISAACLAB to the folder that has both"
+                self.report.problem((*self.node.key, str(name)), message, hint)
 
     def add_joint_settings(self, driven: Mapping[str, Mapping[str, str]]) -> None:
         """Write `joints` of each entity, without the settings that its MJCF has already.
