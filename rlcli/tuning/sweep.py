@@ -110,9 +110,17 @@ class Sweep:
         """Return the trials that are finished, pruned or failed."""
         return [trial for trial in self.trials() if trial.state.name in _ENDED]
 
+    def same_objective(self) -> float | None:
+        """Return the objective that all finished trials have; None if it differs or fewer than two are finished."""
+        values = [trial.value for trial in self._finished()]
+        return values[0] if len(values) > 1 and len(set(values)) == 1 else None
+
+    def _finished(self) -> list[FrozenTrial]:
+        return [trial for trial in self.trials() if trial.state.name == "COMPLETE"]
+
     def best(self) -> FrozenTrial | None:
         """Return the finished trial with the best objective; None if no trial is finished."""
-        done = [trial for trial in self.trials() if trial.state.name == "COMPLETE"]
+        done = self._finished()
         if not done:
             return None
         better = max if self.settings["direction"] == "maximize" else min

@@ -5,6 +5,7 @@ import threading
 
 import pytest
 
+from rlcli.cli.ui.several_trainings import print_sweep
 from rlcli.config.dump import preset_of
 from rlcli.config.load import resolve
 from rlcli.errors import CheckpointError, MachineError, UsageError
@@ -46,6 +47,19 @@ def test_seed_determines_trials(tmp_path):
     assert first == again
     assert not [values for values in first if values in other]
     assert len({values["agent.learning_rate"] for values in first}) == 12
+
+
+def test_equal_objectives_of_all_trials_are_a_warning(tmp_path, capsys):
+    sweep = open_or_join(tmp_path)
+    sweep.tell(sweep.claim(), 0.0)
+    print_sweep(sweep)
+    assert "same objective" not in capsys.readouterr().err  # a single trial
+    sweep.tell(sweep.claim(), 0.0)
+    print_sweep(sweep)
+    assert "warning: all trials have the same objective, return = 0: the budget" in capsys.readouterr().err
+    sweep.tell(sweep.claim(), 0.5)
+    print_sweep(sweep)
+    assert "same objective" not in capsys.readouterr().err
 
 
 def test_trial_values_depend_on_number_not_process(tmp_path):

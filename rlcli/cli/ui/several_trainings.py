@@ -107,6 +107,11 @@ def print_sweep(sweep: Sweep) -> None:
         source = settings["source"]  # a task of no package is named by its folder
         task = settings["task"] if source.get("distribution") else source.get("folder", settings["task"])
         console.info(f"to train with its settings: rlcli train {task} --config {file}")
+    if (same := sweep.same_objective()) is not None:
+        console.warn(
+            f"all trials have the same objective, {settings['objective']} = {same:.6g}: the budget may be too short,"
+            " so that no trial is better than another"
+        )
     console.document(
         "sweep",
         sweep=str(sweep.folder),
