@@ -60,7 +60,10 @@ def create(
 
     package = name.replace("-", "_")
     assets: dict[str, Path] = {}
-    files = render(name, flavour if robot is None else "robot", "" if robot is None else robot.task["summary"])
+    if robot is None:
+        files = render(name, flavour)
+    else:
+        files = render(name, "robot", robot.task["summary"], has_pose=robot.has_pose)
     if robot is not None:
         files |= {f"{package}/model.xml": robot.model, f"{package}/task.yaml": to_yaml(robot.task)}
         assets = {f"{package}/{place}": origin for place, origin in robot.assets.items()}
@@ -104,13 +107,14 @@ def check_name(name: str) -> None:
     raise UsageError(message, hint=f"use {name}-2, for example")
 
 
-def render(name: str, flavour: str, summary: str = "") -> dict[str, str]:
+def render(name: str, flavour: str, summary: str = "", *, has_pose: bool = True) -> dict[str, str]:
     """Return the files of a new task's package, from the templates: path within the package's folder -> text."""
     import jinja2
 
     package = name.replace("-", "_")
     version = ".".join(__version__.split(".")[:2])
-    values = {"name": name, "package": package, "version": version, "flavour": flavour, "summary": summary}
+    values = {"name": name, "package": package, "version": version, "flavour": flavour}
+    values |= {"summary": summary, "has_pose": "yes" if has_pose else ""}
     # No escaping: the texts are Python, TOML, XML and Markdown, and `check_name` has checked the values.
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True, autoescape=False)
     names = {"package": package, "suite": "tests", "gitignore": ".gitignore"}

@@ -20,6 +20,8 @@ _MAX_DECIMATION = 20
 SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 """Joint types with one position: hinge and slide."""
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
+_VIEW = np.array([4.0, 4.0, 3.0])
+"""Direction from the robot to the camera."""
 _ROOT = 1
 """The first body: the root of an entity."""
 
@@ -36,6 +38,8 @@ class Robot:
             "keyframes": [key.name for key in spec.keys],
         }
         home = _default_pose(spec)
+        self.has_pose = home is not None
+        """Whether the file has a default pose; otherwise every joint is at zero, or at the nearest limit."""
         _remove_scene_elements(spec)
         original = spec.compile()
         tree = ElementTree.fromstring(spec.to_xml())
@@ -169,6 +173,18 @@ class Robot:
             robot["init"] = {"joint_pos": pose}
         envs = 256 if self.kind() == "velocity" else 512
         return {"num_envs": envs, "env_spacing": 2.5, "entities": {"robot": robot}}
+
+    def viewer_settings(self) -> dict[str, Any]:
+        """Return the camera of the task: it looks at the robot in its default pose and sees it as a whole."""
+        model, data = self.model, self.data
+        solid = [g for g in range(model.ngeom) if model.geom_bodyid[g]]
+        points, radii = np.vstack([data.xpos[1:], data.geom_xpos[solid]]), np.zeros((model.nbody - 1 + len(solid), 1))
+        radii[model.nbody - 1 :, 0] = model.geom_rbound[solid]
+        low, high = (points - radii).min(axis=0), (points + radii).max(axis=0)
+        lookat = 0.5 * (low + high)
+        eye = lookat + 1.5 * max(float(np.linalg.norm(high - low)), 0.1) * _VIEW / np.linalg.norm(_VIEW)
+        place = {name: [round(float(x), 3) + 0.0 for x in point] for name, point in (("eye", eye), ("lookat", lookat))}
+        return place | ({"follow": "robot"} if self.kind() == "velocity" else {})
 
     def feet(self) -> list[str]:
         """Return the names of the bodies, without the root, that touch the ground in the default pose within 1 cm."""

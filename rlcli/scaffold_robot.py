@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rlcli.errors import TaskError, UsageError
+from rlcli.errors import TaskError, UsageError, listing
 from rlcli.scaffold_mjcf import SCALAR, Robot, round3
 from rlcli.scene.mjcf_scan import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf
@@ -42,6 +42,8 @@ class RobotTask:
     """The task as data of its YAML."""
     found: dict[str, list[str]]
     """Elements of the MJCF: joints, actuators, sensors and keyframes -> their names."""
+    has_pose: bool
+    """Whether the MJCF has a default pose: a keyframe, or the numeric `init_qpos`."""
 
 
 def read_robot(file: Path, name: str) -> RobotTask:
@@ -51,6 +53,10 @@ def read_robot(file: Path, name: str) -> RobotTask:
         UsageError: if there is no such file, or the robot has nothing that can be controlled.
         TaskError: if MuJoCo cannot compile the model, or it has an element that rlcli refuses.
     """
+    if file.is_dir():
+        models = sorted(entry.name for entry in file.glob("*.xml"))
+        inside = f"give one of its files: {listing(models)}" if models else "give the MJCF of a robot, a file in it"
+        raise UsageError(f"--robot: {file} is a folder", hint=inside)
     if not file.is_file():
         raise UsageError(f"--robot: there is no file {file}", hint="give the MJCF of a robot, as in --robot robot.xml")
     try:
@@ -73,6 +79,7 @@ def read_robot(file: Path, name: str) -> RobotTask:
         "episode_length_s": round3(robot.tempo * (20.0 if kind == "velocity" else 8.0)),
         "sim": robot.sim_settings(),
         "scene": robot.scene_settings() | {"sensors": sensors},
+        "viewer": robot.viewer_settings(),
         **parts,
         "play": {"scene": {"num_envs": 16}},
         "agents": {
@@ -81,7 +88,7 @@ def read_robot(file: Path, name: str) -> RobotTask:
         },
     }
     task = json.loads(json.dumps(task))  # without shared lists, which YAML would write as anchors
-    return RobotTask(kind, robot.xml, robot.assets, task, robot.found)
+    return RobotTask(kind, robot.xml, robot.assets, task, robot.found, robot.has_pose)
 
 
 def _asset_roots(file: Path) -> list[Path]:

@@ -42,6 +42,11 @@ def command(
         design = read_robot(robot, name)
         for what, names in design.found.items():
             console.info(f"{len(names)} {what}: {listing([each or '(unnamed)' for each in names])}")
+        if not design.has_pose:
+            console.warn(
+                "no keyframe: the default pose is zero joint angles; to change it, set"
+                " scene.entities.robot.init.joint_pos in task.yaml"
+            )
         console.info(f"task: {design.kind}")
     folder, files = create(name, flavour, output, design)
     for file in files:

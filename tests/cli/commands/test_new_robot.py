@@ -237,6 +237,41 @@ def test_robot_whose_last_body_cannot_move_keeps_its_pose(cli, tmp_path):
     assert result.json["flavour"] == "balance"
 
 
+def test_robot_without_keyframe_has_a_warning_and_a_true_readme(cli, tmp_path):
+    result, _ = written(cli, tmp_path, ARM)
+    readme = (tmp_path / "my-robot" / "README.md").read_text()
+    assert "no keyframe: the default pose is zero joint angles" in result.err
+    assert "no keyframe, so the default pose is zero joint angles" in readme
+    assert "first keyframe" not in readme
+
+
+def test_robot_with_keyframe_has_no_warning(cli, tmp_path):
+    result, _ = written(cli, tmp_path, CART)
+    assert "no keyframe" not in result.err
+    assert "is the first keyframe" in (tmp_path / "my-robot" / "README.md").read_text()
+
+
+def test_camera_is_as_far_away_as_the_robot_is_large(cli, tmp_path):
+    _, task = written(cli, tmp_path, ARM)
+    assert task["viewer"]["lookat"] == pytest.approx([0.0, 0.0, 0.35], abs=0.05)  # the arm is 0.73 m high
+    distance = np.linalg.norm(np.subtract(task["viewer"]["eye"], task["viewer"]["lookat"]))
+    assert 1.0 < distance < 2.0
+
+
+def test_camera_follows_a_walking_robot(cli, tmp_path):
+    _, task = written(cli, tmp_path, DOG)
+    assert task["viewer"]["follow"] == "robot"
+
+
+def test_folder_instead_of_the_robots_file_names_the_files_in_it(cli, tmp_path):
+    (tmp_path / "go1").mkdir()
+    (tmp_path / "go1" / "scene.xml").write_text(ARM)
+    result = cli("new", "my-robot", "--robot", "go1")
+    assert result.code == 2
+    assert "go1 is a folder" in result.err
+    assert "scene.xml" in result.err
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("text", [DOG, CART, ARM], ids=["dog", "cart", "arm"])
 def test_task_passes_check_and_trains(cli, tmp_path, text):
