@@ -41,8 +41,13 @@ def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
         return other
     if not config.is_file():
         require_format(root)
-        found = listing(sorted(p.name for p in root.iterdir())) if root.is_dir() else "no such folder"
-        raise TaskError(f"'{folder}' is not a task, because it has no {file}; found: {found}")
+        inside = sorted(root.iterdir()) if root.is_dir() else []
+        tasks = [repr(str(folder / path.name)) for path in inside if (path / file).is_file()]
+        found = listing(path.name for path in inside) if root.is_dir() else "no such folder"
+        raise TaskError(
+            f"'{folder}' is not a task, because it has no {file}; found: {found}",
+            hint=f"did you mean {' or '.join(tasks[:3])}?" if tasks else None,
+        )
     terms, task = root / "terms.py", root / "task.py"
     return TaskSource(
         name=root.name,

@@ -164,6 +164,11 @@ def test_installed_task_wins_over_folder(tmp_path, monkeypatch):
 def test_folder_without_task_lists_its_files(tmp_path):
     (tmp_path / "notes.txt").write_text("x")
     assert "it has no task.yaml; found: notes.txt" in failure(str(tmp_path))
+    (tmp_path / "my-yam" / "my_yam").mkdir(parents=True)
+    (tmp_path / "my-yam" / "my_yam" / "task.yaml").touch()
+    with pytest.raises(TaskError) as package:
+        find_task(str(tmp_path / "my-yam"))
+    assert package.value.hint == f"did you mean '{tmp_path / 'my-yam' / 'my_yam'}'?"
     assert "no such folder" in failure(str(tmp_path / "nowhere"))
     assert "is a file, not a task's folder" in failure(str(tmp_path / "notes.txt"))
 
