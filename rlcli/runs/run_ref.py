@@ -210,7 +210,10 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
             message = f"there is no valid run{of_task} in {runs_dir}: {_first_of(refused)}"
             raise CheckpointError(message, hint=refused[0].hint)
         if not runs:
-            hint = f"rlcli train {task or 'TASK'} starts one"
+            near = (
+                did_you_mean(task, [run.record["task"]["name"] for run in list_runs(runs_dir, None)]) if task else None
+            )
+            hint = "; ".join(filter(None, (near, f"rlcli train {task or 'TASK'} starts one")))
             raise CheckpointError(f"there is no run{of_task} in {runs_dir.absolute()}", hint=hint)
         if seconds_since(runs[-1].record.get("started")) < -60:
             _log.warning(
@@ -233,6 +236,9 @@ def _find_run(reference: str, runs_dir: Path, task: str | None) -> tuple[Run, st
     for folder, error in broken.items():
         if folder.name == reference:
             raise error
-    names = [run.folder.name for run in runs]
-    near = did_you_mean(reference, [*names, "latest", "shipped"])
+    folders = [run.folder.parent if (run.folder.parent / STUDY).is_file() else run.folder for run in runs]
+    names = list(dict.fromkeys(folder.name for folder in folders))
+    named = [repr(name) for name in names if name.endswith(f"-{reference}")]  # a folder's name is TIME-NAME
+    near = f"did you mean {' or '.join(named[-3:])}?" if named else None
+    near = near or did_you_mean(reference, [*names, *(run.folder.name for run in runs), "latest", "shipped"])
     raise CheckpointError(f"no run '{reference}'", hint=near or f"runs in {runs_dir.absolute()}: {listing(names[-5:])}")

@@ -11,6 +11,7 @@ from support.saved_states import state_of
 from rlcli.errors import CheckpointError, MachineError, UsageError
 from rlcli.runs.run import create_run, open_run
 from rlcli.runs.run_ref import find_checkpoint, find_run, find_runs, list_runs
+from rlcli.runs.study import create_study
 from rlcli.training import checkpoint_writer
 
 RECORD = {"task": {"name": "cartpole", "distribution": "rlcli"}, "seed": 1}
@@ -107,6 +108,26 @@ def test_find_run_suggests_a_similar_name(tmp_path):
     with pytest.raises(CheckpointError) as caught:
         find_run(run.folder.name[:-1], tmp_path)
     assert run.folder.name in caught.value.hint
+
+
+def test_find_run_names_studies_and_not_the_runs_in_them(tmp_path):
+    study = create_study(tmp_path, "cartpole", "base", "a: 1\n", {**RECORD, "device": "cpu"}, [0, 1])
+    single = make_run(tmp_path, name="fast")
+    for reference, hint in (
+        ("base", f"did you mean '{study.name}'?"),
+        ("fast", f"did you mean '{single.folder.name}'?"),
+        ("zebra", f"runs in {tmp_path}: {study.name}, {single.folder.name}"),
+    ):
+        with pytest.raises(CheckpointError) as caught:
+            find_run(reference, tmp_path)
+        assert caught.value.hint == hint
+
+
+def test_task_without_runs_suggests_a_similar_task_with_runs(tmp_path):
+    make_run(tmp_path, task="my_yam")
+    with pytest.raises(CheckpointError, match="no run of my-yam") as caught:
+        find_run("latest", tmp_path, "my-yam")
+    assert caught.value.hint == "did you mean 'my_yam'?; rlcli train my-yam starts one"
 
 
 def test_find_run_refuses_a_too_long_name(tmp_path):
