@@ -171,6 +171,19 @@ def test_missing_checkpoint_is_reported(tmp_path, capsys, arguments, code, says)
     assert says in capsys.readouterr().err
 
 
+def test_verify_with_the_task_of_a_folder_names_the_run(newest, tmp_path, capsys):
+    trained = newest("cartpole").parent.parent
+    run = tmp_path / "my_yam" / trained.name
+    shutil.copytree(trained, run)
+    record = json.loads((run / "run.json").read_text())
+    record["task"]["name"] = "my_yam"
+    (run / "run.json").write_text(json.dumps(record))
+    assert main(["export", "my_yam", "--verify", "--runs-dir", str(tmp_path)]) == 4
+    err = capsys.readouterr().err
+    assert "no task 'my_yam'" in err
+    assert f"rlcli export --checkpoint {run} --verify" in err
+
+
 @pytest.mark.parametrize("missing", ["onnx", "onnxscript", "onnxruntime"])
 def test_missing_extra_names_pip_command(copied, tmp_path, monkeypatch, capsys, missing):
     monkeypatch.setitem(sys.modules, missing, None)

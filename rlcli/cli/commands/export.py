@@ -9,7 +9,7 @@ import typer
 
 from rlcli.cli.ui.console import console
 from rlcli.cli.ui.options import CheckpointRef, RunsDir, TaskOfPolicy, choice
-from rlcli.errors import UsageError, listing
+from rlcli.errors import TaskError, UsageError, listing
 from rlcli.registry.find import path_of
 
 if TYPE_CHECKING:
@@ -108,7 +108,14 @@ def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | N
             hint="--verify needs a run: --checkpoint RUN",
         )
     check_overwrites(file)
-    return open_reference(choice, saved, None if task is None else named_task(task))
+    try:
+        named = None if task is None else named_task(task)
+    except TaskError as error:
+        if choice.run is None or error.message != f"no task '{task}'":
+            raise
+        hint = f"the run of {task} names its task: rlcli export --checkpoint {choice.run.folder} --verify"
+        raise TaskError(error.message, hint=hint) from None
+    return open_reference(choice, saved, named)
 
 
 def _verify(reference: ReferenceEnv, saved: Checkpoint, file: Path, format_: str, episodes: int) -> ClosedLoopResult:
