@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rlcli.errors import TaskError, did_you_mean, listing
+from rlcli.errors import ConfigError, TaskError, did_you_mean, listing
 from rlcli_isaaclab.absent import AbsentValue, reason_of
 from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
 from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.model_lookup import given_models, mjcf_of, model_hint
 from rlcli_isaaclab.sensor_reader import camera_kinds, filter_name, image_name, read_filters, read_sensor
-from rlcli_isaaclab.settings import Key, Node, as_float, kind_of
+from rlcli_isaaclab.settings import Key, Node, Report, as_float, kind_of
 from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
 
 
@@ -40,7 +40,12 @@ class SceneReader:
         """Entity -> joint -> what an action commands: effort, motor, velocity or position."""
 
     def read(self) -> dict[str, Any]:
-        """Return the task's `scene`."""
+        """Return the task's `scene`.
+
+        Raises:
+            ConfigError: if the settings of an entity are missing.
+        """
+        self._require_assets()
         node = self.node
         config: dict[str, Any] = {
             "num_envs": node.get("num_envs", 1),
@@ -50,7 +55,6 @@ class SceneReader:
         ground: Any = None
         lights: dict[str, Any] = {}
         sensors: list[tuple[str, Node]] = []
-        self._report_missing_assets()
         for name, item in node.nodes():
             kind = kind_of(item.data.get("class_type"))
             spawn = item.node("spawn") if "spawn" in item else None
@@ -102,14 +106,21 @@ class SceneReader:
         self.has_terrain = "terrain" in config
         return config
 
-    def _report_missing_assets(self) -> None:
-        """Report the entities whose settings are names of `isaaclab_assets`, of which no folder was found."""
+    def _require_assets(self) -> None:
+        """Refuse entities whose settings are names of `isaaclab_assets`, of which no folder was found.
+
+        Raises:
+            ConfigError: with these mistakes only: without the entities, what refers to them would be reported, too.
+        """
+        missing = Report()
         for name, value in self.node.data.items():
             if isinstance(value, AbsentValue) and value.imported_at:
                 file, asset = value.imported_at.rsplit(":", 2)[0], value.__name__
                 message = f"no folder has isaaclab_assets, from which {file} imports {asset}"
                 hint = "unzip it beside isaaclab_tasks, or set RLCLI_ISAACLAB to the folder that has both"
-                self.report.problem((*self.node.key, str(name)), message, hint)
+                missing.problem((*self.node.key, str(name)), message, hint)
+        if missing.problems:
+            raise ConfigError(missing.problems)
 
     def add_joint_settings(self, driven: Mapping[str, Mapping[str, str]]) -> None:
         """Write `joints` of each entity, without the settings that its MJCF has already.

@@ -339,14 +339,18 @@ def test_missing_module_of_isaac_lab_has_its_name_and_the_users_line(tmp_path, m
     namespace._source_folder.cache_clear()
 
 
-def test_missing_assets_are_the_first_message(tmp_path, monkeypatch):
+CONTACTS = '__import__("isaaclab.sensors", fromlist=["x"]).ContactSensorCfg(prim_path="{ENV_REGEX_NS}/Robot/.*")'
+
+
+def test_missing_assets_are_the_only_message(tmp_path, monkeypatch):
     monkeypatch.delenv(namespace.SOURCE, raising=False)
     namespace._source_folder.cache_clear()
     step = "        self.decimation, self"
     changes = [(step, f'        self.scene.robot = SPOT_CFG.replace(prim_path="{{ENV_REGEX_NS}}/Robot")\n{step}')]
+    changes.append(("    robot = Art", f"    contacts = {CONTACTS}\n    robot = Art"))
     with pytest.raises(ConfigError) as caught:
         rover(tmp_path / "rover", "from isaaclab_assets.robots.spot import SPOT_CFG\n", changes)
-    first = caught.value.problems[0]
+    (first,) = caught.value.problems  # not those of the sensor
     file = tmp_path / "rover" / "rover_env.py"
     assert first.message == f"no folder has isaaclab_assets, from which {file} imports SPOT_CFG"
     assert "RLCLI_ISAACLAB" in first.hint
