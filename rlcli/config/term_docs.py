@@ -69,7 +69,7 @@ class TermEntry:
     def example(self) -> str:
         """One YAML line that uses the term with its required keys."""
         examples = _key_texts()["examples"]
-        values = {"func": self.name, **_SECTION_KEYS.get(self.section, {})}
+        values: dict[str, Any] = {"func": self.name, **_SECTION_KEYS.get(self.section, {})}
         if self.section == "rewards" and _PENALTY.fullmatch(self.name):
             values["weight"] = -1.0
         for key in self.keys:

@@ -335,7 +335,7 @@ class VecEnv(Workflow):
         return self.engine.world(env)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of everything that the next steps depend on, between two steps."""
+        """Return copies of everything that the next steps depend on; call it between two steps."""
         return save_state(self)
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
