@@ -298,6 +298,11 @@ def _terms_index() -> Iterator[str]:
 def _terms_page(section: str) -> Iterator[str]:
     yield f"# {section.capitalize()}\n"
     yield SECTIONS[section] + "\n"
+    if section in ("events", "randomization"):
+        yield "`mode` says when the change is made: `startup` once, at the start; `reset` when an episode starts;"
+        yield "`interval` repeatedly, and then `interval_range_s` is required: the lowest and highest time between two"
+        yield "changes [s]. [EventConfig](../task-schema.md#eventconfig) lists the keys of every event;"
+        yield "[Events and randomisation](../../tutorials/first-task.md#events-and-randomisation) has examples.\n"
     for entry in sorted((entry for where, entry in _terms() if where == section), key=lambda entry: entry.name):
         yield from _term(entry)
 

@@ -1,6 +1,7 @@
 """Helpers for text from files and command lines.
 
-They find unsafe characters, shorten long text, remember long inputs so that messages shorten them, and read numbers.
+They find unsafe characters, shorten long text, remember long inputs, so that `message_line` can cut their repetition in
+a message, and read numbers.
 """
 
 import math

@@ -129,7 +129,7 @@ class Environment(Protocol):
         """
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of everything that the next steps depend on, at a step boundary."""
+        """Return copies of everything that the next steps depend on; call it between two steps."""
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Restore the state returned by `state_dict()`; return its observations by group, (num_envs, d) each.

@@ -1,4 +1,4 @@
-"""State of an environment at a step boundary, as saved in checkpoints, recordings and crash dumps."""
+"""State of an environment between two steps, as saved in checkpoints, recordings and crash dumps."""
 
 from __future__ import annotations
 

@@ -144,7 +144,8 @@ class VecEnv(Workflow):
         5. Final observations and `Episodes` of the episodes that end are computed.
         6. Observers run `on_step`.
         7. Environments whose episode ended, and those of `restart`, are reset.
-        8. Commands and interval events run; environments that they or a reset put out of bounds are quarantined.
+        8. Commands and interval events run. Environments that they or a reset put out of bounds return to a good state;
+           their episode ends with the next step.
         9. Observations are computed.
         """
         if not self._playing:
@@ -334,7 +335,7 @@ class VecEnv(Workflow):
         return self.engine.world(env)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of everything that the next steps depend on, at a step boundary."""
+        """Return copies of everything that the next steps depend on; call it between two steps."""
         return save_state(self)
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -34,7 +34,9 @@ _FINAL = np.uint64(0x46494E414C)
 
 
 class ObservationManager(TensorState):
-    """Manager of the observation terms. Each group cycles through three buffers: a step overwrites no newer result.
+    """Manager of the observation terms. A step overwrites the oldest of a group's three results.
+
+    So a result stays valid during the next two steps.
 
     Args:
         groups: the bound terms of each group.

@@ -95,7 +95,10 @@ class RewardManager(TensorState):
         return {term.name: row for term, row in zip(self.terms, self._rows, strict=True)}
 
     def replace_diverged(self, diverged: Tensor, total: Tensor) -> None:
-        """Replace this step's reward `total`, and its terms, by the `divergence_reward` in diverged environments."""
+        """Set `total` to the `divergence_reward` in diverged environments.
+
+        The episode sums count it in place of this step's terms. Without a `divergence_reward` nothing changes.
+        """
         if self._divergence_reward is None:
             return
         self._sums -= torch.where(diverged, self._values, 0.0)

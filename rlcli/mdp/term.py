@@ -1,6 +1,7 @@
 """Base classes of terms that are dataclasses. Their fields are the keys of the term in the YAML.
 
-A dataclass takes the fields of its last base first. So a term names the base with `entity` and its elements last.
+A term lists JointTerm, GeomTerm or another of these last among its bases that are dataclasses: a dataclass collects the
+fields of its last base first, so `entity` and the selected elements become the first keys.
 """
 
 from __future__ import annotations

@@ -129,11 +129,13 @@ def find_entry(group: str, name: str, *, what: str) -> Entry:
         owners = " and ".join(f"{e.distribution} {e.version}" for e in matches)
         choices = " or ".join(e.qualified for e in matches)
         raise TaskError(f"{what} '{name}' exists in several packages: {owners}", hint=f"write one of {choices}")
-    if any(name in (e.name, e.qualified) for e in catalog(group, hidden=True)[0]):
+    excluded = next((e for e in catalog(group, hidden=True)[0] if name in (e.name, e.qualified)), None)
+    if excluded is not None:
+        plugin = excluded.distribution
         value = os.environ.get("RLCLI_PLUGINS", "").strip()
         excluded_by = f"RLCLI_PLUGINS={value}" if value else plugins_chosen_by()
-        remedy = "unset RLCLI_PLUGINS" if value else "add its distribution to that key, or remove the key"
-        raise TaskError(f"{what} '{name}' is installed, but {excluded_by} excludes its plugin", hint=remedy)
+        hint = "unset RLCLI_PLUGINS" if value else f"add {plugin} to it, or remove the key"
+        raise TaskError(f"{what} '{name}' is installed, but {excluded_by} excludes its plugin {plugin}", hint=hint)
     names = list(dict.fromkeys(e.name for e in entries))
     distributions = listing(sorted({f"{e.distribution} {e.version}" for e in entries}))
     similar = did_you_mean(name, [*names, *(e.qualified for e in entries)] if ":" in name else names)
@@ -172,7 +174,7 @@ def unknown_wanted() -> str:
 
 def plugins_chosen_by() -> str:
     """Return what chose the plugins to use, for messages: RLCLI_PLUGINS, or the key in the user's settings file."""
-    return "RLCLI_PLUGINS" if os.environ.get("RLCLI_PLUGINS", "").strip() else f"plugins in {settings_file()}"
+    return "RLCLI_PLUGINS" if os.environ.get("RLCLI_PLUGINS", "").strip() else f"the key 'plugins' in {settings_file()}"
 
 
 @contextlib.contextmanager

@@ -161,9 +161,10 @@ def read_history(run: Run) -> History:
 
 
 def gather(runs: Sequence[Run]) -> tuple[list[Curve], list[str]]:
-    """Return the curves of runs, in the order of the runs, and a note for each run that was left out or cut.
+    """Return the curves of runs, in the order of the runs, with notes.
 
-    Runs that differ only in their seed become one curve.
+    A note tells each run that is left out, and each curve that ends at the last step of its shortest run. Runs that
+    differ only in their seed become one curve.
 
     Raises:
         CheckpointError: if no run has readable metrics and a readable configuration.

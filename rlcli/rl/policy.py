@@ -17,6 +17,7 @@ from rlcli.rl.cnn import Cnn, CnnSpec
 ACTIVATIONS: dict[str, type[nn.Module]] = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 _LOG_STD_RANGE = (-20.0, 2.0)
 _MAX_BYTES = 2**31
+_OTHER = "export it again, or use another checkpoint"
 _LogStd = Annotated[float, Field(ge=-80, le=80)]
 """Logarithm of a standard deviation that single precision can hold."""
 Layers = Annotated[list[Width], Field(max_length=100)]
@@ -286,7 +287,7 @@ def blank_policy(spec: Mapping[str, object]) -> Policy:
     except ValidationError as error:
         first = next(messages.problems(error, PolicySpec, spec, messages.dotted))
         place = first.path[:80] or "all"
-        raise CheckpointError(f"policy.json is not valid; export it again: {place}: {first.message}") from None
+        raise CheckpointError(f"policy.json is not valid; {_OTHER}: {place}: {first.message}") from None
     with torch.device("meta"):
         policy = Policy(checked)
     if size_of(policy) > _MAX_BYTES:
@@ -316,9 +317,9 @@ def filled(policy: Policy, weights: Mapping[str, Tensor]) -> Policy:
         )
     for name, value in weights.items():
         if not bool(value.isfinite().all()):
-            raise CheckpointError(f"policy.safetensors is corrupt: '{name}' is not finite; export it again")
+            raise CheckpointError(f"policy.safetensors is corrupt: '{name}' is not finite; {_OTHER}")
         if name in ("normalizer.var", "normalizer.count") and bool((value < 0).any()):
-            raise CheckpointError(f"policy.safetensors is corrupt: '{name}' is negative; export it again")
+            raise CheckpointError(f"policy.safetensors is corrupt: '{name}' is negative; {_OTHER}")
     policy.load_state_dict(dict(weights), assign=True)
     return policy.eval().requires_grad_(False)
 

@@ -31,6 +31,7 @@ FIELDS = {
     "mocap_pos", "mocap_quat",
 }  # fmt: skip
 """Fields of MjData that formulas may read."""
+_DAMAGED = "the manifest is damaged: use another checkpoint"
 _NO_LAYOUT = "the checkpoint does not describe the policy's columns, which this rlcli needs: train again"
 _INPUT_NAME = re.compile(r"last_action|steps|action|command|(command|observation)/.{1,1000}", re.DOTALL)
 
@@ -46,13 +47,13 @@ def check_formula(value: Any) -> None:
     """
     if isinstance(value, list):
         if not all(type(item) in (int, float) for item in value):
-            raise ValueError("the constant of a formula must be a list of numbers")
+            raise ValueError(f"the constant of a formula must be a list of numbers; {_DAMAGED}")
         return
     if not isinstance(value, dict):
-        raise ValueError(f"{str(value)[:60]} is not a list of numbers or a mapping; the manifest is damaged")
+        raise ValueError(f"{str(value)[:60]} is not a list of numbers or a mapping; {_DAMAGED}")
     keys, at, name = set(value), value.get("at", []), value.get("given")
     if not isinstance(at, list) or not all(type(i) is int and 0 <= i < 2**31 for i in at):
-        raise ValueError("`at` of a formula must be a list of indices, which are not negative")
+        raise ValueError(f"`at` must be a list of indices from 0 on; {_DAMAGED}")
     if keys == {"field", "at"} and value["field"] in FIELDS:
         return
     if keys in ({"given"}, {"given", "at"}) and isinstance(name, str) and _INPUT_NAME.fullmatch(name):
@@ -62,9 +63,9 @@ def check_formula(value: Any) -> None:
         raise ValueError(f"{str(value)[:60]} is no formula of this rlcli version; use another checkpoint")
     count, of = OPS[value["op"]], value["of"]
     if not isinstance(of, list) or (count is not None and len(of) != count) or not of:
-        raise ValueError(f"operation '{value['op']}' of a formula takes {count or 'one or more'} operands")
+        raise ValueError(f"operation '{value['op']}' takes {count or 'one or more'} operands; {_DAMAGED}")
     if own and not (isinstance(value["key"], str) and all(_are_numbers(value[key]) for key in "ab") and value["b"]):
-        raise ValueError("operation 'filter' of a formula needs lists of coefficients, b and a, and a key")
+        raise ValueError(f"operation 'filter' needs lists of coefficients, b and a, and a key; {_DAMAGED}")
     for part in of:
         check_formula(part)
 

@@ -146,8 +146,8 @@ def find_checkpoint(
         best = run.record.get("best")
         if best not in have:
             raise CheckpointError(
-                f"{run.folder} has no best checkpoint: it was not evaluated",
-                hint="leave out @best to use the newest checkpoint",
+                f"{run.folder} has no best checkpoint: no evaluation during the training chose one, or it was deleted",
+                hint="leave out @best to use the newest checkpoint, or train with agent.eval_interval=N",
             )
         return run, run.checkpoints / f"{best:012d}", "its best evaluation"
     kind, _, number = which.partition(":")

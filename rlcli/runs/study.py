@@ -47,7 +47,7 @@ def read_seeds(text: str) -> list[int]:
 def create_study(
     runs_dir: Path, task: str, name: str | None, config: str, record: Mapping[str, Any], seeds: Sequence[int]
 ) -> Path:
-    """Create the folder of a study, which is one training with several seeds: a run for each seed, not started yet.
+    """Create the folder of a study of several seeds, with a run for each seed; the runs are not started yet.
 
     Args:
         runs_dir: the folder of runs.

@@ -160,7 +160,8 @@ def _require_cheap(pattern: str, length: int) -> None:
             if part.last_varies:
                 raise NameProblem(
                     f"the pattern '{pattern}' repeats a group that itself contains * + ? {{m,n}} or |, as in (a*)* or"
-                    " (a|b)*, which can take exponential time; write it without the outer or the inner repetition"
+                    " (a|b)*, which can take exponential time; repeat only groups without them, for example"
+                    " [ab]* for (a|b)* and a* for (a*)*"
                 )
             if token in "*+" or "," in token:
                 part.repeats, part.varies, part.last_varies = part.repeats + 1, True, True

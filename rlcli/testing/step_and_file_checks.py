@@ -1,4 +1,7 @@
-"""Checks of names, files and step results. Each function checks one clause of the contract."""
+"""Checks of `rlcli check`: names in models, YAML round trip, results of steps.
+
+Each function tests one rule that a task must keep.
+"""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 SAVE_EVERY_S = 60.0
 """Time between checkpoints without a `save_interval` [s]."""
 LONG_S = 0.1
-"""Duration above which an iteration can be interrupted: the trainer's state before it is copied [s]."""
+"""Duration of an iteration above which the next can be interrupted: the state before it is copied [s]."""
 DIVERGED_SHARE = 0.01
 """Share of an iteration's environment steps that may diverge before the run stops."""
 

@@ -72,7 +72,7 @@ class PeriodicEval:
         return {**metrics, _SUCCESS: summary["success"]["rate"]} if "success" in summary else metrics
 
     def improves(self, metrics: Mapping[str, float]) -> bool:
-        """Return whether an evaluation is better than all before it, by success rate, then by return."""
+        """Record the score of an evaluation: success rate, then return. Return whether it is better than all before."""
         better = _score(metrics) > self._best
         self._best = max(self._best, _score(metrics))
         return better

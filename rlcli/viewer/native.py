@@ -43,8 +43,8 @@ def run(playback: Playback, *, title: str, num_drawn: int, port: int, ready: Rea
     try:
         handle = mujoco.viewer.launch_passive(model, data, key_callback=partial(press, playback), show_left_ui=False)
     except RuntimeError as error:
-        hint = "start it as `mjpython -m rlcli play ...`, or add --viewer web" if sys.platform == "darwin" else None
-        raise MachineError(f"the window cannot be opened: {error}", hint=hint) from error
+        start = "start it as `mjpython -m rlcli play ...`, or " if sys.platform == "darwin" else ""
+        raise MachineError(f"the window cannot be opened: {error}", hint=f"{start}add --viewer web") from error
     drawing = set(threading.enumerate()) - before
     try:
         with handle as window:

@@ -110,7 +110,7 @@ def test_plugins_setting_hides_other_plugins(settings, in_process, monkeypatch):
     code, out, err = in_process("list-tasks", "--json")
     assert code == 0
     assert {task["distribution"] for task in json.loads(out)["tasks"]} == {"rlcli"}
-    assert f"plugins in {file} names 'no-such-plugin'" in err
+    assert f"the key 'plugins' in {file} names 'no-such-plugin'" in err
     monkeypatch.setenv("RLCLI_PLUGINS", "another")
     assert "RLCLI_PLUGINS names 'another'" in in_process("list-tasks")[2]
 

@@ -50,6 +50,17 @@ def test_every_meaning_is_of_a_key_that_exists():
     known |= {f"{entry.name}.{key.name}" for entry in entries for key in entry.keys}
     for part in ("keys", "examples"):
         assert set(_key_texts()[part]) <= known
+    assert set(_key_texts()["term_examples"]) <= {entry.name for entry in entries}
+
+
+def test_examples_of_penalties_have_a_negative_weight():
+    examples = {entry.name: entry.example for entry in term_entries() if entry.section == "rewards"}
+    for name, example in examples.items():
+        if name.endswith(("_penalty", "_l1", "_l2", "_cost")) and name != "track_orientation_inv_l2":
+            assert "weight: -1.0" in example, name
+    assert "weight: -1.0" in examples["desired_contacts"]
+    assert "weight: 1.0" in examples["track_orientation_inv_l2"]
+    assert "weight: 1.0" in examples["upright"]
 
 
 @pytest.mark.parametrize("section", SECTIONS)

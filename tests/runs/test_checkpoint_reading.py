@@ -348,7 +348,9 @@ def test_steps_ignores_links(folder):
     ],
 )  # fmt: skip
 def test_numbers_of_a_policy_fit_single_precision(key, value):
-    with pytest.raises(CheckpointError, match=rf"policy\.json is not valid; export it again: {key}"):
+    with pytest.raises(
+        CheckpointError, match=rf"policy\.json is not valid; export it again, or use another checkpoint: {key}"
+    ):
         blank_policy({**SPEC, key: value})
 
 

@@ -251,7 +251,11 @@ class PhysxView:
         (num_envs, bodies - 1, 6, joints), linear before angular
         """
         if self._entity.is_floating:
-            raise TaskError("root_physx_view.get_jacobians cannot be used for a floating base", hint="fix the base")
+            raise TaskError(
+                f"root_physx_view.get_jacobians: '{self._entity.name}' has a floating base; only fixed"
+                " bases are supported",
+                hint="remove the free joint of its model",
+            )
         count = len(self._entity.names["Bodies"])
         update_state(self._env)
         if self._jacobians is None:
@@ -279,7 +283,11 @@ class PhysxView:
     def _motion(self) -> Tensor:
         """Return MuJoCo's motion axes of the joints (`cdof`), angular before linear. (num_envs, joints, 6)"""
         if self._entity.is_floating:
-            raise TaskError("root_physx_view cannot compute joint inertias of a floating base", hint="fix the base")
+            raise TaskError(
+                f"root_physx_view: joint inertias: '{self._entity.name}' has a floating base; only fixed"
+                " bases are supported",
+                hint="remove the free joint of its model",
+            )
         update_state(self._env)
         self._dofs = self._entity.dof_columns.cpu().numpy()
         return self._env.sim.derived_field("cdof")[:, self._dofs]

@@ -108,7 +108,7 @@ def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, 
     rot = [as_float(v) for v in offset.get("rot", (1.0, 0.0, 0.0, 0.0))]
     forward, up = (_rotated(rot, axis) for axis in _FORWARD.get(convention, _FORWARD["ros"]))
     if up[2] < 0.5 * (1.0 - forward[2] ** 2) ** 0.5 - 1e-3:
-        offset.note("approximated", "rot", "the camera does not roll: its upper edge is horizontal")
+        offset.note("approximated", "rot", "the camera's roll is dropped: the image's upper edge is horizontal")
     width, height = item.require("width"), item.require("height")
     aperture = spawn.get("vertical_aperture") or spawn.get("horizontal_aperture", 20.955) * height / width
     near, far = spawn.get("clipping_range", (0.01, 1e6))

@@ -107,7 +107,7 @@ class Randomizer:
         self._set_constants([entry for entry in self.randomizations if entry.trigger == "on_startup"])
 
     def before_reset(self, ids: Tensor) -> None:
-        """Apply `on_reset` to the model, and sample noise for the new episodes, before the task's reset."""
+        """Apply the `on_reset` randomizations of the model, and sample new episodes' noise, before the task's reset."""
         if not self.randomizations or self._steps_since_reset is None or not len(ids):
             return
         due = ids[self._steps_since_reset[ids] >= self.min_frequency]
@@ -127,13 +127,13 @@ class Randomizer:
                     self._sample_noise(entry, kind, ids, None)
 
     def after_reset(self, ids: Tensor) -> None:
-        """Apply `on_reset` to attributes of the state, after the task's reset has written the initial state."""
+        """Apply the `on_reset` randomizations of the state, after the task's reset has written the initial state."""
         for entry in self.randomizations:
             if entry.trigger == "on_reset" and self._acts_on_state(entry) and len(ids):
                 self._apply(entry, ids, None)
 
     def after_step(self) -> None:
-        """Apply `on_interval` where it is due."""
+        """Apply the `on_interval` randomizations that are due."""
         if not self.randomizations or self._steps_since_reset is None:
             return
         env = self._env

@@ -315,7 +315,7 @@ class Stage(Counterpart):
             _add_joint(scene, joint)
 
     def note_ignored(self, what: str, reason: str, lost: bool = False) -> None:
-        """Record a call of the task without effect in MuJoCo, for one message; `lost`: it is logged as a warning."""
+        """Record a call without effect in MuJoCo, to log all at once; `lost`: with a warning, OIGE's motion differs."""
         (self.lost if lost else self.ignored).setdefault(what, f"{user_location()}{reason}")
 
     def _rename_elements(self, prim: Prim, where: str) -> None:

@@ -246,9 +246,12 @@ class XFormPrimView(Counterpart):
         return torch.as_tensor(indices, device=self.env.device).long().reshape(-1)
 
     def _rows_of(self, which: int, indices: Any) -> tuple[Tensor, Any]:
-        """Return (the environments of one body's rows among `indices`, the positions of these rows in `indices`).
+        """Pick one body's rows from the view's row numbers `indices` (None: all).
 
         `which` is the number of the body among the view's bodies in an environment.
+
+        Returns:
+            The environment of each picked row, and an index that picks these rows from `indices`.
         """
         index = self._index(indices)
         if index is None:

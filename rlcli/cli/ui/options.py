@@ -72,7 +72,10 @@ RecordMode = Annotated[str, choice("MODE", "all", "succeeded", "failed", "separa
 CheckpointRef = Annotated[str | None, typer.Option(autocompletion=checkpoints, metavar="CHECKPOINT", help=_CHECKPOINT)]
 Policy = Annotated[str, choice("POLICY", "trained", "zero", "random", "lqr", help="trained, zero, random or lqr.")]
 Stochastic = Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")]
-ProbeTimeout = Annotated[float, typer.Option("--probe-timeout", help="Time limit per task, trainer or driver [s].")]
+ProbeTimeout = Annotated[
+    float,
+    typer.Option("--probe-timeout", help="Time limit per task; doctor: also per trainer and graphics driver [s]."),
+]
 Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Open no viewer unless --viewer is given.")]
 
 

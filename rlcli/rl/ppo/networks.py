@@ -170,7 +170,8 @@ def flatten(module: nn.Module) -> tuple[nn.Parameter, Tensor, dict[str, slice]]:
     """Replace a module's parameters by views of one vector.
 
     Returns:
-        The vector, (p,); its gradient followed by one more number, (p + 1,); and the slice of each parameter.
+        The vector, (p,); its gradient followed by a place for the minibatch's KL divergence, (p + 1,), so that one call
+        averages both over the ranks; and the slice of each parameter.
     """
     parameters = dict(module.named_parameters())
     vector = nn.Parameter(torch.cat([value.detach().flatten() for value in parameters.values()]))
