@@ -55,6 +55,7 @@ def check_target(format_: str, output: Path | None) -> None:
 
     Raises:
         UsageError: for an unknown format, or a file with another suffix.
+        MachineError: if the file cannot be written.
     """
     require_known(format_, [*FORMATS, BUNDLE], "export format", "formats")
     if output is None:
@@ -70,7 +71,10 @@ def check_target(format_: str, output: Path | None) -> None:
         named = output.with_suffix(suffix) if output.name.strip(".") else "FILE"
         hint = f"--format {other}" if other else f"--output {named}"
         raise UsageError(f"'{output}' does not end in {suffix}, the suffix of format {format_}", hint=hint)
-    require_writable(output)
+    try:
+        require_writable(output)
+    except MachineError as error:
+        raise MachineError(error.message, hint="choose a folder that can be written, with --output") from error
 
 
 def _export_obstacle(spec: PolicySpec) -> str | None:

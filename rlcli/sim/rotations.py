@@ -10,69 +10,40 @@ import functools
 import math
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from torch import Tensor
 
 cross: Callable[..., Tensor] = torch.linalg.cross
 """Cross product; this annotation adds the types that torch lacks. (..., 3), (..., 3) -> (..., 3)"""
 
-# Numbers as tensors: torch makes a tensor of a Python number at each use, which takes longer than the product. As with
-# Python numbers, the result has the type of the other operand, and may be on any device.
-_TURNS_PER_RAD = torch.tensor(0.5 / math.pi, dtype=torch.float64)
-_RAD_PER_TURN = torch.tensor(2.0 * math.pi, dtype=torch.float64)
-
 
 def rotate(quat: Tensor, vector: Tensor) -> Tensor:
     """Transform a vector from the quaternion's frame to the parent frame. (..., 4), (..., 3) -> (..., 3)"""
     w, axis = quat[..., :1], quat[..., 1:]
-    twice = cross(axis, vector).mul_(2.0)
-    return (w * twice).add_(vector).add_(cross(axis, twice))
+    twice = 2.0 * cross(axis, vector)
+    return vector + w * twice + cross(axis, twice)
 
 
 def rotate_inverse(quat: Tensor, vector: Tensor) -> Tensor:
     """Transform a vector from the parent frame to the quaternion's frame. (..., 4), (..., 3) -> (..., 3)"""
     w, axis = quat[..., :1], quat[..., 1:]
-    twice = cross(axis, vector).mul_(2.0)
-    return torch.sub(vector, w * twice).add_(cross(axis, twice))
+    twice = 2.0 * cross(axis, vector)
+    return vector - w * twice + cross(axis, twice)
 
 
 def multiply(left: Tensor, right: Tensor) -> Tensor:
     """Return the Hamilton product: the rotation `right`, then `left`. (..., 4), (..., 4) -> (..., 4)"""
-    return _product(left, right, _product_tables(left.device)[2])
-
-
-def _product(left: Tensor, right: Tensor, signs: Tensor) -> Tensor:
-    """Return the Hamilton product, or with other signs that of a conjugate. (..., 4), (..., 4) -> (..., 4)
-
-    All 16 products are computed at once and added in order: the time of a small tensor is that of its operations.
-    """
-    if left.dim() != 2 or left.shape != right.shape:
-        shape = np.broadcast_shapes(left.shape, right.shape)
-        left, right = left.expand(shape).reshape(-1, 4), right.expand(shape).reshape(-1, 4)
-        return _product(left, right, signs).reshape(shape)
-    first, second = _product_tables(left.device)[:2]
-    factors = left.mT.contiguous().index_select(0, first), right.mT.contiguous().index_select(0, second)
-    w, x, y, z = torch.mul(*factors).mul_(signs).chunk(4)
-    return (w + x).add_(y).add_(z).mT
-
-
-@functools.lru_cache
-@torch.inference_mode(False)  # tensors that can be used in both modes
-def _product_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the factors of the 16 products of `multiply`, as elements of its left and its right quaternion (16,).
-
-    Then their signs, and their signs for the conjugate of the left quaternion (16, 1). The products with the left
-    quaternion's w come first, those with its x next, ...; four in a row are for the w, x, y and z of the result.
-    """
-    right = ["wxyz", "xwzy", "yzwx", "zyxw"]
-    signs = [[1.0, 1.0, 1.0, 1.0], [-1.0, 1.0, -1.0, 1.0], [-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]]
-    factors = ["wxyz".index(element) for row in right for element in row]
-    product = torch.tensor(signs)
-    conjugated = product * torch.tensor([1.0, -1.0, -1.0, -1.0])[:, None]
-    first = torch.arange(4, device=device).repeat_interleave(4)
-    second = torch.tensor(factors, device=device)
-    return first, second, product.to(device).view(16, 1), conjugated.to(device).view(16, 1)
+    w1, x1, y1, z1 = left.unbind(-1)
+    w2, x2, y2, z2 = right.unbind(-1)
+    return torch.stack(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ],
+        dim=-1,
+    )
 
 
 def conjugate(quat: Tensor) -> Tensor:
@@ -142,7 +113,7 @@ def roll_pitch_yaw(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def turn_between(left: Tensor, right: Tensor) -> Tensor:
     """Return the angle of the rotation between two orientations, in [0, pi] [rad]. (..., 4), (..., 4) -> (...)"""
-    difference = _product(left, right, _product_tables(left.device)[3])
+    difference = multiply(conjugate(left), right)
     return 2.0 * atan2(length(difference[..., 1:]), difference[..., 0].abs())
 
 
@@ -161,29 +132,19 @@ def rotation_vector(quat: Tensor) -> Tensor:
 
 
 def from_euler(roll: Tensor, pitch: Tensor, yaw: Tensor) -> Tensor:
-    """Return the quaternion of rotations about the fixed axes x, then y, then z [rad]. (...) each -> (..., 4)"""
-    half = torch.stack([roll, pitch, yaw]).flatten(1).mul_(0.5)
-    factors, signs = _euler_tables(half.device)
-    x, y, z = torch.cat([half.cos(), half.sin()]).index_select(0, factors).chunk(3)
-    first, second = torch.mul(x, y).mul_(z).chunk(2)
-    return second.mul_(signs).add_(first).mT.reshape(*roll.shape, 4)
-
-
-@functools.lru_cache
-@torch.inference_mode(False)  # tensors that can be used in both modes
-def _euler_tables(device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the constants of `from_euler`, which computes each of its elements as x y z + sign x' y' z'.
-
-    They are the factors, as rows of the cosines and the sines of half the angles (24,): all x and x', all y and y', all
-    z and z'; and the signs (4, 1).
-    """
-    rows = ["cos x", "cos y", "cos z", "sin x", "sin y", "sin z"]
-    first = [("cos", "cos", "cos"), ("sin", "cos", "cos"), ("cos", "sin", "cos"), ("cos", "cos", "sin")]
-    other = {"cos": "sin", "sin": "cos"}
-    terms = [*first, *(tuple(other[function] for function in term) for term in first)]
-    factors = [rows.index(f"{term[number]} {axis}") for number, axis in enumerate("xyz") for term in terms]
-    signs = torch.tensor([[1.0], [-1.0], [1.0], [-1.0]])
-    return torch.tensor(factors, device=device), signs.to(device)
+    """Return the quaternion of rotations about the fixed axes x, then y, then z [rad]. (n,) each -> (n, 4)"""
+    cr, sr = torch.cos(0.5 * roll), torch.sin(0.5 * roll)
+    cp, sp = torch.cos(0.5 * pitch), torch.sin(0.5 * pitch)
+    cy, sy = torch.cos(0.5 * yaw), torch.sin(0.5 * yaw)
+    return torch.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        dim=-1,
+    )
 
 
 def random_quaternion(u: Tensor, v: Tensor, w: Tensor) -> Tensor:
@@ -215,5 +176,5 @@ def yaw_only(quat: Tensor) -> Tensor:
 
 def wrap_to_pi(angle: Tensor) -> Tensor:
     """Return the same angle in [-pi, pi] [rad]; an angle in this range is returned unchanged."""
-    turns = (angle * _TURNS_PER_RAD).round_()
-    return torch.sub(angle, turns.mul_(_RAD_PER_TURN))
+    turns = (angle * (0.5 / math.pi)).round_()
+    return torch.sub(angle, turns.mul_(2.0 * math.pi))

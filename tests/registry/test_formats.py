@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -9,6 +10,7 @@ import textwrap
 import pytest
 
 from rlcli.errors import pip_install
+from rlcli.registry import find_task
 
 END = "exit code:"
 HIDDEN = ("rlcli-oige", "rlcli-isaaclab")
@@ -115,6 +117,7 @@ def test_other_tasks_work_without_format_plugins(tmp_path):
     assert "format" not in shown[1]
     # runs of every task that were saved before have the key, empty
     (wrong / "task.yaml").write_text(shown[1] + "\noige: {}\n")
+    shutil.copy(find_task("cartpole").root / "cartpole.xml", wrong)
     assert core(tmp_path, ("validate", "./wrong"))[0][0] == 0
 
 
@@ -216,6 +219,7 @@ def test_broken_format_does_not_stop_own_tasks(plugins, cli, task):
     assert shown.returncode == 0, shown.stderr
     (task / "task.yaml").write_text(shown.stdout)
     (task / "task.py").unlink()
+    shutil.copy(find_task("cartpole").root / "cartpole.xml", task)
     done = cli("validate", str(task))
     assert done.returncode == 0, done.stderr
     broken = "plugin elsewhere 1.0: entry point 'elsewhere' = elsewhere:SPEC cannot be imported: RuntimeError: torn"

@@ -189,8 +189,7 @@ def _member(module: str, name: str) -> Any:
             return value
     if path in _modules():
         return _lab_module(path)
-    found = _definitions().get(name)
-    if found is None:
+    if _definitions().get(name) is None:
         raise _UnknownNameError(name, module)
     return lab_name(name)
 

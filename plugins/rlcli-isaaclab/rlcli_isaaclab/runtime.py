@@ -77,7 +77,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
         if not hasattr(self.managed, name):
             own = _own_class(getattr(self.cfg, "_rlcli_class", None))
             if own is not None and "_own" not in self.__dict__:
-                self.__dict__["_own"] = own.__new__(own)
+                self.__dict__["_own"] = object.__new__(own)
                 self._own.__dict__ = self.__dict__  # the object has the attributes of the environment
                 self._own.__init__(self.cfg)
             if own is not None and (name in self.__dict__ or hasattr(own, name)):

@@ -105,7 +105,7 @@ def _line_without_counterpart(file: Path) -> int:
         names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
         names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
         if any(f"{name}.".startswith(f"{module}.") for name in names for module in _REASONS):
-            return node.lineno  # type: ignore[attr-defined,no-any-return]
+            return node.lineno  # type: ignore[attr-defined]
     return 1
 
 

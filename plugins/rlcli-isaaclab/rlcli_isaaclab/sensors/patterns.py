@@ -25,7 +25,7 @@ def lidar_pattern(cfg: Any, device: Any) -> tuple[Tensor, Tensor]:
     count = math.ceil((high - low) / cfg.horizontal_res) + 1
     heading = torch.linspace(low, high, count)
     heading = heading[:-1] if abs(high - low - 360.0) < 1e-6 else heading  # the last ray equals the first one
-    elevation = torch.linspace(*cfg.vertical_fov_range, cfg.channels)
+    elevation = torch.linspace(cfg.vertical_fov_range[0], cfg.vertical_fov_range[1], cfg.channels)
     up, turn = torch.meshgrid(elevation.deg2rad(), heading.deg2rad(), indexing="ij")
     rays = torch.stack([up.cos() * turn.cos(), up.cos() * turn.sin(), up.sin()], dim=-1).flatten(0, 1).to(device)
     return torch.zeros_like(rays), rays

@@ -38,7 +38,8 @@ def resolve_matching_names_values(
     Raises:
         ValueError: if two keys match one string, or a key matches none.
     """
-    names, found, key_of = list(list_of_strings), {}, {}
+    names, found = list(list_of_strings), {}
+    key_of: dict[int, str] = {}
     for pattern, value in data.items():
         matched = [index for index, name in enumerate(names) if re.fullmatch(pattern, name)]
         if not matched:
