@@ -74,7 +74,7 @@ def check_target(format_: str, output: Path | None) -> None:
     try:
         require_writable(output)
     except MachineError as error:
-        raise MachineError(error.message, hint="choose a folder that can be written, with --output") from error
+        raise MachineError(error.message, hint="choose another folder with --output") from error
 
 
 def _export_obstacle(spec: PolicySpec) -> str | None:
