@@ -400,4 +400,4 @@ def test_agent_learns_to_balance(tmp_path, capsys, monkeypatch, agent, seed, bar
     words = ("--agent", agent, "--seed", seed, "--logger", "none", "-q")
     run = rlcli(capsys, "train", "cartpole-direct", *words).out.strip()
     done = rlcli(capsys, "eval", "cartpole-direct", "--checkpoint", run, "--episodes", 1000, "--json").out
-    assert json.loads(done)["success"]["rate"] >= bar
+    assert json.loads(done)["success"]["rate"] > bar
