@@ -2,8 +2,8 @@
 
 Usage: python corpus.py [ID ...] [--stage NAME] [--processes N] [--out FILE.jsonl], with the environment variable
 ISAACLAB_SOURCE at the folder `source` of Isaac Lab 2.3.2, or of its unpacked wheel. Each robot gets a stand-in model
-(`standins.py`). With `--package FOLDER` it runs the tasks that another package registers. When a task ends, FILE gets one
-line of JSON; tasks that have a line are not run again.
+(`standins.py`). With `--package FOLDER` it runs the tasks that another package registers. When a task ends, FILE gets
+one line of JSON; tasks that have a line are not run again.
 """
 
 from __future__ import annotations
