@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -58,32 +58,43 @@ class ManagedEnv(VecEnv):
             if prepare is not None:
                 prepare(scene.spec, config.params)
 
+    command_manager: CommandManager
+    action_manager: ActionManager
+    event_manager: EventManager
+    termination_manager: TerminationManager
+
     def _bind_terms(self) -> None:
-        binder = self._binder
-        # commands first: terms of other sections use them
-        sections = ("commands", "actions", "events", "terminations", "rewards", "curriculum")
+        binder, tunable = self._binder, self._binder.tunable
+        self._all_envs = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        select_all = self._select_all_by_step
+        context = EnvContext(self.num_envs, self.step_dt, self.device, self.engine, tunable, select_all)
+        self._context = context
         self._bound: dict[str, list[BoundTerm]] = {}
-        for section in sections:  # a term of one section may look up the terms of the sections before
-            self._bound[section] = binder.bind_all(section)
+        # the constructor of a term may look up the terms and the managers of the sections before
+        self._bind("commands", CommandManager)
+        self._bind("actions", ActionManager)
+        self._bind("events", EventManager)
         self._observations = {group: binder.bind_group(group) for group in self.config.observations}
+        self._bind("terminations", TerminationManager)
+        self._bind("rewards")
+        self._bind("curriculum")
+
+    def _bind(self, section: str, manager: Callable[[list[BoundTerm], EnvContext], Any] | None = None) -> None:
+        """Bind the terms of a section; then create its manager, unless a term of it or of a section before is wrong."""
+        self._bound[section] = self._binder.bind_all(section)
+        if manager is not None and not self._binder.problems:
+            setattr(self, f"{section.removesuffix('s')}_manager", manager(self._bound[section], self._context))
 
     def _build_workflow(self) -> None:
         # in this order: the first value of a term may use a manager that is built before
-        self._all_envs = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        tunable, bound, task = self._binder.tunable, self._bound, self.config
-        select_all = self._select_all_by_step
-        context = EnvContext(self.num_envs, self.step_dt, self.device, self.engine, tunable, select_all)
-        self.command_manager = CommandManager(bound["commands"], context)
-        self.action_manager = ActionManager(bound["actions"], context)
-        self.termination_manager = TerminationManager(bound["terminations"], context)
-        self.event_manager = EventManager(bound["events"], context)
+        context, task = self._context, self.config
         if self.event_manager.derives:
             self.engine.set_constants()  # allocates per-environment constants, and derives all of them in the same way
         self.event_manager.startup(self._select_all())
         reward_dt = self.step_dt if task.reward_dt_scaling else 1.0
-        self.reward_manager = RewardManager(bound["rewards"], context, reward_dt, task.divergence_reward)
+        self.reward_manager = RewardManager(self._bound["rewards"], context, reward_dt, task.divergence_reward)
         self.observation_manager = ObservationManager(self._observations, task.observations, context)
-        self.curriculum_manager = CurriculumManager(bound["curriculum"], context)
+        self.curriculum_manager = CurriculumManager(self._bound["curriculum"], context)
 
     def stateful_objects(self) -> list[Any]:
         """Return the terms that are objects of classes, whose attributes a step may change."""

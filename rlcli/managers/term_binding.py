@@ -139,6 +139,9 @@ class Binder:
         except (NameProblem, ValueError) as problem:
             self.add_problem(path, str(problem), getattr(problem, "hint", None))
             return None
+        except AttributeError:
+            self.raise_problems()  # a manager is absent because of a problem of its terms
+            raise
         name = str(path[-1])
         own = signature.is_class and not hasattr(call, "state_dict") and not is_framework(type(call).__module__)
         memory = AttributeState(call) if own else None

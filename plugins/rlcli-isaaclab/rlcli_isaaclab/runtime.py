@@ -20,6 +20,7 @@ from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import did_you_mean, listing
 from rlcli.registry import is_framework, load_object
+from rlcli_isaaclab.absent import user_place
 from rlcli_isaaclab.manager_facade import (
     ActionManagerFacade,
     CommandManagerFacade,
@@ -84,7 +85,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
                 return getattr(self._own, name)
             if name.endswith("_manager") and name in dir(type(self)):
                 raise AttributeError(
-                    f"env has no '{name}' yet: use it only in reset() and __call__(), not in __init__()"
+                    f"{user_place()}env has no '{name}' yet: {_CREATED}; use it in reset() or __call__()"
                 )
             known = [n for n in (*dir(type(self)), *dir(self.managed)) if not n.startswith("_")]
             hint = did_you_mean(name, known) or f"its attributes: {listing(sorted(set(known)), 60)}"
@@ -269,6 +270,7 @@ def _own_class(entry: Any) -> type | None:
     return found if own else None
 
 
+_CREATED = "managers are created in the order commands, actions, terminations, rewards, observations, curriculum"
 OWN_CLASS = "isaaclab.envs:ManagerBasedRLEnv"
 """Isaac Lab's environment class in a registration with Gymnasium."""
 

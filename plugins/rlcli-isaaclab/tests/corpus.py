@@ -1,8 +1,9 @@
 """Run every task that Isaac Lab registers, unchanged, and report how far it gets: imports, validates, steps, trains.
 
-Usage: python corpus.py [--only WORD] [--stage NAME] [--out FILE.json], with the environment variable ISAACLAB_SOURCE at
-the folder `source` of Isaac Lab 2.3.2, or of its unpacked wheel. Each robot gets a stand-in model (`standins.py`).
-With `--package FOLDER` it runs the tasks that another package registers.
+Usage: python corpus.py [ID ...] [--stage NAME] [--processes N] [--out FILE.jsonl], with the environment variable
+ISAACLAB_SOURCE at the folder `source` of Isaac Lab 2.3.2, or of its unpacked wheel. Each robot gets a stand-in model
+(`standins.py`). With `--package FOLDER` it runs the tasks that another package registers. When a task ends, FILE gets
+one line of JSON; tasks that have a line are not run again.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import os
 import re
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Sequence
@@ -20,6 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from standins import write
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "tests"))
+from support.task_lists import add_result, read_results, results_of
 
 SOURCE = "ISAACLAB_SOURCE"
 STAGES = ("imports", "validates", "steps", "trains")
@@ -145,10 +150,16 @@ def train(reference: str, folder: Path, overrides: Sequence[str]) -> None:
         raise RuntimeError(f"rlcli train ended with {code}: {log.read_text()[-500:]}")
 
 
+_FORK = threading.Lock()
+
+
 def isolated(limit_s: float, function: Any, *arguments: Any) -> Any:
     """Call a function in a child process and return its result; a failure tuple if the child dies or takes too long."""
-    reader, writer = os.pipe()
-    child = os.fork()
+    with _FORK:  # a child of another thread must not inherit the writer: the reader would not see its end
+        reader, writer = os.pipe()
+        child = os.fork()
+        if child:
+            os.close(writer)
     if child == 0:
         os.close(reader)
         if not os.environ.get("CORPUS_VERBOSE"):
@@ -159,7 +170,6 @@ def isolated(limit_s: float, function: Any, *arguments: Any) -> Any:
         with os.fdopen(writer, "w") as pipe:
             json.dump(result, pipe)
         os._exit(0)
-    os.close(writer)
     start = time.time()
     import select
 
@@ -219,19 +229,19 @@ def lost(notes: Sequence[str]) -> str:
 def main_() -> None:
     """Print one line per task, and the counts."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--only", default="")
+    parser.add_argument("ids", nargs="*", help="tasks to run; none: all")
+    parser.add_argument("--only", default="", help="pattern that the IDs match")
     parser.add_argument("--kind", choices=("manager", "direct", "all"), default="all")
     parser.add_argument("--stage", choices=STAGES, default="trains")
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--out", type=Path, help="file of JSON lines, one for each task; those in it are not run again")
+    parser.add_argument("--processes", type=int, default=1, help="number of tasks that run at a time")
     parser.add_argument("--steps", type=int, default=STEPS, help="steps of the stage `steps`")
     parser.add_argument("--page", type=Path, help="page whose table is written from the results")
     parser.add_argument("--merge", type=Path, nargs="*", help="write the page from files of --out, and run nothing")
-    parser.add_argument("--part", default="0/1", help="i/n: every n-th task")
     parser.add_argument("--package", type=Path, help="folder of another package that registers tasks")
     options = parser.parse_args()
-    rows: dict[str, Any]
     if options.merge:
-        rows = {name: row for file in options.merge for name, row in json.loads(file.read_text()).items()}
+        rows = rows_of(options.merge)
         write_page(rows, options.page)
         count(rows)
         return
@@ -243,35 +253,46 @@ def main_() -> None:
     os.environ.setdefault("RLCLI_ISAACLAB", str(source))
     package = (options.package or source / "isaaclab_tasks" / "isaaclab_tasks").resolve()
     found = tasks(package)
-    part, parts = map(int, options.part.split("/"))
-    rows = {}
+    kinds = {"manager": [False], "direct": [True], "all": [False, True]}[options.kind]
+    rows = rows_of([options.out])
+    wanted = [
+        name
+        for name, kwargs in found.items()
+        if re.search(options.only, name)
+        and name in (options.ids or found)
+        and name not in rows
+        and is_direct(kwargs["entry_point"]) in kinds
+    ]
+    if unknown := set(options.ids) - set(found):
+        parser.error(f"no task has the ID {', '.join(sorted(unknown))}")
     with tempfile.TemporaryDirectory() as folder:
-        wanted = [n for n in found if re.search(options.only, n)]
-        for number, name in enumerate(wanted):
-            direct = is_direct(found[name]["entry_point"])
-            if number % parts != part or options.kind == ("manager" if direct else "direct"):
-                continue
-            stage, reason, facts = isolated(
-                LIMIT_S, run, name, found[name], package, Path(folder) / name, options.stage, options.steps
-            )
-            with_agent = any(
-                key.endswith("_cfg_entry_point") and key not in ("env_cfg_entry_point",) and "robomimic" not in key
-                for key in found[name]
-            )
-            rows[name] = {
-                "direct": direct,
-                "stage": stage,
-                "reason": reason,
-                "agent": with_agent,
-                "last": STAGES.index(options.stage) + 1,
-                **facts,
-            }
-            print(f"{stage} {name}: {reason[:400]}", flush=True)
-            if options.out:
-                options.out.write_text(json.dumps(rows, indent=1))
+        calls = [(name, found[name], package, Path(folder) / name, options.stage, options.steps) for name in wanted]
+        for name, row in results_of(row_of, calls, options.processes):
+            rows[name] = row
+            print(f"{row['stage']} {name}: {row['reason'][:400]}", flush=True)
+            add_result(options.out, {"task": name, **row})
     if options.page:
         write_page(rows, options.page)
     count(rows)
+
+
+def rows_of(files: Sequence[Path | None]) -> dict[str, Any]:
+    """Return the rows of files of `--out`, by task."""
+    return {row.pop("task"): row for file in files for row in read_results(file)}
+
+
+def row_of(name: str, kwargs: dict[str, Any], *arguments: Any) -> tuple[str, dict[str, Any]]:
+    """Run a task in a child process, and return its ID and its row of the report."""
+    start = time.time()
+    stage, reason, facts = isolated(LIMIT_S, run, name, kwargs, *arguments)
+    with_agent = any(
+        key.endswith("_cfg_entry_point") and key not in ("env_cfg_entry_point",) and "robomimic" not in key
+        for key in kwargs
+    )
+    last = STAGES.index(arguments[2]) + 1
+    direct = is_direct(kwargs["entry_point"])
+    row = {"direct": direct, "stage": stage, "reason": reason, "agent": with_agent, "last": last}
+    return name, {**row, "seconds": round(time.time() - start), **facts}
 
 
 def count(rows: dict[str, Any]) -> None:

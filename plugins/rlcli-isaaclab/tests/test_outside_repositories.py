@@ -358,3 +358,54 @@ def test_runner_of_rsl_rl_5_with_its_observation_group(tmp_path):
     resolved = resolve(find_task(f"{tmp_path / 'rover' / 'rover_env.py'}:RoverEnvCfg"))
     assert list(resolved.task.observations) == ["policy"]
     assert (resolved.agent.init_std, resolved.agent.critic.hidden) == (0.5, (16,))
+
+
+BUILT = """
+from isaaclab.managers import ManagerTermBase
+
+class Turns(ManagerTermBase):
+    def __init__(self, cfg, env):
+        super().__init__(cfg, env)
+        actions, commands = env.action_manager, env.command_manager
+        self.before = torch.zeros_like(actions.action)
+        self.facts = actions.total_action_dim, actions.get_term("wheel").action_dim, commands.active_terms
+        self.facts += commands.get_command("goal").shape, env.termination_manager.active_terms
+        self.facts += env.event_manager.active_terms,
+
+    def __call__(self, env):
+        assert self.facts == (2, 1, ["goal"], (4, 3), ["time_out"], ["change"]), self.facts
+        change = (env.action_manager.action - self.before).sum(dim=1)
+        self.before = env.action_manager.action.clone()
+        return change
+
+class Early(ManagerTermBase):
+    def __init__(self, cfg, env):
+        super().__init__(cfg, env)
+        self.names = env.observation_manager.active_terms
+
+    def __call__(self, env):
+        return torch.zeros(env.num_envs)
+
+def change(env, env_ids):
+    pass
+"""
+GOAL = """mdp.UniformVelocityCommandCfg(asset_name='robot', resampling_time_range=(1.0, 1.0), heading_command=False,
+        ranges=mdp.UniformVelocityCommandCfg.Ranges(lin_vel_x=(0, 1), lin_vel_y=(0, 1), ang_vel_z=(0, 1)))"""
+
+
+def test_constructor_of_a_term_reads_the_managers_created_before(tmp_path):
+    sections = {
+        "commands": {"goal": GOAL},
+        "events": {"change": "EventTermCfg(func=change, mode='reset')"},
+        "rewards": {"turns": "RewardTermCfg(func=Turns, weight=1.0)"},
+    }
+    env, result = stepped(rover(tmp_path / "rover", BUILT, **sections))
+    assert result.reward.tolist() == pytest.approx([0.0] * 4)
+    assert env.step(torch.ones(4, 2)).reward.tolist() == pytest.approx([2 * 0.5 * 0.02] * 4)
+
+
+def test_manager_that_is_created_later_is_an_error_with_the_order(tmp_path):
+    early = {"early": "RewardTermCfg(func=Early, weight=1.0)"}
+    expected = r"rover_env.py:\d+: env has no 'observation_manager' yet: managers are created in the order commands"
+    with pytest.raises(Exception, match=expected):
+        make_env(rover(tmp_path / "rover", BUILT, rewards=early), seed=0)

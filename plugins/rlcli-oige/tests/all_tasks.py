@@ -1,13 +1,16 @@
 """Run every task that OmniIsaacGymEnvs registers, as it stands, and report how far each gets.
 
-    python plugins/rlcli-oige/tests/all_tasks.py CHECKOUT [TASK ...] [--page docs/guides/omniisaacgymenvs.md]
+    python plugins/rlcli-oige/tests/all_tasks.py CHECKOUT [TASK ...] [--processes N] [--out FILE.jsonl]
+                                                 [--page docs/guides/omniisaacgymenvs.md]
 
 CHECKOUT is a copy of OmniIsaacGymEnvs' repository; no file of it is changed. Robots without a built-in model get the
 stand-ins of `stand_ins.py`. Each task runs in processes of its own: `rlcli validate`, 200 steps of 16 environments with
-random actions, and `rlcli train` for 3 iterations with the task's own rl_games YAML. The report is JSON on stdout;
-`--page` writes the table of the page.
+random actions, and `rlcli train` for 3 iterations with the task's own rl_games YAML. The report is one line of JSON for
+each task, on stdout and in FILE; tasks that have a line in FILE are not run again. `--page` writes the table of the
+page.
 """
 
+import argparse
 import ast
 import json
 import os
@@ -18,6 +21,9 @@ import tempfile
 from pathlib import Path
 
 import stand_ins
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "tests"))
+from support.task_lists import add_result, read_results, results_of
 
 NUM_ENVS, STEPS, ITERATIONS = 16, 200, 3
 START, END = "<!-- table of all tasks: plugins/rlcli-oige/tests/all_tasks.py -->", "<!-- end of the table -->"
@@ -133,17 +139,25 @@ def main(words: list[str]) -> None:
     if words[0] == "--step":
         step(words[1], words[2], words[3:])
         return
-    page = Path(words[words.index("--page") + 1]) if "--page" in words else None
-    if page is not None:
-        del words[words.index("--page") : words.index("--page") + 2]
-    checkout = Path(words[0]).resolve()
-    rows = []
+    parser = argparse.ArgumentParser()
+    parser.add_argument("checkout", type=Path)
+    parser.add_argument("tasks", nargs="*")
+    parser.add_argument("--page", type=Path)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--processes", type=int, default=1)
+    options = parser.parse_args(words)
+    checkout = options.checkout.resolve()
+    rows = read_results(options.out)
+    known = {row["task"] for row in rows}
     with tempfile.TemporaryDirectory() as folder:
         models = stand_ins.write(Path(folder))
-        for name in words[1:] or registered(checkout):
-            rows.append(examine(name, checkout, Path(folder), models))
-            print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
-    print(json.dumps(rows, indent=1))
+        names = [name for name in options.tasks or registered(checkout) if name not in known]
+        calls = [(name, checkout, Path(folder), models) for name in names]
+        for row in results_of(examine, calls, options.processes):
+            rows.append(row)
+            print(json.dumps(row), flush=True)
+            add_result(options.out, row)
+    page = options.page
     if page is not None:
         before, _, rest = page.read_text(encoding="utf-8").partition(START)
         old, _, after = rest.partition(END)
