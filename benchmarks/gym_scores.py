@@ -19,6 +19,7 @@ import statistics
 import subprocess
 import sys
 import time
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -76,6 +77,8 @@ def finished(folder: Path, task: str, name: str) -> Path | None:
 def train(task: str, seed: int, options: argparse.Namespace) -> Path:
     """Return the run of a seed; train it if it does not exist."""
     name = f"seed{seed}{options.label}"
+    if options.overrides:  # trainings with other overrides have other names
+        name += f"-{zlib.crc32(' '.join(sorted(options.overrides)).encode()):08x}"
     run = finished(options.runs_dir, task, name)
     if run is None:
         begin = time.perf_counter()
@@ -190,6 +193,7 @@ def main() -> None:
             "agent": AGENT,
             "steps": options.steps or STEPS,
             "episodes": options.episodes,
+            "overrides": options.overrides,
         }
         options.output.write_text(json.dumps({**document, "tasks": table, "runs": rows}, indent=1) + "\n")
 

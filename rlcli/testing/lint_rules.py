@@ -7,9 +7,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from itertools import product
+from itertools import cycle, islice, product
 from typing import Any, Literal
 
+import mujoco
 import torch
 from torch import Tensor
 
@@ -206,6 +207,7 @@ def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
     """Check that observations have a size near 1, unless the agent normalises them."""
     if getattr(evidence.subject.resolved.agent, "normalize_observations", False):
         return
+    turning = _angles_without_limits(evidence.rollouts[0].env)
     for where, values in _columns(evidence):
         sizes = values.abs()
         usual, largest = _quantile(sizes, 0.99), float(sizes.max())
@@ -219,7 +221,29 @@ def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
             message += f" well from sizes up to {LARGE:g}"
         factor = 10.0 ** round(math.log10(1.0 / (usual if usual > LARGE else largest)))
         hint = f"scale: {factor:g}, or let the agent normalise (normalize_observations: true)"
+        if usual > LARGE and where in turning:
+            hint = "each turn adds 2 pi: use func: joint_angle, which wraps angles, or terminate the episode earlier"
         yield warning_at(where, message, hint, {"usual": usual, "largest": largest})
+
+
+def _angles_without_limits(env: VecEnv) -> set[str]:
+    """Return the observation columns that are angles of hinges without limits, and that are not wrapped."""
+    found: set[str] = set()
+    if not isinstance(env, ManagedEnv):
+        return found
+    model, _ = env.world(0)
+    for group, terms in env.layout.observations.items():
+        parts = iter(observation_parts(env, group))
+        for term in terms:
+            places = [where for where, _ in islice(parts, term.size if len(term.shape) < 2 else 1)]
+            config = env.config.observations[group].terms[term.name]
+            if config is None or config.func not in ("joint_pos", "joint_pos_rel"):
+                continue
+            entity = env.entities[config.params.get("entity", "robot")]
+            joints = [entity.joint_ids[entity.joint_names.index(name)] for name in term.elements]
+            turns = [model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_limited[j] for j in joints]
+            found |= {where for where, turn in zip(places, cycle(turns)) if turn}
+    return found
 
 
 def _columns(evidence: RolloutEvidence) -> Iterator[tuple[str, Tensor]]:

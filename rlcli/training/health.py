@@ -200,7 +200,8 @@ def no_progress(health: Health) -> Found:
         value = statistics.fmean(health.last(RETURN)) if health.values(RETURN) else 0.0
         done = f"the first {health.progress:.0%} of the training"
         message = f"return, reward terms and episode length have not changed in {done} (return {value:.4g})"
-        yield message, "`rlcli lint TASK` (dead-action, silent-reward), a larger agent.learning_rate, or larger actions"
+        hint = "`rlcli lint TASK` (dead-action, silent-reward, observation-scale), a larger agent.learning_rate"
+        yield message, f"{hint}, or larger actions"
 
 
 def one_termination(health: Health) -> Found:

@@ -154,6 +154,16 @@ def test_observation_scale_finds_column_and_proposes_scale(managed):
     assert remark.numbers["largest"] < 0.001
 
 
+def test_observation_scale_names_angle_that_grows_with_each_turn(managed):
+    managed.config["episode_length_s"] = 8.0
+    managed.config["actions"]["torque"]["scale"] = 8.0
+    managed.config["scene"]["entities"]["robot"]["joints"]["hinge"]["effort_limit"] = 8.0
+    found = [remark for remark in lint(managed, only=["observation-scale"]) if "column 0" in remark.where]
+    assert ["joint_angle" in remark.hint for remark in found] == [True]
+    managed.config["observations"]["policy"]["angle"]["func"] = "joint_angle"
+    assert not [remark for remark in lint(managed, only=["observation-scale"]) if "column 0" in remark.where]
+
+
 def test_observation_scale_accepts_normalizing_agent(managed):
     managed.config["observations"]["policy"]["rate"]["scale"] = 1000.0
     managed.config["agents"] = agents(normalize_observations=True)
