@@ -34,11 +34,6 @@ _SECTION_KEYS: dict[str, dict[str, Any]] = {
     "commands": {"resampling_time_s": [4.0, 8.0]},
 }
 """Required keys of every term of a section, with the values of the examples."""
-_PENALTY = re.compile(
-    r"(?!.*_inv_).*(_l[12]|_penalty(_ratio)?|_cost|_limits?|_error(_abs)?|_contacts|_slide|_slip|_swing_height)"
-    r"|is_terminated(_term)?|contact_forces|feet_clearance|soft_landing|power_consumption"
-)
-"""Names of the rewards that measure something unwanted: their examples have a negative weight."""
 _BOUNDS = (("minimum", ">="), ("exclusiveMinimum", ">"), ("maximum", "<="), ("exclusiveMaximum", "<"))
 
 
@@ -68,14 +63,15 @@ class TermEntry:
     @property
     def example(self) -> str:
         """One YAML line that uses the term with its required keys."""
-        examples = _key_texts()["examples"]
+        texts = _key_texts()
+        examples = texts["examples"]
         values: dict[str, Any] = {"func": self.name, **_SECTION_KEYS.get(self.section, {})}
-        if self.section == "rewards" and _PENALTY.fullmatch(self.name):
+        if self.section == "rewards" and self.name in texts["penalties"]:
             values["weight"] = -1.0
         for key in self.keys:
             if key.required:
                 values[key.name] = examples.get(f"{self.name}.{key.name}", examples.get(key.name, "VALUE"))
-        values |= _key_texts()["term_examples"].get(self.name, {})
+        values |= texts["term_examples"].get(self.name, {})
         inner = ", ".join(f"{key}: {yaml_text(value)}" for key, value in values.items())
         return f"{self.section}: {{{self.name}: {{{inner}}}}}"
 
@@ -149,6 +145,6 @@ def _key_entry(term: Signature, parameter: Parameter) -> KeyEntry:
 
 
 @functools.cache
-def _key_texts() -> dict[str, dict[str, Any]]:
-    texts: dict[str, dict[str, Any]] = load(_KEYS.read_bytes()).data
+def _key_texts() -> dict[str, Any]:
+    texts: dict[str, Any] = load(_KEYS.read_bytes()).data
     return texts

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from rlcli.config.load import resolve
 from rlcli.deploy.env_description import describe
-from rlcli.deploy.export import TOLERANCE, relative_difference
+from rlcli.deploy.export import TOLERANCE, Exported, relative_difference
 from rlcli.deploy.run_policy_files import PROGRAM, generate_program, open_model, write_model, write_program
 from rlcli.envs.direct import DirectEnv
 from rlcli.envs.make import make_env
@@ -168,7 +168,7 @@ def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | N
 
 
 def verify(
-    reference: ReferenceEnv, checkpoint: Checkpoint, file: Path, format_: str, episodes: int
+    reference: ReferenceEnv, checkpoint: Checkpoint, exported: Exported, format_: str, episodes: int
 ) -> ClosedLoopResult:
     """Evaluate the policy in its environment, then run the same episodes with the file in plain MuJoCo.
 
@@ -177,7 +177,7 @@ def verify(
     Args:
         reference: the run's environment.
         checkpoint: the policy's checkpoint.
-        file: the exported policy.
+        exported: the exported policy.
         format_: its format.
         episodes: number of episodes.
 
@@ -185,12 +185,13 @@ def verify(
         CheckpointError: if the metadata does not fit the model.
         MachineError: if a file cannot be written.
     """
-    env = reference.env
+    env, file = reference.env, exported.file
     model = write_model(env.spec, env.engine.model, file.parent)
-    code = generate_program(file, model, format_)
+    code = generate_program(file, model, format_, exported.metadata)
     program = file.parent / PROGRAM
     if not write_program(file.parent, code):
         _log.warning(f"{program} differs from the generated program and is not replaced; delete it to get a new one")
+    _log.info(f"keep {file.name}, {model.name} and {PROGRAM} in one folder: the program reads the other two files")
     _log.info(f"{file.name} controls plain MuJoCo with {model.name} for {episodes} episodes")
     differing = deployment_differences(checkpoint, env.layout.record(), reference.deployment, _may_randomize(env))
     space: dict[str, Any] = {"__name__": "run_policy"}

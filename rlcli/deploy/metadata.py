@@ -93,25 +93,34 @@ def metadata_of(
     }
 
 
-def terms_of_task_code(metadata: dict[str, Any]) -> list[str]:
-    """Return one sentence for each term that `run_policy.py` cannot compute, because it has no formula."""
-    deployment = metadata["deployment"] or {"observations": [], "controls": []}
-    sentences = []
+def required_inputs(metadata: dict[str, Any]) -> dict[str, int]:
+    """Return the inputs that `Controller.act` of `run_policy.py` needs, with their numbers of values.
+
+    They are the commands, and the observations that only the task's code computes, because they have no formula.
+    """
+    deployment = metadata["deployment"] or {"commands": [], "observations": []}
+    sizes = {f"command/{command['name']}": command["size"] for command in deployment["commands"]}
     for term in deployment["observations"]:
         if not term["closed"]:
-            width = (term["columns"][1] - term["columns"][0]) // term["history"]
-            sentences.append(
-                f"run_policy.py cannot compute observation {term['name']}, which only the task's code computes: pass"
-                f" inputs['{term['value']['given']}'] ({width} values of one step, with modifiers, clip and scale"
-                " applied)"
-            )
-    sentences += [
+            sizes[term["value"]["given"]] = (term["columns"][1] - term["columns"][0]) // term["history"]
+    return sizes
+
+
+def terms_of_task_code(metadata: dict[str, Any]) -> list[str]:
+    """Return one sentence for each term that `run_policy.py` cannot compute, because it has no formula."""
+    deployment, sizes = metadata["deployment"] or {"observations": [], "controls": []}, required_inputs(metadata)
+    return [
+        f"run_policy.py cannot compute observation {term['name']}, which only the task's code computes: pass"
+        f" inputs['{term['value']['given']}'] ({sizes[term['value']['given']]} values of one step, with modifiers,"
+        " clip and scale applied)"
+        for term in deployment["observations"]
+        if not term["closed"]
+    ] + [
         f"run_policy.py cannot compute the controls of action {term['name']}, which only the task's code computes:"
         " compute them from Controller.command"
         for term in deployment["controls"]
         if not term["closed"]
     ]
-    return sentences
 
 
 def mjlab_properties(metadata: dict[str, Any], entity: str = "robot") -> dict[str, str]:

@@ -5,10 +5,12 @@ import ctypes
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from rlcli.deploy.metadata import required_inputs, terms_of_task_code
 from rlcli.deploy.numpy_export import literal, substitute
 from rlcli.errors import UsageError
 from rlcli.runs.atomic_io import disk_errors, require_regular, write_atomic
@@ -43,21 +45,39 @@ _IMPORTS = {
     "torch": f"{_STANDARD}import torch\n",
 }
 _PACKAGES = {"onnx": "numpy, mujoco, onnxruntime", "numpy": "numpy and mujoco", "torch": "numpy, mujoco and torch"}
+_ACT = "    def act(self, data, inputs):\n"
+_CHECK = """        sizes = SIZES
+        for name, size in sizes.items():
+            if np.size(inputs.get(name, ())) != size:
+                needed = f"Controller.act needs inputs['{name}'] ({size} values)"
+                way = "an observation is the value of one step, with its modifiers, clip and scale applied"
+                raise ValueError(f"{needed}; {way}")
+"""
+"""First lines of `Controller.act` for a policy that needs inputs."""
+_LOOP = "    policy, xml = "
+"""Begin of the program's own loop, which runs the policy with all commands zero."""
 _TOLERANCE = {"rtol": 1e-4, "atol": 1e-5}
 """Largest accepted difference of a model that was read from XML, which may have only six digits."""
 
 
-def generate_program(policy: Path, model: Path, format_: str) -> str:
+def generate_program(policy: Path, model: Path, format_: str, metadata: dict[str, Any]) -> str:
     """Return the source code of the program that runs a policy file on a model file.
 
-    The program will be in the same folder as the two files.
+    The program will be in the same folder as the two files. If only the task's code computes an observation or a
+    control, the program's own loop is replaced by a message; its `Controller` can be used by another loop.
     """
     text = _TEMPLATE.read_text(encoding="utf-8")
     for parts in (_PACKAGES, _IMPORTS, _OPEN):
         text = text.replace(parts["onnx"], parts[format_])
     reader = "from_xml_path" if model.suffix == ".xml" else "from_binary_path"
     names = {'"policy.onnx"': literal(policy.name), '"model.xml"': literal(model.name), "from_xml_path": reader}
-    return substitute(text, names)
+    text = substitute(text, names)
+    # inserted last: nothing is substituted in names that come from the checkpoint
+    if sizes := required_inputs(metadata):
+        text = text.replace(_ACT, _ACT + _CHECK.replace("SIZES", literal(sizes)))
+    if terms := terms_of_task_code(metadata):
+        text = text[: text.index(_LOOP)] + f"    sys.exit({literal('error: ' + '; '.join(terms))})\n"
+    return text
 
 
 def check_overwrites(policy: Path) -> None:

@@ -20,7 +20,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rlcli.registry.failed_imports import can_be_left_out, failed_import
 from rlcli.registry.formats import Format, aliasing_formats
 
 _COMMON = ("gym", "hydra", "numpy", "omegaconf")
@@ -169,6 +168,9 @@ def _import(
     try:
         return _import_module(name, module_globals, module_locals, fromlist, level)
     except Exception as error:
+        # imported here: every command imports this module, but hardly any has a failing import
+        from rlcli.registry.failed_imports import can_be_left_out, failed_import
+
         scope = module_globals or {}
         package, file = str(scope.get("__package__")), Path(str(scope.get("__file__", "")))
         own = level > 0 or name.partition(".")[0] in (package.partition(".")[0], _trees.get(package.partition(".")[0]))

@@ -1,5 +1,6 @@
 """`rlcli export --verify`: an exported file controls plain MuJoCo, and errors in the file are found."""
 
+import ast
 import json
 import os
 import re
@@ -168,20 +169,26 @@ def test_program_names_observation_of_task_code_that_it_needs(pushed, tmp_path, 
     assert capfd.readouterr().err.count("pass inputs['observation/own'] (1 values of one step, with modifiers") == 1
     result = run_python(tmp_path, "run_policy.py")
     assert (result.returncode, result.stdout, result.stderr.count("\n")) == (1, "", 1), result.stderr
-    assert "error: Controller.act needs inputs['observation/own'] (1 values); an observation" in result.stderr
+    assert (
+        "error: run_policy.py cannot compute observation own, which only the task's code computes: pass inputs"
+        in result.stderr
+    )
     result = run_python(tmp_path, "-c", OWN)
     assert result.stdout == "20 (1,)\n", result.stderr
     result = run_python(tmp_path, "-c", OWN.replace('"observation/own": 2.0', '"observation/own": [1, 2] or 2.0'))
-    assert "ValueError: Controller.act needs inputs['observation/own'] (1 values)" in result.stderr
+    assert "ValueError: Controller.act needs inputs['observation/own'] (1 values); an observation" in result.stderr
 
 
 def test_program_names_missing_file(newest, tmp_path, capfd):
-    verify(capfd, newest("cartpole").parent.parent, tmp_path / "p.py", "--format", "numpy", "--episodes", "2")
+    arguments = ["--output", str(tmp_path / "p.py"), "--format", "numpy", "--verify", "--episodes", "2"]
+    assert main(["export", "--checkpoint", str(newest("cartpole").parent.parent), *arguments]) == 0
+    assert "keep p.py, model.xml and run_policy.py in one folder" in capfd.readouterr().err
     for name in ("model.xml", "p.py"):
         (tmp_path / name).unlink()
         result = run_python(tmp_path, "run_policy.py")
-        assert result.stderr.startswith(f"error: {tmp_path / name} is missing: keep the policy"), result.stderr
-        assert result.stderr.count("\n") == 1
+        last = result.stderr.splitlines()[-1]
+        assert last.startswith("FileNotFoundError"), result.stderr
+        assert str(tmp_path / name) in last
 
 
 def test_numpy_policy_names_its_columns_for_wrong_shape(newest, tmp_path, capfd):
@@ -371,7 +378,7 @@ def test_program_is_short_and_runs_without_rlcli(newest, tmp_path, capfd, format
     run, suffix = newest("cartpole").parent.parent, {"onnx": ".onnx", "numpy": ".py"}[format_]
     verify(capfd, run, tmp_path / f"policy{suffix}", "--format", format_, "--episodes", "2")
     file = tmp_path / "run_policy.py"
-    assert len(file.read_text().splitlines()) <= 105
+    assert len(file.read_text().splitlines()) <= 80
     assert max(map(len, file.read_text().splitlines())) <= 120
     blocked = ["rlcli", "rlcli_tasks", "torch", "pydantic", *(["onnxruntime"] if format_ == "numpy" else [])]
     command = [sys.executable, "-B", "-c", PROGRAM.format(blocked=blocked), str(file), "60"]
@@ -417,10 +424,10 @@ def test_binary_model_is_overwritten_only_beside_program_that_loads_it(tmp_path)
     assert_refused()
     program.write_text('import mujoco\nmujoco.MjModel.from_binary_path("model.mjb")\n')
     assert_refused()
-    program.write_text(run_policy_files.generate_program(policy, tmp_path / "model.xml", "numpy"))
+    program.write_text(run_policy_files.generate_program(policy, tmp_path / "model.xml", "numpy", {"deployment": None}))
     assert_refused()
     for format_ in ("numpy", "onnx", "torch"):
-        program.write_text(run_policy_files.generate_program(policy, model, format_))
+        program.write_text(run_policy_files.generate_program(policy, model, format_, {"deployment": None}))
         run_policy_files.check_overwrites(policy)
     assert model.read_bytes() == b"mine"
 
@@ -438,3 +445,13 @@ def test_program_needs_only_numpy_onnxruntime_and_mujoco(newest, tmp_path, capfd
     result = subprocess.run(asked, cwd=tmp_path, env=bare, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith("300 steps, 5.00 s; qpos ")
+
+
+def test_names_of_inputs_stay_literals_in_generated_program():
+    name = '"model.xml" \'policy.onnx\' "policy.onnx"'
+    term = {"name": name, "closed": False, "columns": [0, 2], "history": 1, "value": {"given": f"observation/{name}"}}
+    metadata = {"deployment": {"commands": [], "observations": [term], "controls": []}}
+    program = run_policy_files.generate_program(Path("p.onnx"), Path("model.xml"), "onnx", metadata)
+    texts = [node.value for node in ast.walk(ast.parse(program)) if isinstance(node, ast.Constant)]
+    assert f"observation/{name}" in texts
+    assert any(str(text).startswith(f"error: run_policy.py cannot compute observation {name}") for text in texts)

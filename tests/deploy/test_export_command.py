@@ -322,7 +322,9 @@ def test_names_of_untrusted_files_stay_literals_in_exported_code(copied, tmp_pat
 
 
 def test_names_of_files_stay_literals_in_generated_program(tmp_path):
-    program = generate_program(Path('a "model.xml" from_xml_path.onnx'), Path("model.xml"), "onnx")
+    program = generate_program(
+        Path('a "model.xml" from_xml_path.onnx'), Path("model.xml"), "onnx", {"deployment": None}
+    )
     names = [node.value for node in ast.walk(ast.parse(program)) if isinstance(node, ast.Constant)]
     assert 'a "model.xml" from_xml_path.onnx' in names
     assert "model.xml" in names

@@ -51,6 +51,7 @@ def test_every_meaning_is_of_a_key_that_exists():
     for part in ("keys", "examples"):
         assert set(_key_texts()[part]) <= known
     assert set(_key_texts()["term_examples"]) <= {entry.name for entry in entries}
+    assert set(_key_texts()["penalties"]) <= {entry.name for entry in entries if entry.section == "rewards"}
 
 
 def test_examples_of_penalties_have_a_negative_weight():

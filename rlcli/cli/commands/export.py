@@ -66,7 +66,7 @@ def command(
     reference = _open_reference(chosen, saved, file, task) if verify else None
     done = export(saved, file, format, None if reference is None else reference.deployment)
     _print_exported(done)
-    verdict = None if reference is None else _verify(reference, saved, done.file, format, episodes)
+    verdict = None if reference is None else _verify(reference, saved, done, format, episodes)
     entries = {"observations": done.observations, "max_difference": done.max_difference, "metadata": done.metadata}
     verified = None if verdict is None else verdict.record()
     _report(chosen.folder, format, done.file, done.file.stat().st_size, **entries, verified=verified)
@@ -118,11 +118,13 @@ def _open_reference(choice: Choice, saved: Checkpoint, file: Path, task: str | N
     return open_reference(choice, saved, named)
 
 
-def _verify(reference: ReferenceEnv, saved: Checkpoint, file: Path, format_: str, episodes: int) -> ClosedLoopResult:
+def _verify(
+    reference: ReferenceEnv, saved: Checkpoint, exported: Exported, format_: str, episodes: int
+) -> ClosedLoopResult:
     """Run the exported file in plain MuJoCo, and print the comparison with the run's evaluation."""
     from rlcli.deploy.closed_loop import verify
 
-    verdict = verify(reference, saved, file, format_, episodes)
+    verdict = verify(reference, saved, exported, format_, episodes)
     for source, terms in (("formulas of the metadata", verdict.by_metadata), ("the task's code", verdict.by_task)):
         if terms:
             console.info(f"terms that are computed by {source}: {', '.join(terms)}")

@@ -2,8 +2,7 @@
 
 On a robot use `Controller`: call `reset` before an episode, then `act` every `step_dt` seconds. `data` has the fields
 that formulas read (qpos, qvel, ...; SI units, quaternions w x y z, joints at the addresses in `deployment.joints`).
-`inputs` are `command/NAME`, and `observation/NAME` of terms without formula: one step, after clip and scale.
-Controls have the order of `deployment.actuators`; you compute those without formula from `command` after `act`.
+`inputs` are `command/NAME`, and `observation/NAME` without formula. Controls have the order of `deployment.actuators`.
 """
 
 import json
@@ -54,20 +53,8 @@ class Controller:
         self.filters[f["key"]] = xs, [y, *ys][: len(ys)]
         return y
 
-    def problem(self, inputs):  # what `inputs` lack, as one sentence; "" if they are complete
-        sizes = {f"command/{command['name']}": command["size"] for command in self.plan["commands"]}
-        for term in self.plan["observations"]:
-            if not term["closed"]:
-                sizes[term["value"]["given"]] = (term["columns"][1] - term["columns"][0]) // term["history"]
-        bad = [name for name, size in sizes.items() if np.size(inputs.get(name, ())) != size]
-        needed = ", ".join(f"inputs['{name}'] ({sizes[name]} values)" for name in bad)
-        way = "an observation is the value of one step, with its modifiers, clip and scale applied"
-        return f"Controller.act needs {needed}; {way}" if bad else ""
-
     def act(self, data, inputs):
-        if self.steps == 0 and (problem := self.problem(inputs)):
-            raise ValueError(problem)
-        given = {"last_action": self.action, "steps": self.steps, **inputs}
+        given, ctrl = {"last_action": self.action, "steps": self.steps, **inputs}, np.array(data.ctrl)
         for term in self.plan["observations"]:
             now = self.value(term["value"], data, given)
             self.history[term["name"]] = [*self.history.get(term["name"], [now] * term["history"])[1:], now]
@@ -75,29 +62,19 @@ class Controller:
         out = self.policy({"obs": self.obs[None], **self.memory})
         self.memory = {part["input"]: out[part["output"]] for part in self.metadata["memory"]}
         self.action, self.command, self.steps = out["action"][0], out["command"][0], self.steps + 1
-        ctrl = np.array(data.ctrl)
         for control in self.plan["controls"]:
             ctrl[control["ctrl"]] = self.value(control["value"] or [], data, out)
         return np.clip(ctrl, *self.bounds)
 
 
 if __name__ == "__main__":
-    files = [Path(__file__).with_name(name) for name in ("policy.onnx", "model.xml")]
-    for file in files:
-        if not file.is_file():
-            sys.exit(f"error: {file} is missing: keep the policy, the model and run_policy.py in one folder")
-    controller, model = Controller(files[0]), mujoco.MjModel.from_xml_path(str(files[1]))
+    policy, xml = (Path(__file__).with_name(name).resolve(strict=True) for name in ("policy.onnx", "model.xml"))
+    controller, model = Controller(policy), mujoco.MjModel.from_xml_path(str(xml))
     data, plan = mujoco.MjData(model), controller.plan
-    inputs = {f"command/{command['name']}": np.zeros(command["size"]) for command in plan["commands"]}
-    own = [control["name"] for control in plan["controls"] if not control["closed"]]
-    if problem := controller.problem(inputs):
-        sys.exit(f"error: {problem}")
-    if own:
-        sys.exit(f"error: compute the controls of {', '.join(own)} from Controller.command: the task's code has them")
     data.qpos[:], data.qvel[:] = plan["start"]["qpos"], plan["start"]["qvel"]
     mujoco.mj_forward(model, data)
     for _ in range(steps := int((*sys.argv, "300")[1])):
-        data.ctrl[:] = controller.act(data, inputs)
+        data.ctrl[:] = controller.act(data, {f"command/{c['name']}": np.zeros(c["size"]) for c in plan["commands"]})
         mujoco.mj_step(model, data, controller.metadata["decimation"])
         mujoco.mj_step1(model, data)  # mj_step leaves positions and sensors of the state before it
     print(f"{steps} steps, {data.time:.2f} s; qpos", *np.round(data.qpos, 3))
