@@ -43,6 +43,8 @@ class PythonTask:
     """Name in `data` -> signature of a function that is not a term of `rlcli.mdp`."""
     notes: list[Note] = field(default_factory=list)
     """How each setting was translated, for a configuration of another framework."""
+    params: type[BaseModel] | None = None
+    """Model of `params` in `data`, the settings of the code of a task of another framework; None: it has none."""
     format: Format | None = None
     """The other framework's format to whose classes the configuration belongs; None: rlcli's own."""
     place: str = ""

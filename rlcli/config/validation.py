@@ -76,6 +76,8 @@ class TaskCheck:
     notes: list[Note] = field(default_factory=list)
     filled: list[Path] = field(default_factory=list)  # paths of the changes that the configuration has received
     format: formats.Format | None = None
+    params: type[BaseModel] | None = None
+    """Model of the parameters of a task of another framework."""
     place: str = ""
     """File and line of a configuration's class in another framework's form; empty for others."""
 
@@ -88,7 +90,7 @@ class TaskCheck:
         known = recorded.data if recorded is not None else {}
         task = python_task.load(self.source, *given_settings(known, {path: value for path, value, _ in changes}))
         self.functions, self.notes, self.format, self.place = task.terms, task.notes, task.format, task.place
-        self.filled = task.filled if recorded is None else []
+        self.filled, self.params = task.filled if recorded is None else [], task.params
         return recorded or Document(task.data)
 
     def add(self, *problems: Problem) -> None:
@@ -385,6 +387,8 @@ class TaskCheck:
 
     def params_model(self) -> type[BaseModel] | None:
         """Return the model of a direct task's parameters; None if it has none."""
+        if self.params is not None:
+            return self.params
         if self.source.task is None or self.source.task_file is None:
             return None
         try:

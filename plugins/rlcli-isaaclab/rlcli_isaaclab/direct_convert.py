@@ -12,8 +12,9 @@ from rlcli.config.python_task import PythonTask
 from rlcli.errors import ConfigError, Problem
 from rlcli_isaaclab import convert
 from rlcli_isaaclab.config_class import is_missing, to_dict
-from rlcli_isaaclab.direct_env import record, shape_of
+from rlcli_isaaclab.direct_env import DirectRLEnvCfg, record, shape_of
 from rlcli_isaaclab.direct_terms import HookTerm
+from rlcli_isaaclab.own_fields import own_fields
 from rlcli_isaaclab.scene_facade import Asset
 from rlcli_isaaclab.scene_reader import SceneReader
 from rlcli_isaaclab.sensor_facade import TerrainImporter
@@ -88,7 +89,8 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
         config["observations"]["critic"] = {"state": {"func": states}}
     if report.problems:
         raise ConfigError(report.problems)
-    return PythonTask({key: v for key, v in config.items() if v is not None}, notes=report.user_notes())
+    config["params"], params = own_fields(original, DirectRLEnvCfg)
+    return PythonTask({key: v for key, v in config.items() if v is not None}, notes=report.user_notes(), params=params)
 
 
 class _Hooks:

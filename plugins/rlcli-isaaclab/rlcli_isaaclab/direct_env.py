@@ -21,6 +21,7 @@ from torch import Tensor
 
 from rlcli.errors import ConfigError, Problem, TaskError
 from rlcli_isaaclab.config_class import MISSING, configclass, fill_missing
+from rlcli_isaaclab.own_fields import set_valid_fields
 from rlcli_isaaclab.setup_scene import Setup, running
 from rlcli_isaaclab.sim import SimulationCfg
 from rlcli_isaaclab.user_files import placed
@@ -229,7 +230,10 @@ class DirectRLEnvCfg:
     xr: Any = None
     log_dir: Any = None
 
-    __rlcli_fill__ = fill_missing
+    def __rlcli_fill__(self, values: Mapping[tuple[str, ...], Any]) -> list[tuple[str, ...]]:
+        """Set missing settings and own fields; return the paths of those that were missing."""
+        set_valid_fields(self, DirectRLEnvCfg, values)  # `_setup_scene` may read them
+        return fill_missing(self, values)
 
     def __rlcli_environment__(self, entry: Any) -> None:
         """Store the environment class that the task's Gymnasium registration names, as a class or `module:Class`."""

@@ -19,6 +19,7 @@ from rlcli.sim.env_selection import Selection
 from rlcli_isaaclab.absent import place_of
 from rlcli_isaaclab.direct_env import DirectRLEnv, building
 from rlcli_isaaclab.observation_noise import noise_model
+from rlcli_isaaclab.own_fields import set_own_fields
 from rlcli_isaaclab.substeps import Substeps
 from rlcli_isaaclab.user_files import placed
 
@@ -56,6 +57,7 @@ class DirectRunner:
         cfg.scene.num_envs, cfg.sim.device = managed.num_envs, str(managed.device)
         cfg.sim.dt, cfg.decimation = managed.physics_dt, managed.config.decimation
         cfg.episode_length_s = managed.config.episode_length_s
+        set_own_fields(cfg, managed.config.params)
         self.cfg = cfg
         self.phase = "build"
         self._substeps = Substeps(managed, "direct task", self)

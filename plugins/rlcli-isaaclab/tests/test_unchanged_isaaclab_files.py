@@ -510,3 +510,71 @@ def test_whole_task_package_of_isaac_lab():
     command = [sys.executable, "corpus.py", "--stage", "steps", "--only", "^Isaac-(Cartpole|Velocity-Flat-G1|Ant)"]
     done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
     assert all(line[0] == "3" for line in done.stdout.splitlines() if "Velocity-Flat-G1" in line), done.stdout
+
+
+OWN = """
+    force = 5.0
+    count: int = 2
+    name = "pole"
+    gains = (1.0, 2)
+    is_slow: bool = False
+    limits: LimitsCfg = LimitsCfg()
+"""
+LIMITS = """
+@configclass
+class LimitsCfg:
+    angle = 3.0
+
+
+@configclass
+class PoleEnvCfg("""
+
+
+@pytest.fixture
+def with_fields(direct):
+    text = DIRECT.replace("\n    force = 5.0\n", OWN).replace("\n@configclass\nclass PoleEnvCfg(", LIMITS)
+    reward = "self.cfg.force * self.cfg.gains[1] + self.cfg.limits.angle + self.cfg.count * torch.ones("
+    direct.write_text(text.replace("        return torch.ones(", f"        return {reward}"))
+    return direct
+
+
+def reward_of(resolved):
+    env = make_env(resolved, seed=0)
+    env.reset()
+    return env.step(torch.zeros(4, 1)).reward.tolist()
+
+
+def test_own_fields_of_a_direct_task_change_on_the_command_line(with_fields):
+    task = find_task(f"{with_fields}:PoleEnvCfg")
+    assert reward_of(resolve(task)) == [5.0 * 2 + 3.0 + 2] * 4
+    words = ["params.force=7", "params.gains=[1, 0.5]", "params.limits.angle=1.5", "params.count=4"]
+    resolved = resolve(task, overrides=words)
+    assert resolved.task.params["name"] == "pole"
+    assert reward_of(resolved) == [7 * 0.5 + 1.5 + 4] * 4
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("params.force=fast", "params.force: .*number"),
+        ("params.count=0.5", "params.count: expected a whole number"),
+        ("params.is_slow=1", "params.is_slow: .*(true|bool)"),
+        ("params.limits.angel=1", "params.limits.angel: .*angle"),
+        ("params.froce=1", "params.froce: .*force"),
+        ("params.robot_cfg=1", "allowed: count, force, gains, is_slow, limits, name"),
+    ],
+)
+def test_wrong_own_field_of_a_direct_task(with_fields, word, message):
+    with pytest.raises(ConfigError, match=message):
+        resolve(find_task(f"{with_fields}:PoleEnvCfg"), overrides=[word])
+
+
+def test_own_field_decides_what_the_scene_has(direct):
+    text = DIRECT.replace("    force = 5.0\n", "    force = 5.0\n    sees: bool = False\n")
+    camera = "TiledCameraCfg(prim_path='/World/envs/env_.*/Camera', width=8, height=8, data_types=['rgb'])"
+    made = f"        if self.cfg.sees:\n            self.scene.sensors['camera'] = TiledCamera({camera})\n"
+    text = text.replace("        light =", f"{made}        light =")
+    direct.write_text(f"from isaaclab.sensors import TiledCamera, TiledCameraCfg\n{text}")
+    task = find_task(f"{direct}:PoleEnvCfg")
+    assert list(resolve(task).task.scene.sensors) == []
+    assert list(resolve(task, overrides=["params.sees=true"]).task.scene.sensors) == ["camera"]

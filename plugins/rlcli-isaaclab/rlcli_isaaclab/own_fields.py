@@ -1,0 +1,86 @@
+"""Fields that a task adds to `DirectRLEnvCfg`, such as `rew_scale_alive`: they become the section `params` of rlcli."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, TypeAdapter, ValidationError, create_model
+
+from rlcli.config.schema import Number, StrictModel
+from rlcli.registry import is_framework
+from rlcli_isaaclab.config_class import is_missing
+
+Numeric = int | Number
+
+
+def own_fields(cfg: Any, base: type) -> tuple[dict[str, Any], type[BaseModel]]:
+    """Return the values of the plain fields that a configuration adds to those of `base`, and their pydantic model.
+
+    Plain are numbers, text, lists of these, and objects of the task's own configuration classes.
+    """
+    known = {field.name for field in dataclasses.fields(base)}
+    values: dict[str, Any] = {}
+    types: dict[str, Any] = {}
+    for name, value in vars(cfg).items():
+        if name in known or name.startswith(("_", "rlcli_")):
+            continue
+        if dataclasses.is_dataclass(value) and not is_framework(type(value).__module__):
+            inner, kind = own_fields(value, _Nothing)
+            if inner:
+                values[name], types[name] = inner, (kind, kind())
+        elif (kind := _type_of(value, type(cfg).__annotations__.get(name))) is not None:
+            values[name] = list(value) if isinstance(value, tuple) else value
+            types[name] = (kind, values[name])
+    return values, create_model("Params", __base__=StrictModel, **types)
+
+
+def set_own_fields(cfg: Any, values: Mapping[str, Any]) -> None:
+    """Set fields of a configuration by name; a mapping sets the fields of the object in a field."""
+    for name, value in values.items():
+        now = getattr(cfg, name)
+        if isinstance(value, Mapping):
+            set_own_fields(now, value)
+        elif now != value and not (isinstance(now, tuple) and list(now) == value):
+            setattr(cfg, name, tuple(value) if isinstance(now, tuple) else value)
+
+
+def set_valid_fields(cfg: Any, base: type, values: Mapping[tuple[str, ...], Any]) -> None:
+    """Set the fields that have a value of the right type at `("params", NAME, ...)`; the others are reported later."""
+    for path, value in values.items():
+        if path[0] != "params":
+            continue
+        owner, kind = cfg, base
+        for part in path[1:-1]:
+            owner, kind = getattr(owner, part, None), _Nothing
+        if dataclasses.is_dataclass(owner):
+            field = own_fields(owner, kind)[1].model_fields.get(path[-1])
+            try:
+                checked = TypeAdapter(field.annotation).validate_python(value, strict=True) if field else None
+            except ValidationError:
+                continue
+            if field is not None:
+                set_own_fields(owner, {path[-1]: checked})
+
+
+@dataclasses.dataclass
+class _Nothing:
+    """Class without fields."""
+
+
+def _type_of(value: Any, annotation: Any) -> Any:
+    """Return the type of a field; None for a value that is not plain. `annotation`: type or text in the source."""
+    if isinstance(value, bool):
+        return bool
+    if isinstance(value, int) and annotation in (int, "int"):
+        return int
+    if isinstance(value, int) or (isinstance(value, float) and math.isfinite(value)):
+        return Numeric
+    if isinstance(value, str):
+        return str
+    if value is None and not is_missing(value):
+        return Any
+    items = [_type_of(item, None) for item in value] if isinstance(value, list | tuple) else []
+    return list[items[0]] if items and items[0] in (Numeric, str) and len(set(items)) == 1 else None  # type: ignore[valid-type]
