@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -55,14 +56,11 @@ def set_valid_fields(cfg: Any, base: type, values: Mapping[tuple[str, ...], Any]
         owner, kind = cfg, base
         for part in path[1:-1]:
             owner, kind = getattr(owner, part, None), _Nothing
-        if dataclasses.is_dataclass(owner):
-            field = own_fields(owner, kind)[1].model_fields.get(path[-1])
-            try:
-                checked = TypeAdapter(field.annotation).validate_python(value, strict=True) if field else None
-            except ValidationError:
-                continue
-            if field is not None:
-                set_own_fields(owner, {path[-1]: checked})
+        field = own_fields(owner, kind)[1].model_fields.get(path[-1]) if dataclasses.is_dataclass(owner) else None
+        if field is not None:
+            with contextlib.suppress(ValidationError):
+                adapter: TypeAdapter[Any] = TypeAdapter(field.annotation or Any)
+                set_own_fields(owner, {path[-1]: adapter.validate_python(value, strict=True)})
 
 
 @dataclasses.dataclass
