@@ -90,7 +90,7 @@ class ClosedLoopResult:
     by_metadata: list[str]
     """Terms that the generated program computed from formulas in the metadata."""
     by_task: list[str]
-    """Terms without a formula. The task's own code computed them from the states of plain MuJoCo."""
+    """Terms without a formula, and forces. The task's own code computed them from the states of plain MuJoCo."""
     synchronized_return: float | None = None
     """Mean return of the re-synchronised episodes; None: they were not needed."""
     disagreeing_steps: int = 0
@@ -240,6 +240,10 @@ def _may_randomize(env: VecEnv) -> bool:
     return isinstance(env, DirectEnv) or not all(event.func.startswith("reset_") for event in events)
 
 
+_FORCES = ("xfrc_applied", "qfrc_applied")
+"""Fields in which a task's code applies forces to bodies and to joints."""
+
+
 class _PlainMujocoRunner:
     """Runner of an exported policy in plain MuJoCo: an MjModel, an MjData and a controller for each environment."""
 
@@ -272,6 +276,8 @@ class _PlainMujocoRunner:
             raise _metadata_error(error) from error
         self._open_terms = [term for term in self._plan["observations"] if not term["closed"]]
         self._decimation = controller.metadata["decimation"]
+        self._forces: set[str] = set()
+        """Fields of forces that the task's code has set in its steps."""
 
     def act(self, obs: Tensor) -> Tensor:
         """Return the actions of the exported policy in the plain simulations.
@@ -306,10 +312,16 @@ class _PlainMujocoRunner:
         self._record_difference("control", *pairs)
         calls = self._env.calls_per_step
         for _ in range(calls):
-            if calls > 1:
+            if self._env.actuators:
                 self._env.compute_efforts()
+            forces = {name: self._engine.field(name).numpy() for name in _FORCES}
             for i, data in enumerate(self._datas):
                 data.ctrl[:] = np.where(self._closed, self._ctrl[i], ctrl[i])
+                for name, values in forces.items():
+                    applied = getattr(data, name)
+                    if not np.array_equal(applied, values[i]):  # no event has set it, but the code of the step
+                        self._forces.add(name)
+                        applied[...] = values[i]
                 mujoco.mj_step(self._models[i], data, self._decimation // calls)
                 self._update_derived(i)
             if self._synchronize:
@@ -351,7 +363,8 @@ class _PlainMujocoRunner:
     def terms(self, *, closed: bool) -> list[str]:
         """Return the terms that the generated program computes itself (`closed`), or those that it cannot compute."""
         kinds = {"observation": self._plan["observations"], "control": self._plan["controls"]}
-        return [f"{kind} {t['name']}" for kind, terms in kinds.items() for t in terms if t["closed"] is closed]
+        named = [f"{kind} {t['name']}" for kind, terms in kinds.items() for t in terms if t["closed"] is closed]
+        return named if closed else [*named, *(f"force data.{name}" for name in sorted(self._forces))]
 
     def _copy_state(self, i: int, is_first: bool) -> None:
         """Copy the state of environment `i` to its plain simulation if a reset or an event has changed it."""

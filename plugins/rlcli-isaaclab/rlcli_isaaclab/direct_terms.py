@@ -83,7 +83,7 @@ class DirectRunner:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore the tensors returned by `state_dict`."""
         self._memory.load_state_dict(state)
-        self.phase = "reset"
+        self.phase = "restored"
 
     def process(self, action: Tensor) -> None:
         """Call `_pre_physics_step`."""
@@ -112,14 +112,15 @@ class DirectRunner:
     def observe(self, group: str, shape: tuple[int, ...]) -> Tensor:
         """Return the observations of a group. The hook runs once per step; `policy` is the first group.
 
-        If episodes end, the hook runs once more for their last observations. Afterwards the state of the task and of
-        torch's generator is restored.
+        If episodes end, the hook runs once more for their last observations; after `load_state_dict`, it runs for the
+        observations of the restored state. Afterwards the state of the task and of torch's generator is restored.
         """
         if self.phase == "build":
             return torch.zeros(self.managed.num_envs, *_channels_first(shape), device=self.managed.device)
         if group == "policy":
             manager = self.managed.termination_manager
-            if self.phase == "done" and bool((manager.terminated | manager.time_outs).any()):
+            is_last = self.phase == "done" and bool((manager.terminated | manager.time_outs).any())
+            if is_last or self.phase == "restored":
                 self._observed = self._without_effects(self._call_observations)
             else:
                 self._observed = self._call_observations()

@@ -134,7 +134,8 @@ class UserTerm:
     def _parameter(self, p: inspect.Parameter, hint: Any, entities: frozenset[str]) -> Parameter:
         entity = hint is SceneEntityCfg or p.name in entities or isinstance(p.default, SceneEntityCfg)
         kind = EntityModel if entity else _PLAIN.get(hint, Any)
-        required = p.default is inspect.Parameter.empty
+        unset = isinstance(p.default, SceneEntityCfg) and any(map(is_missing, vars(p.default).values()))
+        required = p.default is inspect.Parameter.empty or unset
         default = None if required else p.default
         if isinstance(default, SceneEntityCfg):
             data = entity_data(vars(default)).items()  # in Isaac Lab a default with empty names selects all

@@ -128,6 +128,11 @@ def _verify(
     for source, terms in (("formulas of the metadata", verdict.by_metadata), ("the task's code", verdict.by_task)):
         if terms:
             console.info(f"terms that are computed by {source}: {', '.join(terms)}")
+    if any(term.startswith("force ") for term in verdict.by_task):
+        console.info(
+            f"{verdict.program.name} applies no forces: they belong to the environment's code; compute them in your"
+            " program and write them to the MjData before each mj_step"
+        )
     rows = [
         [name, f"{found:.2e}", f"{allowed:g}", "holds" if held else "FAILS"]
         for name, found, allowed, held in verdict.rows()
