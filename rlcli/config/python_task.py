@@ -2,8 +2,10 @@
 
 The configuration is a `TaskConfig`, a mapping with its keys, or a function that returns one. Or it is a configuration
 of another framework with a method `__rlcli_task__(root, models) -> PythonTask`; its optional method
-`__rlcli_fill__(values)` sets the settings that the file leaves open, and returns their paths. Terms are names or
-functions. A function that is not a term of `rlcli.mdp` becomes one of the task's own terms under its name.
+`__rlcli_fill__(values)` sets the settings that the file leaves open, and returns their paths. An agent of another
+framework has a method `__rlcli_agent__(notes)`; its optional method `__rlcli_fit__(agent, observations, notes)` adapts
+the settings to the observation groups of the task. Terms are names or functions. A function that is not a term of
+`rlcli.mdp` becomes one of the task's own terms under its name.
 """
 
 import copy
@@ -423,7 +425,11 @@ def _read_agent(task: PythonTask, name: str, agent: object) -> dict[str, Any] | 
         read = task.format.spec.agent_file if task.format is not None else ""
         return task.format.call(read, agent, name, task.notes) if task.format is not None and read else None
     if isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__"):
-        return agent_data(agent, task.notes)
+        agent = agent() if isinstance(agent, type) else agent
+        data = agent_data(agent, task.notes)
+        if hasattr(agent, "__rlcli_fit__"):
+            agent.__rlcli_fit__(data, task.data.get("observations", {}), task.notes)
+        return data
     return None
 
 

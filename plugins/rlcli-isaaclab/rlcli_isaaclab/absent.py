@@ -45,7 +45,8 @@ _REASONS = {
 
 def reason_of(name: str) -> tuple[str, str]:
     """Return (why rlcli does not have a name of Isaac Lab or Isaac Sim, what to do instead)."""
-    library = LIBRARIES.get(name.partition(".")[0])
+    top = name.partition(".")[0]
+    library = "trimesh" if top == "trimesh" else LIBRARIES.get(top)
     if library is not None:
         return "the library is not installed", pip_install(library)
     words = name.lower()

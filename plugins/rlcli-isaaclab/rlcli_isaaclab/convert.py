@@ -143,12 +143,6 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
             "hidden": policy.get("rnn_hidden_dim", 256),
             "layers": policy.get("rnn_num_layers", 1),
         }
-    groups = top.get("obs_groups")
-    if isinstance(groups, Mapping):
-        if list(groups.get("policy", groups.get("actor", ["policy"]))) not in (["policy"], ["actor"]):
-            top.note("ignored", "obs_groups", "the actor observes the group 'policy'; other groups are left out")
-        if groups.get("critic"):
-            config["critic_obs"] = list(groups["critic"])
     adaptive = algorithm.get("schedule", "adaptive") == "adaptive"
     config |= {
         "num_epochs": algorithm.require("num_learning_epochs"),
@@ -174,7 +168,16 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         how = "the mirror image of left and right, found from the model, replaces the function"
         symmetry.note("approximated", "data_augmentation_func", how)
     algorithm.skip("class_name", "desired_kl")
-    top.skip("class_name", "logger", "neptune_project", "wandb_project", "resume", "load_run", "load_checkpoint")
+    top.skip(
+        "obs_groups",
+        "class_name",
+        "logger",
+        "neptune_project",
+        "wandb_project",
+        "resume",
+        "load_run",
+        "load_checkpoint",
+    )
     for name, option in (
         ("seed", "--seed"),
         ("device", "--device"),

@@ -13,12 +13,13 @@ import yaml
 from rlcli.config.dump import to_yaml
 from rlcli.config.load import check_all
 from rlcli.errors import ConfigError, Problem, UsageError
-from rlcli.formats import Imported
+from rlcli.formats import Imported, Note
 from rlcli.machine import read_plain
 from rlcli.registry import folder_task, model_file
 from rlcli_isaaclab.config_class import to_dict
 from rlcli_isaaclab.convert import agent, task
 from rlcli_isaaclab.envs import ManagerBasedRLEnvCfg
+from rlcli_isaaclab.observation_sets import fit_groups
 from rlcli_isaaclab.settings import Report
 
 MAX_BYTES = 4 * 1024 * 1024
@@ -79,7 +80,7 @@ def convert(env: Path, agent_file: Path | None, folder: Path, models: Mapping[st
     if agent_file is not None:
         agent_report = Report()
         try:
-            data["agents"] = {"default": "rsl-rl", "rsl-rl": _agent(agent_file, agent_report)}
+            data["agents"] = {"default": "rsl-rl", "rsl-rl": _agent(agent_file, agent_report, data)}
         except ConfigError as error:
             problems += [Problem(str(agent_file), p.path, p.message, p.hint) for p in error.problems]
     if problems:
@@ -171,13 +172,18 @@ def _annotation(key: str, value: Any) -> str:
     return "str | None"
 
 
-def _agent(file: Path, report: Report) -> dict[str, Any]:
+def _agent(file: Path, report: Report, data_of_task: Mapping[str, Any]) -> dict[str, Any]:
     data = read(file)
     if "algorithm" not in data or "num_steps_per_env" not in data:
         hint = "agents of rl_games, skrl and Stable-Baselines3 cannot be imported: write the agent by hand"
         what = "not an agent.yaml of RSL-RL: algorithm or num_steps_per_env is missing"
         raise ConfigError([Problem(str(file), "", what, hint)])
-    return agent(data, report)
+    settings = agent(data, report)
+    if data.get("obs_groups"):
+        notes: list[Note] = []
+        fit_groups(data["obs_groups"], settings, data_of_task.get("observations", {}), notes)
+        report.entries |= {("obs_groups",): (note.status, note.text) for note in notes}
+    return settings
 
 
 def _count(value: Any) -> None:

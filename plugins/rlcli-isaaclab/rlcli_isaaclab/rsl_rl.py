@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from rlcli.formats import Note
 from rlcli_isaaclab.config_class import MISSING, configclass, to_dict
+from rlcli_isaaclab.observation_sets import fit_groups
 
 
 @configclass
@@ -128,3 +130,8 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
         if notes is not None:
             notes += report.user_notes("agent")
         return data
+
+    def __rlcli_fit__(self, agent: dict[str, Any], observations: Mapping[str, Any], notes: list[Note]) -> None:
+        """Adapt the settings of the agent to the observation groups of the task."""
+        if isinstance(self.obs_groups, Mapping):
+            fit_groups(self.obs_groups, agent, observations, notes)

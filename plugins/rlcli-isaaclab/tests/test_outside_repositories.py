@@ -358,6 +358,61 @@ def test_runner_of_rsl_rl_5_with_its_observation_group(tmp_path):
     resolved = resolve(find_task(f"{tmp_path / 'rover' / 'rover_env.py'}:RoverEnvCfg"))
     assert list(resolved.task.observations) == ["policy"]
     assert (resolved.agent.init_std, resolved.agent.critic.hidden) == (0.5, (16,))
+    assert resolved.agent.critic_obs == ("policy",)
+
+
+GROUPS = """
+    @configclass
+    class Policy(ObservationGroupCfg):
+        velocity = ObservationTermCfg(func=mdp.base_lin_vel)
+        enable_corruption = True
+    @configclass
+    class Proprio(ObservationGroupCfg):
+        velocity = ObservationTermCfg(func=mdp.joint_vel, noise=GaussianNoiseCfg(std=0.1))
+        history_length = 3
+        enable_corruption = False
+    @configclass
+    class Critic(ObservationGroupCfg):
+        height = ObservationTermCfg(func=mdp.base_pos_z)
+    policy: Policy = Policy()
+    proprio: Proprio = Proprio()
+    critic: Critic = Critic()
+"""
+
+
+def runner_of_groups(folder, groups):
+    velocity = "        velocity = ObservationTermCfg(func=mdp.base_lin_vel)\n"
+    start = f"    @configclass\n    class Policy(ObservationGroupCfg):\n{velocity}"
+    old = f"{start}    policy: Policy = Policy()\n"
+    rover(folder, "from isaaclab.utils.noise import GaussianNoiseCfg\n", [(old, GROUPS)])
+    (folder / "agents").mkdir()
+    text = RUNNER.replace('{"actor": ["actor"], "critic": ["actor"]}', groups)
+    (folder / "agents" / "rsl_rl_cfg.py").write_text(text)
+    return find_task(f"{folder / 'rover_env.py'}:RoverEnvCfg")
+
+
+def test_actor_reads_several_observation_groups(tmp_path):
+    groups = '{"policy": ["policy", "proprio"], "critic": ["policy", "proprio", "critic"]}'
+    resolved = resolve(runner_of_groups(tmp_path / "rover", groups))
+    assert resolved.agent.critic_obs == ("policy", "critic")
+    env, result = stepped(resolved)
+    assert result.obs["policy"].shape == (4, 3 + 3 * 2)
+    assert torch.equal(result.obs["policy"][:, 3:], result.obs["proprio"])
+    assert env.layout.observations["policy"][1].name == "proprio_velocity"
+
+
+def test_actor_reads_another_group_only(tmp_path):
+    groups = '{"policy": ["proprio"], "critic": ["critic"]}'
+    resolved = resolve(runner_of_groups(tmp_path / "rover", groups))
+    assert resolved.agent.critic_obs == ("critic",)
+    _, result = stepped(resolved)
+    assert torch.equal(result.obs["policy"], result.obs["proprio"])
+
+
+def test_observation_group_that_does_not_exist(tmp_path):
+    task = runner_of_groups(tmp_path / "rover", '{"policy": ["policy", "scan"]}')
+    with pytest.raises(ConfigError, match=r"rover_env.py:\d+: obs_groups.policy: no observation group 'scan'"):
+        resolve(task)
 
 
 BUILT = """
