@@ -17,6 +17,9 @@ from rlcli.sim.engine import Engine
 from rlcli.sim.env_selection import Field, Selection, in_place
 from rlcli.sim.saved_tensors import TensorState
 
+_MIN_STATES = 5
+"""Smallest number of states whose mean reward is compared with that of others."""
+
 
 class SuccessCondition:
     """Condition of success, with its value in the newest step and the number of steps for which it has held."""
@@ -80,6 +83,8 @@ class EpisodeCounters(TensorState):
         self.indices: Tensor = memory[1].fill_(-1)
         self.common_step = torch.zeros((), dtype=torch.int64, device=device)
         self.conditions: list[SuccessCondition] = []
+        self.rewards = torch.zeros(num_envs, device=device)
+        """Rewards of the newest step, if the task has conditions of success. (num_envs,)"""
 
     def attach(self, engine: Engine) -> None:
         """Make the attributes `*_field` with `Engine.as_field`: the forms of the tensors that are written fastest."""
@@ -106,10 +111,26 @@ class EpisodeCounters(TensorState):
         self.length_field += 1
         self._common_step += 1
 
-    def count_success(self) -> None:
+    def count_success(self, reward: Tensor) -> None:
         """Count a step for each condition of success where it holds, and set its count to 0 where it does not."""
         for condition in self.conditions:
             condition.count()
+        if self.conditions:
+            self.rewards.copy_(reward)
+
+    def reward_gap(self) -> tuple[float, float] | None:
+        """Return the mean reward of the newest step in states of success minus that in other states, and its error.
+
+        None with fewer than five environments of either kind. New episodes do not count.
+        """
+        if not self.conditions:
+            return None
+        held = functools.reduce(torch.logical_and, (condition.steps > 0.0 for condition in self.conditions))
+        inside, outside = (self.rewards[kind & (self.lengths > 0)].double() for kind in (held, ~held))
+        if min(len(inside), len(outside)) < _MIN_STATES:
+            return None
+        error = math.sqrt(sum(float(part.var()) / len(part) for part in (inside, outside)))
+        return float(inside.mean() - outside.mean()), error
 
     def succeeded(self, ended: Selection, timed_out: Tensor) -> dict[str, Any]:
         """Return the attributes `success`, `conditions` and `condition_values` of `Episodes`, by name.

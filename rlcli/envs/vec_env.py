@@ -162,7 +162,7 @@ class VecEnv(Workflow):
         for sensor in self.sensors.values():
             sensor.update(self.step_dt)
         reward, terminated, truncated = self._compute_rewards_and_dones(diverged)
-        self._counters.count_success()
+        self._counters.count_success(reward)
         if restart is not None:
             reward, terminated = reward.masked_fill(restart, 0.0), terminated & ~restart
             truncated = truncated & ~restart
@@ -291,6 +291,13 @@ class VecEnv(Workflow):
     def condition_shares(self) -> dict[str, float]:
         """Return the share of environments in which each condition of success held in the newest step."""
         return {each.name: float((each.steps > 0.0).float().mean()) for each in self._counters.conditions}
+
+    def success_reward_gap(self) -> tuple[float, float] | None:
+        """Return how much higher the newest reward is in states of success, and the standard error of this difference.
+
+        None if there are too few states of success, or too few others.
+        """
+        return self._counters.reward_gap()
 
     def compute_success(self) -> Tensor | None:
         """Return where all conditions of success hold in the current state; None without one. (num_envs,) bool"""

@@ -26,6 +26,9 @@ _MIN_VALUES = 6
 """Number of a metric's values from which on its change is known: the first three and the last three differ."""
 _SOLVED = 0.3
 """Success rate above which only defects are reported, not signs of slow learning."""
+_MIN_GAPS, _SURE, _RARE = 4, 5.0, 0.02
+"""A lower reward in states of success is reported if so many comparisons differ by so many standard errors, and the
+success rate was never higher than the third number."""
 _AT = 1e-3
 """Relative distance from a bound at which a value counts as at the bound."""
 
@@ -169,6 +172,9 @@ def probe(trainer: Trainer) -> dict[str, float]:
             found[f"Health/clipped/{term.name}"] = float((at_edge & ~constant[columns]).float().mean())
     shares = trainer.env.local.condition_shares()
     found |= {f"Health/held/{name}": share for name, share in shares.items()}
+    gap = trainer.env.local.success_reward_gap()
+    if gap is not None:
+        found |= {"Health/reward_gap": gap[0], "Health/reward_gap_in_errors": gap[0] / max(gap[1], 1e-9)}
     with undisturbed():  # a new policy draws random weights
         policy = trainer.policy().to(obs.device)
     if policy.normalizer is not None and policy.normalizer.clip is not None:
@@ -272,11 +278,16 @@ def update_size(health: Health) -> Found:
         yield f"an update hardly changes the policy: its KL divergence is {kl:.1g}", "a larger agent.learning_rate"
 
 
-def learning_rate_floor(health: Health) -> Found:
-    """Report an adaptive learning rate that is at its lowest value."""
-    rate, (floor, _) = health.median("Loss/learning_rate"), health.settings.get("learning_rate_range", (1e-5, 0.0))
-    adaptive = health.settings.get("schedule") == "adaptive"
-    if adaptive and rate is not None and rate <= 1.01 * floor and health.struggles(0.1):
+def learning_rate_range(health: Health) -> Found:
+    """Report an adaptive learning rate that is at its lowest value, or begins outside its range."""
+    if not str(health.settings.get("schedule")).startswith("adaptive") or not health.struggles(0.1):
+        return
+    rate, (floor, top) = health.median("Loss/learning_rate"), health.settings.get("learning_rate_range", (1e-5, 1.0))
+    begin = health.settings.get("learning_rate", floor)
+    if not 0.99 * floor <= begin <= 1.01 * top:
+        message = f"agent.learning_rate is {begin:.3g}, and the schedule adapts it between {floor:g} and {top:g}"
+        yield message, "a learning rate within agent.learning_rate_range"
+    elif rate is not None and rate <= 1.01 * floor and health.settings["schedule"] == "adaptive":
         message = f"the adaptive learning rate is at its lowest value, {rate:.1g}"
         yield message, "a larger desired_kl, or normalised observations"
 
@@ -359,6 +370,16 @@ def reward_without_success(health: Health) -> Found:
         yield message, "other signs or weights of the rewards, or a reward for success"
 
 
+def reward_against_success(health: Health) -> Found:
+    """Report rewards that are lower in states of success than in other states."""
+    sizes, gaps = health.values("Health/reward_gap_in_errors"), health.values("Health/reward_gap")
+    few = len(sizes) < _MIN_GAPS or max(health.values(SUCCESS), default=0.0) >= _RARE
+    if few or not health.struggles(0.15) or statistics.median(sizes) > -_SURE or sizes[-1] > -_SURE:
+        return
+    message = f"the reward of a step is lower in states of success than in others, by {-statistics.median(gaps):.3g}"
+    yield message, "other signs or weights of the rewards, or a reward for success"
+
+
 def _gaps(values: list[float], bounds: Mapping[str, Any]) -> list[float]:
     """Return the negative distance of each value to its bounds, 0 within them; it rises as a value comes closer."""
     low, high = bounds.get("at_least"), bounds.get("at_most")
@@ -381,8 +402,9 @@ def _approaches(values: list[float]) -> bool:
 
 
 _IN_ORDER: tuple[Callable[[Health], Found], ...] = (
-    *(no_reward, short_episodes, observations, update_size, learning_rate_floor, exploration, dying_pays),
-    *(one_termination, value_function, actions_at_bound, blocked_success, reward_without_success, no_progress),
+    *(no_reward, short_episodes, observations, update_size, learning_rate_range, exploration, dying_pays),
+    *(one_termination, value_function, actions_at_bound, blocked_success, reward_without_success),
+    *(reward_against_success, no_progress),
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in _IN_ORDER}
 """Name -> check, in the order in which findings are listed."""

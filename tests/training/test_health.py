@@ -4,7 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
+from rlcli.api import make
 from rlcli.cli.app import main
 from rlcli.config.load import resolve
 from rlcli.registry import find_task
@@ -26,6 +28,7 @@ HEALTHY = {
     "Policy/mean_std": lambda i: 1.0 - 0.005 * i,
 }
 STILL = {"Train/mean_reward": lambda i: -2.0 + 0.01 * (i % 3)}
+CONSTANT = ("agent.schedule=constant", "agent.desired_kl=null")
 FAILING = {"Train/success_rate": lambda i: 0.0, "Success/pole": lambda i: 0.0}
 
 
@@ -125,8 +128,15 @@ def test_progress_is_unknown_while_few_iterations_end_episodes(every, named):
 
 def test_adaptive_learning_rate_at_its_floor_is_found():
     changes = {**FAILING, "Loss/learning_rate": lambda i: 1e-5}
-    assert "learning-rate-floor" in findings(changes, "agent.schedule=adaptive")
-    assert "learning-rate-floor" not in findings(changes)
+    assert "learning-rate-range" in findings(changes, "agent.schedule=adaptive")
+    assert "learning-rate-range" not in findings(changes)
+
+
+@pytest.mark.parametrize(("rate", "named"), [(1e-7, True), (1e-5, False), (1e-2, False), (0.1, True)])
+def test_adaptive_learning_rate_that_begins_outside_its_range_is_found(rate, named):
+    found = findings(FAILING, f"agent.learning_rate={rate}")
+    assert ("learning-rate-range" in found) is named
+    assert "learning-rate-range" not in findings({**FAILING}, f"agent.learning_rate={rate}", *CONSTANT)
 
 
 def test_condition_that_blocks_success_is_named_with_its_value():
@@ -158,6 +168,26 @@ def test_rewards_that_lead_away_from_success_are_named(held, named):
     assert ("reward-without-success" in found) is named
     if named:
         assert "no more often than at the start: 'pole' in 3.0%" in found["reward-without-success"].message
+
+
+@pytest.mark.parametrize(("errors", "success", "named"), [(-20.0, 0.0, True), (-20.0, 0.1, False), (2.0, 0.0, False)])
+def test_rewards_that_are_lower_in_states_of_success_are_named(errors, success, named):
+    gap = {"Health/reward_gap": lambda i: 0.05 * errors, "Health/reward_gap_in_errors": lambda i: errors}
+    found = findings({**FAILING, **gap, "Train/success_rate": lambda i: success})
+    assert ("reward-against-success" in found) is named
+
+
+@pytest.mark.parametrize("weight", [1.0, -1.0])
+def test_gap_of_rewards_has_the_sign_of_the_weight(weight):
+    """The pole is upright in states of success, where the penalty of its angle is small."""
+    others = [f"rewards.{name}.weight=0" for name in ("alive", "terminating", "cart_vel", "pole_vel")]
+    env = make("cartpole", num_envs=256, overrides=[*others, f"rewards.pole_pos.weight={-weight}"])
+    env.reset(seed=3)
+    assert env.success_reward_gap() is None
+    for _ in range(20):
+        env.step(torch.zeros(256, 1))
+    gap, error = env.success_reward_gap()
+    assert gap * weight > 3.0 * error > 0.0
 
 
 def test_resumed_run_drops_a_finding_of_iterations_after_its_checkpoint(tmp_path, monkeypatch):
