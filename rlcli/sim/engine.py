@@ -14,7 +14,8 @@ from torch import Tensor
 
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DependencyError, Problem, pip_install
-from rlcli.machine import native_stderr_discarded, require_device
+from rlcli.machine.devices import require_device
+from rlcli.machine.native_stderr import native_stderr_discarded
 from rlcli.sim.divergence_report import HISTORY_MEMORY, Call, Divergence, StateHistory, StateLayout
 from rlcli.sim.env_selection import Field, Groups, Selection
 

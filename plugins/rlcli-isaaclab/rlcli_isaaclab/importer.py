@@ -14,7 +14,7 @@ from rlcli.config.dump import to_yaml
 from rlcli.config.load import check_all
 from rlcli.errors import ConfigError, Problem, UsageError
 from rlcli.formats import Imported
-from rlcli.machine import read_plain
+from rlcli.machine.plain_files import read_plain
 from rlcli.registry import folder_task, model_file
 from rlcli_isaaclab.config_class import to_dict
 from rlcli_isaaclab.convert import agent, task
