@@ -113,7 +113,7 @@ def open_trainer(agent: str, num_envs: int) -> dict[str, Any]:
     """Make a trainer of the cartpole with the common sizes."""
     from rlcli.config.load import resolve
     from rlcli.envs.make import make_env
-    from rlcli.machine import available_cores
+    from rlcli.machine.cores import available_cores
     from rlcli.registry import find_task, load_object
 
     close()

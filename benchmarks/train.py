@@ -25,7 +25,7 @@ from stable_baselines3.common.logger import Logger
 from rlcli.adapters.sb3 import Sb3VecEnv
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
-from rlcli.machine import available_cores
+from rlcli.machine.cores import available_cores
 from rlcli.registry import find_task
 from rlcli.rl.ppo.trainer import PpoTrainer
 from rlcli.rl.sb3.trainer import Sb3Trainer

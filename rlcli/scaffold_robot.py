@@ -9,23 +9,18 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rlcli.config.strict_yaml import load
 from rlcli.errors import TaskError, UsageError, listing
 from rlcli.scaffold_mjcf import SCALAR, Robot, round3
 from rlcli.scene.mjcf_scan import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf
 
-_AGENT = {
-    **{"trainer": "ppo", "algorithm": "ppo", "num_steps": 24, "num_epochs": 5, "num_minibatches": 4},
-    **{"learning_rate": 1.0e-3, "schedule": "adaptive_linear", "desired_kl": 0.01, "gamma": 0.99, "lam": 0.95},
-    **{"clip_range": 0.2, "entropy_coef": 0.005, "max_grad_norm": 1.0, "normalize_observations": True},
-    **{"init_std": 0.6, "action_bound": None},
-    **{part: {"hidden": [128, 64], "activation": "elu"} for part in ("actor", "critic")},
-}
+_TEMPLATES = Path(__file__).parent / "templates" / "robot_tasks"
 
 
 @dataclass(slots=True)
@@ -84,7 +79,7 @@ def read_robot(file: Path, name: str) -> RobotTask:
         "play": {"scene": {"num_envs": 16}},
         "agents": {
             "default": "ppo",
-            "ppo": {**_AGENT, "max_iterations": 1500 if kind == "velocity" else 300},
+            "ppo": _fill("agent", {"max_iterations": 1500 if kind == "velocity" else 300}),
         },
     }
     task = json.loads(json.dumps(task))  # without shared lists, which YAML would write as anchors
@@ -111,119 +106,52 @@ _SUMMARIES = {
 }
 
 
+def _fill(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the data of a YAML template in which each value `$key` is replaced by `values[key]`."""
+
+    def filled(node: Any) -> Any:
+        if isinstance(node, dict):
+            return {key: filled(item) for key, item in node.items()}
+        if isinstance(node, list):
+            return [filled(item) for item in node]
+        return values[node[1:]] if isinstance(node, str) and node.startswith("$") else node
+
+    data: dict[str, Any] = filled(load((_TEMPLATES / f"{name}.yaml").read_bytes()).data)
+    return data
+
+
 def _velocity(robot: Robot) -> dict[str, Any]:
-    joints, feet = [robot.name(j) for j in robot.driven], robot.feet()
     speed = round3(math.sqrt(robot.gravity * robot.com_height / 15.0))  # a slow walk for every size: Froude number 1/15
-    yaw_rate, period = round3(0.6 / robot.tempo), round3(10.0 * robot.tempo)
-    return {
-        "commands": {
-            "velocity": {
-                **{"func": "uniform_velocity", "resampling_time_s": [period, period], "lin_vel_x": [-speed, speed]},
-                "lin_vel_y": [round3(-0.5 * speed), round3(0.5 * speed)],
-                **{"ang_vel_z": [-yaw_rate, yaw_rate], "rel_standing": 0.05},
-            }
-        },
-        "actions": {"joint_position": {"func": "joint_position", "joints": joints, "scale": 0.25}},
-        "observations": {
-            "policy": {
-                "base_lin_vel": {"func": "base_lin_vel", "noise": {"kind": "uniform", "low": -0.1, "high": 0.1}},
-                "base_ang_vel": {"func": "base_ang_vel", "noise": {"kind": "uniform", "low": -0.2, "high": 0.2}},
-                "projected_gravity": {"func": "projected_gravity"},
-                "velocity_command": {"func": "generated_commands", "command": "velocity"},
-                **_joint_observations(joints),
-                "last_action": {"func": "last_action"},
-            }
-        },
-        "events": {
-            "friction": {
-                "func": "randomize_geom_friction",
-                "mode": "startup",
-                "axes": [0],
-                "range": [0.6, 1.2],
-                "operation": "scale",
-                "shared": True,
-            },
-            "root": {"func": "reset_root_state_uniform", "mode": "reset", "yaw": [-3.1415927, 3.1415927]},
-            "joints": {"func": "reset_joints_by_offset", "mode": "reset", "joints": joints, "position": [-0.1, 0.1]},
-        },
-        "rewards": {
-            "track_lin_vel": {
-                **{"func": "track_lin_vel_xy_exp", "weight": 1.5, "command": "velocity"},
-                "std": round3(0.5 * speed),  # a robot that stands still earns a third of this reward
-            },
-            "track_ang_vel": {
-                **{"func": "track_ang_vel_z_exp", "weight": 0.75, "command": "velocity"},
-                "std": round3(0.5 * yaw_rate),
-            },
-            "lin_vel_z": {"func": "lin_vel_z_l2", "weight": -2.0},
-            "ang_vel_xy": {"func": "ang_vel_xy_l2", "weight": -0.05},
-            "flat_orientation": {"func": "flat_orientation_l2", "weight": -2.5},
-            "pose": {"func": "joint_deviation_l1", "weight": -0.05, "joints": joints},
-            "joint_acc": {"func": "joint_acc_l2", "weight": -2.5e-7, "joints": joints},
-            "action_rate": {"func": "action_rate_l2", "weight": -0.01},
-            "feet_air_time": {
-                "func": "feet_air_time",
-                "weight": 0.5,
-                "sensor": "feet",
-                "command": "velocity",
-                "threshold": round3(0.2 * robot.tempo),
-            },
-            "fall": {"func": "is_terminated", "weight": -100.0},
-        },
-        "terminations": {
-            "time_out": {"func": "time_out", "time_out": True},
-            "trunk_contact": {"func": "illegal_contact", "sensor": "trunk", "threshold": 1.0},
-            "tilted": {"func": "bad_orientation", "limit_angle": 1.0},
-        },
-        "success": {
-            "velocity": {"func": "mean_velocity_error", "command": "velocity", "at_most": round3(0.42 * speed)},
-            "yaw_rate": {"func": "mean_yaw_rate_error", "command": "velocity", "at_most": round3(0.5 * yaw_rate)},
-        },
-        "_sensors": {
-            "feet": {"kind": "contact", "bodies": feet, "against": "ground"},
-            "trunk": {"kind": "contact", "bodies": robot.trunk(), "against": "ground"},
-        },
+    yaw_rate = round3(0.6 / robot.tempo)
+    values = {
+        "joints": [robot.name(j) for j in robot.driven],
+        "feet": robot.feet(),
+        "trunk": robot.trunk(),
+        "period": round3(10.0 * robot.tempo),
+        "speed": speed,
+        "minus_speed": -speed,
+        "half_speed": round3(0.5 * speed),
+        "minus_half_speed": round3(-0.5 * speed),
+        "yaw_rate": yaw_rate,
+        "minus_yaw_rate": -yaw_rate,
+        "half_yaw_rate": round3(0.5 * yaw_rate),
+        "air_time": round3(0.2 * robot.tempo),
+        "velocity_error": round3(0.42 * speed),
     }
+    return _fill("velocity", values)
 
 
 def _reach(robot: Robot) -> dict[str, Any]:
-    joints, hand, box = [robot.name(j) for j in robot.driven], robot.body_name(robot.last_body()), robot.workspace()
-    goal = {"bodies": hand, "command": "goal"}
-    return {
-        "commands": {
-            "goal": {
-                "func": "uniform_pose",
-                "bodies": hand,
-                "resampling_time_s": [round3(8.0 * robot.tempo)] * 2,
-                **dict(zip("xyz", box, strict=True)),
-            }
-        },
-        "actions": {"joint_position": {"func": "joint_position", "joints": joints, "scale": 0.5}},
-        "observations": {
-            "policy": {
-                **_joint_observations(joints),
-                "goal": {
-                    "func": "generated_commands",
-                    "command": "goal",
-                    "columns": [i for i in range(3) if box[i][0] < box[i][1]],
-                },
-                "last_action": {"func": "last_action"},
-            }
-        },
-        "events": {
-            "joints": {"func": "reset_joints_by_offset", "mode": "reset", "joints": joints, "position": [-0.2, 0.2]}
-        },
-        "rewards": {
-            "distance": {"func": "position_command_error", "weight": -2.0, **goal},
-            "near": {"func": "position_command_error_tanh", "weight": 1.0, **goal, "std": 0.1},
-            "action_rate": {"func": "action_rate_l2", "weight": -0.001},
-            "joint_vel": {"func": "joint_vel_l2", "weight": -0.001, "joints": joints},
-        },
-        "terminations": {"time_out": {"func": "time_out", "time_out": True}},
-        "success": {
-            "position": {"func": "body_goal_distance", **goal, "at_most": 0.05, "hold_s": round3(0.5 * robot.tempo)}
-        },
+    box = robot.workspace()
+    values = {
+        "joints": [robot.name(j) for j in robot.driven],
+        "hand": robot.body_name(robot.last_body()),
+        "period": round3(8.0 * robot.tempo),
+        **dict(zip("xyz", box, strict=True)),
+        "moving_axes": [i for i in range(3) if box[i][0] < box[i][1]],
+        "hold_s": round3(0.5 * robot.tempo),
     }
+    return _fill("reach", values)
 
 
 def _balance(robot: Robot) -> dict[str, Any]:

@@ -15,12 +15,14 @@ import typer
 from typer._click.exceptions import ClickException, NoArgsIsHelpError
 from typer._click.exceptions import UsageError as ClickUsageError
 
+from rlcli.cli.import_hooks import AddressSpaceCheck, MatplotlibFinder
 from rlcli.cli.ui.console import console, print_log_records, redirect_to_null
 from rlcli.cli.ui.help_text import HelpGroup
 from rlcli.cli.ui.options import CHOOSE, TYPER_ERRORS, BodyError, add_command
 from rlcli.config.user_settings import read_settings
 from rlcli.errors import INTERRUPTED, CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
-from rlcli.machine import AddressSpaceCheck, MatplotlibFinder, delay_garbage_collection, memory_error
+from rlcli.machine.garbage_collection import delay_garbage_collection
+from rlcli.machine.memory import memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.registry.plugin_imports import exit_refused
 from rlcli.registry.task_code_monitor import error_of_task, observe_task_code, raised_by_task

@@ -13,7 +13,7 @@ from typing import Any
 from rlcli.config import strict_yaml
 from rlcli.config.strict_yaml import Document, Path, YamlError
 from rlcli.errors import ConfigError, Problem
-from rlcli.machine import read_plain
+from rlcli.machine.plain_files import read_plain
 from rlcli.safe_text import shorten
 
 _KEY = re.compile(r'"([^"]+)"|([^.="\s]+)')

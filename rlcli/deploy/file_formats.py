@@ -15,7 +15,7 @@ from torch import Tensor
 from rlcli.deploy.deployed_policy import DeployedPolicy
 from rlcli.deploy.numpy_export import numpy_bytes, read_numpy
 from rlcli.errors import CheckpointError, DependencyError, pip_install
-from rlcli.machine import require_address_space
+from rlcli.machine.memory import require_address_space
 
 KEY = "rlcli"
 """Key of the metadata in a file: a property of the ONNX model, an extra file of the torch program."""

@@ -8,7 +8,7 @@ from rlcli.doctor.check import Check
 from rlcli.doctor.compute_and_graphics import check_isolated
 from rlcli.doctor.host_and_settings import machine_checks, settings_checks
 from rlcli.doctor.installation import entry_checks, installation_checks, metadata_checks
-from rlcli.machine import require_address_space
+from rlcli.machine.memory import require_address_space
 from rlcli.registry.entries import GROUPS
 from rlcli.registry.probe import TIMEOUT_S
 

@@ -13,7 +13,9 @@ from typing import Any
 from rlcli.doctor.check import Check
 from rlcli.doctor.installation import MUJOCO_PACKAGES, version
 from rlcli.errors import MachineError, pip_install
-from rlcli.machine import available_cores, has_gpu_driver, python_command
+from rlcli.machine.cores import available_cores
+from rlcli.machine.devices import has_gpu_driver
+from rlcli.machine.processes import python_command
 from rlcli.registry.plugin_imports import release_numbers
 from rlcli.registry.probe import signal_name
 from rlcli.sim.gl import candidates

@@ -9,7 +9,9 @@ from pathlib import Path
 from rlcli.config.user_settings import read_settings
 from rlcli.doctor.check import Check
 from rlcli.errors import ConfigError
-from rlcli.machine import available_cores, available_memory, core_quota, memory_limit
+from rlcli.machine.control_groups import core_quota
+from rlcli.machine.cores import available_cores
+from rlcli.machine.memory import available_memory, memory_limit
 from rlcli.registry import plugins_chosen_by, unknown_wanted
 from rlcli.settings import settings_file
 

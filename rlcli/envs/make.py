@@ -9,7 +9,7 @@ from rlcli.config.python_task import source_of
 from rlcli.config.schema import TaskConfig
 from rlcli.envs.shard_range import Shard
 from rlcli.envs.vec_env import VecEnv
-from rlcli.machine import restore_garbage_collection
+from rlcli.machine.garbage_collection import restore_garbage_collection
 from rlcli.progress import track
 from rlcli.registry import load_object
 

@@ -24,7 +24,7 @@ from rlcli.envs.saved_state import load_state, save_state
 from rlcli.envs.shard_range import Shard
 from rlcli.envs.step_result import Episodes, StepRecord, StepResult
 from rlcli.envs.workflow import Workflow
-from rlcli.machine import require_device
+from rlcli.machine.devices import require_device
 from rlcli.managers.term_binding import Binder
 from rlcli.sim.engine import Engine
 from rlcli.sim.env_selection import Field, Selection

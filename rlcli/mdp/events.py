@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rlcli.errors import listing
 from rlcli.mdp.parameter_types import Entity, ManagedEnv
-from rlcli.mdp.randomization_base import Pair, Ranges, element_names
+from rlcli.mdp.randomization_base import Pair, Ranges, element_names, require_supported
 from rlcli.mdp.term import BodyTerm, JointTerm, Term
-from rlcli.scene.names import NameProblem
 from rlcli.sim.env_selection import Selection
 from rlcli.sim.rotations import from_euler, multiply, random_quaternion
 from rlcli.sim.saved_tensors import TensorState
@@ -89,12 +87,11 @@ class ResetJointsWithinLimits(JointTerm):
     velocity: Range = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        finite = self.entity.data.joint_limits()[0][0].isfinite()[self.joints].tolist()
-        names = element_names(self.entity, "Joints", self.joints)
-        if not all(finite):
-            unlimited = [name for name, limited in zip(names, finite, strict=True) if not limited]
-            raise NameProblem(f"these joints have no limits: {listing(unlimited)}", "choose joints that have a range")
-        self._count = len(names)
+        finite = self.entity.data.joint_limits()[0][0].isfinite().tolist()
+        require_supported(
+            self.entity, "Joints", self.joints, finite, "without limits", "choose joints that have a range"
+        )
+        self._count = len(element_names(self.entity, "Joints", self.joints))
 
     def __call__(self, selection: Selection) -> None:
         """Draw the joint state of the selected environments."""

@@ -15,6 +15,7 @@ from typing import Any, NoReturn, TypeVar
 
 from rlcli.errors import DependencyError, RlcliError, TaskError, pip_install
 from rlcli.formats import FormatSpec
+from rlcli.machine.native_output import descriptor_redirected
 from rlcli.progress import track
 from rlcli.registry.entries import Entry
 from rlcli.task import API_VERSION, TaskSpec
@@ -143,7 +144,10 @@ def contain_side_effects() -> Iterator[None]:
     """
     folder = _current_folder()
     settings = _torch_settings() or _TORCH_DEFAULTS
-    with contextlib.redirect_stdout(sys.stderr), _descriptor_to_stderr():
+    with contextlib.suppress(OSError, ValueError):  # stdout is closed
+        if sys.__stdout__ is not None:
+            sys.__stdout__.flush()
+    with contextlib.redirect_stdout(sys.stderr), descriptor_redirected(1, 2):
         try:
             yield
         finally:
@@ -206,21 +210,3 @@ def _current_folder() -> str | None:
         return os.getcwd()
     except OSError:  # the folder was removed
         return None
-
-
-@contextlib.contextmanager
-def _descriptor_to_stderr() -> Iterator[None]:
-    """Redirect file descriptor 1 to stderr, for C code that writes to it directly."""
-    try:
-        if sys.__stdout__ is not None:
-            sys.__stdout__.flush()
-        kept = os.dup(1)
-        os.dup2(2, 1)
-    except (OSError, ValueError):  # stdout or stderr is closed
-        yield
-        return
-    try:
-        yield
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)

@@ -21,7 +21,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rlcli.machine import address_space, available_cores, python_command, require_address_space
+from rlcli.machine.cores import available_cores
+from rlcli.machine.memory import address_space, require_address_space
+from rlcli.machine.processes import python_command
 from rlcli.progress import Work, track
 from rlcli.registry import OWN, TASKS, Entry, package_folder
 

@@ -15,7 +15,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
 from rlcli.errors import INTERRUPTED, STOPPED, MachineError
-from rlcli.machine import launcher_number, python_command
+from rlcli.machine.processes import launcher_number, python_command
 from rlcli.progress import track
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rlcli.machine import has_onednn, processor
+from rlcli.machine.processor import has_onednn, processor
 
 _aten = torch.ops.aten
 _AVX512 = torch.backends.cpu.get_cpu_capability() == "AVX512"

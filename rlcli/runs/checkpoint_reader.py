@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from rlcli.errors import CheckpointError
-from rlcli.machine import available_memory
+from rlcli.machine.memory import available_memory
 from rlcli.rl.policy import Policy, blank_policy, filled, size_of
 from rlcli.rl.trainer import Rows, TrainerState
 from rlcli.runs.safe_io import JSON_LIMIT, Count, FileModel, check_json, manifest_error, parse_json, read_file

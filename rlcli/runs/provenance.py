@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import rlcli
 from rlcli.errors import TaskError
-from rlcli.machine import has_onednn, processor
+from rlcli.machine.processor import has_onednn, processor
 from rlcli.registry import TRAINERS, find_entry, is_framework, model_file, package_folder
 
 if TYPE_CHECKING:

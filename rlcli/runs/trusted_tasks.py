@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import MachineError
-from rlcli.machine import read_plain
+from rlcli.machine.plain_files import read_plain
 from rlcli.registry import TaskSource, find_task, python_place
 from rlcli.runs.atomic_io import write_atomic
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from rlcli.errors import CheckpointError, one_line
-from rlcli.machine import available_memory
+from rlcli.machine.memory import available_memory
 from rlcli.runs.safe_io import read_file
 
 _MAX_BYTES = 4 * 2**30

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from rlcli.machine import read_plain
+from rlcli.machine.plain_files import read_plain
 from rlcli.safe_text import shorten
 from rlcli.scene.mjcf_cost import ENDLESS, ModelCost, element_cost, mjcf_number, number_of, stored_arrays
 

@@ -11,7 +11,7 @@ import mujoco
 
 from rlcli.config.schema import EntityConfig, SceneConfig, SimConfig, TerrainConfig
 from rlcli.errors import ConfigError, Problem, one_line
-from rlcli.machine import memory_error
+from rlcli.machine.memory import memory_error
 from rlcli.scene.avoid_sparse_newton import avoid_sparse_newton
 from rlcli.scene.entity_spec import checked_models, entity_spec, frame_of_start_pose, name_all, write_masses
 from rlcli.scene.ground_and_lights import add_ground_plane, add_lights, add_materials

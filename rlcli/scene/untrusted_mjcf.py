@@ -21,7 +21,8 @@ import mujoco
 import numpy as np
 
 from rlcli.errors import listing, one_line
-from rlcli.machine import memory_error, python_command
+from rlcli.machine.memory import memory_error
+from rlcli.machine.processes import python_command
 from rlcli.registry import chosen_model, model_file
 from rlcli.safe_text import shorten
 from rlcli.scene.mjcf_cost import ModelCost

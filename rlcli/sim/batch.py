@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rlcli.config.schema import SimConfig
 from rlcli.errors import did_you_mean
-from rlcli.machine import available_cores
+from rlcli.machine.cores import available_cores
 from rlcli.sim import divergence_report as report
 from rlcli.sim.acceleration_fields import ACCELERATION_FIELDS, force_sensor_columns
 from rlcli.sim.batch_world_state import BatchWorlds, engine_call

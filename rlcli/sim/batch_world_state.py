@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rlcli.errors import DivergedError, did_you_mean, listing, one_line
-from rlcli.machine import require_memory
+from rlcli.machine.memory import require_memory
 from rlcli.sim.divergence_report import HISTORY_MEMORY, MORE_MEMORY, Call, StateHistory, StateLayout
 from rlcli.sim.env_selection import Selection, ids_of
 from rlcli.sim.mujoco_private import (

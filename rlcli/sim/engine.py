@@ -14,7 +14,8 @@ from torch import Tensor
 
 from rlcli.config.schema import SimConfig
 from rlcli.errors import ConfigError, DependencyError, Problem, pip_install
-from rlcli.machine import native_stderr_discarded, require_device
+from rlcli.machine.devices import require_device
+from rlcli.machine.native_output import descriptor_redirected
 from rlcli.sim.divergence_report import HISTORY_MEMORY, Call, Divergence, StateHistory, StateLayout
 from rlcli.sim.env_selection import Field, Groups, Selection
 
@@ -234,7 +235,7 @@ def open_engine(model: mujoco.MjModel, num_envs: int, config: SimConfig, *, devi
         return open_cpu_engine(model, num_envs, config)
     require_device(device)
     try:
-        with native_stderr_discarded() if device == "cpu" else contextlib.nullcontext():
+        with descriptor_redirected(2) if device == "cpu" else contextlib.nullcontext():
             from rlcli.sim.warp import WarpEngine  # without a GPU, Warp's libraries warn that there is no driver
     except ImportError as error:
         raise DependencyError(f"the GPU engine needs mujoco-warp: {error}", hint=pip_install("rlcli[gpu]")) from None

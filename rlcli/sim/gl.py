@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import MachineError, one_line
-from rlcli.machine import require_address_space
+from rlcli.machine.memory import require_address_space
 
 _PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6", "glfw": "a running display server"}
 _ADDRESS_SPACE = 2 << 30

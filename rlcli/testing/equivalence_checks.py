@@ -24,7 +24,7 @@ from rlcli.envs.make import make_env
 from rlcli.envs.managed import ManagedEnv
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, DeviceError, RlcliError, pip_install
-from rlcli.machine import read_plain
+from rlcli.machine.plain_files import read_plain
 from rlcli.rl.rng import rng_state
 from rlcli.runs.policy_bundle import open_bundle
 from rlcli.runs.restore import require_fit

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Literal
 
 from rlcli.errors import error_with_type
-from rlcli.machine import memory_error
+from rlcli.machine.memory import memory_error
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from rlcli.config.load import Resolved
 from rlcli.deploy.env_description import describe
 from rlcli.envs.make import make_env
 from rlcli.errors import CheckpointError, one_line
-from rlcli.machine import available_memory
+from rlcli.machine.memory import available_memory
 from rlcli.rl.optimizers import below
 from rlcli.rl.policy import blank_policy, filled
 from rlcli.rl.trainer import TrainerState

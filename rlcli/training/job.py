@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlcli.machine import available_cores
+from rlcli.machine.cores import available_cores
 from rlcli.runs.run import Run
 
 if TYPE_CHECKING:

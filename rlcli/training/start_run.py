@@ -14,7 +14,7 @@ from rlcli.config.load import Resolved, resolve
 from rlcli.envs.sharding.worker_count import number_of_workers
 from rlcli.envs.sharding.worker_pool import close_early, start_early
 from rlcli.errors import CheckpointError, DeviceError, UsageError
-from rlcli.machine import choose_device
+from rlcli.machine.devices import choose_device
 from rlcli.rl import distributed
 from rlcli.runs.provenance import environment_record, file_digest
 from rlcli.runs.run import RECORD, WAITING, Run, create_run, initialize_run, open_run, require_own

@@ -17,7 +17,7 @@ from typing import Any
 
 from rlcli.envs.sharding.worker_count import ONE_WORKER
 from rlcli.errors import STOPPED, RlcliError
-from rlcli.machine import python_command
+from rlcli.machine.processes import python_command
 from rlcli.training.signals import StopRequest
 
 _log = logging.getLogger(__name__)

@@ -23,7 +23,8 @@ from rlcli.config.load import Resolved
 from rlcli.envs.sharding.training_env import make_training_env
 from rlcli.envs.sharding.worker_count import number_of_workers
 from rlcli.errors import ConfigError
-from rlcli.machine import available_cores, available_memory, resident_memory
+from rlcli.machine.cores import available_cores
+from rlcli.machine.memory import available_memory, resident_memory
 from rlcli.rl.trainer import Trainer
 from rlcli.training.job import threads
 from rlcli.training.setup import make_trainer

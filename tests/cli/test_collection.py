@@ -8,14 +8,14 @@ from rlcli.cli.app import main
 
 PROBE = """
 import gc, sys
-from rlcli import machine
+from rlcli.machine import garbage_collection
 usual = gc.get_threshold()
-as_usual, seen = machine.restore_garbage_collection, []
+as_usual, seen = garbage_collection.restore_garbage_collection, []
 def record_thresholds():
     seen.append(gc.get_threshold())
     as_usual()
     seen.append(gc.get_threshold())
-machine.restore_garbage_collection = record_thresholds
+garbage_collection.restore_garbage_collection = record_thresholds
 from rlcli.cli.app import main
 code = main()
 assert code == 0, code

@@ -5,7 +5,8 @@ import json
 import pytest
 from support.broken_plugins import BROKEN, FILES, SPEC
 
-from rlcli.machine import available_cores, core_quota
+from rlcli.machine.control_groups import core_quota
+from rlcli.machine.cores import available_cores
 
 
 def checks(done):

@@ -16,7 +16,7 @@ from rlcli.doctor.compute_and_graphics import (
 from rlcli.doctor.host_and_settings import harmful_variables, machine_checks, memory_check, settings_checks
 from rlcli.doctor.installation import installation_checks, violates_bounds
 from rlcli.errors import pip_install
-from rlcli.machine import memory_limit
+from rlcli.machine.memory import memory_limit
 from rlcli.settings import settings_file
 
 

@@ -87,7 +87,7 @@ def test_every_child_process_is_started_by_one_function():
     for file in Path(rlcli.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.List) and any("sys.executable" in ast.unparse(item) for item in node.elts):
-                assert file.name == "machine.py", f"{file}:{node.lineno}: use machine.python_command"
+                assert file.name == "processes.py", f"{file}:{node.lineno}: use rlcli.machine.processes.python_command"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of address space")

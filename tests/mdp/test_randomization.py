@@ -533,7 +533,7 @@ BAD = [
     ({"func": "randomize_pd_gains", "stiffness": U}, "joints without an actuator model: "),
     ({"func": "randomize_effort_limit", "actuators": "spin", "range": U}, "actuators without an effort limit: spin"),
     ({"func": "randomize_pair_friction", "pairs": "none", "range": U}, "no pair matches 'none'"),
-    ({"func": "reset_joints_within_limits", "joints": ["slide"]}, "these joints have no limits: slide"),
+    ({"func": "reset_joints_within_limits", "joints": ["slide"]}, "joints without limits: slide"),
 ]
 
 

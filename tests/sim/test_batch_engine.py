@@ -46,7 +46,7 @@ def scatter(engine, seed=0):
 
 
 def test_engine_refuses_more_worlds_than_memory_holds(monkeypatch):
-    monkeypatch.setattr("rlcli.machine.available_memory", lambda: 2**30)
+    monkeypatch.setattr("rlcli.machine.memory.available_memory", lambda: 2**30)
     with pytest.raises(DeviceError, match=r"^1000000 environments need at least \d\.\d GiB, 1\.0 GiB are") as no:
         engine_of(model_of(), 1_000_000)
     assert no.value.hint == "use fewer environments: --num-envs"
@@ -54,7 +54,7 @@ def test_engine_refuses_more_worlds_than_memory_holds(monkeypatch):
 
 
 def test_engine_states_the_memory_of_many_worlds_before_it_builds_them(monkeypatch, caplog):
-    monkeypatch.setattr("rlcli.machine.available_memory", lambda: 2**24)
+    monkeypatch.setattr("rlcli.machine.memory.available_memory", lambda: 2**24)
     monkeypatch.setattr("rlcli.sim.batch_world_state.make_batch", None)
     with pytest.raises(TypeError):  # nothing is built
         engine_of(model_of(), 3000)

@@ -18,7 +18,7 @@ import torch
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.envs.vec_env import VecEnv
-from rlcli.machine import processor
+from rlcli.machine.processor import processor
 from rlcli.registry import find_task
 
 FILE = Path(__file__).with_name("golden_trajectories.json")

@@ -12,7 +12,7 @@ import yaml
 from rlcli.config.strict_yaml import MAX_BYTES
 from rlcli.errors import ConfigError, Problem
 from rlcli.formats import Note, Status
-from rlcli.machine import read_plain
+from rlcli.machine.plain_files import read_plain
 from rlcli.rl.ppo.rl_games_file import WITHOUT_EFFECT, RlGamesReader
 from rlcli_isaaclab.settings import Node, Report
 

@@ -14,7 +14,7 @@ from rlcli.config.dump import to_yaml
 from rlcli.config.load import check_all
 from rlcli.errors import ConfigError, Problem, UsageError
 from rlcli.formats import Imported, Note
-from rlcli.machine import read_plain
+from rlcli.machine.plain_files import read_plain
 from rlcli.registry import folder_task, model_file
 from rlcli_isaaclab.config_class import to_dict
 from rlcli_isaaclab.convert import agent, task
@@ -182,7 +182,8 @@ def _agent(file: Path, report: Report, data_of_task: Mapping[str, Any]) -> dict[
     if data.get("obs_groups"):
         notes: list[Note] = []
         fit_groups(data["obs_groups"], settings, data_of_task.get("observations", {}), notes)
-        report.entries |= {("obs_groups",): (note.status, note.text) for note in notes}
+        if notes:
+            report.entries[("obs_groups",)] = (notes[0].status, "; ".join(note.text for note in notes))
     return settings
 
 

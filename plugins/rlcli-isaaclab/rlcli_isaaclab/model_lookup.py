@@ -12,7 +12,7 @@ import yaml
 
 from rlcli.config.strict_yaml import MAX_BYTES
 from rlcli.errors import TaskError
-from rlcli.machine import read_plain
+from rlcli.machine.plain_files import read_plain
 from rlcli.registry.models import MODELS
 
 MODEL_MAP = "models.yaml"

@@ -55,7 +55,7 @@ def command(
     """
     from rlcli.config.layers import flags
     from rlcli.config.load import resolve
-    from rlcli.machine import limit_openmp_spinning
+    from rlcli.machine.processes import limit_openmp_spinning
     from rlcli.runs.trusted_tasks import named_task
 
     limit_openmp_spinning()
@@ -181,7 +181,10 @@ def _preset_file(name: str, overwrite: bool) -> Path:
 def _machine(resolved: Resolved) -> dict[str, Any]:
     """Return the machine's processor, cores, memory, load and versions, as JSON data; warn if the machine is busy."""
     import rlcli
-    from rlcli.machine import available_cores, available_memory, core_quota, processor
+    from rlcli.machine.control_groups import core_quota
+    from rlcli.machine.cores import available_cores
+    from rlcli.machine.memory import available_memory
+    from rlcli.machine.processor import processor
     from rlcli.runs.provenance import versions
     from rlcli.tuning.bench import load
 

@@ -40,7 +40,7 @@ def command(
             Compare five iterations, even if software or machine have changed.
     """
     from rlcli.cli.ui.difference_table import report_differences
-    from rlcli.machine import limit_openmp_spinning
+    from rlcli.machine.processes import limit_openmp_spinning
     from rlcli.runs.run_ref import default_runs_dir, find_run
 
     limit_openmp_spinning()  # as `rlcli train` does
@@ -69,7 +69,7 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
         The new run, its environment steps, and the changes of software and machine.
     """
     from rlcli.cli.ui.progress_view import TrainingView
-    from rlcli.machine import available_cores
+    from rlcli.machine.cores import available_cores
     from rlcli.runs.provenance import built_record, environment_record
     from rlcli.runs.reproduction import changed_entries, create_reproduction, milestones
     from rlcli.runs.restore import resolve_run

@@ -70,7 +70,7 @@ def command(
             Resume the newest run until iteration 500.
     """
     from rlcli.config.layers import flags
-    from rlcli.machine import limit_openmp_spinning
+    from rlcli.machine.processes import limit_openmp_spinning
     from rlcli.rl import distributed
     from rlcli.runs.run_ref import default_runs_dir
     from rlcli.training.signals import StopRequest

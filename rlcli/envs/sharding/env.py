@@ -37,7 +37,7 @@ from rlcli.envs.sharding.worker_pool import Worker, take_workers
 from rlcli.envs.step_result import Episodes, StepRecord, StepResult
 from rlcli.envs.vec_env import VecEnv
 from rlcli.errors import ConfigError, one_line
-from rlcli.machine import available_cores
+from rlcli.machine.cores import available_cores
 from rlcli.registry.task_imports import imported_files
 from rlcli.sim.divergence_report import MAX_DESCRIBED
 from rlcli.sim.saved_tensors import mean_of, means

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
 from rlcli.errors import RlcliError, TaskError
-from rlcli.machine import memory_error
+from rlcli.machine.memory import memory_error
 from rlcli.registry.task_code_monitor import error_of_task, observe_task_code
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ import os
 from rlcli.config.load import Resolved
 from rlcli.config.schema import CameraSensorConfig
 from rlcli.errors import ConfigError
-from rlcli.machine import available_cores, available_memory
+from rlcli.machine.cores import available_cores
+from rlcli.machine.memory import available_memory
 
 ENVS_PER_WORKER = 512
 """Fewest environments per process that `auto` allows: with fewer, the fixed cost of a process outweighs its gain."""

@@ -20,7 +20,8 @@ from rlcli.envs.sharding import worker
 from rlcli.envs.sharding.channel import SPIN_S, Channel, ChannelClosedError
 from rlcli.envs.sharding.worker import Job
 from rlcli.errors import MachineError
-from rlcli.machine import python_command, require_address_space
+from rlcli.machine.memory import require_address_space
+from rlcli.machine.processes import python_command
 from rlcli.registry.task_code_monitor import warn_once
 
 _CODE = (

@@ -7,19 +7,17 @@ from typing import Any, Literal
 
 import mujoco
 
-from rlcli.errors import listing
 from rlcli.mdp.randomization_base import (
     SMALLEST,
     AxisRandomization,
     FieldRandomization,
     OrientationRandomization,
     Randomization,
-    element_names,
+    require_supported,
     unset_simple,
 )
 from rlcli.mdp.term import BodyTerm
 from rlcli.scene.model_fields import ModelField
-from rlcli.scene.names import NameProblem
 from rlcli.sim.env_selection import Selection
 
 
@@ -34,13 +32,10 @@ class RandomizeBodyMass(Randomization, BodyTerm):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        is_massless = (self.target.original[:, 0] == 0).tolist()
-        if self.with_inertia and any(is_massless):
-            bodies = element_names(self.entity, "Bodies", self.bodies)
-            names = [name for name, massless in zip(bodies, is_massless, strict=True) if massless]
-            raise NameProblem(
-                f"these bodies have no mass: {listing(names)}", "choose others, or set with_inertia: false"
-            )
+        if self.with_inertia:
+            has_mass = (self.entity.engine.model.body_mass[self.entity.body_ids] > 0).tolist()
+            hint = "choose others, or set with_inertia: false"
+            require_supported(self.entity, "Bodies", self.bodies, has_mass, "without mass", hint)
         self._inertia = ModelField(self.entity, "body_inertia", self.bodies) if self.with_inertia else None
 
     def __call__(self, selection: Selection) -> None:

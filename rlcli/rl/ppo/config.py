@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from rlcli.config.schema import AgentConfig, Count, NotNegative, Positive, StrictModel, Width, Widths
+from rlcli.config.strict_yaml import load
 from rlcli.trainers import TrainerSpec
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -218,44 +220,7 @@ class PpoConfig(AgentConfig):
         return self
 
 
-DIALECTS: Mapping[str, Mapping[str, Any]] = {
-    "rsl_rl": {
-        "num_steps": 24,
-        "bootstrap": "pre_step",
-        "shuffle": "update",
-        "entropy_coef": 0.01,
-        "clip_grad": "separate",
-        "schedule": "adaptive",
-        "desired_kl": 0.01,
-        "std": "scalar",
-        "actor": {"hidden": [256, 256, 256], "activation": "elu"},
-        "critic": {"hidden": [256, 256, 256], "activation": "elu"},
-    },
-    "rl_games": {
-        "bootstrap": "pre_step",
-        "shuffle": "none",
-        "value_coef": 2.0,
-        "bounds_coef": 1e-4,
-        "learning_rate": 3e-4,
-        "schedule": "adaptive",
-        "desired_kl": 0.008,
-        "kl_from": "last_pass",
-        "learning_rate_range": [1e-6, 1e-2],
-        "init": "zero_bias",
-    },
-    "sb3": {
-        "num_epochs": 10,
-        "clip_value": None,
-        "value_coef": 0.5,
-        "normalize_advantage": "minibatch",
-        "max_grad_norm": 0.5,
-        "learning_rate": 3e-4,
-        "adam_eps": 1e-5,
-        "init": "orthogonal",
-        "actor": {"activation": "tanh"},
-        "critic": {"activation": "tanh"},
-    },
-}
+DIALECTS: Mapping[str, Mapping[str, Any]] = load(Path(__file__).with_name("dialects.yaml").read_bytes()).data
 """Dialect -> its defaults where they differ from those of `PpoConfig`."""
 
 SPEC = TrainerSpec(

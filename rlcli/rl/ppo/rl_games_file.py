@@ -6,10 +6,11 @@
 from __future__ import annotations
 
 import math
+import pathlib
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from rlcli.config.strict_yaml import Path
+from rlcli.config.strict_yaml import Path, load
 from rlcli.errors import did_you_mean, listing
 from rlcli.formats import Status
 
@@ -27,42 +28,9 @@ class Sink(Protocol):
         """Record a mistake."""
 
 
-_DIRECT = {
-    "gamma": "gamma",
-    "tau": "lam",
-    "learning_rate": "learning_rate",
-    "horizon_length": "num_steps",
-    "minibatch_size": "minibatch_size",
-    "mini_epochs": "num_epochs",
-    "e_clip": "clip_range",
-    "entropy_coef": "entropy_coef",
-    "bounds_loss_coef": "bounds_coef",
-    "normalize_input": "normalize_observations",
-    "normalize_value": "normalize_value",
-    "max_epochs": "max_iterations",
-    "save_frequency": "save_interval",
-}
-WITHOUT_EFFECT = {
-    "name": "the task names the run",
-    "full_experiment_name": "use --name",
-    "env_name": "rlcli has one environment loop",
-    "device": "use --device",
-    "device_name": "use --device",
-    "multi_gpu": "use --gpus",
-    "ppo": "",
-    "mixed_precision": "updates use float32",
-    "num_actors": "use scene.num_envs",
-    "score_to_win": "training runs until its budget is used",
-    "save_best_after": "the best checkpoint is always kept",
-    "print_stats": "",
-    "player": "use `rlcli play`",
-    "seq_length": "sequences are always whole rollouts",
-    "games_to_track": "",
-    "max_frames": "",
-    "minibatch_size_per_env": "",
-    "use_diagnostics": "",
-    "seq_len": "sequences are always whole rollouts",
-}
+_KEYS = load(pathlib.Path(__file__).with_name("rl_games_keys.yaml").read_bytes()).data
+_DIRECT: dict[str, str] = _KEYS["settings"]
+WITHOUT_EFFECT: dict[str, str] = _KEYS["without_effect"]
 """Key of `params.config` that changes nothing in rlcli -> reason."""
 _KL_GRAINS = {"legacy": "minibatch", "standard": "epoch", "standard_epoch": "iteration"}
 _SCHEDULES = {

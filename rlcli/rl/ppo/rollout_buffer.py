@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from rlcli.machine import require_memory
+from rlcli.machine.memory import require_memory
 from rlcli.sim.state_cache import is_finite
 
 

@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, RolloutBufferSamples
 from torch import Tensor
 
-from rlcli.machine import require_memory
+from rlcli.machine.memory import require_memory
 from rlcli.rl.policy import Normalizer
 from rlcli.rl.trainer import Rows
 from rlcli.sim.saved_tensors import require_matching_tensors

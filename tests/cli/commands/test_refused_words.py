@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from rlcli import machine
 from rlcli.errors import ConfigError
-from rlcli.machine import read_plain
+from rlcli.machine import plain_files
+from rlcli.machine.plain_files import read_plain
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -85,7 +85,7 @@ def test_task_that_is_a_pipe_is_named_as_such(cli):
 
 
 def test_config_file_is_read_up_to_its_limit(cli, monkeypatch):
-    monkeypatch.setattr(machine, "_PIPE_S", 0.1)
+    monkeypatch.setattr(plain_files, "_PIPE_S", 0.1)
     with open("sparse.yaml", "wb") as file:
         file.truncate(3 * 2**30)
     assert "larger than 262144 bytes" in cli("show", "cartpole", "--config", "sparse.yaml").err

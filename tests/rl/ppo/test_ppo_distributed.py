@@ -16,7 +16,7 @@ from support import worlds
 from rlcli.config.load import resolve
 from rlcli.envs.make import make_env
 from rlcli.errors import UsageError
-from rlcli.machine import available_cores
+from rlcli.machine.cores import available_cores
 from rlcli.registry import find_task
 from rlcli.rl.distributed import _exit_code, is_rank_zero, local_rank_and_size
 from rlcli.rl.ppo.trainer import PpoTrainer

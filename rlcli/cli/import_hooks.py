@@ -1,0 +1,45 @@
+"""Import hooks of the command line: checks and settings for large libraries."""
+
+import contextlib
+from collections.abc import Sequence
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+from types import ModuleType
+
+from rlcli.machine.memory import require_address_space
+
+
+class AddressSpaceCheck:
+    """Import hook that calls `require_address_space` before a large library is imported."""
+
+    @staticmethod
+    def find_spec(name: str, *_: object) -> None:
+        """Check the limit for a large library, and return None: the next finder of `sys.meta_path` finds the module.
+
+        Raises:
+            MachineError: if the limit is too low for this library.
+        """
+        if name in ("numpy", "mujoco", "torch"):
+            require_address_space()
+
+
+class MatplotlibFinder:
+    """Import hook that imports matplotlib with its own folder as the current folder.
+
+    matplotlib reads a file `matplotlibrc` of the current folder, which may be a pipe or belong to someone else.
+    """
+
+    @staticmethod
+    def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
+        """Return the specification of matplotlib; None for other modules."""
+        spec = PathFinder.find_spec(name, path, target) if name == "matplotlib" else None
+        if spec is None or spec.loader is None or spec.origin is None:
+            return None
+        execute, folder = spec.loader.exec_module, Path(spec.origin).parent / "mpl-data"
+
+        def execute_in_folder(module: ModuleType) -> None:
+            with contextlib.chdir(folder):
+                execute(module)
+
+        spec.loader.exec_module = execute_in_folder  # type: ignore[method-assign]
+        return spec
