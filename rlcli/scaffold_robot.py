@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -155,7 +155,7 @@ def _reach(robot: Robot) -> dict[str, Any]:
 
 
 def _balance(robot: Robot) -> dict[str, Any]:
-    driven, moving = [robot.name(j) for j in robot.driven], sorted([*robot.driven, *robot.passive])
+    moving = sorted([*robot.driven, *robot.passive])
     posed = [j for j in moving if not robot.is_wheel(j)]
     if not posed and not robot.free:
         posed = moving  # a wheel on a fixed axis: there is nothing else to hold
@@ -164,45 +164,25 @@ def _balance(robot: Robot) -> dict[str, Any]:
     held: dict[float, list[str]] = {}
     for joint in hinges:
         held.setdefault(round(float(robot.data.qpos[robot.model.jnt_qposadr[joint]]), 4), []).append(robot.name(joint))
-    joints, wheels = [robot.name(j) for j in posed], [robot.name(j) for j in moving if j not in posed]
-    scale = {robot.name(j): round3(abs(robot.max_effort(j))) for j in robot.driven}
-    success, ends = _balance_conditions(robot, held)
-    rewards: dict[str, Any] = {"alive": {"func": "is_alive", "weight": 1.0}}
-    if robot.free:
-        rewards["upright"] = {"func": "flat_orientation_l2", "weight": -2.0}
-    if hinges:
-        rewards["pose"] = {"func": "joint_deviation_l1", "weight": -0.5, "joints": [robot.name(j) for j in hinges]}
-        rewards["speed"] = {"func": "joint_vel_l2", "weight": -0.005, "joints": joints}
-    if wheels:  # a wheel must turn to balance the robot: its angle is free, and its speed costs little
-        rewards["wheel_speed"] = {"func": "joint_vel_l2", "weight": -2.0e-4, "joints": wheels}
-    return {
-        "actions": {"effort": {"func": "joint_effort", "joints": driven, "scale": scale}},
-        "observations": {"policy": _balance_observations(robot.free, joints, wheels)},
-        "events": {
-            **({"root": {"func": "reset_root_state_uniform", "mode": "reset", **_TILT}} if robot.free else {}),
-            "joints": {
-                "func": "reset_joints_by_offset",
-                "mode": "reset",
-                "joints": [robot.name(j) for j in moving],
-                "position": [-0.1, 0.1],
-                "velocity": [-0.1, 0.1],
-            },
-        },
-        "rewards": {
-            **rewards,
-            "effort": {"func": "action_l2", "weight": -0.005},
-            "fall": {"func": "is_terminated", "weight": -2.0},
-        },
-        "terminations": {
-            "time_out": {"func": "time_out", "time_out": True},
-            **ends,
-        },
-        "success": success,
+    values = {
+        "driven": [robot.name(j) for j in robot.driven],
+        "scale": {robot.name(j): round3(abs(robot.max_effort(j))) for j in robot.driven},
+        "moving": [robot.name(j) for j in moving],
+        "joints": [robot.name(j) for j in posed],
+        "hinges": [robot.name(j) for j in hinges],
+        "wheels": [robot.name(j) for j in moving if j not in posed],
     }
-
-
-_TILT = {"roll": [-0.05, 0.05], "pitch": [-0.05, 0.05]}
-"""Initial tilt of a floating base [rad]."""
+    task = _fill("balance", values)
+    observations, rewards = task["observations"]["policy"], task["rewards"]
+    if not robot.free:
+        del task["events"]["root"], rewards["upright"]
+        del observations["base_lin_vel"], observations["base_ang_vel"], observations["projected_gravity"]
+    for terms in (observations, rewards):
+        for name in [name for name, term in terms.items() if term.get("joints") == []]:
+            del terms[name]
+    task["success"], ends = _balance_conditions(robot, held)
+    task["terminations"] |= ends
+    return task
 
 
 def _balance_conditions(robot: Robot, held: dict[float, list[str]]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -218,17 +198,3 @@ def _balance_conditions(robot: Robot, held: dict[float, list[str]]) -> tuple[dic
         bounds = [target - 1.0, target + 1.0]
         ends[f"{name}_lost"] = {"func": "joint_pos_out_of_manual_limit", "joints": joints, "bounds": bounds}
     return success, ends
-
-
-def _balance_observations(free: bool, joints: Sequence[str], wheels: Sequence[str]) -> dict[str, Any]:
-    base = {name: {"func": name} for name in ("base_lin_vel", "base_ang_vel", "projected_gravity") if free}
-    turning = {"wheel_vel": {"func": "joint_vel_rel", "joints": list(wheels), "scale": 0.1}} if wheels else {}
-    return {**base, **(_joint_observations(joints) if joints else {}), **turning}
-
-
-def _joint_observations(joints: Sequence[str]) -> dict[str, Any]:
-    noise = {"kind": "uniform", "low": -0.01, "high": 0.01}
-    return {
-        "joint_pos": {"func": "joint_pos_rel", "joints": list(joints), "noise": noise},
-        "joint_vel": {"func": "joint_vel_rel", "joints": list(joints), "scale": 0.1},
-    }
