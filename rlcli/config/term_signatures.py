@@ -12,6 +12,7 @@ import inspect
 import re
 import textwrap
 import warnings
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Self, Union
@@ -412,3 +413,26 @@ def term_entries(data: dict[str, Any]) -> list[tuple[str, KeyPath, dict[str, Any
         else:
             found += [(section, (section, n), t) for n, t in content.items() if isinstance(t, dict)]
     return found
+
+
+def with_terms(
+    task: schema.TaskConfig, terms: Mapping[KeyPath, schema.TermConfig | None], params: dict[str, Any] | None
+) -> schema.TaskConfig:
+    """Return the task with its terms (path -> validated term) and parameters. Terms that are None are removed."""
+    update: dict[str, Any] = {} if params is None else {"params": params}
+    for section in SECTIONS:
+        if section == "observations":
+            update[section] = {
+                name: group.model_copy(update=_kept_terms(terms, (section, name), group.terms), deep=False)
+                for name, group in task.observations.items()
+            }
+        else:
+            update[section] = _kept_terms(terms, (section,), getattr(task, section))
+    return task.model_copy(update=update)
+
+
+def _kept_terms(
+    terms: Mapping[KeyPath, schema.TermConfig | None], at: KeyPath, names: Iterable[str]
+) -> dict[str, schema.TermConfig]:
+    found = {name: terms.get((*at, name)) for name in names}
+    return {name: term for name, term in found.items() if term is not None}

@@ -23,6 +23,7 @@ from rlcli.config.term_signatures import (
     params_model,
     read_params,
     term_entries,
+    with_terms,
 )
 from rlcli.errors import ConfigError, DependencyError, Problem, TaskError, did_you_mean, listing, pip_install
 from rlcli.formats import Note
@@ -317,7 +318,7 @@ class TaskCheck:
             self._require_direct(data)
         if self.problems or not isinstance(task, TaskConfig):
             return None
-        return _filled(task, terms, params)
+        return with_terms(task, terms, params)
 
     def _validate(self, model: type[BaseModel], data: Any, at: Path) -> BaseModel | None:
         """Validate the data at a path with a model; add the problems and return None if it is not valid."""
@@ -419,25 +420,6 @@ class TaskCheck:
             if section != "success" and data.get(section):
                 text = f"a direct task has no {section} terms; its class implements them: delete this section"
                 self.problem((section,), text)
-
-
-def _filled(task: TaskConfig, terms: Mapping[Path, TermConfig | None], params: dict[str, Any] | None) -> TaskConfig:
-    """Return the task with its terms (path -> validated term) and parameters. Terms that are None are removed."""
-    update: dict[str, Any] = {} if params is None else {"params": params}
-    for section in SECTIONS:
-        if section == "observations":
-            update[section] = {
-                name: group.model_copy(update=_kept_terms(terms, (section, name), group.terms), deep=False)
-                for name, group in task.observations.items()
-            }
-        else:
-            update[section] = _kept_terms(terms, (section,), getattr(task, section))
-    return task.model_copy(update=update)
-
-
-def _kept_terms(terms: Mapping[Path, TermConfig | None], at: Path, names: Iterable[str]) -> dict[str, TermConfig]:
-    found = {name: terms.get((*at, name)) for name in names}
-    return {name: term for name, term in found.items() if term is not None}
 
 
 @functools.lru_cache(maxsize=16)
