@@ -254,6 +254,9 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
     if not file.endswith(".py"):
         return _registered(source)
     module = import_file(FilePath(file))
+    if not hasattr(module, attribute.partition(".")[0]) and attribute in registrations:
+        uses = [registrations[attribute]]
+        return _with_environment(_object(uses[0][CONFIGURATION]), uses[0]), _registered_agents(uses[0])
     value: Any = module
     for part in attribute.split("."):
         if not hasattr(value, part):

@@ -77,10 +77,8 @@ class TaskCheck:
     notes: list[Note] = field(default_factory=list)
     filled: list[Path] = field(default_factory=list)  # paths of the changes that the configuration has received
     format: formats.Format | None = None
-    params: type[BaseModel] | None = None
-    """Model of the parameters of a task of another framework."""
-    place: str = ""
-    """File and line of a configuration's class in another framework's form; empty for others."""
+    params: type[BaseModel] | None = None  # model of the parameters of a task of another framework
+    place: str = ""  # file and line of a configuration's class in another framework's form; empty for others
 
     def document(self, changes: Iterable[Change] = ()) -> Document:
         """Return the content of the task's file. A configuration in Python gets the models that `changes` name."""
@@ -378,20 +376,18 @@ class TaskCheck:
         model = self.params_model()
         if len(self.problems) > count or not isinstance(values, dict):
             return None  # the problem is reported already
+        if model is None and values:
+            reason = "the task's class has no Params" if self.source.task else "only direct tasks have params"
+            self.problem(("params",), f"{reason}; remove this block")
         if model is None:
-            if values:
-                reason = "the task's class has no Params" if self.source.task else "only direct tasks have params"
-                self.problem(("params",), f"{reason}; remove this block")
             return {}
         checked = self._validate(model, values, ("params",))
         return checked.model_dump() if checked is not None else None
 
     def params_model(self) -> type[BaseModel] | None:
         """Return the model of a direct task's parameters; None if it has none."""
-        if self.params is not None:
+        if self.params is not None or self.source.task is None or self.source.task_file is None:
             return self.params
-        if self.source.task is None or self.source.task_file is None:
-            return None
         try:
             return read_params(self.source.task_file, self.source.task.rpartition(":")[2])
         except SyntaxError as error:

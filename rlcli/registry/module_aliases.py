@@ -239,12 +239,14 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
     if in_tree:
         return importlib.import_module(f"{own}.{rest}" if rest else own), sys.modules[own]
     if first not in sys.modules:
-        _import_folder_above(first, Path(file))
+        _import_folder_above(first, rest, Path(file))
     return None, None
 
 
-def _import_folder_above(name: str, file: Path) -> None:
-    """Import as a package the folder `name` above a task file, or a package in one of the folders above the file.
+def _import_folder_above(name: str, inner: str, file: Path) -> None:
+    """Import as a package the folder `name` above a task file, or a folder in one of the folders above the file.
+
+    Such a folder is a package, or has the file of the module `name.inner`.
 
     Such files import modules by their path in the repository, for example `source.robot.mdp`, from another
     distribution of the repository that is not installed, for example `source/robot_assets/robot_assets`, or from a
@@ -253,7 +255,8 @@ def _import_folder_above(name: str, file: Path) -> None:
     found = [parent for parent in file.parents if parent.name == name]
     if not found:
         beside = (folder for parent in file.parents for folder in (parent / name / name, parent / name))
-        found = [folder for folder in beside if (folder / "__init__.py").is_file()]
+        module = f"{inner.replace('.', '/')}.py" if inner else "__init__.py"
+        found = [folder for folder in beside if any((folder / part).is_file() for part in ("__init__.py", module))]
     folder = found[0] if found else None
     spec = PathFinder.find_spec(name)
     if folder is None or (spec is not None and str(folder) not in (spec.submodule_search_locations or ())):

@@ -167,6 +167,8 @@ def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
         config["symmetry"] = {"augment": bool(augment), "mirror_coef": coefficient}
         how = "the mirror image of left and right, found from the model, replaces the function"
         symmetry.note("approximated", "data_augmentation_func", how)
+    if str(algorithm.get("optimizer", "adam")).lower() != "adam":
+        algorithm.note("ignored", "optimizer", "rlcli's ppo uses Adam")
     algorithm.skip("class_name", "desired_kl")
     top.skip(
         "obs_groups",

@@ -81,6 +81,7 @@ class RslRlPpoAlgorithmCfg:
     value_loss_coef: float = MISSING
     use_clipped_value_loss: bool = MISSING
     clip_param: float = MISSING
+    optimizer: str = "adam"
     normalize_advantage_per_mini_batch: bool = False
     rnd_cfg: Any = None
     symmetry_cfg: Any = None

@@ -190,6 +190,8 @@ def collect(data: Any) -> dict[str, dict[str, list[str]]]:
                 add(value["asset_name"], "joint", value.get("joint_names"))
                 for key in ("body_name", "body_names"):
                     add(value["asset_name"], "body", value.get(key))
+            for pair in value.get("synced_feet_pair_names") or ():  # the gait reward of Isaac Lab's Spot
+                add("robot", "body", pair)
             for key in ("open_command_expr", "close_command_expr"):
                 if isinstance(value.get(key), Mapping):
                     add(value.get("asset_name"), "joint", list(value[key]))

@@ -464,3 +464,33 @@ def test_manager_that_is_created_later_is_an_error_with_the_order(tmp_path):
     expected = r"rover_env.py:\d+: env has no 'observation_manager' yet: managers are created in the order commands"
     with pytest.raises(Exception, match=expected):
         make_env(rover(tmp_path / "rover", BUILT, rewards=early), seed=0)
+
+
+def test_module_in_a_folder_without_init_beside_the_package(tmp_path):
+    (tmp_path / "parts_of_test").mkdir()
+    (tmp_path / "parts_of_test" / "arm.py").write_text("STIFFNESS = 3.0\n")
+    stepped(rover(tmp_path / "tasks", "from parts_of_test.arm import STIFFNESS\n"))
+
+
+def test_task_that_a_file_registers(tmp_path):
+    rover(tmp_path / "rover")
+    entry = "entry_point='isaaclab.envs:ManagerBasedRLEnv', kwargs={'env_cfg_entry_point': RoverEnvCfg}"
+    file = tmp_path / "rover" / "register_tasks.py"
+    file.write_text(f"import gymnasium\nfrom rover_env import RoverEnvCfg\n\ngymnasium.register('Pond-v0', {entry})\n")
+    assert "alive" in resolve(find_task(f"{file}:Pond-v0")).task.rewards
+
+
+LOW = """
+from dataclasses import MISSING
+
+def low(env, asset_cfg=SceneEntityCfg("robot", body_names=MISSING)):
+    return torch.full((env.num_envs,), float(len(asset_cfg.body_ids)))
+"""
+
+
+def test_default_without_names_of_bodies_must_be_given(tmp_path):
+    given = "RewardTermCfg(func=low, weight=1.0, params={'asset_cfg': SceneEntityCfg('robot', body_names=['upper'])})"
+    _, result = stepped(rover(tmp_path / "a", LOW, rewards={"low": given}))
+    assert result.reward.tolist() == pytest.approx([0.02] * 4)
+    with pytest.raises(ConfigError, match=r"rover_env.py:\d+: rewards.low: missing key 'asset_cfg'"):
+        rover(tmp_path / "b", LOW, rewards={"low": "RewardTermCfg(func=low, weight=1.0)"})
