@@ -74,11 +74,15 @@ def finished(folder: Path, task: str, name: str) -> Path | None:
     return None
 
 
+def run_name(seed: int, label: str, overrides: list[str]) -> str:
+    """Return the name of a training; trainings with other overrides have other names."""
+    name = f"seed{seed}{label}"
+    return f"{name}-{zlib.crc32(' '.join(sorted(overrides)).encode()):08x}" if overrides else name
+
+
 def train(task: str, seed: int, options: argparse.Namespace) -> Path:
     """Return the run of a seed; train it if it does not exist."""
-    name = f"seed{seed}{options.label}"
-    if options.overrides:  # trainings with other overrides have other names
-        name += f"-{zlib.crc32(' '.join(sorted(options.overrides)).encode()):08x}"
+    name = run_name(seed, options.label, options.overrides)
     run = finished(options.runs_dir, task, name)
     if run is None:
         begin = time.perf_counter()

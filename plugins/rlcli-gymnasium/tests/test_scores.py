@@ -49,6 +49,12 @@ def test_v3_return_equals_older_gymnasium_task(task):
     assert failed or task not in ("gym-hopper", "gym-walker2d")
 
 
+def test_run_with_other_overrides_has_another_name():
+    settings = [[], ["agent.gamma=0.98"], ["agent.gamma=0.99"], ["agent.gamma=0.99", "agent.lam=0.9"]]
+    assert len({gym_scores.run_name(1, "", overrides) for overrides in settings}) == len(settings)
+    assert gym_scores.run_name(1, "-a", []) == "seed1-a"
+
+
 def test_table_has_medians_and_reached_goals():
     def row(seed, v3, v5):
         counts = {name: {"mean": mean, "std": 1.0, "low": 0.0, "high": 0.0} for name, mean in (("v3", v3), ("v5", v5))}
