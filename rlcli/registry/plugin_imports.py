@@ -6,6 +6,7 @@ import logging
 import operator
 import os
 import re
+import reprlib
 import sys
 import threading
 import traceback
@@ -13,7 +14,7 @@ from collections.abc import Iterator
 from importlib import metadata
 from typing import Any, NoReturn, TypeVar
 
-from rlcli.errors import DependencyError, RlcliError, TaskError, pip_install
+from rlcli.errors import DependencyError, RlcliError, TaskError, error_with_type, pip_install
 from rlcli.formats import FormatSpec
 from rlcli.machine.native_output import descriptor_redirected
 from rlcli.progress import track
@@ -79,6 +80,15 @@ def call_entry(entry: Entry, *arguments: Any) -> Any:
         return list(value) if isinstance(value, Iterator) else value
 
 
+def wrong_result(entry: Entry, what: str, value: object, expected: str) -> PluginError:
+    """Return the error for a result of a plugin's function, named by `what`, that is not what it should be."""
+    plugin = f"plugin {entry.distribution} {entry.version}"
+    return PluginError(
+        f"{plugin}: {what} returned a {type(value).__name__}, {reprlib.repr(value)}; expected {expected}",
+        hint=f"update or uninstall {entry.distribution}; report it to its authors",
+    )
+
+
 @contextlib.contextmanager
 def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> Iterator[None]:
     """Name a plugin in errors of the `with` block, which runs its code.
@@ -98,9 +108,9 @@ def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> It
     except (passed_on, KeyboardInterrupt):
         raise
     except BaseException as error:
-        reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise PluginError(
-            f"{plugin}entry point '{entry.name}' = {entry.value} {failure}: {reason}{error_location(error)}",
+            f"{plugin}entry point '{entry.name}' = {entry.value} {failure}:"
+            f" {error_with_type(error)}{error_location(error)}",
             hint=_newer_rlcli(entry)
             or f"update or uninstall {entry.distribution}; as its author, correct its code or its entry point in"
             " pyproject.toml, and install it again",
