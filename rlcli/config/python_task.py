@@ -23,7 +23,7 @@ from pydantic import BaseModel, ValidationError
 from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.strict_yaml import Path
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
-from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing
+from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing, short_error
 from rlcli.formats import Note
 from rlcli.registry import TaskSource, import_file, is_framework, load_module, load_object
 from rlcli.registry.failed_imports import FailedImport, error_location, report_failures, take_failures
@@ -104,7 +104,7 @@ def load(
         raise
     except Exception as error:
         require_module(error)
-        message = f"{source.python}: {type(error).__name__}: {error}{error_location(error)}"
+        message = f"{source.python}: {short_error(error)}{error_location(error)}"
         raise TaskError(message, hint=_hint(error)) from error
     return task
 
