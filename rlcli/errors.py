@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rlcli.safe_text import message_line
+from rlcli.safe_text import message_line, shorten
 
 INTERRUPTED, STOPPED = 130, 75
 """Exit codes after Ctrl-C, and after another signal that stops a run."""
@@ -188,6 +188,11 @@ def error_with_type(error: BaseException) -> str:
     if isinstance(error, RlcliError):
         return error.message
     return ": ".join(filter(None, (type(error).__name__, error_text(error))))
+
+
+def short_error(error: BaseException) -> str:
+    """Return `error_with_type` of an error from the code of a task or plugin, on one line of at most 200 characters."""
+    return shorten(" ".join(error_with_type(error).split()), 200)
 
 
 def one_line(error: BaseException, limit: int | None = None) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from rlcli.task import API_VERSION
+from rlcli.task import API_VERSION, require_field_types
 
 if TYPE_CHECKING:
     from rlcli.config.layers import Origin
@@ -78,6 +78,9 @@ class FormatSpec:
     aliases: Mapping[str, str] = field(default_factory=dict)
     api: int = API_VERSION
 
+    def __post_init__(self) -> None:
+        require_field_types(self)
+
 
 @dataclass(slots=True)
 class Translation:
@@ -93,6 +96,13 @@ class Translation:
     """Agents that were read from a separate file: name -> settings."""
     agents_origin: Callable[[tuple[str | int, ...]], Origin] | None = None
     """Function like `origin` for the paths in `agents`; None: no agents were read from a file."""
+
+    def __post_init__(self) -> None:
+        notes_are = isinstance(self.notes, list) and all(isinstance(note, Note) for note in self.notes)
+        if not isinstance(self.data, dict) or not isinstance(self.agents, dict) or not notes_are:
+            raise TypeError("data and agents of a Translation must be dicts, notes a list of Notes")
+        if not callable(self.origin) or not (self.agents_origin is None or callable(self.agents_origin)):
+            raise TypeError("origin and agents_origin of a Translation must be functions")
 
 
 @dataclass(slots=True)

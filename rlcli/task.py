@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, get_type_hints
 
 API_VERSION = 1
 """Version of the plugin interface. A plugin that needs a newer version is refused, with both numbers."""
@@ -37,13 +37,40 @@ class TaskSpec:
     api: int = API_VERSION
 
     def __post_init__(self) -> None:
-        if isinstance(self.terms, str):
-            raise TypeError(f"terms of a TaskSpec must be a tuple of modules; write ({self.terms!r},)")
-        if not isinstance(self.api, int) or self.api < 1:
-            raise TypeError(f"api of a TaskSpec must be a whole number of 1 or more, found {self.api!r}")
-        for name in ("package", "summary", "config", "policies"):
-            if not isinstance(getattr(self, name), str):
-                raise TypeError(f"{name} of a TaskSpec must be a string, found {getattr(self, name)!r}")
+        require_field_types(self)
+
+
+def require_field_types(spec: Any) -> None:
+    """Check the types of the fields of a plugin's `TaskSpec`, `TrainerSpec` or `FormatSpec`.
+
+    Raises:
+        TypeError: with the name of the first wrong field.
+    """
+    for name, kind in get_type_hints(type(spec)).items():
+        value = getattr(spec, name)
+        if not _has_type(value, kind) or (name == "api" and value < 1):
+            raise TypeError(f"{name} of a {type(spec).__name__} must be {_KINDS[kind]}, found {repr(value)[:100]}")
+
+
+_KINDS: dict[Any, str] = {
+    str: "a string",
+    str | None: "a string or None",
+    bool: "True or False",
+    int: "a whole number of 1 or more",
+    tuple[str, ...]: "a tuple of strings, such as ('a',)",
+    Mapping[str, str]: "a mapping from strings to strings",
+}
+"""Types of the fields of specs, in words."""
+
+
+def _has_type(value: Any, kind: Any) -> bool:
+    if kind == str | None:
+        return value is None or isinstance(value, str)
+    if kind == tuple[str, ...]:
+        return isinstance(value, tuple | list) and all(isinstance(item, str) for item in value)
+    if kind == Mapping[str, str]:
+        return isinstance(value, Mapping) and all(isinstance(text, str) for pair in value.items() for text in pair)
+    return isinstance(value, kind) and (kind is not int or not isinstance(value, bool))
 
 
 # Aliases for the parameters of terms. A YAML file gives a name or regular expressions; the term receives the object or

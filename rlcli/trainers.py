@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rlcli.task import API_VERSION
+from rlcli.task import API_VERSION, require_field_types
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,3 +31,6 @@ class TrainerSpec:
     parallel: bool = False
     gpu: bool = False
     api: int = API_VERSION
+
+    def __post_init__(self) -> None:
+        require_field_types(self)

@@ -7,8 +7,10 @@ import functools
 import importlib
 import os
 import re
+import signal
 import sys
 import traceback
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -20,12 +22,21 @@ from rlcli.cli.ui.console import console, print_log_records, redirect_to_null
 from rlcli.cli.ui.help_text import HelpGroup
 from rlcli.cli.ui.options import CHOOSE, TYPER_ERRORS, BodyError, add_command
 from rlcli.config.user_settings import read_settings
-from rlcli.errors import INTERRUPTED, CheckpointError, ConfigError, MachineError, RlcliError, Stopped, UsageError
+from rlcli.errors import (
+    INTERRUPTED,
+    CheckpointError,
+    ConfigError,
+    MachineError,
+    RlcliError,
+    Stopped,
+    TaskError,
+    UsageError,
+)
 from rlcli.machine.garbage_collection import delay_garbage_collection
 from rlcli.machine.memory import memory_error
 from rlcli.registry import OWN, TRAINERS, catalog, load_entry, load_object, malformed_metadata_ignored
 from rlcli.registry.plugin_imports import exit_refused
-from rlcli.registry.task_code_monitor import error_of_task, observe_task_code, raised_by_task
+from rlcli.registry.task_code_monitor import error_of_task, observe_task_code, place_in_task, raised_by_task
 from rlcli.safe_text import remember_given
 from rlcli.settings import settings_file, use_settings
 from rlcli.trainers import TrainerSpec
@@ -103,6 +114,8 @@ def main(arguments: list[str] | None = None) -> int:
     if console.owns_process:
         os.environ.setdefault("PYTHONSAFEPATH", "1")  # MuJoCo's GLFW starts Python, which imports from this folder
         delay_garbage_collection()
+        if hasattr(signal, "SIGALRM"):
+            signal.signal(signal.SIGALRM, _on_alarm)
         sys.meta_path[:0] = [AddressSpaceCheck, MatplotlibFinder]
     arguments = sys.argv[1:] if arguments is None else arguments
     if not {"COMP_WORDS", "_TYPER_COMPLETE_ARGS"}.intersection(os.environ) and "complete_" in os.environ.get(
@@ -120,6 +133,13 @@ def main(arguments: list[str] | None = None) -> int:
     except OSError:
         redirect_to_null(sys.stdout)
     return code
+
+
+def _on_alarm(_: int, frame: FrameType | None) -> None:
+    """Raise an error for a timer of a task's code, which would otherwise end the process without a message."""
+    place = place_in_task(frame)
+    message = "a timer has ended (SIGALRM), and no handler is set"
+    raise TaskError(f"{place}: {message}" if place else message, hint="remove signal.alarm or signal.setitimer")
 
 
 def _with_values(arguments: list[str]) -> list[str]:

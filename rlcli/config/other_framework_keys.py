@@ -1,13 +1,18 @@
-"""Keys of a task file that only the environment class of another framework's format reads.
+"""Task files of other frameworks: keys that only the environment class of a format reads, and translated files.
 
-In the file such a key is at the top level; in a `TaskConfig` it is below the key `foreign`.
+In the file, such a key is at the top level; in a `TaskConfig` it is below the key `foreign`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
+from rlcli.config.layers import Layers, Origin
 from rlcli.config.schema import TaskConfig
+from rlcli.config.strict_yaml import Path
+from rlcli.formats import Translation
+from rlcli.registry import Entry
 from rlcli.registry.formats import format_keys
+from rlcli.registry.plugin_imports import wrong_result
 
 
 def foreign_keys(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -23,3 +28,24 @@ def move_foreign_keys(data: Mapping[str, Any]) -> dict[str, Any]:
         return dict(data)
     own = {key: value for key, value in data.items() if key not in keys}
     return {**own, "foreign": {key: data[key] for key in sorted(keys) if data[key] != {}}}
+
+
+def merge_translation(layers: Layers, found: Translation, entry: Entry) -> None:
+    """Merge the result of a format's `read` into the layers of a configuration; `entry` is the format's entry point.
+
+    Raises:
+        PluginError: if one of its functions returns another value than an `Origin`.
+    """
+
+    def checked(origin: Callable[[Path], Origin]) -> Callable[[Path], Origin]:
+        def place(path: Path) -> Origin:
+            value = origin(path)
+            if not isinstance(value, Origin):
+                raise wrong_result(entry, "origin of a Translation", value, "an Origin")
+            return value
+
+        return place
+
+    layers.merge(found.data, checked(found.origin))
+    if found.agents_origin is not None:
+        layers.merge(found.agents, checked(found.agents_origin))

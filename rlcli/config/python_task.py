@@ -23,11 +23,11 @@ from pydantic import BaseModel, ValidationError
 from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.strict_yaml import Path
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
-from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing
+from rlcli.errors import ConfigError, Problem, RlcliError, TaskError, did_you_mean, listing, short_error
 from rlcli.formats import Note
 from rlcli.registry import TaskSource, import_file, is_framework, load_module, load_object
 from rlcli.registry.failed_imports import FailedImport, error_location, report_failures, take_failures
-from rlcli.registry.formats import Format, call_usable, format_of_module, require_module
+from rlcli.registry.formats import Format, first_result, format_of_module, require_module
 from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registrations
 
 _log = logging.getLogger(__name__)
@@ -104,7 +104,7 @@ def load(
         raise
     except Exception as error:
         require_module(error)
-        message = f"{source.python}: {type(error).__name__}: {error}{error_location(error)}"
+        message = f"{source.python}: {short_error(error)}{error_location(error)}"
         raise TaskError(message, hint=_hint(error)) from error
     return task
 
@@ -270,8 +270,8 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
         return _with_environment(value, uses[0]), _registered_agents(uses[0])
     folder, form = FilePath(file).parent, format_of_module(value.__rlcli_task__.__module__)
     files = sorted(folder.glob(_AGENTS))
-    if form is not None and form.spec.agents_beside:
-        files += form.call(form.spec.agents_beside, folder)
+    if form is not None:
+        files += form.call("agents_beside", folder) or ()
     return value, _agents_in_modules([module]) or _agents_in_modules(map(import_file, files))
 
 
@@ -425,8 +425,7 @@ def _read_agent(task: PythonTask, name: str, agent: object) -> dict[str, Any] | 
         agent: a file, a mapping, or an object with settings.
     """
     if isinstance(agent, FilePath):
-        read = task.format.spec.agent_file if task.format is not None else ""
-        return task.format.call(read, agent, name, task.notes) if task.format is not None and read else None
+        return None if task.format is None else task.format.call("agent_file", agent, name, task.notes)
     if isinstance(agent, Mapping | BaseModel) or hasattr(agent, "__rlcli_agent__"):
         agent = agent() if isinstance(agent, type) else agent
         data = agent_data(agent, task.notes)
@@ -443,4 +442,5 @@ def _report_choice(message: str) -> None:
 
 def _hint(error: BaseException) -> str | None:
     """Return the hint of an installed format about an error of a task's code; None if no format has one."""
-    return next((hint for hint in call_usable(lambda spec: spec.hint, error) if hint is not None), None)
+    hint: str | None = first_result("hint", error)
+    return hint

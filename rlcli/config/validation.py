@@ -12,7 +12,7 @@ from rlcli.config import messages, python_task
 from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read, without
 from rlcli.config.model_option import MODELS, given_settings, model_path
 from rlcli.config.older_success import upgraded
-from rlcli.config.other_framework_keys import foreign_keys, move_foreign_keys
+from rlcli.config.other_framework_keys import foreign_keys, merge_translation, move_foreign_keys
 from rlcli.config.schema import AgentConfig, TaskConfig, TermConfig
 from rlcli.config.strict_yaml import Document, Path
 from rlcli.config.term_signatures import (
@@ -131,11 +131,9 @@ class TaskCheck:
         if not unknown:
             return False
         for form in formats.installed_formats():
-            found = form.call(form.spec.read, document, self.source) if form.spec.read else None
+            found = form.call("read", document, self.source)
             if found is not None:
-                self.layers.merge(found.data, found.origin)
-                if found.agents_origin is not None:
-                    self.layers.merge(found.agents, found.agents_origin)
+                merge_translation(self.layers, found, form.entry)
                 self.notes += found.notes
                 return True
         for known in formats.missing_formats().values():
@@ -408,9 +406,9 @@ class TaskCheck:
 
     def _require_direct(self, data: Mapping[str, Any]) -> None:
         """Check that a direct task has no terms but those of `success`, and the settings of another format's class."""
-        if self.format is not None and self.format.spec.check:
+        if self.format is not None:
             key = self.format.spec.key
-            for path, message, hint in self.format.call(self.format.spec.check, data.get(key, {})):
+            for path, message, hint in self.format.call("check", data.get(key, {})) or ():
                 self.problem((key, *path), message, hint)
         for section in SECTIONS:
             if section != "success" and data.get(section):

@@ -13,7 +13,7 @@ from rlcli.config.schema import StrictModel, TaskConfig
 from rlcli.envs.articulation import ArticulationView
 from rlcli.envs.layout import Layout, TermLayout
 from rlcli.envs.vec_env import VecEnv
-from rlcli.errors import ConfigError, RlcliError, TaskError
+from rlcli.errors import ConfigError, RlcliError, TaskError, short_error
 from rlcli.managers.attribute_state import AttributeState
 from rlcli.managers.termination import DIVERGED
 from rlcli.random import stream
@@ -184,7 +184,7 @@ class DirectEnv(VecEnv):
         except RlcliError:
             raise
         except Exception as error:
-            message = f"task '{source.name}' is broken: {source.task}: {type(error).__name__}: {error}"
+            message = f"task '{source.name}' is broken: {source.task}: {short_error(error)}"
             raise TaskError(message) from error
         if not (isinstance(task_class, type) and issubclass(task_class, DirectTask)):
             raise TaskError(

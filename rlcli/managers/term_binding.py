@@ -16,7 +16,7 @@ from rlcli.config.load import Resolved
 from rlcli.config.schema import TermConfig
 from rlcli.config.strict_yaml import Path
 from rlcli.config.term_signatures import SELECTORS, Signature
-from rlcli.errors import ConfigError, DivergedError, Problem, ShapeError, TaskError, did_you_mean, listing
+from rlcli.errors import ConfigError, DivergedError, Problem, ShapeError, TaskError, did_you_mean, listing, short_error
 from rlcli.managers.attribute_state import AttributeState
 from rlcli.managers.curriculum_values import TunableValues
 from rlcli.random import stream
@@ -183,7 +183,7 @@ class Binder:
             try:
                 return getattr(load_module(module), signature.attribute)
             except Exception as error:
-                raise TaskError(f"{signature.file}: cannot be imported: {type(error).__name__}: {error}") from error
+                raise TaskError(f"{signature.file}: cannot be imported: {short_error(error)}") from error
         return getattr(importlib.import_module(signature.module), signature.attribute)
 
     def add_problem(self, path: Path, message: str, hint: str | None = None) -> None:
@@ -320,8 +320,8 @@ class CheckedTerm:
         """Return the value of the current step."""
         value = self._call()
         try:
-            plain = value.dtype is self._dtype and not (value.requires_grad or value.is_neg())
-            if plain and value.shape == self._shape:
+            plain = value.dtype is self._dtype and not (value.requires_grad or value.is_neg() or value.is_meta)
+            if plain and value.shape == self._shape and value.layout is torch.strided:
                 return value  # type: ignore[no-any-return]
         except (AttributeError, RuntimeError):  # no tensor, or a nested one
             pass

@@ -27,6 +27,9 @@ GROUPS = (TASKS, TRAINERS, FORMATS)
 OWN = "rlcli"
 """The distribution of the built-in tasks and trainers. Its entries win over entries of plugins with the same name."""
 
+MAX_ENTRIES = {TASKS: 1000, TRAINERS: 50, FORMATS: 50}
+"""Largest number of entry points that a distribution may have in each group; every command loads all formats."""
+
 _entry_points: Any = vars(metadata.Distribution)["entry_points"].fget
 """The original getter of the standard library. It raises for malformed metadata, also inside of
 `malformed_metadata_ignored`."""
@@ -86,12 +89,27 @@ def catalog(group: str = TASKS, *, hidden: bool = False) -> tuple[list[Entry], l
             name, version = _name_and_version(distribution)
             if wanted is not None and _normalized(name) not in wanted:
                 continue
-            for point in _entry_points(distribution):
-                if point.group == group:
-                    entries.setdefault((point.name, _normalized(name)), Entry(point.name, point.value, name, version))
+            for point in _plugin_points(distribution)[group]:
+                entries.setdefault((point.name, _normalized(name)), Entry(point.name, point.value, name, version))
         except Exception as error:
             broken.setdefault(folder, Broken(folder, f"malformed metadata ({type(error).__name__}: {error})"))
     return sorted(entries.values(), key=lambda e: (e.name, e.distribution)), list(broken.values())
+
+
+def _plugin_points(distribution: metadata.Distribution) -> dict[str, list[metadata.EntryPoint]]:
+    """Return the entry points of a distribution in each group of plugins.
+
+    Raises:
+        ValueError: if it has more than `MAX_ENTRIES`; other errors for malformed metadata.
+    """
+    found: dict[str, list[metadata.EntryPoint]] = {group: [] for group in GROUPS}
+    for point in _entry_points(distribution):
+        if point.group in found:
+            found[point.group].append(point)
+    for group, points in found.items():
+        if len(points) > MAX_ENTRIES[group]:
+            raise ValueError(f"{len(points)} entry points in {group}, at most {MAX_ENTRIES[group]} are allowed")
+    return found
 
 
 def _entry_points_text(distribution: metadata.Distribution) -> str:
@@ -150,7 +168,7 @@ def unreadable_distributions() -> list[Broken]:
     for distribution in metadata.distributions():
         folder = Path(str(getattr(distribution, "_path", "?")))
         try:
-            _entry_points(distribution)
+            _plugin_points(distribution)
             _name_and_version(distribution)
         except Exception as error:
             reason = f"malformed metadata ({type(error).__name__}: {error}) in {folder}"

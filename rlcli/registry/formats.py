@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.errors import DependencyError, TaskError, pip_install
-from rlcli.formats import FormatSpec
+from rlcli.formats import FormatSpec, Translation
 from rlcli.registry.entries import FORMATS, OWN, Entry, catalog, find_entry
-from rlcli.registry.plugin_imports import PluginError, call_entry, load_entry, load_spec
+from rlcli.registry.plugin_imports import PluginError, call_entry, load_entry, load_spec, wrong_result
 from rlcli.registry.task_location import TaskSource
 
 _log = logging.getLogger(__name__)
@@ -47,13 +47,49 @@ class Format:
         """
         return load_entry(replace(self.entry, value=reference), object)
 
-    def call(self, reference: str, *arguments: Any) -> Any:
-        """Import a function of the format by a reference of its spec, and call it. A generator is read to its end.
+    def call(self, part: str, *arguments: Any) -> Any:
+        """Call a function of the format; return None if the format does not have it. A generator is read to its end.
+
+        Args:
+            part: the attribute of the `FormatSpec` that names the function, such as `find`.
+            arguments: the arguments of the function.
 
         Raises:
-            PluginError: for any error of the plugin.
+            PluginError: for any error of the plugin, and for a result of a wrong type.
         """
-        return call_entry(replace(self.entry, value=reference), *arguments)
+        reference = getattr(self.spec, part)
+        if not reference:
+            return None
+        value = call_entry(replace(self.entry, value=reference), *arguments)
+        is_valid, expected = _RESULTS[part]
+        if not is_valid(value):
+            raise wrong_result(self.entry, f"{part} = {reference}", value, expected)
+        return value
+
+
+def _is_mistake(item: Any) -> bool:
+    """Return whether an item is what `FormatSpec.check` yields: a path, a message and a hint."""
+    if not isinstance(item, tuple | list) or len(item) != 3 or not isinstance(item[0], tuple | list):
+        return False
+    return all(isinstance(step, str | int) for step in item[0]) and isinstance(item[1], str) and _is_text(item[2])
+
+
+def _is_text(value: Any) -> bool:
+    return value is None or isinstance(value, str)
+
+
+_RESULTS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "find": (lambda value: value is None or isinstance(value, TaskSource), "a TaskSource or None"),
+    "read": (lambda value: value is None or isinstance(value, Translation), "a Translation or None"),
+    "check": (lambda value: isinstance(value, list | tuple) and all(map(_is_mistake, value)), "(path, message, hint)s"),
+    "hint": (_is_text, "a string or None"),
+    "agents_beside": (
+        lambda value: isinstance(value, list | tuple) and all(isinstance(file, Path) for file in value),
+        "Paths",
+    ),
+    "agent_file": (lambda value: value is None or isinstance(value, dict), "a dict or None"),
+}
+"""Function of a format -> whether a value may be its result, and what may be, for the message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,18 +160,22 @@ def usable_formats() -> Iterator[Format]:
 
 def find_in_formats(path: Path) -> TaskSource | None:
     """Return the task of a folder or file in an installed format; None if no working format recognises it."""
-    tasks = call_usable(lambda spec: spec.find, path)
-    return next((task for task in tasks if task is not None), None)
+    source: TaskSource | None = first_result("find", path)
+    return source
 
 
-def call_usable(reference: Callable[[FormatSpec], str], *arguments: Any) -> Iterator[Any]:
-    """Call a function of every installed format that has it. For a broken format, log a warning instead."""
+def first_result(part: str, *arguments: Any) -> Any:
+    """Call a function of each installed format until one returns another value than None; return this value.
+
+    The arguments are those of `Format.call`. For a broken format, log a warning instead.
+    """
     for form in usable_formats():
         try:
-            if reference(form.spec):
-                yield form.call(reference(form.spec), *arguments)
+            if (found := form.call(part, *arguments)) is not None:
+                return found
         except PluginError as error:
             _log.warning(error)
+    return None
 
 
 def format_of_key(keys: Mapping[str, Any]) -> Format | None:

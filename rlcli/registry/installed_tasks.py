@@ -4,7 +4,7 @@ import importlib.util
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 
-from rlcli.errors import TaskError
+from rlcli.errors import TaskError, short_error
 from rlcli.registry.entries import GROUPS, Entry, catalog
 from rlcli.registry.plugin_imports import contain_side_effects, error_location, load_spec
 from rlcli.registry.task_location import TaskSource
@@ -113,6 +113,4 @@ def _find(module: str, entry: Entry) -> ModuleSpec | None:
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        raise TaskError(
-            f"task '{entry.qualified}' is broken: {type(error).__name__}: {error}{error_location(error)}"
-        ) from error
+        raise TaskError(f"task '{entry.qualified}' is broken: {short_error(error)}{error_location(error)}") from error

@@ -1,6 +1,8 @@
 """Lookup of a robot's model file (MJCF) in the task's folder, another task's folder, a package, or a user's folder."""
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from rlcli.errors import MissingModelError, TaskError, listing
@@ -21,9 +23,10 @@ def model_file(root: Path, model: str) -> Path:
 
     Raises:
         MissingModelError: if a model that the user must provide is not found.
-        TaskError: if there is no such task or package, or the file is outside of its folder.
+        TaskError: if there is no such task or package, or the file is outside of its folder or cannot be opened.
     """
-    return _model_file(root, chosen_model(root, model))
+    with _system_errors(model):
+        return _model_file(root, chosen_model(root, model))
 
 
 def chosen_model(root: Path, model: str) -> str:
@@ -54,15 +57,25 @@ def existing_model_file(root: Path, model: str) -> Path:
         MissingModelError: if a model that the user must provide is not found.
         TaskError: if there is no such file, task or package, or the file is outside of its folder.
     """
-    file = model_file(root, model).resolve()
-    if ":" not in model and not file.is_relative_to(root):
-        raise TaskError(f"'{model}' lies outside the task's folder {root}; move it inside")
-    if file.exists() and not file.is_file():
-        raise TaskError(f"'{model}' in {root} is not a regular file; put an MJCF in its place")
-    if not file.exists():
-        files = sorted(str(path.relative_to(root)) for path in root.rglob("*.xml") if path.is_file())
-        raise TaskError(f"no file '{model}' in {root}", hint=f"MJCF files there: {', '.join(files) or 'none'}")
-    return file
+    with _system_errors(model):
+        file = model_file(root, model).resolve()
+        if ":" not in model and not file.is_relative_to(root):
+            raise TaskError(f"'{model}' lies outside the task's folder {root}; move it inside")
+        if file.exists() and not file.is_file():
+            raise TaskError(f"'{model}' in {root} is not a regular file; put an MJCF in its place")
+        if not file.exists():
+            files = sorted(str(path.relative_to(root)) for path in root.rglob("*.xml") if path.is_file())
+            raise TaskError(f"no file '{model}' in {root}", hint=f"MJCF files there: {', '.join(files) or 'none'}")
+        return file
+
+
+@contextlib.contextmanager
+def _system_errors(model: str) -> Iterator[None]:
+    """Turn errors of the system about a model's path, such as one with a too long name, into a TaskError."""
+    try:
+        yield
+    except OSError as error:
+        raise TaskError(f"the model '{model}' cannot be opened: {error.strerror}; correct its path") from None
 
 
 def _install_hint(model: str) -> str:

@@ -1,19 +1,21 @@
 """Import of plugins, protected against what their code prints, raises or changes."""
 
+import builtins
 import contextlib
 import importlib
 import logging
 import operator
 import os
 import re
+import reprlib
 import sys
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from typing import Any, NoReturn, TypeVar
 
-from rlcli.errors import DependencyError, RlcliError, TaskError, pip_install
+from rlcli.errors import DependencyError, RlcliError, TaskError, listing, pip_install, short_error
 from rlcli.formats import FormatSpec
 from rlcli.machine.native_output import descriptor_redirected
 from rlcli.progress import track
@@ -79,6 +81,15 @@ def call_entry(entry: Entry, *arguments: Any) -> Any:
         return list(value) if isinstance(value, Iterator) else value
 
 
+def wrong_result(entry: Entry, what: str, value: object, expected: str) -> PluginError:
+    """Return the error for a result of a plugin's function, named by `what`, that is not what it should be."""
+    plugin = f"plugin {entry.distribution} {entry.version}"
+    return PluginError(
+        f"{plugin}: {what} returned a {type(value).__name__}, {reprlib.repr(value)}; expected {expected}",
+        hint=f"update or uninstall {entry.distribution}; report it to its authors",
+    )
+
+
 @contextlib.contextmanager
 def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> Iterator[None]:
     """Name a plugin in errors of the `with` block, which runs its code.
@@ -98,9 +109,9 @@ def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> It
     except (passed_on, KeyboardInterrupt):
         raise
     except BaseException as error:
-        reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         raise PluginError(
-            f"{plugin}entry point '{entry.name}' = {entry.value} {failure}: {reason}{error_location(error)}",
+            f"{plugin}entry point '{entry.name}' = {entry.value} {failure}:"
+            f" {short_error(error)}{error_location(error)}",
             hint=_newer_rlcli(entry)
             or f"update or uninstall {entry.distribution}; as its author, correct its code or its entry point in"
             " pyproject.toml, and install it again",
@@ -140,8 +151,9 @@ def contain_side_effects() -> Iterator[None]:
     """Send what the `with` block prints to stderr, also from C code, and undo its changes of the current folder.
 
     Changes of torch's default type, default device and gradient mode are undone, too, with a warning: rlcli's own
-    tensors would change with them.
+    tensors would change with them. So are built-in functions that were deleted or replaced by a value.
     """
+    built_in = _BUILT_IN.copy()
     folder = _current_folder()
     settings = _torch_settings() or _TORCH_DEFAULTS
     with contextlib.suppress(OSError, ValueError):  # stdout is closed
@@ -151,10 +163,23 @@ def contain_side_effects() -> Iterator[None]:
         try:
             yield
         finally:
+            _restore_built_in(built_in)
             if folder is not None and _current_folder() != folder:
                 os.chdir(folder)
             if (_torch_settings() or settings) != settings:
                 _restore_torch(*settings)
+
+
+_BUILT_IN = builtins.__dict__
+
+
+def _restore_built_in(before: dict[str, Any], is_callable: Callable[[object], bool] = callable) -> None:
+    """Restore the built-in functions that were deleted or are no longer callable. Until then, call none of them."""
+    lost = [name for name in before if is_callable(before[name]) and not is_callable(_BUILT_IN.get(name))]
+    if lost:
+        _BUILT_IN.update(before)
+        names = listing(lost, limit=3)
+        _log.warning("code that was imported has deleted or broken the built-in functions %s; undone", names)
 
 
 _TORCH_DEFAULTS = ("torch.float32", "cpu", True)

@@ -15,7 +15,7 @@ from types import CodeType, FrameType
 from typing import Any
 
 import rlcli
-from rlcli.errors import TaskError, error_text, error_with_type
+from rlcli.errors import TaskError, error_text, error_with_type, short_error
 from rlcli.registry.entries import FORMATS, OWN, TASKS, TRAINERS, Entry, catalog
 from rlcli.registry.formats import is_framework
 from rlcli.safe_text import shorten
@@ -44,7 +44,7 @@ def error_of_task(error: BaseException) -> TaskError | None:
     frame, line = found[-1]
     code = frame.f_code
     return TaskError(
-        f"{code.co_filename}:{line}: {code.co_name}: {error_with_type(error)}",
+        f"{code.co_filename}:{line}: {code.co_name}: {short_error(error)}",
         hint="correct the task's code at this line; --debug shows the traceback",
     )
 
@@ -124,7 +124,7 @@ def observe_task_code() -> Iterator[None]:
             warn_once(f"{place}: {shorten(text, _MOST_TEXT)}")
 
     def on_warning(message: Any, category: type[Warning], filename: str, lineno: int, *_: Any) -> None:
-        report(_place(sys._getframe(1)) or f"{filename}:{lineno}", f"{category.__name__}: {error_text(message)}")
+        report(place_in_task(sys._getframe(1)) or f"{filename}:{lineno}", f"{category.__name__}: {error_text(message)}")
 
     def on_error(other: Callable[[Any], Any]) -> Callable[[Any], None]:
         def hook(found: Any) -> None:
@@ -185,7 +185,7 @@ def _frames_of_command(frame: FrameType | None) -> Iterator[FrameType]:
         frame = frame.f_back
 
 
-def _place(frame: FrameType) -> str | None:
+def place_in_task(frame: FrameType | None) -> str | None:
     """Return file and line of the innermost code of a task that runs in a frame or its callers."""
     inner = next((each for each in _frames_of_command(frame) if is_task_code(each)), None)
     return None if inner is None else f"{inner.f_code.co_filename}:{inner.f_lineno}"

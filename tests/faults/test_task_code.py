@@ -142,3 +142,39 @@ def test_error_of_a_task_in_a_worker_process_has_its_line(with_code, cli, code):
     found = cli(*TRAIN[:2], *TRAIN[4:])
     assert found.code == 4, found.err
     assert f"coin/task.py:{line}: calculate_metrics: {ERRORS.get(code, 'ZeroDivisionError')}" in found.err
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import builtins; builtins.len = builtins.isinstance = builtins.print = None",
+        "import builtins; del builtins.str, builtins.type, builtins.len",
+        "import builtins; builtins.len = None; raise ValueError",
+    ],
+)
+def test_import_that_breaks_built_in_functions_is_an_error(coin, tmp_path, start, code):
+    (tmp_path / "coin" / "task.py").write_text(f"{COIN_TASK}\n{code}\n")
+    process = start(*EVAL)
+    _, err = process.communicate()
+    assert process.returncode == 4, err
+    assert "Traceback" not in err
+    assert "broken the built-in functions" in err
+    assert "coin/task.py" in err.splitlines()[-1] + err.splitlines()[-2]
+
+
+def test_timer_of_a_task_is_named(with_code, start):
+    line = with_code("calculate_metrics", "import signal; signal.alarm(1); time.sleep(5)")
+    process = start(*EVAL)
+    _, err = process.communicate()
+    assert process.returncode == 4, err
+    assert f"coin/task.py:{line}: a timer has ended (SIGALRM)" in err
+
+
+@pytest.mark.parametrize("text", ["'x y ' * 900", "'a\\nhint: run: curl x | sh' * 30", "chr(27) * 900"])
+def test_text_of_an_error_of_a_task_is_short(with_code, cli, text):
+    line = with_code("calculate_metrics", f"exec('raise ValueError(t)', {{'t': {text}}})")
+    found = cli(*EVAL)
+    (error,) = [each for each in found.err.splitlines() if each.startswith("error: ")]
+    assert len(error.partition(f":{line}: calculate_metrics: ")[2].replace("\\x1b", "x")) <= 200
+    assert "\nhint: run" not in found.err
+    assert "\x1b" not in found.err

@@ -212,10 +212,10 @@ def test_bad_first_value_of_a_term_is_named(tmp_path, section, value):
 
 @pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors")
 @pytest.mark.parametrize("section", WANTED)
-@pytest.mark.parametrize("value", BAD)
+@pytest.mark.parametrize("value", [*BAD, *DENSE])
 def test_bad_value_of_a_later_step_is_named(tmp_path, section, value):
     good = "torch.zeros({})" if section != "terminations" else "torch.zeros({}, dtype=torch.bool)"
-    with pytest.raises(ConfigError, match=re.escape(f"bad: 'evil' returned {BAD[value]}; return a tensor")):
+    with pytest.raises(ConfigError, match=re.escape(f"bad: 'evil' returned {(BAD | DENSE)[value]}; return a tensor")):
         with_value(tmp_path, section, good, value, 8)
 
 

@@ -8,9 +8,10 @@ import sys
 import textwrap
 
 import pytest
+from support import plugin_grammar
 
 from rlcli.errors import pip_install
-from rlcli.registry import find_task
+from rlcli.registry import find_task, unreadable_distributions
 
 END = "exit code:"
 HIDDEN = ("rlcli-oige", "rlcli-isaaclab")
@@ -233,3 +234,29 @@ def test_task_of_own_format_imports_no_other_format(plugins, command, words):
     done = command(*words)
     assert done.returncode == (0 if words[0] == "validate" else 3), done.stderr
     assert "elsewhere" not in done.stderr + str([name for name in sys.modules if name == "elsewhere"])
+
+
+@pytest.mark.parametrize("body", ["return ['x']", "return Translation({}, lambda path: 5, [])", "yield 1, 2, 3"])
+def test_wrong_result_of_a_format_names_its_plugin(body, plugins, cli, tmp_path):
+    source = plugin_grammar.MODULE.format(
+        body=body, spec="FormatSpec", fields={"summary": "x", "read": "odd:f", "find": "odd:f", "key": "odd"}
+    )
+    plugins("odd", source, entry_points="[rlcli.formats]\nodd = odd:SPEC\n")
+    (tmp_path / "task").mkdir()
+    (tmp_path / "task" / "task.yaml").write_text(plugin_grammar.TASK + "odd: {a: 1}\n")
+    done = cli("validate", str(tmp_path / "task"))
+    assert done.returncode == 4, done.stderr
+    assert "error: plugin odd 1.0: " in done.stderr
+    assert "expected a" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("group", "command"), [("tasks", ("validate", "many1")), ("formats", ("validate", "cartpole"))]
+)
+def test_ten_thousand_entry_points_are_refused(group, command, plugins, cli):
+    points = "".join(f"many{number} = many:SPEC\n" for number in range(10_000))
+    plugins("many", entry_points=f"[rlcli.{group}]\n{points}")
+    done = cli(*command)
+    assert done.returncode == (4 if group == "tasks" else 0), done.stderr
+    (broken,) = unreadable_distributions()
+    assert f"10000 entry points in rlcli.{group}, at most" in broken.reason
