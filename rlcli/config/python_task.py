@@ -276,9 +276,9 @@ def _import_configuration(source: TaskSource) -> tuple[Any, dict[str, Any]]:
 
 
 def _agents_in_modules(modules: Iterable[Any]) -> dict[str, Any]:
-    """Return the settings of agents in another framework's form that some modules define, by name.
+    """Return the agent settings in another framework's format that are variables or classes of these modules.
 
-    The name is the name of the variable or class; a single agent has the name of its library.
+    The key is the name of the variable or class; if there is only one, the name of its library.
     """
     found = {
         name: item

@@ -71,12 +71,12 @@ def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyIn
     """Find the policies to compare; zero, random and lqr, which need no run, act in the task of the first run.
 
     Args:
-        names: a run or checkpoint, or zero, random, lqr, for each policy.
+        names: for each policy a run or checkpoint, or shipped, zero, random or lqr.
         request: the further settings, the same for all policies.
 
     Raises:
-        UsageError: for fewer than two policies, or if no policy belongs to a run.
-        ConfigError: if the tasks of the policies differ.
+        UsageError: for fewer than two policies, if no policy belongs to a run, or if the tasks have different names.
+        ConfigError: with every setting in which the tasks differ.
     """
     from rlcli.runs.policy_ref import SHIPPED
 

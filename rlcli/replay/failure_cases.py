@@ -198,7 +198,8 @@ class StagedCase:
 def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase:
     """Build the task of a failure case, to compute contacts and draw images.
 
-    `named` is the task on the command line; its code is used if neither it nor the recorded task is installed.
+    `named` is the task on the command line, or None. Its code is used if it is a local file or folder and the recorded
+    task is not installed.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `rlcli.replay.resimulate.stage`.

@@ -271,7 +271,8 @@ class Staged:
 def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
     """Build the task of a failure or crash file, and a simulation for each of the recorded environments.
 
-    `named` is the task on the command line; its code is used if neither it nor the recorded task is installed.
+    `named` is the task on the command line, or None. Its code is used if it is a local file or folder and the recorded
+    task is not installed.
 
     Raises:
         TaskError: if the task is not installed any more.

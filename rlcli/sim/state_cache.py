@@ -42,7 +42,7 @@ class SimData:
         self.stamp = 0
         """Number of updates; a cached value with an older stamp is out of date."""
         self.command_stamp = 0
-        """Number of updates of the commands; a cached goal with an older stamp is out of date."""
+        """Number of updates of the commands; a value of `once_per_goal` with an older stamp is out of date."""
         self._goals: dict[tuple[object, ...], tuple[tuple[int, int, int], Tensor]] = {}
         self._saved_at, self._summed = -1, (-1, 0.0)
         self._moved: Selection | None = None
@@ -126,7 +126,10 @@ class SimData:
         return value
 
     def once_per_goal(self, key: tuple[object, ...], command: Tensor, compute: Callable[[], Tensor]) -> Tensor:
-        """Return `compute()`, cached under `key` until the state or the command changes, for all terms of a step."""
+        """Return `compute()`, cached under `key` until the state or the command changes, for all terms of a step.
+
+        A goal is what a command asks for; such values are, for example, the distance or the angle to it.
+        """
         # torch counts its own writes to a tensor; commands that managers write through numpy change `command_stamp`
         writes = 0 if command.is_inference() else command._version
         stamps = (self.stamp, self.command_stamp, writes)

@@ -194,7 +194,8 @@ def _serve_with_checks(server: Any, port: int) -> Any:
 class _OwnProcessListener(socket.socket):
     """Socket that accepts only connections of this process.
 
-    The panel sends its drawing to the viewer over the loopback interface too, which every local user can reach.
+    MuJoCo's headless GUI, in this process, sends its drawing to the viewer over the loopback interface, which every
+    local user can reach.
     """
 
     def accept(self) -> tuple[socket.socket, Any]:

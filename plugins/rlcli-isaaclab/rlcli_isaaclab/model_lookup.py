@@ -49,7 +49,8 @@ def given_models(root: Path, asked: Mapping[str, Any]) -> GivenModels:
     folders of RLCLI_MODELS. For each name, `--model` wins, then the first file.
 
     Raises:
-        TaskError: if a file is not a mapping of text, or names a file that does not exist.
+        TaskError: if a file is not YAML, is not a mapping from names to a model's file or to a mapping with `model`
+            and `gains`, or names a file that does not exist.
     """
     found = GivenModels()
     for name, value in asked.items():

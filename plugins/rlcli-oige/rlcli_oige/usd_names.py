@@ -77,7 +77,7 @@ class Ignored:
 
 
 class Vector(np.ndarray):
-    """A vector of USD: a numpy array with USD's getters."""
+    """Counterpart of `Gf.Vec2f` to `Gf.Vec4d`: a numpy array."""
 
     def __new__(cls, *values: Any) -> Vector:
         """Return a vector of numbers, or of another vector."""

@@ -30,7 +30,7 @@ class Shards(Protocol):
         """Return the results of `function(vec_env, *arguments)`, called in every shard, in order."""
 
     def call_one(self, env: int, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return `function(vec_env, row, *arguments)`, called in the shard where environment `env` is a `row`."""
+        """Return `function(vec_env, row, *arguments)`, called in the shard of `env`; `row` is its index there."""
 
 
 class ShardedEngine:
