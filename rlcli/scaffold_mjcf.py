@@ -39,7 +39,7 @@ class Robot:
         }
         home = _default_pose(spec)
         self.has_pose = home is not None
-        """Whether the file has a default pose; otherwise every joint is at zero, or at the nearest limit."""
+        """Whether the file has a default pose. Without one, a joint starts at zero, or at its limit nearest to zero."""
         _remove_scene_elements(spec)
         original = spec.compile()
         tree = ElementTree.fromstring(spec.to_xml())

@@ -38,7 +38,7 @@ class RobotTask:
     found: dict[str, list[str]]
     """Elements of the MJCF: joints, actuators, sensors and keyframes -> their names."""
     has_pose: bool
-    """Whether the MJCF has a default pose: a keyframe, or the numeric `init_qpos`."""
+    """Whether the MJCF has a default pose: a keyframe, or the element `numeric` with the name `init_qpos`."""
 
 
 def read_robot(file: Path, name: str) -> RobotTask:

@@ -231,6 +231,10 @@ class TaskCheck:
                     self._report_no_agent(origin.where)
                     continue
                 path = ("agents", name, *path[1:])
+            if path[0] in formats.format_keys() and path[0] not in self.layers.data:
+                message = f"the task has no settings '{path[0]}' of another framework, so nothing would read this one"
+                self.add(Problem(origin.where, messages.dotted(path), message, "remove it"))
+                continue
             if path[0] == MODELS:
                 form = self.format or formats.format_of_key(foreign_keys(self.layers.data))
                 if not (path := model_path(path, form, self.problems)):
@@ -300,6 +304,9 @@ class TaskCheck:
         self.read_terms()
         data = {key: value for key, value in self.layers.data.items() if key not in PATCHES}
         self.format = formats.format_of_key(foreign_keys(data)) or self.format
+        if "foreign" in data:
+            message = "a task file has no key 'foreign': settings of another framework stand at the top level"
+            self.problem(("foreign",), message, "write the framework's own key, such as 'oige', without 'foreign'")
         for section in [name for name in SECTIONS if isinstance(_mapping(data.get(name)).get("func"), str)]:
             func = data.pop(section)["func"]
             self.problem((section,), "a term needs a name", f"write {section}: {{NAME: {{func: {func}, ...}}}}")

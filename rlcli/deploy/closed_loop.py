@@ -192,7 +192,7 @@ def verify(
     if not write_program(file.parent, code):
         _log.warning(f"{program} differs from the generated program and is not replaced; delete it to get a new one")
     _log.info(f"keep {file.name}, {model.name} and {PROGRAM} in one folder: the program reads the other two files")
-    _log.info(f"{file.name} controls plain MuJoCo with {model.name} for {episodes} episodes")
+    _log.info(f"checking {file.name}: it controls {model.name} in MuJoCo without rlcli for {episodes} episodes")
     differing = deployment_differences(checkpoint, env.layout.record(), reference.deployment, _may_randomize(env))
     space: dict[str, Any] = {"__name__": "run_policy"}
     # the code generated here, not the run_policy.py on disk, which the user may have changed

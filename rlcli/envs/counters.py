@@ -84,7 +84,7 @@ class EpisodeCounters(TensorState):
         self.common_step = torch.zeros((), dtype=torch.int64, device=device)
         self.conditions: list[SuccessCondition] = []
         self.rewards = torch.zeros(num_envs, device=device)
-        """Rewards of the newest step, if the task has conditions of success. (num_envs,)"""
+        """Rewards of the newest step. (num_envs,)"""
 
     def attach(self, engine: Engine) -> None:
         """Make the attributes `*_field` with `Engine.as_field`: the forms of the tensors that are written fastest."""
@@ -112,11 +112,13 @@ class EpisodeCounters(TensorState):
         self._common_step += 1
 
     def count_success(self, reward: Tensor) -> None:
-        """Count a step for each condition of success where it holds, and set its count to 0 where it does not."""
+        """Count a step for each condition of success where it holds, and set its count to 0 where it does not.
+
+        `reward`, (num_envs,), is kept for `reward_gap`.
+        """
         for condition in self.conditions:
             condition.count()
-        if self.conditions:
-            self.rewards.copy_(reward)
+        self.rewards = reward
 
     def reward_gap(self) -> tuple[float, float] | None:
         """Return the mean reward of the newest step in states of success minus that in other states, and its error.

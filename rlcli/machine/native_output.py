@@ -1,4 +1,4 @@
-"""What C code writes to stdout and stderr, past Python's streams."""
+"""Redirection of the output that C code writes directly to stdout and stderr, without Python's `sys.stdout`."""
 
 import contextlib
 import os

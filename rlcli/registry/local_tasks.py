@@ -89,7 +89,10 @@ def python_task(reference: str, name: str | None = None) -> TaskSource:
     if not file.is_file():
         raise TaskError(f"there is no file '{file}'; check the path")
     if file == path and not attribute:
-        raise TaskError(f"'{reference}' does not name an object in the file", hint=f"write {reference}:NAME")
+        raise TaskError(
+            f"'{reference}' names no task in the file",
+            hint=f"write {reference}:NAME, with the class, function or variable that is the task's configuration",
+        )
     return TaskSource(
         name=name or re.sub(r"[^A-Za-z0-9_.-]", "-", label),
         root=file.parent,

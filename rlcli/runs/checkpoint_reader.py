@@ -263,8 +263,8 @@ class Checkpoint:
         size, limit = sum(shard.size for shard in shards), available_memory() // 3
         if size > limit:
             raise CheckpointError(
-                f"{self.folder}: '{name}' needs {size:,} bytes of memory, at most {limit:,} are used"
-                "; end other programs"
+                f"{self.folder}: '{name}' needs {size:,} bytes of memory; rlcli uses at most {limit:,},"
+                " a third of the free memory; end other programs"
             )
 
         def read(start: int, end: int) -> dict[str, Tensor]:

@@ -151,7 +151,8 @@ def require_name(name: str | None) -> None:
         UsageError: if it cannot.
     """
     if name is not None and not _NAME.fullmatch(name):
-        raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint="use letters, digits, - and _")
+        hint = "begin with a letter or digit; then letters, digits, '.', '-' and '_' are allowed"
+        raise UsageError(f"--name '{name}' cannot be part of a folder's name", hint=hint)
     if name is not None and len(name) > MAX_NAME:
         raise UsageError(f"--name has {len(name)} characters; at most {MAX_NAME} are allowed", hint="shorten it")
 

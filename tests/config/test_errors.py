@@ -77,6 +77,7 @@ TYPOS = [
         None,
     ),
     ("params.x=1", "params: only direct tasks have params; remove this block", None),
+    ("foreign.x.y=1", "foreign: a task file has no key 'foreign'", "write the framework's own key"),
     ("success={near: {func: joint_error, joints: [a], at_most: 1, hold_s: -1}}", "success.near.hold_s: expected", None),
     ("agent.gamma=2", "agents.one.gamma: expected a number <= 1, found 2", None),
     ("agent.gama=0.9", "agents.one.gama: unknown key 'gama'", "did you mean 'gamma'?"),

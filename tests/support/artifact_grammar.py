@@ -25,6 +25,7 @@ from safetensors import safe_open
 
 from rlcli.cli.app import main
 from rlcli.replay.trajectory import content_digest
+from support.case_runs import run_cases
 from support.yaml_grammar import VALUES, Raw, paths
 
 SECONDS = 10
@@ -280,23 +281,8 @@ def complaint(code, out, err, seconds):
 
 def run_all(first, count, good, folder):
     """Run cases; print each bad one and the counts; return the number of bad ones."""
-    codes, bad, slowest = {}, 0, 0.0
     torch.set_num_threads(1)
-    for seed in range(first, first + count):
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        begin = time.process_time()
-        code, wrong = run(seed, good, folder)
-        slowest = max(slowest, time.process_time() - begin)
-        codes[str(code)] = codes.get(str(code), 0) + 1
-        bad += bool(wrong)
-        if wrong:
-            print(f"seed {seed}: {wrong}", flush=True)
-        if seed % 50 == 49:
-            print(f"seed {seed} done", flush=True)
-    ends = ", ".join(f"exit {code}: {number}" for code, number in sorted(codes.items()))
-    print(f"{count} cases from seed {first}: {ends}; {bad} bad; slowest {slowest:.1f} s of processor time", flush=True)
-    return bad
+    return run_cases(lambda seed: run(seed, good, folder), first, count, folder)
 
 
 if __name__ == "__main__":

@@ -9,13 +9,13 @@ import io
 import os
 import random
 import re
-import shutil
 import signal
 import sys
 import time
 from pathlib import Path
 
 from rlcli.cli.app import main
+from support.case_runs import run_cases
 
 SECONDS = 10
 MARK = "\u0436"
@@ -193,20 +193,7 @@ def run(seed, folder):
 
 def run_all(first, count, folder):
     """Run cases; print each bad one and the counts; return the number of bad ones."""
-    codes, bad, slowest = {}, 0, 0.0
-    for seed in range(first, first + count):
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        begin = time.process_time()
-        code, wrong = run(seed, folder)
-        slowest = max(slowest, time.process_time() - begin)
-        codes[str(code)] = codes.get(str(code), 0) + 1
-        bad += bool(wrong)
-        if wrong:
-            print(f"seed {seed}: {wrong}", flush=True)
-    ends = ", ".join(f"exit {code}: {number}" for code, number in sorted(codes.items()))
-    print(f"{count} cases from seed {first}: {ends}; {bad} bad; slowest {slowest:.1f} s of processor time", flush=True)
-    return bad
+    return run_cases(lambda seed: run(seed, folder), first, count, folder)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ import io
 import os
 import random
 import resource
-import shutil
 import signal
 import sys
 import time
@@ -18,6 +17,7 @@ from pathlib import Path
 
 from rlcli.cli.app import main
 from rlcli.registry import formats, module_aliases
+from support.case_runs import run_cases
 
 SECONDS = 10
 CODES = (0, 2, 3, 4, 5, 6, 7, 8, 9, 10)
@@ -386,20 +386,7 @@ def complaint(result, out, err, seconds):
 
 def run_all(first, count, folder):
     """Run cases; print each bad one and the counts; return the number of bad ones."""
-    codes, bad, slowest = {}, 0, 0.0
-    for seed in range(first, first + count):
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        begin = time.process_time()
-        result, wrong = run(seed, folder)
-        slowest = max(slowest, time.process_time() - begin)
-        codes[str(result)] = codes.get(str(result), 0) + 1
-        bad += bool(wrong)
-        if wrong:
-            print(f"seed {seed}: {wrong}", flush=True)
-    ends = ", ".join(f"exit {code}: {number}" for code, number in sorted(codes.items()))
-    print(f"{count} cases from seed {first}: {ends}; {bad} bad; slowest {slowest:.1f} s of processor time", flush=True)
-    return bad
+    return run_cases(lambda seed: run(seed, folder), first, count, folder)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from pathlib import Path
 from rlcli.cli.app import main
 from rlcli.config import strict_yaml
 from rlcli.registry import TASKS, catalog, find_task
+from support.case_runs import run_cases
 
 SECONDS = 10
 CODES = (0, 2, 3, 4, 7)
@@ -180,21 +181,11 @@ def complaint(code, printed, seconds, given):
 
 
 def run_all(first, count, folder):
-    """Run cases; print each bad one and the counts."""
+    """Run cases; print each bad one and the counts; return the number of bad ones."""
     os.chdir(folder)
-    originals, codes, bad, slowest = documents(), {}, 0, 0.0
-    for seed in range(first, first + count):
-        begin = time.process_time()
-        code, wrong = run(seed, originals, folder)
-        slowest = max(slowest, time.process_time() - begin)
-        codes[code] = codes.get(code, 0) + 1
-        bad += bool(wrong)
-        if wrong:
-            print(f"seed {seed}: {wrong}", flush=True)
-    ends = ", ".join(f"exit {code}: {number}" for code, number in sorted(codes.items()))
-    print(f"{count} cases from seed {first}: {ends}; {bad} bad; slowest {slowest:.1f} s of processor time", flush=True)
-    return int(bad > 0)
+    originals = documents()
+    return run_cases(lambda seed: run(seed, originals, folder), first, count)
 
 
 if __name__ == "__main__":
-    sys.exit(run_all(int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])))
+    sys.exit(run_all(int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])) > 0)

@@ -22,6 +22,14 @@ def test_framework_settings_become_task_config_keys(tmp_path):
     assert task.foreign["oige"]["mjcf"] == {"Arm": {"model": "arm.xml"}}
 
 
+def test_settings_of_the_environment_class_change_where_the_task_has_them(tmp_path):
+    assert (
+        resolved(arm_folder(tmp_path / "arm"), "oige.env.maxEffort=3.0").task.foreign["oige"]["env"]["maxEffort"] == 3.0
+    )
+    with pytest.raises(ConfigError, match=r"oige.nosuch: the task has no settings 'oige' of another framework"):
+        resolve(find_task("cartpole"), overrides=["oige.nosuch=1"])
+
+
 def test_agent_yaml_beside_task_becomes_ppo_agent(tmp_path):
     agent = resolved(arm_folder(tmp_path / "arm")).agent
     assert (agent.trainer, agent.dialect, agent.max_iterations) == ("ppo", "rl_games", 7)

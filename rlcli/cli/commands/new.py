@@ -44,8 +44,8 @@ def command(
             console.info(f"{len(names)} {what}: {listing([each or '(unnamed)' for each in names])}")
         if not design.has_pose:
             console.warn(
-                "no keyframe: the default pose is zero joint angles; to change it, set"
-                " scene.entities.robot.init.joint_pos in task.yaml"
+                "no keyframe: the default pose is zero joint angles, or the limit nearest to zero; to change it, set"
+                " scene.entities.robot.init.joint_pos in task.yaml, and the height in scene.entities.robot.pos"
             )
         console.info(f"task: {design.kind}")
     folder, files = create(name, flavour, output, design)
