@@ -231,7 +231,9 @@ class TaskCheck:
                     self._report_no_agent(origin.where)
                     continue
                 path = ("agents", name, *path[1:])
-            if path[0] in formats.format_keys() and path[0] not in self.layers.data:
+            # `format_keys` imports the formats, so it comes last
+            unknown = foreign_keys({str(path[0]): None}).keys() - self.layers.data.keys() - {MODELS}
+            if unknown and unknown <= formats.format_keys():
                 message = f"the task has no settings '{path[0]}' of another framework, so nothing would read this one"
                 self.add(Problem(origin.where, messages.dotted(path), message, "remove it"))
                 continue
