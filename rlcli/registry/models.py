@@ -71,11 +71,12 @@ def existing_model_file(root: Path, model: str) -> Path:
 
 @contextlib.contextmanager
 def _system_errors(model: str) -> Iterator[None]:
-    """Turn errors of the system about a model's path, such as one with a too long name, into a TaskError."""
+    """Turn errors about a model's path, such as a too long name or a null character, into a TaskError."""
     try:
         yield
-    except OSError as error:
-        raise TaskError(f"the model '{model}' cannot be opened: {error.strerror}; correct its path") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise TaskError(f"the model '{model}' cannot be opened: {reason}; correct its path") from None
 
 
 def _install_hint(model: str) -> str:

@@ -248,6 +248,17 @@ def test_model_with_a_name_too_long_for_the_system_is_a_mistake_of_its_line(mode
     assert "File name too long" in err
 
 
+@pytest.mark.parametrize("model", ["\\0", "a\\0b.xml", "cartpole:a\\0b.xml", "package:rlcli/\\0"])
+def test_null_character_in_a_models_name_is_a_mistake_of_its_line(model, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "task").mkdir()
+    (tmp_path / "task" / "task.yaml").write_text(GOOD.replace("model: cartpole.xml", f'model: "{model}"'))
+    assert main(["validate", "./task"]) == 3
+    err = capsys.readouterr().err
+    assert err.startswith("error: task/task.yaml:"), err
+    assert "embedded null byte" in err
+
+
 NUM_ENVS = ["0", "-1", "-0", "1_000", "4.0", "04", "1e12", "1e3", "1.5", "1e-5", "nan", ".nan", ".inf", "true", "null",
             "", "[]", "{}", "abc", "0x10", "\u0661\u0662", "\uff11\uff12", "16777217", "1000000000000", "9" * 5000,
             "'4'", "!!int 4", "4,5", "~", "-" * 10]  # fmt: skip
