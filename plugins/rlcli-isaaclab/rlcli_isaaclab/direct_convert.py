@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -138,6 +139,11 @@ def _names(setup: Any, env: Any) -> list[str]:
 
 
 def _source_of(env_class: type) -> str:
-    """Return the source code of a class and of its bases that belong to the task."""
-    bases = [base for base in env_class.__mro__ if not base.__module__.startswith(("rlcli_isaaclab", "gymnasium"))]
-    return "\n".join(inspect.getsource(base) for base in bases if base is not object)
+    """Return the source code of a class and of its bases that belong to the task.
+
+    Bases of the standard library are left out: some are written in C (`typing.Generic` from Python 3.12 on) and have
+    no source.
+    """
+    foreign = {"rlcli_isaaclab", "gymnasium", *sys.stdlib_module_names}
+    bases = [base for base in env_class.__mro__ if base.__module__.partition(".")[0] not in foreign]
+    return "\n".join(inspect.getsource(base) for base in bases)

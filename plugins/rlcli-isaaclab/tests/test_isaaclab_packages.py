@@ -1,6 +1,7 @@
 """Packages built on Isaac Lab: folders on `sys.path`, libraries, actuators of their own, kinematic objects, ranges."""
 
 import dataclasses
+import threading
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ from test_isaaclab_user_code import rover
 
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError, TaskError, pip_install
-from rlcli_isaaclab import namespace
+from rlcli_isaaclab import direct_convert, namespace
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.convert import agent
 from rlcli_isaaclab.format import LIBRARIES
@@ -420,3 +421,13 @@ def test_file_without_names_of_a_format_belongs_to_the_format_of_its_task(tmp_pa
     monkeypatch.setattr(namespace.importlib.util, "find_spec", lambda name: None if name == "warp" else find(name))
     with pytest.raises(TaskError, match=r"kernels_of_test.py:7: warp.func cannot be used: .* not installed"):
         rover(folder, added)
+
+
+class _Local(threading.local):
+    """A class whose base of the standard library is written in C, as `typing.Generic` is from Python 3.12 on."""
+
+    marker = 1
+
+
+def test_source_of_a_direct_task_leaves_out_bases_without_source():
+    assert "marker = 1" in direct_convert._source_of(_Local)
