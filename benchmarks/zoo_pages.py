@@ -200,6 +200,8 @@ def fresh_seeds(zoo: Path) -> list[str]:
         measured = [f"{value:.3f}" for value in row["success"]]
         values = " | ".join([*measured, *["" for _ in document["seeds"][len(measured) :]]])
         lines.append(f"| [{task}]({task}.md) | {values} | {longest} | {row.get('machine', '2 CPU cores')} |")
+    lines += ["", "What limits the seeds below 0.95:", ""]
+    lines += [f"- {task}: {row['limit']}" for task, row in document["tasks"].items() if "limit" in row]
     return [*lines, ""]
 
 
