@@ -59,6 +59,8 @@ class FormatSpec:
         aliases: name of a module of the framework -> name of the module that replaces it in imports of task files, or
             -> `module:function`. Modules below it are replaced, too. `function(name, file)` returns the module for
             a full name that `file` imports, or None.
+        libraries: the aliases that are libraries, such as numpy. An import of one does not show that a task file
+            belongs to this format; an import of another alias does.
         api: the `API_VERSION` that the format was written for.
     """
 
@@ -76,6 +78,7 @@ class FormatSpec:
     agent_file: str = ""
     agent_order: tuple[str, ...] = ()
     aliases: Mapping[str, str] = field(default_factory=dict)
+    libraries: tuple[str, ...] = ()
     api: int = API_VERSION
 
     def __post_init__(self) -> None:

@@ -22,8 +22,6 @@ from typing import Any
 
 from rlcli.registry.formats import Format, aliasing_formats
 
-_COMMON = ("gym", "hydra", "numpy", "omegaconf")
-"""Libraries that files of all formats import."""
 _MOST_FILES = 200
 """Largest number of files of a task in which imports of formats are counted."""
 _python_import = builtins.__import__
@@ -311,8 +309,8 @@ def _formats_for(first: str, file: str) -> tuple[Format, ...]:
     ]
     if len(forms) < 2 or not file.endswith(".py"):
         return tuple(forms)
-    shared = {*_COMMON, *set.intersection(*(set(form.spec.aliases) for form in forms))}
-    own = {form.name: tuple(set(form.spec.aliases) - shared) for form in forms}
+    shared = set.intersection(*(set(form.spec.aliases) for form in forms))
+    own = {form.name: tuple(set(form.spec.aliases) - shared - set(form.spec.libraries)) for form in forms}
     counts = {name: _imports(file, aliases) for name, aliases in own.items()}
     if len(set(counts.values())) == 1:
         root = next((root for root in _roots if Path(file).is_relative_to(root)), Path(file).parent)

@@ -19,11 +19,12 @@ LIBRARIES = {
     **{"hid": "hidapi", "sklearn": "scikit-learn", "cv2": "opencv-python", "PIL": "pillow", "warp": "warp-lang"},
 }
 """Libraries that come with Isaac Lab -> their name for pip. A missing one raises an error when it is used."""
-FOREIGN = (
+_FRAMEWORK = (
     *("isaaclab", "isaaclab_tasks", "isaaclab_assets", "isaaclab_rl", "isaaclab_contrib", "isaaclab_mimic"),
-    *("isaacsim", "omni", "pxr", "carb", "usdrt", "toml", "pink", "pinocchio", "trimesh"),
-    *LIBRARIES,
+    *("isaacsim", "omni", "pxr", "carb", "usdrt"),
 )
+_LIBRARIES = ("toml", "pink", "pinocchio", "trimesh", *LIBRARIES)
+FOREIGN = (*_FRAMEWORK, *_LIBRARIES)
 """Packages whose modules `namespace.py` replaces in task files."""
 
 SPEC = FormatSpec(
@@ -35,6 +36,7 @@ SPEC = FormatSpec(
     agent_order=("rsl-rl", "rl-games", "skrl", "sb3"),
     agents_beside="rlcli_isaaclab.format:agents_beside",
     aliases={"rlcli.isaaclab": "rlcli_isaaclab", **dict.fromkeys(FOREIGN, "rlcli_isaaclab.namespace:module_of")},
+    libraries=_LIBRARIES,
 )
 
 

@@ -42,6 +42,7 @@ SPEC = FormatSpec(
             "rlcli_oige.replacement_modules:find",
         ),
     },
+    libraries=("gym", "numpy", "hydra", "omegaconf", "warp"),
 )
 
 

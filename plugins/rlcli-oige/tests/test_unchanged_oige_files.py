@@ -76,16 +76,17 @@ def test_original_import_lines_step_like_changed_ones(tmp_path):
     assert not new & {"omni", "pxr", "carb", "gym", "omniisaacgymenvs"}
 
 
-def test_helper_file_that_only_mentions_another_framework_belongs_to_its_task(tmp_path):
-    """`trimesh` is a module that Isaac Lab's plugin replaces; here it is part of a name, and no import statement."""
+@pytest.mark.parametrize(("first", "name"), [("", "convert_to_trimesh"), ("from matplotlib import colors\n", "mark")])
+def test_helper_file_with_a_library_of_another_framework_belongs_to_its_task(tmp_path, first, name):
+    """Isaac Lab's plugin replaces imports of `trimesh` and `matplotlib`; neither makes the file one of Isaac Lab's."""
     config = package(
         tmp_path, UNCHANGED.replace("import carb", "import carb\nfrom omniisaacgymenvs.robots import marks")
     )
-    helper = "from pxr import UsdPhysics\n\n\ndef convert_to_trimesh():\n    return UsdPhysics.CollisionAPI\n"
+    helper = f"{first}from pxr import UsdPhysics\n\n\ndef {name}():\n    return UsdPhysics.CollisionAPI\n"
     (config.parents[2] / "robots" / "marks.py").write_text(helper)
     env = build(config)
     marks = sys.modules[type(env.task).__module__].marks
-    assert marks.convert_to_trimesh().__module__.startswith("rlcli_oige")
+    assert getattr(marks, name)().__module__.startswith("rlcli_oige")
 
 
 def test_folder_without_package_has_its_own_modules(tmp_path):
