@@ -160,10 +160,12 @@ def _command_name(arguments: list[str]) -> str | None:
 
 
 def _require_words(arguments: list[str]) -> None:
-    """Check that no word of the command line is empty (`--record ""`, `--record=`) and that all are UTF-8.
+    """Check that no argument of the command line is empty (`--record ""`, `--record=`) and that all are UTF-8.
+
+    The values of environment variables `RLCLI_*` are checked too, because some of them are values of options.
 
     Raises:
-        UsageError: with the word and its place.
+        UsageError: with the argument, and the option or variable that it belongs to.
     """
     for position, word in enumerate(arguments):
         if not word or (word.startswith("--") and word.endswith("=")):
@@ -220,7 +222,12 @@ def _require_folder_and_output() -> None:
 
 
 def _as_rlcli_error(error: BaseException, arguments: list[str]) -> RlcliError:
-    """Return the error to print for any exception."""
+    """Convert an exception to the error that is printed; an exception that is not expected is a bug in rlcli.
+
+    Args:
+        error: any exception of a command, a task's code or a library.
+        arguments: the words of the command line, for the hint of a wrong option.
+    """
     # a corrupt checkpoint may claim any size: its error names the file, which helps more than "too little memory"
     if not isinstance(error, CheckpointError) and (too_little := memory_error(error)):
         return too_little
@@ -271,7 +278,10 @@ def _user_settings(arguments: list[str]) -> dict[str, Any]:
 
 
 def _usage_message(error: ClickException) -> str:
-    """Return the message of a wrong command line, in the same words as that of a wrong setting."""
+    """Return the message of a wrong command line.
+
+    A wrong value, which pydantic rejects, gets the wording that a wrong value in a task file gets.
+    """
     cause, message = error.__cause__, error.format_message()
     if cause is None or not hasattr(cause, "errors"):  # only pydantic's ValidationError has it
         return message
@@ -334,4 +344,4 @@ _FOREIGN_OPTIONS = {
 }
 """Option of another program -> what to write for rlcli."""
 _SHORT_FOR = {"lr": "learning_rate"}
-"""Usual abbreviation -> key of the agent's settings."""
+"""Abbreviation that users type -> key of the agent's settings."""

@@ -91,7 +91,7 @@ def test_against_lqr_adds_its_results(cli):
     assert "success, zero" in text
     assert "success, lqr" in text
     assert "nominal" in text
-    assert "worst of the grid: gravity" in text
+    assert "worst variant of the grid: gravity" in text
 
 
 def test_limits_apply_to_the_worst_variant_and_search(cli):

@@ -1,4 +1,4 @@
-"""`rlcli autopsy`: the recorded failed and outlier episodes of a training."""
+"""`rlcli autopsy`: show the episodes that a training recorded because they failed or were outliers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SORT_KEYS: dict[str, Callable[[FailureCase], Any]] = {
     "kind": lambda case: (case.failure.kind, case.ended_by),
 }
 _MAX_COLUMNS = 12
-"""Most columns of observations, actions or reward terms that are printed."""
+"""Largest number of printed columns of observations, of actions and of reward terms, each."""
 
 
 def command(
@@ -127,7 +127,11 @@ def _row(case: FailureCase) -> list[str]:
 def _print_case(
     run: Run, case: FailureCase, number: int, steps: int, video: Path | None, named: TaskSource | None
 ) -> None:
-    """Print one recorded episode; without the task's code it has no contacts and no video."""
+    """Print one recorded episode: what ended it, its rewards, last steps and contacts; render it with --video.
+
+    Contacts and video need the task's model. If the task cannot be imported, the contacts are left out with a
+    message, and --video is an error.
+    """
     from rlcli.replay.failure_cases import stage_case
 
     staged, error = None, None

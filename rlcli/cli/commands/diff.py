@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rlcli.runs.run import Run
 
 Side = tuple[str, list[str]]
-"""A run or a task, and its overrides."""
+"""One side of the comparison: the run or task as it is typed, and the overrides that follow it."""
 
 
 def command(
@@ -68,7 +68,7 @@ def command(
             equal = _compare_configurations(*both, left, right)
     except RecursionError:
         raise CheckpointError(
-            f"the files of {left[0]} or {right[0]} are damaged; compare other runs, or train again"
+            f"a file of {left[0]} or {right[0]} is damaged: its data is nested too deeply; compare other runs"
         ) from None
     if not equal:
         raise typer.Exit(9)
@@ -93,7 +93,11 @@ def _sides(words: list[str]) -> tuple[Side, Side]:
 
 
 def _task(side: Side, agent: str | None) -> Resolved | None:
-    """Return the configuration of a task; None if the side is a run."""
+    """Return the configuration of a task, resolved with the overrides of its side; None if the side is a run.
+
+    Raises:
+        UsageError: if overrides follow a run.
+    """
     from rlcli.config.load import resolve
     from rlcli.runs.run import RECORD
 
@@ -114,7 +118,14 @@ def _task(side: Side, agent: str | None) -> Resolved | None:
 
 
 def _compare_configurations(one: Resolved | Run, other: Resolved | Run, left: Side, right: Side) -> bool:
-    """Compare the resolved configurations, the models and the code of two tasks, or of a task and a run."""
+    """Print the differences of two configurations, in their values, model files and code; return whether none exist.
+
+    Args:
+        one: configuration of a task, or a run.
+        other: the one to compare with; at least one of the two is a task.
+        left: what was typed for `one`.
+        right: what was typed for `other`.
+    """
     from rlcli.runs.config_diff import compare_files, compare_values, run_values, task_values
     from rlcli.runs.provenance import sources
     from rlcli.runs.run import Run

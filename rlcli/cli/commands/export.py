@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rlcli.runs.run import Run
 
 _MAX_KEYS = 10
-"""Most keys that are printed in which the metadata of the file and the task differ."""
+"""Largest number of keys that --verify prints if the metadata of the exported file differs from the task."""
 
 
 def command(

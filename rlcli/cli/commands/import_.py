@@ -99,7 +99,7 @@ def rsl_rl(
 
 
 def _resolve(task: str, agent: str | None, activation: str | None, action_bound: float | None) -> Resolved:
-    """Check the options, and return the configuration of the task."""
+    """Check --activation and --action-bound, and return the configuration of the task with its agent on the CPU."""
     from rlcli.config.load import resolve
     from rlcli.registry import find_task
 
@@ -185,7 +185,7 @@ def _add_formats() -> None:
 
 
 def _missing(name: str) -> Callable[[], None]:
-    """Return the command for a task format whose plugin is missing or broken; it raises an error with the remedy."""
+    """Return a command for a task format whose plugin is missing or broken; its error says what to install."""
 
     def command() -> None:
         missing = missing_formats()

@@ -22,7 +22,8 @@ def command(
         name: Name of the task in lowercase letters, digits and hyphens, such as my-arm.
         robot: MJCF of a robot, for which the task is written: velocity tracking for a floating base with feet and at
             least four driven joints, reaching goals for a fixed base with all joints driven, else balancing.
-        flavour: yaml (lists of terms), or direct (one class with the hooks of the direct workflow).
+        flavour: yaml (a task.yaml with lists of terms: observations, rewards and others), or direct (one Python class
+            that computes observations, rewards and terminations).
         output: Folder to write. [default: a new folder named after the task]
 
     Examples:

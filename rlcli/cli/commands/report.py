@@ -72,7 +72,12 @@ def command(
 
 
 def _add_media(page: Page, run: Run, checkpoint: Path | None, *, no_eval: bool, no_video: bool) -> tuple[str, str]:
-    """Add evaluation and video to the page; return for each `stored`, `made`, `older` or an empty text (missing)."""
+    """Add evaluation and video to the page.
+
+    Returns:
+        For the evaluation and the video where it comes from: `stored` (a file of the run), `made` (now), `older` (a
+        file of an earlier checkpoint), or an empty text (the page has none).
+    """
     from rlcli.reporting.page_evaluation import PageMedia
 
     if checkpoint is None:

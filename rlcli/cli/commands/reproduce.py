@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rlcli.runs.run import Run
 
 Row = tuple[str, Any, Any]
-"""A fact about software or machine, its value at the time of the run, and its value now."""
+"""A name, such as `torch` or `cpu`, of a version or a property of the machine; its value in run.json; its value now."""
 
 
 def command(
@@ -66,7 +66,7 @@ def _train_again(original: Run, until: int, runs: Path, name: str, force: bool) 
     """Train the first iterations of a run again.
 
     Returns:
-        The new run, its environment steps, and the changes of software and machine.
+        The new run, the number of its environment steps, and the versions and machine properties that have changed.
     """
     from rlcli.cli.ui.progress_view import TrainingView
     from rlcli.machine.cores import available_cores

@@ -87,7 +87,10 @@ def _row(run: Overview, runs_dir: Path) -> list[str]:
 
 
 def _tags(run: Overview) -> str:
-    """Return the remarks on a run: a device other than the CPU, several processes, weights of another run."""
+    """Return the text of the column REMARK: the device if it is not the CPU, the number of processes if it is above 1.
+
+    It ends with `from weights` if the training started with the weights of a checkpoint (--init-from).
+    """
     tags = []
     if (device := str(run.tags.get("device", "cpu"))) != "cpu":
         tags.append(device)

@@ -108,7 +108,11 @@ def _read_sweeps(texts: list[str] | None, points: int) -> list[Sweep]:
 
 
 def _resolve_run(request: PolicyRequest) -> PolicyRequest:
-    """Return the request for a policy; a run as the first argument (`RUN|TASK`) becomes its checkpoint."""
+    """Return the request, with a run that was typed as the first argument (`RUN|TASK`) as its checkpoint.
+
+    Raises:
+        UsageError: if --checkpoint is given too.
+    """
     from rlcli.evaluation.session import is_run_name
 
     task = request.task
@@ -137,7 +141,7 @@ def _show(result: StressResult, policy: str, against: str | None) -> list[HeatMa
         console.heat_map(heat_map.title, f"{heat_map.rows.name} / {heat_map.columns.name}".strip(" /"), heat_map)
     worst = result.worst
     entry = {**result.grid, **result.searched}[worst][metric]
-    where = "found by the search" if worst in result.searched else "of the grid"
+    where = "variant found by the search" if worst in result.searched else "variant of the grid"
     text = f"{metric} {mean_or_rate(entry):.4f} ({interval(entry)})"
     console.data("")
     console.data(f"worst {where}: {describe_point(result.sweeps, worst)}: {text}")

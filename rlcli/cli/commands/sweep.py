@@ -177,10 +177,10 @@ def _search(
 
 
 def _check_options(ctx: typer.Context, task: str | None) -> None:
-    """Check that the given options belong to a new sweep, `sweep show` or `sweep compare`.
+    """Check that every given option is an option of what was typed: a new sweep, `sweep show` or `sweep compare`.
 
     Raises:
-        UsageError: with the first option that does not.
+        UsageError: with the first option that is not, or for an unknown --pruner.
     """
     sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
     given = [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]

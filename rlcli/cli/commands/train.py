@@ -102,7 +102,13 @@ def command(
 
 
 def _study(request: TrainingRequest, seeds: str | None, jobs: int | None, seed: int | None) -> list[int] | Path | None:
-    """Return the seeds of a new study, or the folder of a study to resume; None for a single training."""
+    """Return the seeds of a new study, or the folder of a study to resume; None for a single training.
+
+    A study is a folder with one run for each seed of --seeds.
+
+    Raises:
+        UsageError: for options that contradict each other, such as --seed and --seeds.
+    """
     from rlcli.rl import distributed
     from rlcli.runs.run import STUDY
     from rlcli.runs.study import read_seeds

@@ -6,7 +6,7 @@ from pathlib import Path
 import typer
 
 Offer = tuple[str, str]
-"""A word to complete with, and its description."""
+"""A word that the shell offers as a completion, and the description that the shell shows beside the word."""
 
 _MAX_RUNS = 50
 
@@ -43,7 +43,7 @@ def runs(ctx: typer.Context, incomplete: str) -> list[Offer]:
 
 
 def checkpoints(ctx: typer.Context, incomplete: str) -> list[Offer]:
-    """Return runs and `shipped`; after `RUN@` return the best checkpoint and the steps of that run."""
+    """Return the newest runs, `latest` and `shipped`; for a word that begins with `RUN@`, the run's checkpoints."""
     run, at, _ = incomplete.partition("@")
     if at:
         return _starting([(f"{run}@{name}", "") for name in _checkpoint_names(ctx, run)], incomplete)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 SCHEMA_VERSION = 1
 _ERRORS_OF_ONE_RANK = ("bug", "device", "diverged")
-"""Kinds of errors that may happen on one rank only, so that every rank prints them."""
+"""Values of `RlcliError.kind` of errors that may happen on one rank only, so that every rank prints them."""
 _ESCAPED = re.compile(f"{UNSAFE.pattern}|[\t\n]")
 _NO_READER = (errno.EPIPE, errno.EIO)
 """Errors of writing to a pipe without a reader, and to a terminal that was closed."""
@@ -49,7 +49,7 @@ class Console:
 
     @contextlib.contextmanager
     def stdout_kept(self) -> Iterator[None]:
-        """Redirect what libraries print on stdout to stderr with --json, so that stdout has only the document."""
+        """With --json, redirect what libraries print on stdout to stderr, so that stdout has only the document."""
         if not self.json or sys.stdout is None or sys.stderr is None:
             yield
             return
@@ -61,7 +61,7 @@ class Console:
             self.out = None
 
     def clear_line(self) -> None:
-        """Remove the line with the progress, if there is one."""
+        """Erase the line of progress from the terminal, if the last line is one (`has_line`)."""
         if self.has_line and sys.stderr is not None:
             self.has_line = False
             with contextlib.suppress(OSError, ValueError):  # the terminal may be closed
@@ -148,7 +148,11 @@ class Console:
 
 
 def _shade(share: float) -> str:
-    """Return rich's style of a heat map's cell: black on red for a share of 0, on yellow for 0.5, on green for 1."""
+    """Return rich's style of a heat map's cell: black text on a colour from red over yellow to green.
+
+    Args:
+        share: position of the cell's value on the colour scale: 0 is red, 0.5 yellow, 1 green.
+    """
     red, green = min(1.0, 2.0 - 2.0 * share), min(1.0, 2.0 * share)
     return f"#000000 on #{round(225 * red):02x}{round(200 * green):02x}40"
 
@@ -183,7 +187,7 @@ def plain(text: str) -> str:
 
 
 def output_error(error: OSError) -> MachineError:
-    """Return the error for output that cannot be written."""
+    """Return the error that stdout cannot be written, with the reason of the operating system."""
     return MachineError(f"cannot write the output: {error.strerror or error}", hint="redirect it to another place")
 
 

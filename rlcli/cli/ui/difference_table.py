@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rlcli.runs.config_diff import Difference, Section
 
 _MAX_ROWS = 10
-"""Differences of one kind that the table shows without -v."""
+"""Largest number of differences of one kind (physics, MDP, agent, cosmetic, or a section) in the table without -v."""
 _WIDTH = 40
 """Longest cell [characters]."""
 
@@ -23,11 +23,11 @@ def report_differences(command: str, sections: Sequence[Section], left: str, rig
     """Print the differences between two runs or configurations (the left and the right side).
 
     Args:
-        command: the command, for the JSON document.
-        sections: the parts that were compared.
+        command: name of the command in the JSON document: diff or reproduce.
+        sections: the parts that were compared (configuration, metrics, weights ...), each with its differences.
         left: name of the left side.
         right: name of the right side.
-        entries: further entries of the document.
+        entries: further entries of the JSON document.
 
     Returns:
         Whether the sides are equal, except for cosmetic differences.

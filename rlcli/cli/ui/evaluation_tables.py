@@ -19,7 +19,11 @@ INTERVAL = "95 % INTERVAL"
 
 
 def show_summary(summary: Mapping[str, Any]) -> None:
-    """Print the metrics of an evaluation, each with its interval."""
+    """Print the metrics of an evaluation, each with its 95 % confidence interval.
+
+    Args:
+        summary: the result of an evaluation, as its JSON document has it: metric -> mean or rate with `low` and `high`.
+    """
     entries = [("success rate", summary["success"])] if "success" in summary else []
     for name, condition in summary.get("conditions", {}).items():
         entries.append((f"success: {name} held", condition["held"]))
@@ -58,7 +62,12 @@ def show_comparison(comparison: Comparison) -> None:
 
 
 def show_stress(result: StressResult, against: str | None) -> None:
-    """Print a table with a row for each variant of the task."""
+    """Print a table with a row for each variant of the task: values of the varied parameters, metrics, intervals.
+
+    Args:
+        result: the evaluations of all variants.
+        against: name of the other policy of --against, for its column; None: there is none.
+    """
     from rlcli.evaluation.stress_sweeps import format_value
 
     metric = result.metric

@@ -29,10 +29,10 @@ def report_findings(
 
     Args:
         command: `check` or `lint`.
-        task: the task.
+        task: the task as the user typed it.
         kind: `check` or `rule`.
-        results: names of the checks with their findings; None instead of findings: the check did not run.
-        records: all findings as JSON.
+        results: names of the checks or rules with their findings; None instead of findings: it did not run.
+        records: all findings as JSON data, for the document.
         notes: name of a check -> a remark that is not a problem.
         fail_on_warnings: whether a task with warnings fails.
     """

@@ -32,7 +32,11 @@ METAVARS = {int: "INTEGER", float: "FLOAT", Path: "PATH"}
 
 
 def read_docstring(function: Callable[..., Any]) -> tuple[str, dict[str, str], str]:
-    """Split the docstring of a command into its text, the help of its parameters, and its examples."""
+    """Split the docstring of a command's function into the parts that `--help` prints.
+
+    Returns:
+        The text before the sections, parameter -> help (of `Options:`), and the text of `Examples:`.
+    """
     head, _, examples = inspect.cleandoc(function.__doc__ or "").partition("\n\nExamples:\n")
     text, _, options = head.partition("\n\nOptions:\n")
     entries = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", options, re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Missing dependencies: which one an exception means, and the command that installs it."""
+"""Conversion of a failed import into an error with the pip command that installs the missing dependency."""
 
 import re
 from importlib import metadata

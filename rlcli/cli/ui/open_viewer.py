@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 CHOICES = ("auto", *VIEWERS, "none")
 """Values of --viewer."""
 Choice = tuple[str, str]
-"""A viewer, and the reason for choosing it."""
+"""Name of a viewer (or none), and the reason for choosing it, which `play` prints."""
 
 
 def require_viewer(viewer: str | None, port: int | None, *, to_file: bool) -> None:
@@ -44,14 +44,14 @@ def require_viewer(viewer: str | None, port: int | None, *, to_file: bool) -> No
         )
     if port is not None and (to_file or viewer not in (None, "auto", "web")):
         hint = "leave out --port" if to_file else "write --viewer web, or leave out --port"
-        raise UsageError("--port is an option of the web viewer", hint=hint)
+        raise UsageError("--port sets the port of the web viewer, which is not opened here", hint=hint)
 
 
 def read_commands(texts: Sequence[str]) -> dict[str, float]:
     """Parse the values of --command, such as `vx=0.5,wz=0`: name of a command -> value.
 
     Raises:
-        UsageError: for a text of another form.
+        UsageError: for a part that is not NAME=NUMBER, or whose number is not finite.
     """
     values = {}
     for part in ",".join(texts).split(",") if texts else ():
@@ -111,7 +111,7 @@ def show(session: Session, viewers: Sequence[Choice], *, port: int | None, drawn
         drawn: number of environments to show.
 
     Returns:
-        Whether a viewer was opened; if not, the caller prints values.
+        Whether a viewer was opened; False for the viewer none, for which the caller prints values.
 
     Raises:
         MachineError, DependencyError: if the last viewer does not work.

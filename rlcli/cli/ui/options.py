@@ -30,7 +30,7 @@ def choice(metavar: str, *names: str, help: str | None = None) -> Any:
 
 
 def random_if_minus_one(seed: int) -> int:
-    """Return the seed; a random seed if it is -1."""
+    """Return the value of --seed; for -1 return a random seed below 2**31."""
     if seed != -1:
         return seed
     import secrets
@@ -115,7 +115,10 @@ TYPER_ERRORS = (OSError, EOFError, typer.Exit, typer.Abort, typer.BadParameter)
 
 
 class BodyError(Exception):
-    """Carrier of an error in the body of a command that typer would take for its own, such as that of a closed pipe."""
+    """Wrapper around an error of a command's function, so that typer does not handle it as an error of its own.
+
+    Without the wrapper, typer ends the command without a message, for example at the OSError of a closed pipe.
+    """
 
     def __init__(self, error: Exception) -> None:
         self.error = error
@@ -181,7 +184,10 @@ def add_command(app: typer.Typer, name: str, function: Callable[..., None], **se
 
 @dataclass(frozen=True)
 class _StrictNumber:
-    """Annotation for pydantic: read a number in the form of a task file. This module does not import pydantic."""
+    """Annotation for pydantic: read the text of an option as a number, by the same rules as a number in a task file.
+
+    The class has pydantic's hook, but this module imports pydantic's core only when an option is read.
+    """
 
     least: float | None
     most: float | None
@@ -200,7 +206,7 @@ def _read(value: object) -> object:
 
 
 def _with_strict_number(parameter: inspect.Parameter) -> inspect.Parameter:
-    """Return a command's parameter; if it is a number, its text must have the form of a number in a task file."""
+    """Return a command's parameter; a number gets the type `_StrictNumber`, other parameters are unchanged."""
     kind, *infos = get_args(parameter.annotation) or (None,)
     kind = next((number for number in (int, float) if kind in (number, number | None)), None)
     if kind is None or not infos:
@@ -238,6 +244,11 @@ def video_file(video: Path | None, default: str) -> Path | None:
 def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> None:
     """Check, before any work is done, that an output file can be written.
 
+    Args:
+        output: the file; None: nothing is checked.
+        what: what the file holds, for messages: picture or page.
+        suffixes: the allowed suffixes, such as `.png`.
+
     Raises:
         UsageError: for a suffix that is not one of `suffixes`, or something else than a regular file.
         MachineError: if its folder does not exist or takes no files.
@@ -255,7 +266,7 @@ def check_output(output: Path | None, what: str, suffixes: Sequence[str]) -> Non
 
 
 def exit_on_failures(failures: list[str]) -> None:
-    """Print the limits that failed; exit with code 9 if there are any."""
+    """Print the failed limits of --fail-under and --fail-over; exit with code 9 if there are any."""
     for failure in failures:
         console.info(f"failed: {failure}")
     if failures:

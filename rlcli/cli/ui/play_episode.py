@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rlcli.viewer.video_writer import VideoWriter
 
 _MAX_REASONS = 6
-"""Most reasons for running the earlier episodes that a message lists."""
+"""Largest number of reasons in the message that says why earlier episodes of the environment were run first."""
 
 
 def check_choice(
@@ -31,7 +31,7 @@ def check_choice(
     """Check, before anything is built, that --env and --episode name one episode and fit the other options.
 
     Raises:
-        UsageError: if they do not.
+        UsageError: if one of the two is missing, --num-envs is too small, or --record-mode or --command is given.
     """
     if env is None or episode is None:
         given, missing = ("--episode", "--env") if env is None else ("--env", "--episode")
@@ -119,7 +119,10 @@ def _print_origin(session: Session, start: EpisodeStart, env_id: int, episode: i
 
 
 def _origin(session: Session, start: EpisodeStart, env_id: int, episode: int) -> dict[str, Any]:
-    """Return which episode was repeated, as JSON data; call this after the episode has run."""
+    """Return which episode was repeated, as JSON data; warn if it is only repeatable with the same --num-envs.
+
+    Call this after the episode has run: only then it is known whether the task used a shared random generator.
+    """
     shared = start.shared_draws()
     if shared:
         console.warn(

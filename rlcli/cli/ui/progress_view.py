@@ -19,7 +19,10 @@ _WORK_AFTER_S = 1.4
 """Time after which running work is shown on a terminal [s]; shorter work is not shown."""
 _REDRAW_EVERY_S = 0.25
 _MIN_SHARE, _MIN_ELAPSED_S = 0.2, 30.0
-"""The time left is shown when this share is done or this time [s] has passed: the first parts take longer (imports)."""
+"""The time left is shown when this share of the work is done or this time [s] has passed.
+
+Earlier estimates are too long, because the first parts include imports and compilation.
+"""
 _MAX_ROWS = 100
 """Rows of one table; an untrusted run may have any number of metrics."""
 _MAX_S = 1e10
@@ -105,7 +108,11 @@ class WorkView:
 
 
 def work_line(running: Sequence[Work]) -> str:
-    """Return one line about the running work, the outermost first: names with counts, percentage, time left."""
+    """Return one line about the running work: names with counts, percentage, time left.
+
+    Args:
+        running: parts of the command that are being done now, the outermost first; parts of several threads are mixed.
+    """
     works = list(running)
     counts = [f"{work.what} {work.done:,}/{work.total:,}" if work.total else work.what for work in works]
     counted = [work for work in works if work.total]

@@ -90,7 +90,7 @@ def _cells(run: Overview) -> list[str]:
 
 
 def print_sweep(sweep: Sweep) -> None:
-    """Print the trials and the best one, as a table and as a JSON document."""
+    """Print the trials of a sweep and how to train with the best one's settings, as a table and as a JSON document."""
     settings, best = sweep.settings, sweep.best()
     rows, documents = [], {}
     for trial in sweep.trials():

@@ -1,4 +1,4 @@
-"""Properties of a terminal: its colours, its width, and whether a stream is one."""
+"""Properties of an output stream: whether it is a terminal, its colours and its width."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _ANY_WIDTH = 10_000
-"""Width of lines [characters] in a pipe, where lines need not fit."""
+"""Line width [characters] for output into a pipe or file, wide enough that no line is wrapped."""
 
 
 def is_terminal(stream: TextIO | None) -> bool:

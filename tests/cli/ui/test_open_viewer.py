@@ -109,13 +109,16 @@ def test_play_prints_viewer_and_reason(cli):
         (("--viewer", "wbe"), "did you mean 'web'"),
         (("--viewer", "browser"), ", ".join(("auto", *VIEWERS, "none"))),
         *(
-            (("--viewer", name, "--port", "0"), "--port is an option of the web viewer")
+            (("--viewer", name, "--port", "0"), "--port sets the port of the web viewer, which is not opened here")
             for name in (*VIEWERS, "none")
             if name != "web"
         ),
         (("--viewer", "web", "--port", "70000"), "'--port'"),
         (("--viewer", "web", "--video", "x.gif"), "leave out --viewer"),
-        (("--port", "0", "--video", "x.gif"), "--port is an option of the web viewer; hint: leave out --port"),
+        (
+            ("--port", "0", "--video", "x.gif"),
+            "--port sets the port of the web viewer, which is not opened here; hint: leave out --port",
+        ),
         (("--show", "3"), "above the number of environments, 2; hint: --num-envs 3"),
         (("--show", "0"), "'--show'"),
         (("--command", "vx"), "--command 'vx' is not NAME=NUMBER"),
