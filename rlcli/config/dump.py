@@ -109,7 +109,7 @@ def to_yaml_with_origins(resolved: Resolved, data: dict[str, Any] | None = None)
 
     Args:
         resolved: the configuration.
-        data: the part of it to write, from `select`; None: all of it.
+        data: the part of the configuration to write, as `select` returns it; None: the whole configuration.
     """
     lines: list[str] = []
     _annotate(to_data(resolved) if data is None else data, (), resolved, lines)
@@ -128,7 +128,7 @@ def origins(resolved: Resolved, data: dict[str, Any] | None = None) -> dict[str,
 
     Args:
         resolved: the configuration.
-        data: the part of it to look at, from `select`; None: all of it.
+        data: the part of the configuration to look at, as `select` returns it; None: the whole configuration.
     """
     return {
         messages.dotted(path): _origin(resolved, path)
@@ -223,13 +223,16 @@ def _annotate(value: Any, path: Path, resolved: Resolved, lines: list[str]) -> N
 
 
 def _inline(value: object) -> str:
-    """Return a value as YAML on one line."""
+    """Return a value as YAML on one line, for example a list as `[1, 2]`."""
     text: str = yaml.dump((value,), Dumper=_Dumper, default_flow_style=True, width=10**6, allow_unicode=True)
     return text.strip()[1:-1]
 
 
 def _origin(resolved: Resolved, path: Path) -> str:
-    """Return the origin of the value at a path as text; for a list also the origins of items that overrides changed."""
+    """Return the origin of the value at a path as text, such as `task.yaml:3:5`, or `default`.
+
+    For a list, the origins of single items that overrides changed are added.
+    """
     known = resolved.layers.origins
     if path not in known:
         return "default"
@@ -249,7 +252,7 @@ def _explicit_origins(resolved: Resolved) -> list[tuple[Path, Origin]]:
 
 
 def _until_list(data: object, path: tuple[Any, ...]) -> tuple[tuple[Any, ...], Any]:
-    """Cut a path at the first list on it, and return it with the value there.
+    """Cut a path at the first list on it; return the cut path and the value at that path.
 
     An override can change one item of a list, but a `--config` file can only replace the whole list.
     """

@@ -166,7 +166,9 @@ def read(file: FilePath, name: str | None = None, *, pipe: bool = False) -> Docu
 
 
 def document_origins(document: Document, name: str, layer: str, at: Path = ()) -> Callable[[Path], Origin]:
-    """Return the function from the path of a value, relative to `at`, to the value's origin.
+    """Return a function that maps the path of a value in a parsed file to its origin: layer, file, line and column.
+
+    The paths that the function takes are relative to `at`.
 
     Args:
         document: the parsed file.
@@ -226,7 +228,7 @@ def parse_override(text: str) -> tuple[Path, Any]:
 
 
 def override_place(text: str) -> str:
-    """Return the text that names an override as the location of a mistake in a message."""
+    """Return the location of a mistake in an override, for messages: `override 'KEY.PATH=VALUE'`, shortened."""
     return f"override '{shorten(text, 150)}'"
 
 
@@ -236,7 +238,10 @@ def parse_address(text: str) -> tuple[str, ...]:
 
 
 def without(data: Any, paths: Iterable[Path]) -> Any:
-    """Return a copy of nested mappings with None at these paths; the values there are validated separately."""
+    """Return a copy of nested mappings with None instead of the values at these paths.
+
+    The caller validates those values separately, with their own models.
+    """
     inner: dict[Any, list[Path]] = {}
     for path in paths:
         if path == ():

@@ -39,6 +39,7 @@ class Resolved:
     agent: AgentConfig | None
     """Settings of the chosen agent; None for a task without agents."""
     agent_name: str | None
+    """Name of the chosen agent; None for a task without agents."""
     trainer: TrainerSpec | None
     """Trainer of the agent; None without an agent."""
     layers: Layers
@@ -55,7 +56,13 @@ class Resolved:
         return self.layers.place(path)
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> Problem:
-        """Return a `Problem` for the value at a path of this configuration, with its location."""
+        """Return a mistake in the configuration as a `Problem`, for the caller to raise in a `ConfigError`.
+
+        Args:
+            path: keys and list indices of the wrong value.
+            message: what is wrong.
+            hint: what to write instead.
+        """
         return Problem(self.place(path), messages.dotted(path), message, hint)
 
     def with_num_envs(self, count: int) -> Self:
@@ -64,7 +71,7 @@ class Resolved:
         return replace(self, task=self.task.model_copy(update={"scene": scene}))
 
     def without_randomness(self) -> Self:
-        """Return the configuration without events, curriculum and noise."""
+        """Return the configuration without events, curriculum and observation noise, for tests of exact dynamics."""
         clean = {"enable_corruption": False}
         observations = {name: group.model_copy(update=clean) for name, group in self.task.observations.items()}
         changes: dict[str, Any] = {"events": {}, "curriculum": {}, "observations": observations}
@@ -202,9 +209,11 @@ def missing_models(resolved: Resolved) -> list[str]:
 
 
 def extensions(source: TaskSource) -> tuple[Vocabulary, type[BaseModel] | None]:
-    """Return the terms that a task may name, its own ones included, and the model of a direct task's parameters.
+    """Return what a task file may contain beyond the fixed keys: the terms, and the parameters of a direct task.
 
-    The model is None for a manager-based task, and for a direct task without parameters.
+    Returns:
+        The terms that the file may name (those of `rlcli.mdp` and the task's own), and the pydantic model of `params`;
+        None instead of the model for a manager-based task, and for a direct task without parameters.
 
     Raises:
         ConfigError: if the source code of the task cannot be read.

@@ -32,7 +32,7 @@ _BOUNDS = {
 }
 
 KeyLocations = Mapping[str, list[str]]
-"""Key -> its dotted paths in the whole schema."""
+"""Key, such as `num_envs` -> the dotted paths at which a task file may have it, such as `scene.num_envs`."""
 
 
 def problems(
@@ -163,7 +163,7 @@ def _inside(location: str) -> str:
 
 
 def _expected(item: Any) -> str:
-    """Return what was expected by one of pydantic's errors, in words: `a number > 0`, `true or false`."""
+    """Return in words what the value of one of pydantic's errors must be, such as `a number > 0` or `true or false`."""
     kind, context = item["type"], item.get("ctx", {})
     if kind in _BOUNDS:
         sign, key = _BOUNDS[kind]
@@ -202,7 +202,10 @@ def _unquoted(text: str, items: Iterable[Any]) -> str | None:
 
 
 def _data_path(item: Any, data: Any) -> Path:
-    """Return the path in the data of one of pydantic's errors: its location without the tags of unions."""
+    """Return the path of the wrong value in the data, from one of pydantic's errors (`item`).
+
+    The location in the error also has the names of union members, which are no keys of the data; they are left out.
+    """
     path: list[str | int] = []
     location = item["loc"]
     for position, step in enumerate(location):
@@ -234,7 +237,7 @@ def _length(model: type[BaseModel], path: Path) -> int | None:
 
 
 def _arms_at(model: type[BaseModel], path: Path) -> list[Any]:
-    """Return the types that a model allows for the value at a path."""
+    """Return the types that a model allows for the value at a path; several for a union, whose members are `arms`."""
     arms: list[Any] = [model]
     for step in path:
         arms = [below for arm in arms for child in _children(arm, step) for below in _arms(child)]

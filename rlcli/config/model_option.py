@@ -46,7 +46,11 @@ def read_models(words: Iterable[str]) -> dict[str, Any]:
 
 
 def given_settings(recorded: Mapping[str, Any], changes: Mapping[Path, Any]) -> tuple[dict[str, Any], dict[Path, Any]]:
-    """Return the models, by name, and the values, by path, that a configuration in Python receives.
+    """Return the settings that are passed to a task in Python, whose file may leave models and values open.
+
+    Returns:
+        Name of a robot or object -> its MJCF file (as from `read_models`), and path of a setting -> its value: the
+        values that the run has stored, then the changes.
 
     Args:
         recorded: the configuration that a run has stored; empty without a run.

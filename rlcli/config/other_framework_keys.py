@@ -1,6 +1,7 @@
-"""Task files of other frameworks: keys that only the environment class of a format reads, and translated files.
+"""Task files in another framework's format: their own top-level keys, and the merging of translated files.
 
-In the file, such a key is at the top level; in a `TaskConfig` it is below the key `foreign`.
+Only the environment class of the format reads such a key, for example `oige`. In the file it is at the top level; in a
+`TaskConfig` it is below the key `foreign`.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,10 +32,16 @@ def move_foreign_keys(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def merge_translation(layers: Layers, found: Translation, entry: Entry) -> None:
-    """Merge the result of a format's `read` into the layers of a configuration; `entry` is the format's entry point.
+    """Merge a task file that a format's plugin has translated into the layers of a configuration.
+
+    Args:
+        layers: the configuration so far.
+        found: the result of the plugin's function `read`: the translated data, and functions that return the origin
+            (file and line) of each value.
+        entry: the plugin's entry point, for messages.
 
     Raises:
-        PluginError: if one of its functions returns another value than an `Origin`.
+        PluginError: if one of these functions returns something else than an `Origin`.
     """
 
     def checked(origin: Callable[[Path], Origin]) -> Callable[[Path], Origin]:

@@ -2,10 +2,12 @@
 
 The configuration is a `TaskConfig`, a mapping with its keys, or a function that returns one. Or it is a configuration
 of another framework with a method `__rlcli_task__(root, models) -> PythonTask`; its optional method
-`__rlcli_fill__(values)` sets the settings that the file leaves open, and returns their paths. An agent of another
-framework has a method `__rlcli_agent__(notes)`; its optional method `__rlcli_fit__(agent, observations, notes)` adapts
-the settings to the observation groups of the task. Terms are names or functions. A function that is not a term of
-`rlcli.mdp` becomes one of the task's own terms under its name.
+`__rlcli_fill__(values)` sets required settings that have no value in the file, and returns their paths. An agent of
+another framework has a method `__rlcli_agent__(notes)`; its optional method `__rlcli_fit__(agent, observations, notes)`
+adapts the settings to the observation groups of the task.
+
+Terms are names or functions. A function that is not a term of `rlcli.mdp` becomes one of the task's own terms under its
+name.
 """
 
 import copy
@@ -52,7 +54,7 @@ class PythonTask:
     place: str = ""
     """File and line of the configuration's class; empty if unknown."""
     filled: list[Path] = field(default_factory=list)
-    """Paths of the settings that the file leaves open and the command line gives."""
+    """Paths of required settings that have no value in the file and got one from the command line."""
 
 
 def source_of(value: object, root: FilePath | None = None, name: str = "task") -> TaskSource:
@@ -75,7 +77,7 @@ def load(
     Args:
         source: the task.
         models: name of a robot or object -> its MJCF file, from `--model`.
-        values: path -> value of a setting, for settings that the configuration of another framework leaves open.
+        values: path -> value, for required settings that have no value in a configuration of another framework.
 
     Raises:
         TaskError: if the code of the task raises an error, or the configuration's object does not exist.
@@ -123,7 +125,7 @@ def to_task(
         label: name of the configuration in messages.
         root: the folder of the task.
         models: name of a robot or object -> its MJCF file, from `--model`.
-        values: path -> value of a setting, for settings that the configuration of another framework leaves open.
+        values: path -> value, for required settings that have no value in a configuration of another framework.
 
     Raises:
         ConfigError: if the object is not a configuration.
@@ -155,6 +157,9 @@ def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
     Args:
         value: a mapping, the settings of a trainer (an `AgentConfig`), or an object with `__rlcli_agent__(notes)`.
         notes: the list to which notes about the translation are added.
+
+    Raises:
+        TypeError: if the settings are not a mapping.
     """
     value = value() if isinstance(value, type) else value
     if hasattr(value, "__rlcli_agent__"):
@@ -358,7 +363,13 @@ def _agent_object(entry: object) -> Any:
 
 
 def _is_entry(entry: object, module: str, attribute: str) -> bool:
-    """Return whether `entry`, a reference `module:name` or an object, is the object `attribute` of a module."""
+    """Return whether an argument of a registration with Gymnasium is the object `attribute` of a module.
+
+    Args:
+        entry: the argument: a reference `module:name`, or the object itself.
+        module: dotted name of the module.
+        attribute: name of the object in the module.
+    """
     if isinstance(entry, str):
         return entry == f"{module}:{attribute}"
     kind = entry if hasattr(entry, "__qualname__") else type(entry)  # the configuration's class
@@ -386,9 +397,10 @@ def _object(entry: object) -> Any:
 
 
 def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
-    """Add agents, by name, to a task. The default is the first one in `agent_order` of the format, or the only one.
+    """Add agents, by name, to the data of a task, and choose the default agent.
 
-    Of several agents, those that rlcli cannot read are left out, each with a note.
+    The default is the first name in the format's `agent_order` that exists; without an order, the only agent. If there
+    are several agents, those that rlcli cannot read are left out, each with a note.
     """
     order = task.format.spec.agent_order if task.format is not None else ()
     found: dict[str, Any] = {}

@@ -73,7 +73,11 @@ def load(text: str | bytes) -> Document:
 
 
 def load_value(text: str) -> Any:
-    """Parse one value, such as `1e-3`, `[1, 2]`, `{a: 1}` or `text`, as it would be read after a key."""
+    """Parse one value, such as `1e-3`, `[1, 2]`, `{a: 1}` or `text`, as it would be read after a key.
+
+    Raises:
+        YamlError: with the position of the first mistake.
+    """
     return _parse(_decode(text))[0]
 
 
@@ -95,7 +99,10 @@ def _after(before: str) -> Mark:
 
 
 def _parse(text: str) -> tuple[Any, dict[Path, Mark]]:
-    """Return the parsed value of a YAML text, and path -> position (line, column). The caller may change both."""
+    """Return the parsed value of a YAML text, and path -> position (line, column).
+
+    Both are copies of the cached result, so the caller may change them.
+    """
     value, marks = _parse_cached(text)
     return _copy(value), dict(marks)
 
@@ -134,7 +141,7 @@ def _events(text: str) -> Iterator[events.Event]:
 
 
 def _checked_events(text: str) -> Iterator[events.Event]:
-    """Yield PyYAML's events; refuse long files, further documents, anchors, aliases and tags."""
+    """Yield PyYAML's parsing events; raise YamlError for long files, further documents, anchors, aliases and tags."""
     documents = 0
     for count, event in enumerate(_events(text)):
         if count > MAX_ITEMS:
@@ -164,7 +171,12 @@ class _Reader:
     marks: dict[Path, Mark] = field(default_factory=dict)
 
     def value(self, event: events.Event, path: Path) -> Any:
-        """Return the value that starts with an event; `path` is where the value is in the file."""
+        """Return the value that starts with an event, and read its further events from `stream`.
+
+        Args:
+            event: first event of the value.
+            path: keys and list indices that lead to the value.
+        """
         self.marks.setdefault(path, _position(event))  # `_mapping` has stored the position of the key
         if isinstance(event, events.ScalarEvent):
             return _scalar(event, key=False)
@@ -203,7 +215,15 @@ def _position(event: events.Event) -> Mark:
 
 
 def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
-    """Return the value of a scalar by the rules of YAML 1.2; refuse scalars that other parsers read differently."""
+    """Return the value of a scalar by the rules of YAML 1.2.
+
+    Args:
+        event: the scalar.
+        key: whether the scalar is a key of a mapping.
+
+    Raises:
+        YamlError: for a scalar that parsers of YAML 1.1 read differently, such as `on` or `010`.
+    """
     text = event.value
     if len(text) > MAX_SCALAR:
         raise YamlError(f"the value is longer than {MAX_SCALAR} characters; shorten it", event.start_mark)

@@ -97,7 +97,7 @@ def term_entries(pattern: str = "", term_files: Iterable[Path] = ()) -> list[Ter
 
 
 def type_text(schema: Mapping[str, Any]) -> str:
-    """Return a JSON schema as text with its range: `number > 0`, `[number >= 0, number] or null`."""
+    """Return the type of a JSON Schema as text with its range: `number > 0`, `[number >= 0, number] or null`."""
     if "$ref" in schema:
         return str(schema["$ref"]).rsplit("/", 1)[-1]
     for union in ("anyOf", "oneOf", "allOf"):

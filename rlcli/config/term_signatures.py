@@ -36,10 +36,10 @@ SECTIONS: dict[str, type[schema.TermConfig]] = {
 """Section of the YAML -> model of the keys that all its terms share."""
 
 SELECTORS = ("Joints", "Bodies", "Sites", "Sensors", "Actuators", "Geoms", "Tendons", "Pairs")
-"""Aliases of `rlcli.task` that select elements of the term's `entity`."""
+"""Names in `rlcli.task` for annotations of parameters whose value selects elements of the term's `entity` by name."""
 
 NAMED = ("Entity", "Command", "Address", "ContactSensor", "RaySensor", "CameraSensor")
-"""Aliases of `rlcli.task` that name one object."""
+"""Names in `rlcli.task` for annotations of parameters whose value is the name of one object."""
 
 _TYPES: dict[str, Any] = {
     "float": schema.Number,
@@ -74,7 +74,10 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """Name, parameters and location of a term, as read from its source file."""
+    """Name, parameters and location of a term, as read from its source file.
+
+    A term is a function or class that a task file names with `func`, for example a reward.
+    """
 
     name: str
     """Name in YAML."""
@@ -125,7 +128,7 @@ class Vocabulary:
         return sorted({*self.own, *builtin_terms(section)})
 
     def other_section(self, section: str, name: str) -> str | None:
-        """Return another section that has a built-in term of this name, or None."""
+        """Return another section with a built-in term of this name, for a hint; None if there is no such section."""
         return next((other for other in SECTIONS if other != section and name in builtin_terms(other)), None)
 
 
@@ -283,7 +286,10 @@ def _model(name: str, base: type[schema.StrictModel], fields: dict[str, Any]) ->
 
 @functools.cache
 def _closed(section: str) -> type[schema.TermConfig]:
-    """Return the model of the keys that all terms of a section share, as a class that refuses unknown keys."""
+    """Return a subclass of a section's model (of the keys that all its terms share) that refuses unknown keys.
+
+    The models of single terms add the parameters of their functions to this class.
+    """
     base = SECTIONS[section]
     config = ConfigDict(extra="forbid", protected_namespaces=())  # a parameter may start with `model_`
     return type(base.__name__, (base,), {"model_config": config, "__module__": __name__})
@@ -382,7 +388,7 @@ def _literal(node: ast.expr) -> Any:
 
 
 def _field_default(node: ast.expr | None) -> Any:
-    """Return the default of a field of `Params` in the form that pydantic's `create_model` takes."""
+    """Return the default of a field of `Params` for pydantic's `create_model`: `...` for a required field."""
     if node is None:
         return ...
     if isinstance(node, ast.Call) and last_name(node.func) == "Field":
@@ -418,7 +424,13 @@ def term_entries(data: dict[str, Any]) -> list[tuple[str, KeyPath, dict[str, Any
 def with_terms(
     task: schema.TaskConfig, terms: Mapping[KeyPath, schema.TermConfig | None], params: dict[str, Any] | None
 ) -> schema.TaskConfig:
-    """Return the task with its terms (path -> validated term) and parameters. Terms that are None are removed."""
+    """Return a copy of a task with its validated terms and parameters.
+
+    Args:
+        task: the validated task, which has None instead of its terms.
+        terms: path of a term, such as `("rewards", "alive")` -> the validated term; None removes the term.
+        params: validated parameters of a direct task; None: the task keeps its own.
+    """
     update: dict[str, Any] = {} if params is None else {"params": params}
     for section in SECTIONS:
         if section == "observations":

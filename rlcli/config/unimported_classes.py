@@ -85,7 +85,7 @@ class ClassSearch:
                 yield from self.walk(base, seen)
 
     def bases(self, source: SourceClass) -> list[SourceClass]:
-        """Return the direct base classes of a class; none after `MAX_CLASSES` classes."""
+        """Return the direct base classes of a class that are found; an empty list after `MAX_CLASSES` classes."""
         if not self._left:
             return []
         self._left -= 1
@@ -126,7 +126,12 @@ class ClassSearch:
 
 
 def _module_files(file: Path, node: ast.ImportFrom) -> Iterator[Path]:
-    """Yield the files that the module in `node`, a `from MODULE import ...` of a file, may have; they may not exist."""
+    """Yield the files that may define the module of an import statement; they may not exist.
+
+    Args:
+        file: the importing file.
+        node: its statement `from MODULE import ...`.
+    """
     parts = (node.module or "").split(".")
     # an absolute import may start at any folder above the file, because the root of the package is unknown
     roots: Sequence[Path] = file.parents[node.level - 1 : node.level] if node.level else file.parents

@@ -63,7 +63,11 @@ Change = tuple[Path, Any, Origin]
 
 @dataclass(slots=True)
 class TaskCheck:
-    """Check of one configuration, step by step: the sources merged so far, and every problem found so far."""
+    """Check of one configuration, step by step: the sources merged so far, and every problem found so far.
+
+    `load.resolve` calls the methods in their order: `changes`, `document`, `read_task`, `choose_agent`, `merge_agent`,
+    `apply` and `patch` merge the sources; `agent` and `task` validate the result. Problems are collected in `problems`.
+    """
 
     source: TaskSource
     layers: Layers = field(default_factory=Layers)
@@ -72,6 +76,7 @@ class TaskCheck:
     missing: DependencyError | None = None
     """Error for a trainer that is not installed; None: there is no such error."""
     locations: messages.KeyLocations = field(default_factory=dict)
+    """Where each key is allowed, for hints about misplaced keys."""
     functions: dict[str, Signature] = field(default_factory=dict)
     """Own terms of a configuration in Python, by name."""
     notes: list[Note] = field(default_factory=list)
@@ -81,7 +86,12 @@ class TaskCheck:
     place: str = ""  # file and line of a configuration's class in another framework's form; empty for others
 
     def document(self, changes: Iterable[Change] = ()) -> Document:
-        """Return the content of the task's file. A configuration in Python gets the models that `changes` name."""
+        """Return the content of the task's file.
+
+        Args:
+            changes: changes from the command line. A configuration in Python receives the models of --model and
+                values for its required settings from them.
+        """
         file = self.source.config  # YAML: a task, or the record of a run
         recorded = upgraded(read(file, self.source.label), file) if file.suffix != ".py" else None
         if recorded is not None and self.source.python is None and self.source.value is None:
@@ -93,7 +103,7 @@ class TaskCheck:
         return recorded or Document(task.data)
 
     def add(self, *problems: Problem) -> None:
-        """Add problems.
+        """Add problems to those found so far.
 
         Raises:
             ConfigError: if there are more than `MAX_PROBLEMS`.
@@ -213,7 +223,12 @@ class TaskCheck:
             self.add(Problem(where, "agent", "the task has several agents and no default", hint))
 
     def patch(self, layer: str, at: Path) -> None:
-        """Merge the mapping at path `at` over the task: `play`, or `task` of the chosen agent."""
+        """Merge a mapping of the configuration over the task itself: `play`, or `task` of the chosen agent.
+
+        Args:
+            layer: kind of source in the origins of the values: play or agent.
+            at: path of the mapping.
+        """
         patch = self.layers.get(at)
         if patch is None or not self._is_mapping(patch, at):
             return
@@ -224,7 +239,12 @@ class TaskCheck:
         self.layers.merge(task, lambda path: Origin(layer, self.layers.place(at + path)))
 
     def apply(self, changes: Iterable[Change], name: str | None) -> None:
-        """Apply changes from the command line. `agent.x` changes the agent `name`."""
+        """Set the values of overrides and flags of the command line.
+
+        Args:
+            changes: path, value and origin of each.
+            name: the chosen agent, which `agent.KEY=VALUE` changes; None: such a change is a problem.
+        """
         for path, value, origin in changes:
             if path[0] == "agent":
                 if name is None:
@@ -234,7 +254,7 @@ class TaskCheck:
             # `format_keys` imports the formats, so it comes last
             unknown = foreign_keys({str(path[0]): None}).keys() - self.layers.data.keys() - {MODELS}
             if unknown and unknown <= formats.format_keys():
-                message = f"the task has no settings '{path[0]}' of another framework, so nothing would read this one"
+                message = f"the task has no settings '{path[0]}' of another framework, so nothing would read this value"
                 self.add(Problem(origin.where, messages.dotted(path), message, "remove it"))
                 continue
             if path[0] == MODELS:
@@ -256,7 +276,7 @@ class TaskCheck:
     # --- validation ---
 
     def agent(self, name: str) -> tuple[TrainerSpec | None, AgentConfig | None]:
-        """Return the agent's trainer and its validated settings; None if they are not valid."""
+        """Return the trainer of an agent and the agent's validated settings; None for each that is not valid."""
         at: Path = ("agents", name)
         for path in (("agents",), at):
             data = self.layers.get(path)
@@ -366,7 +386,7 @@ class TaskCheck:
         return base.model_construct(**dict(checked)) if checked is not None else None
 
     def _siblings(self, path: Path) -> list[str]:
-        """Return the names of all terms in the section (or group of observations) of the term at a path."""
+        """Return the names of all terms in the section (or observation group) of the term at a path."""
         terms = _mapping(self.layers.get(path[:-1]))
         return [name for name, term in terms.items() if isinstance(term, dict) and "func" in term]
 
@@ -414,7 +434,11 @@ class TaskCheck:
             self.problem(("observations",), "the observations need a group 'policy' with at least one term: add one")
 
     def _require_direct(self, data: Mapping[str, Any]) -> None:
-        """Check that a direct task has no terms but those of `success`, and the settings of another format's class."""
+        """Check that a direct task has no terms except those of `success`.
+
+        For a task in another framework's format, the format's plugin also checks the settings that only its
+        environment class reads.
+        """
         if self.format is not None:
             key = self.format.spec.key
             for path, message, hint in self.format.call("check", data.get(key, {})) or ():

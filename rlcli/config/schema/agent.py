@@ -10,7 +10,7 @@ from rlcli.safe_text import float_or_nan
 
 
 class AutopsyConfig(StrictModel):
-    """Recording of failed and unusual episodes during training; `rlcli autopsy RUN` shows the recordings."""
+    """Recording of failed and outlier episodes during training; `rlcli autopsy RUN` shows the recordings."""
 
     seconds: Annotated[float, Field(gt=0, le=60), _FractionString()] = 2.0
     """Length of the recorded end of an episode [s]."""
@@ -65,13 +65,13 @@ class AgentConfig(StrictModel):
     """Iterations between two evaluations of the policy, as `rlcli eval` does them; null: no evaluations. RUN@best is
     the checkpoint with the best evaluation."""
     eval_episodes: Count = 100
-    """Number of episodes of each of these evaluations."""
+    """Number of episodes of each evaluation of `eval_interval`."""
     until: Annotated[str, AfterValidator(_check_threshold)] | None = None
     """Threshold at which training ends before its budget: success=X, return=X or length=X. It is reached when the lower
     end of an evaluation's 95 % interval is at least X. With a threshold, `eval_interval: null` means a twentieth of the
     budget, and `eval_episodes` is raised to the number that the interval of a success rate needs."""
     autopsy: AutopsyConfig | None = AutopsyConfig()
-    """Recording of failed and unusual episodes during training on a CPU; null: no recording."""
+    """Recording of failed and outlier episodes during training on a CPU; null: no recording."""
     torch_threads: Threads | None = None
     """Number of CPU threads of the policy update; null: min(4, cores). Another number gives other rounding errors."""
     action_bound: Positive | None = 1.0

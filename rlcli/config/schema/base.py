@@ -77,7 +77,7 @@ Positive = Annotated[float, Field(gt=0), _FractionString(), _Limits(1e-38, 1e38)
 NotNegative = Annotated[float, Field(ge=0), _FractionString(), _Limits(0.0, 1e38)]
 """Number of at least 0."""
 Seconds = Annotated[float, Field(gt=0), _FractionString(), _Limits(0.0, 1e9)]
-"""Time that is divided by the control period: with `sim.dt` of at least 1e-9 the number of steps fits 64 bits."""
+"""Duration above 0 [s], at most 1e9, so that its number of environment steps fits 64 bits for every `sim.dt`."""
 Count = Annotated[int, Field(ge=1), _Limits(1, 2**31 - 1)]
 """Whole number of at least 1."""
 Width = Annotated[int, Field(ge=1, le=2**24)]

@@ -132,7 +132,7 @@ class InitialStateConfig(StrictModel):
     joint_vel: dict[str, Number] = {}
     """Joint name or regex -> default velocity [m/s or rad/s]."""
     lin_vel: Vec3 = (0.0, 0.0, 0.0)
-    """Linear velocity of a free root body, world frame [m/s]; of its `velocity_point`."""
+    """Linear velocity of a free root body, world frame [m/s]: of its origin or centre of mass, see `velocity_point`."""
     ang_vel: Vec3 = (0.0, 0.0, 0.0)
     """Angular velocity of a free root body, world frame [rad/s]."""
 
@@ -192,8 +192,8 @@ class EntityConfig(StrictModel):
     init: InitialStateConfig = InitialStateConfig()
     """Default state. A joint that is not listed starts at the MJCF's qpos0 with velocity 0."""
     soft_joint_pos_limit_factor: Annotated[float, Field(gt=0, le=100), _FractionString()] = 1.0
-    """Part of the joint range, around its middle, that is inside the soft limits; above 1, the soft limits are wider
-    than the joint range."""
+    """Factor from the joint range to the range of the soft limits, around the same middle. Terms read the soft limits;
+    the physics does not enforce them."""
 
     @model_validator(mode="after")
     def _one_kind(self, info: ValidationInfo) -> Self:
@@ -240,7 +240,7 @@ class SceneConfig(StrictModel):
     terrain: TerrainConfig | None = None
     """Uneven ground. All environments share it and start at different positions on it."""
     lights: LightsConfig = LightsConfig(dome=DomeLightConfig())
-    """Lights."""
+    """Lights of the scene: ambient light from all directions, and parallel light."""
     entities: dict[str, EntityConfig] = Field(json_schema_extra={"minProperties": 1, "maxProperties": _MAX_ENTITIES})
     """Name -> robot or object; at most 500."""
     sensors: dict[str, SensorConfig] = {}

@@ -106,17 +106,17 @@ class TaskConfig(StrictModel):
     actions: dict[str, ActionConfig | None] = {}
     """Action terms, in the order of the policy's output. null removes a term."""
     commands: dict[str, CommandConfig | None] = {}
-    """Command terms."""
+    """Command terms: goals for the policy, such as a target velocity."""
     observations: dict[str, ObservationGroupConfig] = {}
     """Groups of observation terms. The group `policy` is the input of the policy."""
     events: dict[str, EventConfig | None] = {}
-    """Event terms."""
+    """Event terms: changes of environments at the start, at resets or at intervals."""
     rewards: dict[str, RewardConfig | None] = {}
-    """Reward terms."""
+    """Reward terms. The reward of a step is their weighted sum."""
     terminations: dict[str, TerminationConfig | None] = {}
-    """Termination terms."""
+    """Termination terms. An episode ends when one of them is true."""
     curriculum: dict[str, CurriculumConfig | None] = {}
-    """Curriculum terms."""
+    """Curriculum terms: changes of the task during training, such as its difficulty."""
     success: dict[str, SuccessConfig | None] = {}
     """Conditions of success, by name; an episode succeeds if it times out while all of them hold."""
     reward_dt_scaling: bool = True

@@ -65,7 +65,7 @@ class RewardConfig(TermConfig):
 
 
 class TerminationConfig(TermConfig):
-    """A termination term."""
+    """A termination term. Its function returns in which environments the episode ends."""
 
     time_out: bool = False
     """true: the episode is truncated (the value of the last state is bootstrapped); false: it is terminated."""
@@ -276,11 +276,11 @@ class ObservationGroupConfig(StrictModel):
 
 
 class ActionConfig(TermConfig):
-    """An action term. It applies its columns of the policy's output."""
+    """An action term. It receives some columns of the policy's output and controls actuators or forces with them."""
 
     delay: DelayConfig | None = None
-    """Delay with which the term gets its columns; null: none. The observation `last_action` and the rewards of actions
-    are not delayed."""
+    """Delay with which the term receives its columns of the policy's output; null: none. The observation `last_action`
+    and the rewards of actions are not delayed."""
 
 
 class CommandConfig(TermConfig):

@@ -11,9 +11,10 @@ class PatchConfig(StrictModel):
     """Keys that all kinds of generated ground share."""
 
     proportion: NotNegative = 1.0
-    """Share of the columns (without curriculum: of the patches), relative to the other sub-terrains."""
+    """Share of the grid's columns (with `curriculum: false` of its patches) that have this kind of ground, relative to
+    the other sub-terrains."""
     border: NotNegative = 0.0
-    """Width of the flat edge of the patch [m], rounded to whole cells."""
+    """Width of the flat edge of the patch [m], rounded to whole cells of the height field."""
 
 
 class FlatPatchConfig(PatchConfig):
@@ -155,13 +156,13 @@ class TerrainGeneratorConfig(StrictModel):
     resolution: Positive = 0.1
     """Distance between two points of the height field [m]."""
     sub_terrains: Annotated[dict[str, SubTerrainConfig], Field(min_length=1)]
-    """Name -> a kind of ground."""
+    """Name -> a kind of ground (flat, noise, stairs ...) with its settings."""
     difficulty: ShareRange = (0.0, 1.0)
     """Difficulty of the first and of the last row, in [0, 1]."""
     curriculum: bool = True
     """true: one kind of ground for each column, difficulty by row; false: both are drawn for each patch."""
     max_start_level: Annotated[int, Field(ge=0)] | None = None
-    """Environments start at random levels from 0 to this one; null: to the last level."""
+    """Highest level (row of the grid, from 0) at which environments start; each draws its level. null: the last one."""
     seed: int = 0
     """Seed of the terrain's random heights."""
     friction: NotNegative = 1.0
