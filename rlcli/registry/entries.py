@@ -23,7 +23,7 @@ TRAINERS = "rlcli.trainers"
 FORMATS = "rlcli.formats"
 """Entry-point group of plugins with formats of other frameworks' task files."""
 GROUPS = (TASKS, TRAINERS, FORMATS)
-"""The groups of entry points that plugins offer."""
+"""All entry-point groups of plugins."""
 OWN = "rlcli"
 """The distribution of the built-in tasks and trainers. Its entries win over entries of plugins with the same name."""
 
@@ -177,9 +177,9 @@ def unreadable_distributions() -> list[Broken]:
 
 
 def unknown_wanted() -> str:
-    """Return the names in RLCLI_PLUGINS or the user's settings that no installed plugin has, as a list for a message.
+    """Return the names in RLCLI_PLUGINS, or the setting `plugins`, that no installed plugin has.
 
-    The text is empty if there are no such names.
+    The result is one text for a message, such as `'my-plugin', 'other'`; it is empty if there are no such names.
     """
     wanted = _enabled_distributions()
     if not wanted:
@@ -191,7 +191,7 @@ def unknown_wanted() -> str:
 
 
 def plugins_chosen_by() -> str:
-    """Return what chose the plugins to use, for messages: RLCLI_PLUGINS, or the key in the user's settings file."""
+    """Return where the user chose the plugins, for messages: RLCLI_PLUGINS, or the key `plugins` of a settings file."""
     return "RLCLI_PLUGINS" if os.environ.get("RLCLI_PLUGINS", "").strip() else f"the key 'plugins' in {settings_file()}"
 
 

@@ -1,4 +1,7 @@
-"""Imports that failed in the `__init__.py` of a package that registers tasks: another of its tasks may be wanted."""
+"""Replacements of modules whose import failed in a package that registers several tasks.
+
+With the replacement, the other tasks of the package can still be used; the error is raised if the module is used.
+"""
 
 import logging
 import sysconfig
@@ -10,7 +13,7 @@ from rlcli.registry.formats import is_framework
 
 _log = logging.getLogger(__name__)
 _failures: dict[str, Exception] = {}
-"""Name of a module -> the error of its import, for the imports that were not reported yet."""
+"""Name of a module -> the error of its import, for imports whose warning was not printed yet."""
 _LIBRARIES = tuple(path for name, path in sysconfig.get_paths().items() if name.endswith(("lib", "stdlib")))
 """Folders of Python's and of installed libraries."""
 
@@ -43,22 +46,23 @@ def failed_import(name: str, error: Exception) -> FailedImport:
 
 
 def take_failures() -> list[str]:
-    """Return a text for each failed import since the last call: the module, the error, and its file and line."""
+    """Return a text for each import that failed since the last call: the module, the error, and its file and line."""
     found = [f"{name} is left out: {error}{error_location(error)}" for name, error in _failures.items()]
     _failures.clear()
     return found
 
 
 def report_failures() -> None:
-    """Print a warning for each failed import since the last report."""
+    """Log a warning for each failed import that was not reported yet."""
     for text in take_failures():
         _log.warning("%s", text)
 
 
 def can_be_left_out(name: str, level: int, file: Path) -> bool:
-    """Return whether a task file's failing import may be left out.
+    """Return whether a task file's failing import may be left out, because it may belong to another task.
 
-    The file is the `__init__.py` of a package, and it registers tasks, or imports a package that does.
+    This is so if the file is the `__init__.py` of a package and registers tasks with Gymnasium, or the imported package
+    does.
 
     Args:
         name: name of the module in the import statement, without leading dots.
@@ -72,7 +76,7 @@ def can_be_left_out(name: str, level: int, file: Path) -> bool:
 
 
 def error_location(error: BaseException) -> str:
-    """Return ` (file:line)` of the code that raised an error, if possible of the task's own code."""
+    """Return ` (file:line)`, for messages, of the code that raised an error: if possible of the task's own code."""
     frames = [
         (frame.f_code.co_filename, line, is_framework(str(frame.f_globals.get("__name__", ""))))
         for frame, line in traceback.walk_tb(error.__traceback__)

@@ -12,7 +12,7 @@ from rlcli.registry.local_tasks import folder_task, python_task
 from rlcli.registry.task_location import TaskSource
 
 KEYWORDS = ("latest", "shipped")
-"""Words of a command line that name the newest run and the policy of a task, never a folder."""
+"""Words that name the newest run (`latest`) and the policy that a task ships (`shipped`), never a folder."""
 
 
 def path_of(word: str) -> Path:

@@ -68,7 +68,7 @@ class Format:
 
 
 def _is_mistake(item: Any) -> bool:
-    """Return whether an item is what `FormatSpec.check` yields: a path, a message and a hint."""
+    """Return whether an item of the result of `FormatSpec.check` has the right form: (path, message, hint or None)."""
     if not isinstance(item, tuple | list) or len(item) != 3 or not isinstance(item[0], tuple | list):
         return False
     return all(isinstance(step, str | int) for step in item[0]) and isinstance(item[1], str) and _is_text(item[2])
@@ -89,7 +89,7 @@ _RESULTS: dict[str, tuple[Callable[[Any], bool], str]] = {
     ),
     "agent_file": (lambda value: value is None or isinstance(value, dict), "a dict or None"),
 }
-"""Function of a format -> whether a value may be its result, and what may be, for the message."""
+"""Function of a `FormatSpec` -> the test of its result, and the allowed results in words, for the error message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,10 +226,10 @@ def format_keys() -> set[str]:
 
 
 def require_format(path: Path) -> None:
-    """Check that a folder or file does not need the plugin of a known format that is not installed.
+    """Raise an error if a folder or file is in a known format whose plugin is not installed.
 
     Raises:
-        DependencyError: if it needs one, with the `pip install` command.
+        DependencyError: with the `pip install` command of the plugin.
     """
     for form in missing_formats().values():
         if path.is_dir():
@@ -241,10 +241,10 @@ def require_format(path: Path) -> None:
 
 
 def require_module(error: BaseException) -> None:
-    """Check that `error` is not the failed import of a module that belongs to a format without its plugin.
+    """Raise a better error if `error` is the failed import of a module of a known format that is not installed.
 
     Raises:
-        DependencyError: if it is, with the `pip install` command.
+        DependencyError: with the `pip install` command of the format's plugin.
     """
     name = error.name if isinstance(error, ModuleNotFoundError) else None
     for form in missing_formats().values() if name else ():

@@ -1,4 +1,4 @@
-"""Tasks of installed packages: their files, and the packages that a configuration may name."""
+"""Lookup of the tasks of installed packages and their files, and of modules that a configuration may name."""
 
 import importlib.util
 from importlib.machinery import ModuleSpec
@@ -78,7 +78,7 @@ def package_folders(package: str) -> list[Path]:
 
 
 def is_offered(module: str, source: TaskSource) -> bool:
-    """Return whether a configuration may name a module: it is in the task's own package or in an installed plugin.
+    """Return whether a configuration may name a module, because it is in the task's own package or in a plugin.
 
     The module is not imported, because the configuration may come from an untrusted file.
     """
@@ -103,9 +103,16 @@ def _module_file(module: str, entry: Entry) -> Path:
 
 
 def _find(module: str, entry: Entry) -> ModuleSpec | None:
-    """Return the spec of a module; None if there is no such module. Its parent packages are imported.
+    """Return importlib's `ModuleSpec` (the location) of a module; None if there is no such module.
 
-    `entry` is the entry point of the task, for the message of an error.
+    The parent packages of the module are imported.
+
+    Args:
+        module: dotted name of the module.
+        entry: entry point of the task, for the message of an error.
+
+    Raises:
+        TaskError: if the import of a parent package fails.
     """
     try:
         with contain_side_effects():

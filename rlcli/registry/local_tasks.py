@@ -13,9 +13,14 @@ from rlcli.registry.task_location import TaskSource
 def folder_task(folder: Path, file: str = "task.yaml") -> TaskSource:
     """Return the task of a folder.
 
-    The folder has a `task.yaml`, and optionally `terms.py` and `task.py` (with a class `Task`). Or it has a task in an
-    installed format of another framework. Else the configuration is in Python: `TASK` in `task.py`, or the task that
-    the package registers with Gymnasium. `file` is the name of the YAML file, if it is not `task.yaml`.
+    The folder has one of these:
+    - a `task.yaml`, and optionally `terms.py` and `task.py` (with a class `Task`),
+    - a task file in another framework's format whose plugin is installed,
+    - a configuration in Python: `TASK` in `task.py`, or a task that the package registers with Gymnasium.
+
+    Args:
+        folder: the folder.
+        file: name of its YAML file.
 
     Raises:
         TaskError: if the folder has no task, or several tasks.

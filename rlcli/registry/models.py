@@ -30,7 +30,9 @@ def model_file(root: Path, model: str) -> Path:
 
 
 def chosen_model(root: Path, model: str) -> str:
-    """Return the first existing one of the alternatives in `model`, separated by ` | `; do not check a single one.
+    """Return the first of the alternatives in `model`, separated by ` | `, whose file exists.
+
+    A model without alternatives is returned without a check.
 
     Raises:
         MissingModelError: if none of the alternatives exists.
@@ -51,7 +53,11 @@ def chosen_model(root: Path, model: str) -> str:
 
 
 def existing_model_file(root: Path, model: str) -> Path:
-    """Return the resolved path of the model file that a task in the folder `root` names by the text `model`.
+    """Return the resolved path of a model file, like `model_file`, and check that it is an existing regular file.
+
+    Args:
+        root: folder of the task.
+        model: text with which the task names the file.
 
     Raises:
         MissingModelError: if a model that the user must provide is not found.
@@ -80,7 +86,7 @@ def _system_errors(model: str) -> Iterator[None]:
 
 
 def _install_hint(model: str) -> str:
-    """Return what the user can do so that the model of this name is found, as the hint of an error."""
+    """Return the hint of a missing model: how the user can provide it (a folder, a package, a task)."""
     kind, _, file = model.partition(":")
     if kind == "models":
         return f"set {MODELS} to a folder that holds {file}"

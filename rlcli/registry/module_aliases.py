@@ -32,11 +32,11 @@ _roots: list[Path] = []
 _by_file: dict[str, ModuleType] = {}
 """Path of a task file -> the module that was imported from it."""
 _known_paths: list[frozenset[str]] = []
-"""`sys.path` before the task file that is being executed; empty if none is."""
+"""The entries of `sys.path` before the task file that is being executed; an empty list if no file is executed."""
 
 
 class TaskFileLoader(SourceFileLoader):
-    """Loader of one Python file of a task."""
+    """Loader of one Python file of a task, whose imports of another framework get the plugin's modules."""
 
     def exec_module(self, module: ModuleType) -> None:
         """Execute the file with the `__import__` of task files."""
@@ -54,7 +54,7 @@ class TaskFileLoader(SourceFileLoader):
 
 
 class _KnownFileLoader(Loader):
-    """Loader of a file of a task that was already imported under another name: it gives the same module."""
+    """Loader of a task file that was already imported under another name: it returns the same module object."""
 
     def __init__(self, known: ModuleType) -> None:
         self._known, self._spec = known, known.__spec__
@@ -64,7 +64,7 @@ class _KnownFileLoader(Loader):
         return self._known
 
     def exec_module(self, module: ModuleType) -> None:
-        """Execute nothing; undo the change of the module's spec by the import system."""
+        """Execute nothing; restore the `__spec__` of the module, which the import system has changed."""
         module.__spec__ = self._spec
 
 
@@ -114,7 +114,7 @@ class _TaskFinder(MetaPathFinder):
     """Import finder (an entry of `sys.meta_path`) for the registered folders of task files."""
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, target: Any = None) -> ModuleSpec | None:
-        """Return the spec of a file in a registered folder; None for any other module."""
+        """Return the `ModuleSpec` of a file in a registered folder, with a loader for task files; None for others."""
         if path is None:
             _add_own_paths()
         if path is not None and name.partition(".")[0] not in _trees:
@@ -135,15 +135,15 @@ class _TaskFinder(MetaPathFinder):
 
 
 def _folders_above() -> list[Path]:
-    """Return the folders of PYTHONPATH that contain a task: a repository's root, from which its files import."""
+    """Return the folders of PYTHONPATH that contain a task's folder, such as the root of its repository."""
     given = (Path(entry).resolve() for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry)
     return [folder for folder in given if any(root.is_relative_to(folder) for root in _roots)]
 
 
 def _add_own_paths() -> None:
-    """Treat folders that a task's files have added to `sys.path` as folders of the task.
+    """Register folders that a task's files have added to `sys.path` as folders of the task.
 
-    Folders of installed packages and of Python itself are excepted.
+    Folders of installed packages and of Python itself are not registered.
     """
     for entry in sys.path if _known_paths else ():
         folder = Path(entry).resolve()
@@ -159,9 +159,10 @@ def _import(
     fromlist: Sequence[str] | None = (),
     level: int = 0,
 ) -> Any:
-    """Import a module for a file of a task, as the built-in `__import__` does.
+    """Import a module for a file of a task. The parameters are those of the built-in `__import__`.
 
-    If the import of a task fails in the `__init__.py` of a package, the package's other tasks can still be used.
+    If the import of one task fails in the `__init__.py` of a package, a `FailedImport` takes its place, so that the
+    package's other tasks can still be used.
     """
     try:
         return _import_module(name, module_globals, module_locals, fromlist, level)
@@ -189,7 +190,7 @@ def _import_module(
     fromlist: Sequence[str] | None = (),
     level: int = 0,
 ) -> Any:
-    """Import a module for a file of a task."""
+    """Import a module for a file of a task: the plugin's module if a format replaces it, else the real one."""
     scope = module_globals or {}
     module, top = _resolve(name, scope) if level == 0 else (None, None)
     if module is None:
@@ -208,7 +209,7 @@ def _import_module(
 
 
 def _with_members(module: ModuleType, members: Mapping[str, Any]) -> ModuleType:
-    """Return a copy of a module that has these members, too; the module itself if there are no members."""
+    """Return a copy of a module with these members added or replaced; the module itself if there are no members."""
     if not members:
         return module
     copy = ModuleType(module.__name__)

@@ -82,7 +82,14 @@ def call_entry(entry: Entry, *arguments: Any) -> Any:
 
 
 def wrong_result(entry: Entry, what: str, value: object, expected: str) -> PluginError:
-    """Return the error for a result of a plugin's function, named by `what`, that is not what it should be."""
+    """Return the error for a plugin's function that has returned a value of a wrong type.
+
+    Args:
+        entry: the plugin's entry point.
+        what: name of the function, for the message.
+        value: the value that it returned.
+        expected: the allowed values, in words.
+    """
     plugin = f"plugin {entry.distribution} {entry.version}"
     return PluginError(
         f"{plugin}: {what} returned a {type(value).__name__}, {reprlib.repr(value)}; expected {expected}",
@@ -92,12 +99,12 @@ def wrong_result(entry: Entry, what: str, value: object, expected: str) -> Plugi
 
 @contextlib.contextmanager
 def _plugin_named(entry: Entry, failure: str, passed_on: type[RlcliError]) -> Iterator[None]:
-    """Name a plugin in errors of the `with` block, which runs its code.
+    """Convert errors of the `with` block, which runs a plugin's code, to errors that name the plugin.
 
     Args:
-        entry: the plugin's entry.
-        failure: what the message states about the entry point before the reason.
-        passed_on: class of errors that are passed on, like Ctrl-C.
+        entry: the plugin's entry point.
+        failure: what has failed, for the message: `cannot be imported` or `failed`.
+        passed_on: class of errors that are raised unchanged, as KeyboardInterrupt is.
 
     Raises:
         PluginError: for any other error.
@@ -174,7 +181,14 @@ _BUILT_IN = builtins.__dict__
 
 
 def _restore_built_in(before: dict[str, Any], is_callable: Callable[[object], bool] = callable) -> None:
-    """Restore the built-in functions that were deleted or are no longer callable. Until then, call none of them."""
+    """Restore the built-in functions that a plugin deleted or replaced by a value that cannot be called.
+
+    Before they are restored, this function must not call any built-in function; `is_callable` is bound early for this.
+
+    Args:
+        before: name -> object of the module `builtins` before the plugin's code ran.
+        is_callable: the built-in `callable`.
+    """
     lost = [name for name in before if is_callable(before[name]) and not is_callable(_BUILT_IN.get(name))]
     if lost:
         _BUILT_IN.update(before)

@@ -1,4 +1,4 @@
-"""What the code of tasks and plugins does while a command runs: its errors, its warnings, and calls that hang."""
+"""Reports about the code of tasks and plugins while a command runs: its errors, its warnings, and calls that hang."""
 
 import contextlib
 import functools
@@ -50,7 +50,7 @@ def error_of_task(error: BaseException) -> TaskError | None:
 
 
 def _frames_of(error: BaseException) -> list[tuple[FrameType, int]]:
-    """Return the frames of an error's traceback, of its causes' ones if there is no frame of a task in it."""
+    """Return the frames of an error's traceback with their lines; if no frame is a task's, those of its cause."""
     seen: set[int] = set()
     frames: list[tuple[FrameType, int]] = []
     cause: BaseException | None = error
@@ -71,7 +71,7 @@ def raised_by_task(error: BaseException) -> bool:
 
 
 def is_task_code(frame: FrameType) -> bool:
-    """Return whether a frame runs code of a task: a file outside of rlcli and libraries, or an installed plugin."""
+    """Return whether a frame runs code of a task: a file of an installed plugin, or outside of rlcli and libraries."""
     return _is_task_file(frame.f_code.co_filename, _module(frame).partition(".")[0])
 
 
@@ -163,18 +163,18 @@ def warn_once(text: str) -> None:
 
 
 class _LastResort(logging.Handler):
-    """Handler of records, such as those of a task, whose logger has no handler of its own."""
+    """Logging handler of last resort: for records, such as those of a task, whose logger has no handler."""
 
     def __init__(self, report: Any) -> None:
         super().__init__(logging.WARNING)
         self._report = report
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Report the record."""
+        """Report the text of a record, with the file and line that logged it."""
         try:
             text = record.getMessage()
         except Exception as error:  # such as `logging.warning("%d", "x")`
-            text = f"its text cannot be made: {type(error).__name__}"
+            text = f"a log record whose text cannot be formatted: {type(error).__name__}"
         self._report(f"{record.pathname}:{record.lineno}", text)
 
 
@@ -234,9 +234,12 @@ class _Watch(threading.Thread):
 
 
 def _calls(frames: Iterable[FrameType]) -> Iterator[FrameType]:
-    """Yield the frames in which code of a task or format runs that other code has called; the innermost first.
+    """Yield the frames in which rlcli has called code of a task or plugin, the innermost first.
 
     Frames of trainers are left out, except for their import: an iteration may take minutes.
+
+    Args:
+        frames: the frames of the running code, the innermost first.
     """
     inner: FrameType | None = None
     for frame in (*frames, None):

@@ -1,4 +1,4 @@
-"""Where a task comes from: the files and modules from which it is read, checked and built."""
+"""Location of a task: the files and modules from which it is read, checked and built."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class TaskSource:
-    """Where a task comes from: its name, its files, and the references by which its code is imported."""
+    """Location of a task: its name, its files, and the references (`module:name`) by which its code is imported."""
 
     name: str
     """Name of the task, as on the command line."""
@@ -50,7 +50,7 @@ class TaskSource:
 
     @property
     def without_terms_hint(self) -> str:
-        """Begin of a hint that says why a task in YAML has no own terms; empty if it has some."""
+        """First part of the hint for an unknown term: why a task in YAML has no own terms; empty if it has some."""
         if self.term_files or self.python is not None or self.value is not None:
             return ""
         if self.distribution is None:
@@ -60,7 +60,7 @@ class TaskSource:
         return "TaskSpec.terms names no module with own terms; "
 
     def record(self) -> dict[str, str | None]:
-        """Return the data that a run stores to find the task again."""
+        """Return what `run.json` stores to find the task again: name, distribution and version, or the folder."""
         folder = None if self.distribution else str(self.root)
         record = {"name": self.name, "distribution": self.distribution, "version": self.version, "folder": folder}
         return record | ({"python": self.python} if self.python and folder else {})
