@@ -61,10 +61,10 @@ def require_regular(file: Path) -> None:
 
 
 def require_writable(file: Path) -> None:
-    """Check, before any work, that a file can be written: nothing else is there, and its folder takes new files.
+    """Check, before any work, that a file can be written: no folder or device has its name, and its folder is writable.
 
-    Access rights do not tell this for every folder, so an empty temporary file is created and removed. Of folders that
-    do not exist yet, the nearest one that exists is tested.
+    Access rights do not show this for every folder, so an empty temporary file is created and removed. If the folder
+    does not exist yet, the nearest folder above it that exists is tested.
 
     Raises:
         UsageError: for a folder, a pipe, a socket or a device.
@@ -141,7 +141,7 @@ def finite_json(value: Any) -> Any:
 
 
 def disk_error(path: Path, error: OSError) -> MachineError:
-    """Return the error for a path that cannot be written, with a hint that fits the cause."""
+    """Convert an OSError of writing a path to a MachineError, with a hint that fits the cause (its errno)."""
     gone = [str(folder) for folder in path.parents if error.errno == errno.ENOENT and not folder.exists()]
     missing = f" (there is no folder {gone[-1]})" if gone else ""
     hint = _HINTS.get(error.errno or 0) if gone or error.errno != errno.ENOENT else "choose another folder"
@@ -149,10 +149,10 @@ def disk_error(path: Path, error: OSError) -> MachineError:
 
 
 def require_lock(path: Path) -> None:
-    """Check that this process still holds the lock of the run in which it writes.
+    """Check that this process still holds the lock of the run that contains a path; other paths need no lock.
 
     Raises:
-        MachineError: if the lock file was deleted or belongs to another folder, or the run was moved away.
+        MachineError: if the lock file was deleted or replaced, or the run was moved away.
     """
     try:
         require_locks(path)

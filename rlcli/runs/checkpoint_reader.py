@@ -19,11 +19,11 @@ from rlcli.runs.safe_io import JSON_LIMIT, Count, FileModel, check_json, manifes
 
 FORMAT = 1
 PARTS = ("policy", "trainer", "env", "rng")
-"""Tensor files of every checkpoint: the policy; critics and optimisers; environment; random generators. A trainer may
-add parts."""
+"""Tensor files PART.safetensors of every checkpoint. policy: the policy; trainer: critics and optimisers; env: state of
+the environments; rng: random generators. A trainer may add parts."""
 LOG_FOLDER = "logs"
-"""Folder beside the checkpoints with logs: rows that several checkpoints share, such as rows of a replay buffer. Files
-in the folder never change."""
+"""Folder beside the checkpoints with data in rows that several checkpoints share, such as the rows of a replay buffer.
+Such data is called a log. Files in the folder never change."""
 _ROWS_AT_ONCE = 1000
 _MAX_SHARD_BYTES = 2**30
 _HEADER_LIMIT = 4 * 2**20

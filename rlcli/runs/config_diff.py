@@ -58,7 +58,10 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Result of the comparison of one part, such as the configurations; `compared` says how much was compared."""
+    """Result of the comparison of one part, such as the configurations.
+
+    `compared` is the amount that was compared, as text for the table, such as `120 keys`.
+    """
 
     name: str
     compared: str
@@ -66,7 +69,7 @@ class Section:
 
 
 Values = dict[Path, tuple[Any, str | None]]
-"""The values of a configuration by path, each with the place where it was written."""
+"""Path of a key -> its value, and the place where the value was written, such as `config.yaml:12:3`."""
 
 
 def run_values(run: Run) -> Values:
@@ -112,7 +115,7 @@ def compare_values(left: Values, right: Values) -> Section:
 
 
 def compare_files(left: Mapping[str, str], right: Mapping[str, str]) -> Section:
-    """Compare the files of two tasks, from file name -> SHA-256.
+    """Compare the files of two tasks. `left` and `right` map the name of a file to its SHA-256.
 
     Differing Python files are of the category MDP, all others (robot models) of the category physics.
     """

@@ -140,12 +140,12 @@ def state_of(run: Run) -> tuple[str, str | None]:
 
 
 def newest_rows(run: Run) -> list[dict[str, Any]]:
-    """Return the last rows of a run's `metrics.jsonl`, as many as a limited part of the file has, the oldest first."""
+    """Return at most 20 of the last rows (metric -> number) of a run's `metrics.jsonl`, the oldest first."""
     return [*_rows_backwards(run)][::-1]
 
 
 def _rows_backwards(run: Run) -> Iterator[dict[str, Any]]:
-    """Yield the last rows of a run's `metrics.jsonl`, the newest first; corrupt lines are skipped."""
+    """Yield at most 20 of the last rows of a run's `metrics.jsonl`, the newest first; corrupt lines are skipped."""
     for size in (_TAIL_BYTES, 2 * _MAX_ROW_BYTES):
         data, whole = _tail(run, size)
         lines = data.split(b"\n")[0 if whole else 1 : -1]  # the text after the last newline is still being written

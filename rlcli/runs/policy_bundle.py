@@ -87,7 +87,7 @@ def write_bundle(
         checkpoint: the checkpoint.
         output: the folder; an older bundle in it is replaced.
         run: the run of the checkpoint, which records the hardware and duration of the training.
-        evaluation: the summary from `rlcli eval`.
+        evaluation: the result of `rlcli eval` for this checkpoint; None: the checkpoint's own entry, if it has one.
 
     Raises:
         CheckpointError: if the checkpoint is corrupt, or its manifest has no layout of the policy's columns.

@@ -1,4 +1,4 @@
-"""Schema of two entries of a checkpoint's manifest.json, which may be untrusted: `layout` and `deployment`.
+"""Schema of the entries `layout` and `deployment` of a checkpoint's manifest.json, which may be untrusted.
 
 The layout lists the columns of observations and actions that a policy was trained with. The deployment record describes
 the environment, with formulas for observations and controls, for programs that run the policy without rlcli.
@@ -83,7 +83,7 @@ class _Record(FileModel):
 
 
 class _Columns(_Record):
-    """Names, unit and scale of the columns of one observation or action term."""
+    """Names, unit and scale of the columns (numbers of the vector) of one observation or action term."""
 
     name: str
     size: int = Field(ge=1)
@@ -136,9 +136,10 @@ class LayoutRecord(_Record):
 
 
 class _Formula(_Record):
-    """Formula for columns of a term.
+    """Formula (`value`, see `check_formula`) for the columns of a term.
 
-    `closed` is true if `value` is a formula on the state of the simulation, which needs no code of the task.
+    `closed` is true if the formula computes the columns from MjData, the actions and the commands alone, so that a
+    program needs no code of the task.
     """
 
     @model_validator(mode="after")
@@ -288,9 +289,9 @@ def deployment_differences(checkpoint: Checkpoint, layout: object, deployment: o
 
 
 def _comparable_parts(deployment: Any, randomized: bool) -> dict[str, Any]:
-    """Return the part of a deployment record that can be compared: no formulas, and nothing the engine decides.
+    """Return the entries of a deployment record that the checkpoint and the environment must have in common.
 
-    With `randomized`, gains and the start state are left out, too.
+    Formulas are left out, and settings of the physics engine. With `randomized`, so are gains and the start state.
     """
     terms = {group: [_without_values(t) for t in found] for group, found in deployment["observations"].items()}
     rest = {key: deployment[key] for key in ("actuators", "commands", *(() if randomized else ("start",)))}

@@ -49,9 +49,14 @@ _MAX_BYTES = 64 * 1024**2
 
 
 def environment_record(resolved: Resolved, engine_threads: int, torch_threads: int) -> dict[str, Any]:
-    """Return the part of the record that is known before the environment is built; `built_record` returns the rest.
+    """Return the entries of run.json that are known before the environment is built; `built_record` returns the others.
 
-    It imports neither torch nor MuJoCo.
+    The function imports neither torch nor MuJoCo.
+
+    Args:
+        resolved: configuration of the task and the agent.
+        engine_threads: number of CPU threads of the physics.
+        torch_threads: number of CPU threads of torch.
     """
     return {
         "rlcli": rlcli.__version__,
@@ -71,7 +76,11 @@ def environment_record(resolved: Resolved, engine_threads: int, torch_threads: i
 
 
 def built_record(model: mujoco.MjModel, device: str) -> dict[str, Any]:
-    """Return the part of the record that needs the built environment: torch's settings, the compiled model's hash."""
+    """Return the entries of run.json that need the built environment.
+
+    Returns:
+        `torch` (settings of torch that change rounding, GPU) and `model` (hash of the compiled model).
+    """
     import torch
 
     denormal = torch.tensor([1e-310], dtype=torch.float64)

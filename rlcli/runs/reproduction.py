@@ -1,4 +1,4 @@
-"""Reproduction of a run by `rlcli reproduce`: whether it can be equal, what has changed, and what to compare."""
+"""Parts of `rlcli reproduce`, which trains a run again: checks before the training, and the new run's folder."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,9 +35,14 @@ def require_reproducible(run: Run) -> None:
 
 
 def changed_entries(run: Run, now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Return (name, value of the run, present value) of what has changed since a run and affects its results.
+    """Return the versions and properties of the machine that have changed since a run and affect its results.
 
-    `now` is the record of the present software and machine, from `rlcli.runs.provenance`.
+    Args:
+        run: the run.
+        now: the record of the present software and machine, from `rlcli.runs.provenance`.
+
+    Returns:
+        (name, value in run.json, present value) of each.
     """
     return [row for row in differences(run.record, now) if row[0] not in IRRELEVANT]
 
@@ -50,9 +55,7 @@ def milestones(run: Run, until: int) -> list[int]:
 
 
 def create_reproduction(original: Run, runs_dir: Path, name: str, now: Mapping[str, Any]) -> tuple[Run, Path | None]:
-    """Create a run with the configuration, seed and threads of another run.
-
-    Return it and the checkpoint from which both start, or None if they start with random weights.
+    """Create a run with the configuration, seed and number of threads of another run.
 
     Args:
         original: the run to reproduce.
@@ -60,8 +63,11 @@ def create_reproduction(original: Run, runs_dir: Path, name: str, now: Mapping[s
         name: part of the name of its folder.
         now: the record of the present software and machine, from `rlcli.runs.provenance`.
 
+    Returns:
+        The new run, and the checkpoint with the initial weights of both runs; None for random weights.
+
     Raises:
-        CheckpointError: if the checkpoint from which both start has changed.
+        CheckpointError: if the checkpoint with the initial weights has changed since then.
     """
     was = original.record
     initial = Path(was["init_from"]) if was.get("init_from") else None

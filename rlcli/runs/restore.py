@@ -23,7 +23,8 @@ def source_of(run: Run, named: TaskSource | None = None) -> TaskSource:
 
     Args:
         run: the run.
-        named: the task on the command line; it is used if neither it nor the recorded task is installed. None: no task.
+        named: the task on the command line. It replaces the recorded task if both are folders or files, for example
+            after the task's folder was moved. None: no task was named.
 
     Raises:
         TaskError: if the task is not installed any more.
@@ -44,7 +45,7 @@ def recorded_task(
         record: the record.
         what: name of the task in messages, such as `the task of RUN`.
         run: the run that holds the record, if there is one.
-        named: the task on the command line; it is used if neither it nor the recorded task is installed. None: no task.
+        named: the task on the command line, which replaces a task in a folder; see `source_of`.
 
     Raises:
         TaskError: if the task is not installed any more.
@@ -85,7 +86,7 @@ def resolve_run(
         run: the run.
         play: whether to apply the task's `play:` changes.
         flags: dotted key -> value.
-        named: the task on the command line; it is used if neither it nor the recorded task is installed. None: no task.
+        named: the task on the command line, which replaces a task in a folder; see `source_of`.
     """
     return resolve(source_of(run, named), play=play, flags=flags)
 
@@ -163,7 +164,10 @@ def _differing_rows(record: Mapping[str, Any], current: Mapping[str, Any]) -> li
 
 
 def _fields(record: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Return the terms and the control period of a layout, by the names that the table of differences shows."""
+    """Return the terms and the control period of a layout, for the comparison.
+
+    The key is the name of the row in the table of differences, such as `observations.policy[0]`.
+    """
     fields: dict[str, Mapping[str, Any]] = {}
     for group, terms in record.get("observations", {}).items():
         for position, term in enumerate(terms):
@@ -176,7 +180,7 @@ def _fields(record: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 
 
 _CONTRACT = ("name", "size", "elements", "scale", "offset", "clip", "history", "modifiers")
-"""Keys of a term that must be equal. Units are only text, and limits belong to the robot, not to the policy."""
+"""Keys of a term's layout that must be equal for the policy. Units are only text, and limits belong to the robot."""
 
 
 def _differ(was: Mapping[str, Any] | None, now: Mapping[str, Any] | None) -> bool:

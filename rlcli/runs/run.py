@@ -77,7 +77,7 @@ class Run:
             raise CheckpointError(f"{self.config}:{error.line}:{error.column} is corrupt: {error.message}") from None
 
     def findings(self) -> list[str]:
-        """Return what the health checks of the training have found, a sentence for each finding."""
+        """Return the problems that the health checks of the training have found, a sentence for each."""
         return [f"{each['check']}: {each['message']}; try {each['hint']}" for each in self.record.get("health", ())]
 
     def update(self, **entries: Any) -> None:
@@ -158,7 +158,12 @@ def require_name(name: str | None) -> None:
 
 
 def initialize_run(folder: Path, config: str, record: Mapping[str, Any]) -> Run:
-    """Write config.yaml and run.json (`record`) of a new run into its empty folder, and lock it.
+    """Write the first files of a new run into its empty folder, and lock it for this process.
+
+    Args:
+        folder: the folder.
+        config: content of config.yaml, the resolved configuration.
+        record: first entries of run.json.
 
     Raises:
         MachineError: if the folder cannot be written; it is deleted.

@@ -149,9 +149,12 @@ def _compare_tensors(left: Mapping[str, Tensor], right: Mapping[str, Tensor], pr
 
 
 def _compare_elements(left: Tensor, right: Tensor, where: str) -> Iterator[Difference]:
-    """Yield the first element in which two tensors differ, bit by bit; or the difference of their types and shapes.
+    """Yield the difference of two tensors: their types and shapes, or the first element that is not equal bit by bit.
 
-    `where` is the name of the tensors in the result.
+    Args:
+        left: a tensor.
+        right: the tensor to compare it with.
+        where: name of the tensors in the result.
     """
     import torch
 
@@ -199,7 +202,13 @@ def _first_unequal(left: Mapping[Any, Any], right: Mapping[Any, Any], keys: Iter
 
 
 def _presence(word: str, left: bool, right: bool) -> tuple[str | None, str | None]:
-    """Return the two values of a `Difference` for an entry that may exist: `word` where it exists, else None."""
+    """Return the left and the right value of a `Difference` of an entry that one side does not have.
+
+    Args:
+        word: the value of a side that has the entry; that of the other side is None.
+        left: whether the left side has the entry.
+        right: whether the right side has the entry.
+    """
     return word if left else None, word if right else None
 
 

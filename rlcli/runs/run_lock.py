@@ -1,4 +1,4 @@
-"""Lock of a run's folder: only the process that holds it may write there, and each write checks that it still does."""
+"""Lock of a run's folder: only the process that holds the lock may write there, and each write checks the lock."""
 
 import os
 import stat
@@ -47,12 +47,12 @@ class RunLock:
         self._lock.release()
 
     def require(self) -> None:
-        """Check that the lock file is still the one that this process has locked.
+        """Check that the lock file is still the file that this process has locked.
 
-        It differs if the file was deleted, or if the folder was moved away and another folder is in its place.
+        It is another one if the file was deleted, or if the folder was moved away and another folder is in its place.
 
         Raises:
-            MachineError: if it is not: another process may then lock the folder, too.
+            MachineError: if it is another file: a second process could then lock the folder, too.
             OSError: if the folder does not exist any more.
         """
         try:
@@ -102,7 +102,10 @@ def _identity(file: Path) -> tuple[int, int]:
 
 
 def _can_share(handle: int) -> bool:
-    """Return whether a lock file can get a shared lock, which ends when the handle is closed."""
+    """Return whether no process holds the lock: a shared lock of the open lock file is tried.
+
+    The shared lock ends when the handle is closed.
+    """
     try:
         import fcntl
     except ImportError:  # Windows

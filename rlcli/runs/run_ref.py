@@ -89,7 +89,7 @@ def _list_runs(runs_dir: Path, task: str | None) -> tuple[list[Run], list[Checkp
 
 
 def _first_of(refused: list[CheckpointError]) -> str:
-    """Return the message of the first error, and the number of further errors: runs that were skipped."""
+    """Return a text about the runs that cannot be read: the message of the first error, and the number of others."""
     more = f"; {len(refused) - 1} more are skipped" if len(refused) > 1 else ""
     return refused[0].message + more
 
@@ -165,7 +165,7 @@ def find_checkpoint(
 
 
 def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Path, str]:
-    """Return the newest valid checkpoint of a run, and the reason for the choice; warn of each newer, corrupt one.
+    """Return the newest valid checkpoint of a run, and the reason for the choice; log each newer one that is corrupt.
 
     Args:
         run: the run.
@@ -174,7 +174,8 @@ def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Pat
         whole: whether the whole checkpoint must be valid, or only its policy.
 
     Raises:
-        CheckpointError: if the newest intact one has another format, or is the untrained policy of step 0.
+        CheckpointError: if no checkpoint is valid, the newest valid one has another format, or it is the untrained
+            policy of step 0 although the run has newer, corrupt checkpoints.
     """
     from rlcli.runs.checkpoint_reader import FormatError, open_checkpoint
 
@@ -194,7 +195,7 @@ def _newest_valid(run: Run, have: list[int], why: str, whole: bool) -> tuple[Pat
             hint = "restore a newer checkpoint from a backup; to use the untrained policy, write RUN@step:0"
             raise CheckpointError(message, hint=hint)
         return folder, f"{why}, its newest {'good ' if skipped else ''}checkpoint"
-    raise AssertionError("a run without checkpoints came here, although find_checkpoint refuses it")
+    raise AssertionError("bug in rlcli: find_checkpoint must not pass a run without checkpoints")
 
 
 def default_runs_dir() -> Path:

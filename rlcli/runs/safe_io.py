@@ -122,7 +122,10 @@ def manifest_error(file: Path, difference: str) -> CheckpointError:
 
 
 def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
-    """Read the last bytes of a plain file that may be growing; return them and whether they are the whole file.
+    """Read the last `limit` bytes of a plain file that may be growing.
+
+    Returns:
+        The bytes, and whether they are the whole file.
 
     Raises:
         CheckpointError: if it is a link, not a regular file, or cannot be read.
@@ -136,7 +139,12 @@ def read_tail(file: Path, limit: int) -> tuple[bytes, bool]:
 
 @contextlib.contextmanager
 def _opened(file: Path) -> Iterator[tuple[BinaryIO, int]]:
-    """Open a regular file for a `with` block, and give its size [bytes]; errors in the block name the file."""
+    """Open a regular file for a `with` block, which receives the open file and its size [bytes].
+
+    Raises:
+        CheckpointError: with the name of the file, if it is a link or no regular file, or for an error in the block.
+        FileNotFoundError: if it does not exist.
+    """
     try:
         if file.is_symlink():
             raise CheckpointError(f"{file} is a link; replace it by the file itself")

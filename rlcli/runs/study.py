@@ -1,6 +1,6 @@
 """Studies: folders with several runs, of one configuration with several seeds or of the trials of a sweep.
 
-The entry `kind` of study.json tells which. This module imports neither torch nor mujoco.
+The entry `kind` of study.json is `seeds` or `sweep`. This module imports neither torch nor MuJoCo.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""Protection against foreign code: the code of a task that a run or a recording names is loaded only if it is trusted.
+"""Protection against untrusted code: the task that a run or a recording names is imported only if the user trusts it.
 
 Installed tasks are always trusted. A run may also name a task folder or a configuration in Python; its author chose
 them, so they are untrusted. They are loaded only after the user has named them on a command line of this machine. The
@@ -33,7 +33,11 @@ def named_task(name: str) -> TaskSource:
 
 
 def is_known(record: Mapping[str, Any]) -> bool:
-    """Return whether the user has named the folder or the Python configuration of a task's record before."""
+    """Return whether the user has named this task on a command line before, so that its code is trusted.
+
+    Args:
+        record: the task's record (`TaskSource.record`), with its folder or its configuration in Python.
+    """
     try:
         key = _key(record)
         return read_plain(_file(key), _MAX_BYTES) == key.encode()

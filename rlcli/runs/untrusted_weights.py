@@ -44,13 +44,21 @@ VEC_NORMALIZE_HINT = (
 
 
 def read_archive_file(file: Path) -> bytes:
-    """Read a whole file; a file above 4 GiB or a quarter of the memory is refused."""
+    """Read a whole file.
+
+    Raises:
+        CheckpointError: if there is no such file, or it is larger than 4 GiB or a quarter of the memory.
+    """
     limit = min(_MAX_BYTES, available_memory() // 4)
     return read_file(file.resolve(), limit, missing=f"there is no file {file}; check the path")
 
 
 def read_member(file: Path, name: str) -> bytes:
-    """Return the content of the member `name` of a zip file. All members are checked before."""
+    """Return the content of the member `name` of a zip file. All members of the file are checked first.
+
+    Raises:
+        CheckpointError: if the file is no zip, is too large, has unsafe members, or lacks the member.
+    """
     data = read_archive_file(file)
     if data[:1] == b"\x80":
         raise CheckpointError(
@@ -117,6 +125,9 @@ def read_tensors(data: bytes, where: str) -> Mapping[str, Any]:
     Args:
         data: content of the file.
         where: name of the file in messages.
+
+    Raises:
+        CheckpointError: if the file is not a torch file, is corrupt, or has other types.
     """
     if data[:4] != b"PK\x03\x04":
         kind = "a plain pickle or a file of torch before 1.6" if data[:1] == b"\x80" else "not a torch file"
