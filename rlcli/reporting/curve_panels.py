@@ -9,9 +9,9 @@ from rlcli.reporting.curves import Curve, Line
 
 REWARDS, TERMINATIONS = "Episode_Reward/", "Episode_Termination/"
 METRICS = {"return": "Train/mean_reward", "success": "Train/success_rate", "length": "Train/mean_episode_length"}
-"""Short name -> metric."""
+"""Name of a metric for --metrics -> its name in metrics.jsonl."""
 GROUPS = {"rewards": REWARDS, "terminations": TERMINATIONS}
-"""Short name -> prefix of its metrics."""
+"""Name of a group of metrics for --metrics -> prefix of their names in metrics.jsonl."""
 DEFAULT = (*METRICS, *GROUPS)
 
 _TITLES = {
@@ -50,12 +50,12 @@ class Panel:
 
 
 def choose(curves: Sequence[Curve], names: Sequence[str] | None = None, axis: str = "steps") -> list[Panel]:
-    """Return the panels of a picture of learning curves, one for each metric.
+    """Return the panels of a picture of learning curves: one for each metric, and one for all reward terms of a curve.
 
     Args:
         curves: the curves, each of one run or of runs that differ only in their seed.
-        names: metrics, short names, or groups of metrics (the part before the slash); None: the default ones that the
-            runs have.
+        names: keys of `METRICS` or `GROUPS`, or names in metrics.jsonl, or the part of these names before the slash;
+            None: those of `METRICS` and `GROUPS` that the runs have.
         axis: the x axis, a key of `AXES`.
 
     Raises:
@@ -106,7 +106,10 @@ def _panel(curves: Sequence[Curve], metric: str, axis: str) -> Panel:
 
 
 def _stacks(curves: Sequence[Curve], metrics: Sequence[str], axis: str) -> list[Panel]:
-    """Return a panel for each curve with the shares of the terminations; means over seeds, so that they sum to 1."""
+    """Return a panel for each curve with stacked bands: the share of episodes that each termination ended.
+
+    Over several seeds the bands are means, because the shares of all terminations must add up to 1.
+    """
     panels = []
     for curve in curves:
         items = _items((metric.removeprefix(TERMINATIONS), curve.mean(metric, axis)) for metric in metrics)
@@ -116,5 +119,8 @@ def _stacks(curves: Sequence[Curve], metrics: Sequence[str], axis: str) -> list[
 
 
 def _items(lines: Iterable[tuple[str, Line | None]]) -> list[Item]:
-    """Return an item for each line that is not None; the position sets the colour, so that panels agree."""
+    """Return an item for each line that is not None; its position in `lines` sets its colour.
+
+    So a curve has the same colour in every panel, also in a picture where some panels lack a curve.
+    """
     return [Item(label, line, index) for index, (label, line) in enumerate(lines) if line is not None]

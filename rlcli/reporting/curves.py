@@ -40,12 +40,12 @@ _TRIM = 0.25
 FEWEST_FOR_IQM = 4
 """Smallest number of runs for which the interquartile mean leaves values out; for fewer runs it is the mean."""
 _MAX_POINTS = 1000
-"""Most points of a curve over several runs."""
+"""Largest number of points of a curve over several runs."""
 _MAX_METRICS = 1000
 _NAMED = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-((?!\d+$).+)")
 """Folder name of a run with a `--name`; group 1 is that name."""
 _MAX_DIFFERENCES = 3
-"""Most settings in the label of a curve."""
+"""Largest number of settings in the label of a curve."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +94,9 @@ class Curve:
         return [name for name in first.metrics if all(name in other.metrics for other in others)]
 
     def line(self, metric: str, axis: str = "steps") -> Line | None:
-        """Return a metric over an axis; for several runs, the interquartile mean over the runs with its 95 % interval.
+        """Return a metric over an x axis; for several runs, their interquartile mean with its 95 % interval.
 
-        None if a run does not have the metric, or if the runs have no common range of the axis.
+        Return None if a run does not have the metric, or if the runs have no common range of the axis.
         """
         aligned = self._aligned(metric, axis)
         if aligned is None:
@@ -105,7 +105,7 @@ class Curve:
         return Line(x, values[0]) if len(values) == 1 else Line(x, iqm(values), *interval(values))
 
     def mean(self, metric: str, axis: str = "steps") -> Line | None:
-        """Return the mean of a metric over the runs, without an interval.
+        """Return the mean of a metric over the runs, without an interval, or None as `line` does.
 
         Unlike interquartile means, the means of shares still add up to 1.
         """
@@ -113,7 +113,10 @@ class Curve:
         return None if aligned is None else Line(aligned[0], aligned[1].mean(axis=0))
 
     def _aligned(self, metric: str, axis: str) -> tuple[Array, Array] | None:
-        """Return a metric of all runs at p common points of the axis: x (p,), values (runs, p); None if impossible."""
+        """Interpolate a metric of all runs to p common points of the x axis.
+
+        Return x (p,) and values (runs, p); None if a run does not have the metric, or there is no common range of x.
+        """
         if any(metric not in history.metrics for history in self.histories):
             return None
         lines = []
@@ -161,10 +164,11 @@ def read_history(run: Run) -> History:
 
 
 def gather(runs: Sequence[Run]) -> tuple[list[Curve], list[str]]:
-    """Return the curves of runs, in the order of the runs, with notes.
+    """Return the curves of runs, in the order of the runs. Runs that differ only in their seed become one curve.
 
-    A note tells each run that is left out, and each curve that ends at the last step of its shortest run. Runs that
-    differ only in their seed become one curve.
+    Returns:
+        The curves, and notes for the user: a sentence for each run that is left out, and for each curve that ends
+        early, at the last step of its shortest run.
 
     Raises:
         CheckpointError: if no run has readable metrics and a readable configuration.
@@ -214,7 +218,15 @@ def iqm(values: Array) -> Array:
 
 
 def interval(values: Array, resamples: int = RESAMPLES) -> tuple[Array, Array]:
-    """Return the ends of the interquartile mean's 95 % interval over n runs (bootstrap). (n, p) -> (p,), (p,)"""
+    """Return the lower and the upper end of the interquartile mean's 95 % bootstrap interval over n runs.
+
+    Args:
+        values: the values of each run at p points. (n, p)
+        resamples: number of bootstrap draws.
+
+    Returns:
+        Lower ends and upper ends, (p,) each.
+    """
     count = len(values)
     picks = np.random.Generator(np.random.PCG64(0)).integers(0, count, (resamples, count))
     cut = int(_TRIM * count)
@@ -228,9 +240,13 @@ def interval(values: Array, resamples: int = RESAMPLES) -> tuple[Array, Array]:
 
 
 def align(lines: Sequence[tuple[Array, Array]]) -> tuple[Array, Array] | None:
-    """Interpolate the lines (x, y) of runs to common points; return x (p,) and values (runs, p).
+    """Interpolate the lines of several runs to p common points.
 
-    None if the lines have no common range of x.
+    Args:
+        lines: x and y of each run; x is ascending.
+
+    Returns:
+        x (p,) and the values of all runs (runs, p); None if the lines have no common range of x.
     """
     first = lines[0][0]
     if all(np.array_equal(x, first) for x, _ in lines):

@@ -49,7 +49,7 @@ class HeatMap:
 def heat_maps(
     sweeps: Sequence[Sweep], values: Sequence[tuple[str, Mapping[Point, float]]], metric: str
 ) -> list[HeatMap]:
-    """Return one heat map for each policy; all have the same colour scale.
+    """Return one heat map for each policy, all with the same colour scale.
 
     Args:
         sweeps: the varied parameters, one or more, each with its values.

@@ -49,7 +49,10 @@ def templates() -> jinja2.Environment:
 
 
 def _clean(value: object) -> Any:
-    """Replace the characters of a text that HTML forbids, and shorten it; return values of other types as they are."""
+    """Replace characters that HTML forbids in a template's value, and shorten it to 2000 characters.
+
+    Values that are not text, and embedded videos, are returned unchanged.
+    """
     if not isinstance(value, str) or isinstance(value, Markup) or value.startswith("data:video/mp4;base64,"):
         return value
     return shorten(_NOT_SHOWN.sub("\ufffd", value), _MAX_CHARACTERS, "…")

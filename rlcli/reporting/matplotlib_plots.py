@@ -31,9 +31,9 @@ _WIDTH, _HEIGHT = 5.2, 3.2
 _PAGE_SIZE = (4.1, 2.7)
 """Size of a panel on an HTML page [inches]. The page scales it up, so its text becomes larger."""
 _ONE_COLUMN = 8
-"""Most lines of a legend with one column."""
+"""Largest number of entries in a legend with one column; a longer legend has two."""
 _MAX_LABEL = 64
-"""Most characters of a label."""
+"""Largest length of a label [characters]."""
 _NOT_DRAWN = re.compile(f"{UNSAFE.pattern}|[\t\n\ufffe\uffff]")
 """Characters that a picture cannot show, and characters that change the direction of text."""
 
@@ -181,7 +181,10 @@ def _lines(axes: Any, items: Sequence[Item]) -> None:
 
 
 def _stack(axes: Any, items: Sequence[Item]) -> None:
-    """Plot shares of episodes as stacked bands, scaled down where the sum is above 1 (several causes of an end)."""
+    """Plot shares of episodes as stacked bands.
+
+    Where the shares add up to more than 1, because some episodes ended by several terminations, they are scaled to 1.
+    """
     if not items:
         return
     grid = max((item.line.x for item in items), key=len)

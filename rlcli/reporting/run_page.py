@@ -30,7 +30,7 @@ from rlcli.runs.restore import recorded_task, resolve_run
 from rlcli.runs.run import Run
 
 _MAX_CHARACTERS = 2000
-"""Most characters of an error message on the page."""
+"""Largest length of an error message on the page [characters]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,14 @@ def gather_page(run: Run, checkpoint: Path | None) -> Page:
 
 @contextlib.contextmanager
 def _part(page: Page, name: str, failure: str, *errors: type[Exception]) -> Iterator[None]:
-    """Context in which a part of the page is read; an error of a given type becomes the reason why it is missing."""
+    """Read a part of the page in a `with` block; an error becomes the reason on the page why the part is missing.
+
+    Args:
+        page: the page.
+        name: name of the part, a key of `page.missing`.
+        failure: beginning of the reason, such as `There are no learning curves`.
+        errors: types of errors that are handled; others are raised.
+    """
     try:
         yield
     except errors as error:
@@ -194,7 +201,11 @@ def _settings(run: Run, document: strict_yaml.Document) -> list[Setting]:
 
 
 def _installed(run: Run) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the installed task's settings: key -> value, and key -> where it is set; empty if it is missing."""
+    """Return the settings of the run's task as it is installed now, to compare them with the run's.
+
+    Returns:
+        Dotted key -> value, and dotted key -> where the value is set; both are empty if the task is not installed.
+    """
     from rlcli.config.dump import to_data
 
     device = "cuda" if str(run.record.get("device", "")).startswith("cuda") else "cpu"

@@ -74,7 +74,7 @@ def task_card(resolved: Resolved, layout: Mapping[str, Any] | None = None) -> Ca
 
     Args:
         resolved: the configuration.
-        layout: sizes and units of the compiled terms, from `rlcli.envs.layout.Layout.record`; None leaves them out.
+        layout: sizes and units of the terms' columns, from `rlcli.envs.layout.Layout.record`; None leaves them out.
     """
     source = resolved.source
     return card(resolved.task, resolved.vocabulary, name=source.name, source=source, layout=layout)
@@ -95,7 +95,8 @@ def card(
         vocabulary: the signatures of its terms.
         name: the task's name.
         source: the task's files; None leaves out the docstrings of a direct task.
-        layout: sizes, units and elements of the compiled terms; None leaves them out.
+        layout: sizes, units and element names of the terms' columns, from `rlcli.envs.layout.Layout.record`; None
+            leaves them out.
     """
     layout = layout or {}
     tables = [
@@ -347,7 +348,10 @@ def _direct(task: TaskConfig, source: TaskSource | None) -> Iterable[Table]:
 
 
 def _hooks(file: Path, class_name: str) -> list[tuple[str, str, str]]:
-    """Return the rows (what it decides, name, first paragraph of its docstring) for a direct task's class and hooks."""
+    """Return a row for the class of a direct task and for each of its hooks (methods) that has a docstring.
+
+    A row is: the part of the task that the hook decides, its name, and the first paragraph of its docstring.
+    """
     docstrings: dict[str, str] = {}
     for source in reversed(ClassSearch().lineage(file, class_name)):  # bases first, so that a class overrides them
         functions = [inner for inner in source.node.body if isinstance(inner, ast.FunctionDef)]
@@ -374,9 +378,10 @@ def _meaning(section: str, config: TermConfig, vocabulary: Vocabulary) -> tuple[
 
 
 def _parameters(section: str, config: TermConfig, vocabulary: Vocabulary) -> str:
-    """Return a term's parameters as text.
+    """Return a term's parameters as text, such as `std` = 0.5.
 
-    Selectors that match everything (`.*`) are left out, and default entities that the docstring does not name.
+    Left out are selectors of joints, bodies or other elements that match all of them (`.*`), and defaults of parameters
+    that name an entity, command or sensor, unless the term's docstring mentions the parameter.
     """
     signature = vocabulary.find(section, config.func)
     parameters = {p.name: p for p in signature.parameters} if signature else {}
