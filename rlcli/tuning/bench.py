@@ -36,16 +36,16 @@ HORIZONS = ("num_steps", "n_steps", "num_steps_per_env", "train_freq")
 UNSTEADY = 0.15
 """Relative spread above which a measurement is repeated, and the machine is reported as busy."""
 WORTH = 0.97
-"""Share of the present iteration time below which another setting is recommended."""
+"""Another setting is recommended only if its iteration takes less than this share of the present setting's time."""
 _ACTIONS = 8
-"""Number of different random actions that are applied in turn."""
+"""Number of batches of random actions that the environments receive in turn."""
 _ENV_BYTES = 256 * 2**10
 """Assumed memory of one environment before the first measurement [bytes]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How long and how often `rlcli bench` measures."""
+    """Duration and number of the measurements of `rlcli bench`. A block is a series of calls that is timed as one."""
 
     block_s: float = 0.4
     """Shortest duration of a block of calls [s]."""
@@ -96,7 +96,8 @@ class Trained:
 
     setting: Setting
     alike: bool
-    """Whether an iteration has the same samples and gradient steps as with the present setting."""
+    """Whether an iteration has as many samples and gradient steps as with the task's own setting, so that a training
+    learns equally."""
     samples: int = 0
     """Samples in an iteration."""
     seconds: float | None = None
@@ -120,7 +121,7 @@ class Trained:
 
 @dataclass(slots=True)
 class Findings:
-    """All measurements of a benchmark so far, and the setting that it recommends."""
+    """All measurements of a benchmark so far, and the recommended setting."""
 
     stepped: list[Stepped] = field(default_factory=list)
     trained: list[Trained] = field(default_factory=list)
@@ -159,7 +160,12 @@ class _Training:
         self.seconds.append(self.trainer.iterate().seconds)
 
     def row(self, setting: Setting, *, alike: bool) -> Trained:
-        """Return the speed of the iterations so far; `alike`: see `Trained`."""
+        """Return the speed of the iterations so far.
+
+        Args:
+            setting: sizes and threads of the training.
+            alike: whether the setting trains as the task's own one does, see `Trained.alike`.
+        """
         total = sum(sum(parts.values()) for parts in self.seconds)
         names = dict.fromkeys(name for parts in self.seconds for name in parts)
         shares = {name: sum(parts.get(name, 0.0) for parts in self.seconds) / total for name in names}
@@ -197,7 +203,7 @@ class Bench:
         self.present = Setting(present.task.scene.num_envs, horizon, minibatches, engine, update, workers)
 
     def run(self) -> Findings:
-        """Run all measurements; `findings` holds those that are finished."""
+        """Run all measurements and return them; if it is interrupted, `findings` has the finished ones."""
         self._step_all()
         self._train_all()
         return self.findings
@@ -283,7 +289,10 @@ class Bench:
         self._compare(best)
 
     def _sizes(self, setting: Setting) -> Iterator[Setting]:
-        """Yield settings with half and twice the environments and equal samples per iteration: other rollouts."""
+        """Yield settings with half and twice the environments, and rollouts of twice and half the steps.
+
+        So the number of samples in an iteration stays equal.
+        """
         if setting.horizon is None:
             return
         samples = setting.num_envs * setting.horizon
@@ -316,7 +325,7 @@ class Bench:
 
     @contextlib.contextmanager
     def _open_training(self, setting: Setting) -> Iterator[_Training]:
-        """Context with a training in the given setting, ready for `iterate`."""
+        """Build a training with a setting for a `with` block, ready for `iterate`."""
         trainer, env = make_trainer(self._resolve(self.changes(setting)), 42, "cpu", setting.torch_threads)
         with contextlib.closing(env):
             trainer.start()
@@ -383,7 +392,7 @@ def _spread(blocks: list[float]) -> float:
 
 
 def _powers(most: int) -> list[int]:
-    """Return 1, 2, 4, ... up to the number `most`, and `most` itself: the thread counts to measure."""
+    """Return the numbers of threads to measure: 1, 2, 4, ... up to `most`, and `most` itself."""
     return sorted({*(2**n for n in range(int(math.log2(most)) + 1)), most})
 
 

@@ -1,4 +1,4 @@
-"""`rlcli sweep compare`: time to a threshold with the best trial's settings and with the task's own, several seeds."""
+"""Training for `rlcli sweep compare`: time to a threshold with the best trial's settings and with the task's own."""
 
 import logging
 import tempfile
@@ -167,7 +167,10 @@ def compare(
 
 @contextmanager
 def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[TrainingRequest]:
-    """Context with a copy of the request that has the settings shared by a sweep's trials, except their budget."""
+    """Copy a request for a `with` block, with the settings that all trials of a sweep share, except their budget.
+
+    A temporary file has the content of the sweep's `--config` file.
+    """
     from rlcli.runs.restore import recorded_task
 
     settings = sweep.settings
@@ -226,7 +229,16 @@ def _train(
 
 
 def _run_folder(sweep: Path, name: str, request: TrainingRequest, changes: Sequence[str]) -> Path:
-    """Return the folder for a training; a number is appended if a run with other settings has this name already."""
+    """Return the folder for a training: a new one, or that of a run with exactly these settings, which is resumed.
+
+    A number is appended to the name if a run with other settings has it already.
+
+    Args:
+        sweep: folder of the sweep.
+        name: name of the folder.
+        request: the request for the training.
+        changes: overrides of this training.
+    """
     config = to_yaml(to_data(request.resolve(changes)[0]))
     number = 1
     while True:

@@ -1,4 +1,4 @@
-"""Where Optuna stores the trials of a sweep: a journal file in its folder, or a database for several machines."""
+"""Storage of a sweep's trials by Optuna: a journal file in the sweep's folder, or a database for several machines."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ JOURNAL = "journal.log"
 _CONNECT_S = 20
 """Time that a database may take to answer [s]."""
 _WITH_CONNECT_TIMEOUT = ("postgresql", "psycopg", "psycopg2", "mysql", "mysqldb", "pymysql")
-"""Drivers, and dialects with such a default driver, that take `connect_timeout`."""
+"""Drivers of SQLAlchemy, and dialects with such a default driver, that have the option `connect_timeout`."""
 _MAX_JOURNAL = 512 * 2**20
 _ATTEMPTS = 5
 """Attempts to create the tables of a database."""
@@ -76,7 +76,10 @@ def open_study(folder: Path, settings: Mapping[str, Any], storage: str | None, *
 
 @contextlib.contextmanager
 def storage_errors(storage: str | None) -> Iterator[None]:
-    """Context that converts errors of a database into a MachineError.
+    """Convert errors of a sweep's database inside a `with` block; other errors are raised unchanged.
+
+    Args:
+        storage: URL of the database; None: the sweep has none.
 
     Raises:
         MachineError: if the database cannot be reached.

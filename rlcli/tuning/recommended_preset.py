@@ -18,7 +18,7 @@ def bench_preset(
         resolved: the task's configuration with the changes of the command line.
         changes: the recommended settings: dotted key -> value.
         findings: the measurements.
-        machine: processor, memory and versions of the machine that was measured.
+        machine: properties of the machine: `cpu`, `cores` and `versions` (package -> version).
         agent_named: whether the command line names the agent; the preset then makes it the default.
     """
     data = preset_of(resolved, agent_named)

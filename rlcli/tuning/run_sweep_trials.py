@@ -33,7 +33,17 @@ _NOT_CAUSED_BY_TRIAL = (7, 8, 10, STOPPED, INTERRUPTED)
 
 
 def check_parameters(request: TrainingRequest, parameters: Sequence[Parameter], objective: Objective) -> Resolved:
-    """Check, before anything is written, that trials can be trained and evaluated; return the first configuration.
+    """Check, before anything is written, that trials can be trained and evaluated.
+
+    Every bound and every choice of the parameters is tried in a configuration.
+
+    Args:
+        request: the request for the trainings.
+        parameters: the varied settings.
+        objective: the metric that ranks the trials.
+
+    Returns:
+        A configuration with bounds of the parameters, which has the task and the agent of all trials.
 
     Raises:
         ConfigError: for an unknown key, or a bound that is not valid for its key.
@@ -82,7 +92,11 @@ class _Stage:
     """Iterations that are included in `trained_s`."""
 
     def add_trained_time(self, rows: Sequence[Mapping[str, Any]]) -> float:
-        """Add the durations of the new rows of `metrics.jsonl`; return the time of all rollouts and updates [s]."""
+        """Add the durations in rows of `metrics.jsonl` that are not counted yet; return the training time so far [s].
+
+        Args:
+            rows: the newest rows, the oldest first.
+        """
         new_rows = [row for row in rows if row["iteration"] > self.counted]
         if new_rows and new_rows[0]["iteration"] > self.counted + 1:  # rows were missed, or the run was resumed
             self.trained_s = max(self.trained_s, overview(self.trial.folder).duration_s or 0.0)

@@ -111,7 +111,7 @@ def read_objective(text: str) -> Objective:
     """Parse the option `--objective`, such as `success@30s`, `return@2e6steps` or `return`.
 
     Raises:
-        UsageError: for a text of another form.
+        UsageError: for another metric, or a limit that is not a number above 0.
     """
     found = _OBJECTIVE.fullmatch(text)
     number = float(found[2] or 1.0) if found else 0.0

@@ -1,4 +1,4 @@
-"""Where the time of an environment step goes: by stage of the step, and by term."""
+"""Profile of an environment step: the time of each of its stages, and of each term."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Cost:
 
 
 def profile_step(resolved: Resolved, seconds: float) -> list[Cost]:
-    """Run a task with random actions for some seconds, and return the cost of each stage of its step and of its terms.
+    """Run a task with random actions for some seconds, and return the time of each stage of a step and of each term.
 
     The times come from Python's profiler, which makes short functions look slower than they are: compare terms only
     with each other. Terms of one section that share a function have one row.

@@ -46,12 +46,12 @@ _KINDS: dict[str, type] = {
     **dict.fromkeys(("params", "overrides"), list),
     **dict.fromkeys(("source", "flags"), dict),
 }
-"""Types of the entries of a sweep's `study.json`."""
+"""Name of an entry of a sweep's `study.json` -> its type."""
 _ENDED = ("COMPLETE", "PRUNED", "FAIL")
 
 
 class _TrialNotes(FileModel):
-    """Notes that `Sweep.tell` stores with a trial."""
+    """Entries that `Sweep.tell` stores with a trial: training time [s], environment steps, and why the trial failed."""
 
     seconds: float | None = None
     step: Count | None = None
@@ -59,7 +59,7 @@ class _TrialNotes(FileModel):
 
 
 class _FinishedTrial(_TrialNotes):
-    """A finished trial: its notes, and the value of the sweep's only objective."""
+    """Entries of a finished trial: those of `Sweep.tell`, and the value of the objective."""
 
     values: tuple[float]
 
@@ -83,7 +83,7 @@ class Trial:
 
 @dataclass(slots=True)
 class Sweep:
-    """Sweep: its folder, its settings, the varied parameters, and Optuna's study, which stores the trials."""
+    """Hyperparameter search: its folder, its settings, the varied parameters, and Optuna's study with the trials."""
 
     folder: Path
     settings: dict[str, Any]
@@ -111,7 +111,10 @@ class Sweep:
         return [trial for trial in self.trials() if trial.state.name in _ENDED]
 
     def same_objective(self) -> float | None:
-        """Return the objective that all finished trials have; None if it differs or fewer than two are finished."""
+        """Return the objective's value if all finished trials have the same; None if not, or for fewer than two.
+
+        Then the search has nothing to choose from, which the user is warned of.
+        """
         values = [trial.value for trial in self._finished()]
         return values[0] if len(values) > 1 and len(set(values)) == 1 else None
 
@@ -135,7 +138,7 @@ class Sweep:
         return [p.override(values[p.key]) for p in self.parameters if p.key in values]
 
     def trial_folder(self, number: int) -> Path:
-        """Return the folder of the trial with a number; the folder is a run."""
+        """Return the folder of a trial, by its number; the folder is a run."""
         return self.folder / f"trial-{number:04d}"
 
     def document(self, trial: FrozenTrial) -> dict[str, Any]:
@@ -183,7 +186,14 @@ class Sweep:
             return self._claim(lock, self._with_own_sampler(new))
 
     def tell(self, trial: Trial, value: float | None = None, *, state: str | None = None, **notes: Any) -> None:
-        """Store the result of an ended trial: its objective or its state, and further entries (`notes`)."""
+        """Store the result of an ended trial, and release its lock.
+
+        Args:
+            trial: the trial.
+            value: value of the objective; None for a trial without a result.
+            state: state of a trial without a result: `PRUNED` or `FAIL`.
+            notes: further entries, see `_TrialNotes`.
+        """
         for key, note in notes.items():
             trial.trial.set_user_attr(key, note)
         self.study.tell(trial.trial, value, state=_state(state))
@@ -191,7 +201,7 @@ class Sweep:
         trial.release()
 
     def write_preset(self, data: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> Path | None:
-        """Write the best trial as a `--config` file, with a comment that names the trial.
+        """Write the settings of the best trial as a `--config` file, and return the file; None if no trial is finished.
 
         Args:
             data: returns the content of the file for a trial's values (key -> value).
@@ -219,7 +229,10 @@ class Sweep:
         return f"{platform.node()}:{self.folder.resolve()}"
 
     def _is_here(self, trial: FrozenTrial) -> bool:
-        """Return whether a trial was started in this folder on this machine; true if the sweep has no database."""
+        """Return whether a trial was started in this folder on this machine, so that it can be resumed here.
+
+        All trials of a sweep without a database were.
+        """
         return self.settings["storage"] is None or trial.user_attrs.get(_LOCATION) == self._here
 
     def _lock_trial(self, number: int) -> FileLock | None:
@@ -233,7 +246,10 @@ class Sweep:
         return None
 
     def _with_own_sampler(self, trial: FrozenTrial | optuna.Trial) -> optuna.Trial:
-        """Return a trial whose new values depend only on the seed and the trial's number; existing ones are kept."""
+        """Return Optuna's trial with a sampler of its own, so that its values depend only on seed and trial number.
+
+        Values that the trial has already are kept.
+        """
         import optuna
 
         self.study.sampler = _sampler(derive(self.settings["seed"], f"trial {trial.number}"))

@@ -26,11 +26,14 @@ _log = logging.getLogger(__name__)
 CURVES = "curves.csv"
 PICTURE = "curves.svg"
 METRICS = {"return": "Train/mean_reward", "success": "Train/success_rate"}
-"""Name in tables and documents -> metric."""
+"""Name in tables and JSON documents -> name in metrics.jsonl."""
 
 
 class StudyView(AbstractContextManager[Any], Protocol):
-    """Context that shows the progress of a study's runs (a study: one configuration trained with several seeds)."""
+    """Display of the progress of a study's runs, used in a `with` block.
+
+    A study is one configuration that is trained with several seeds.
+    """
 
     def poll(self) -> None:
         """Update the view if the last update is old enough."""
