@@ -67,7 +67,7 @@ class CrashDumper(StepObserver):
 
 
 def stop_observing_divergences(env: Environment, observer: StepObserver) -> None:
-    """Remove an observer of divergences. If it is the last one, the engine need not keep its calls any more."""
+    """Remove an observer of divergences. After the last one, the engine keeps no more than its newest call."""
     env.observers.remove(observer)
     if not env.observers.on_divergence and env.engine.replayable is not None:
         env.engine.replayable.record_calls(1)
@@ -78,7 +78,7 @@ class CallTrace:
     """Copies of the last engine calls of one environment, from which another thread can simulate them again."""
 
     divergence: Divergence
-    """The divergence; for an episode that did not diverge, its cause is the reason why the episode is kept."""
+    """The divergence. For an episode that did not diverge, `divergence.cause` is why the episode was recorded."""
     calls: list[Call]
     final: NDArray[np.float64]
     """The state after the last call, or before it if that call is pending."""
@@ -113,14 +113,17 @@ def trace_calls(env: Environment, divergence: Divergence, pending: bool = False)
 def describe_traces(
     traces: Sequence[CallTrace], model: mujoco.MjModel, resolved: Resolved, follows_constants: bool, *, diverged: bool
 ) -> tuple[list[World], dict[str, Tensor]]:
-    """Simulate engine calls again to describe them; return the descriptions and tensors for a trajectory file.
+    """Simulate engine calls again, and convert them to the form of a trajectory file.
 
     Args:
         traces: the calls of each environment.
         model: the model of all environments.
         resolved: the configuration.
         follows_constants: whether MuJoCo's constants are derived again from an environment's model fields.
-        diverged: whether the traces end in a divergence.
+        diverged: whether the traces end in a divergence, whose physics step is then searched.
+
+    Returns:
+        The `World` of each environment for the file's header, and the file's tensors (`world.K.*`), by name.
     """
     worlds, tensors = [], {}
     for number, trace in enumerate(traces):
@@ -147,7 +150,7 @@ def describe_traces(
 
 
 def write_dump(env: Environment, found: list[Divergence], pending: bool, folder: Path, parents: bool) -> Path:
-    """Write a crash dump with the last engine calls of the environments that diverged; return its file.
+    """Write a crash dump with the last engine calls of the environments that diverged.
 
     Args:
         env: the environment, before the diverged states are restored.

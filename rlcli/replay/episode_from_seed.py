@@ -1,4 +1,4 @@
-"""Run one episode of an evaluation again from its seed: the episode K of environment E of `rlcli eval`.
+"""Repetition of one episode of `rlcli eval` from its seed: episode K of environment E.
 
 A random number depends on the seed, the term, the environment and the index of its episode. If nothing else connects
 the episodes of a task, episode K starts at once. In other tasks an episode also depends on the earlier ones, because of
@@ -41,14 +41,14 @@ class EpisodeStart:
 
 
 def start_episode(env: VecEnv, act: Act, env_id: int, episode: int, *, drawn_actions: bool = False) -> EpisodeStart:
-    """Bring an environment to the beginning of one of its episodes.
+    """Reset an environment to the beginning of one episode of an evaluation; run earlier episodes if they affect it.
 
     Args:
         env: the environments, newly created.
         act: the policy, a function from observations to actions.
         env_id: the environment of the episode.
         episode: its index, from 0.
-        drawn_actions: whether the policy is stochastic.
+        drawn_actions: whether the policy draws random numbers (a stochastic policy, or random actions).
 
     Raises:
         ConfigError: if an episode does not end because the task has no time-out.

@@ -1,4 +1,4 @@
-"""Failure cases: recordings of failed and unusual episodes of a training, as `rlcli autopsy` reads and shows them.
+"""Failure cases: recordings of failed and outlier episodes of a training, as `rlcli autopsy` reads and shows them.
 
 No code of a run is executed.
 """
@@ -31,7 +31,7 @@ _MAX_FILES = 10_000
 
 @dataclass(frozen=True, slots=True)
 class FailureCase:
-    """Recording of the last steps of a failed or unusual episode of a training."""
+    """Recording of the last steps of a failed or outlier episode of a training."""
 
     trajectory: Trajectory
 
@@ -82,7 +82,7 @@ class FailureCase:
         return dict(zip(names, self.values(name).T, strict=True))
 
     def record(self) -> dict[str, Any]:
-        """Return the metadata of the recording, everything but the values of the steps, as plain JSON."""
+        """Return the recording as JSON data, without the values of its steps: why, when and where it was recorded."""
         episode, failure = self.episode, self.failure
         facts = {
             "file": str(self.trajectory.file),
@@ -144,7 +144,7 @@ def list_failure_cases(run: Run) -> list[FailureCase]:
 
 
 def why_no_cases(run: Run) -> str:
-    """Return the text that says why a run has no failure cases."""
+    """Return one sentence that explains to the user why a run has no failure cases."""
     device = str(run.record.get("device", "cpu"))
     if device.startswith("cuda"):
         return (
@@ -169,7 +169,7 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class StagedCase:
-    """A failure case with a simulation of its task, as installed now, to compute contacts and draw images."""
+    """A failure case, and a simulation of its task as it is installed now, which computes contacts and images."""
 
     staged: Staged
     states: list[NDArray[np.float64]]
@@ -198,8 +198,10 @@ class StagedCase:
 def stage_case(case: FailureCase, named: TaskSource | None = None) -> StagedCase:
     """Build the task of a failure case, to compute contacts and draw images.
 
-    `named` is the task on the command line, or None. Its code is used if it is a local file or folder and the recorded
-    task is not installed.
+    Args:
+        case: the failure case.
+        named: the task on the command line; it replaces the recorded task if both are local files or folders, for
+            example after the task's folder was moved. None: no task was named.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `rlcli.replay.resimulate.stage`.

@@ -1,8 +1,8 @@
-"""Recorder of the last seconds of failed and unusual episodes of a training, for `rlcli autopsy`.
+"""Recorder of the last seconds of failed and outlier episodes of a training, for `rlcli autopsy`.
 
 Ring buffers hold the last seconds of all environments: the states at the beginning of each engine call (`StateHistory`
 in `rlcli.sim.divergence_report`), observations, actions and rewards. In each iteration one episode of every kind is
-copied: for each set of terminations the one with the lowest return, the ones with unusually low and high returns, and
+copied: for each set of terminations the one with the lowest return, the outliers with a low and with a high return, and
 the first that diverged for each cause. The thread that writes the next checkpoint writes them to files. When a training
 resumes, files that are newer than the checkpoint are removed, because their episodes are run again.
 
@@ -45,14 +45,14 @@ from rlcli.sim.divergence_report import Divergence
 
 _log = logging.getLogger(__name__)
 RECENT = 1024
-"""Number of recent returns with which the next ones are compared."""
+"""Number of recent episodes with whose returns a new return is compared."""
 LEAST = 64
-"""Number of returns below which no return is unusual."""
+"""Smallest number of recent returns with which a new return can be an outlier."""
 FAR = 3.0
-"""Distance from the quartiles, in interquartile ranges, above which a return is unusual (Tukey's outer fences)."""
+"""Distance from the quartiles, in interquartile ranges, above which a return is an outlier (Tukey's outer fences)."""
 _RETURNS_FILE = "recent.json"
 _MIN_SPREAD = 1e-3
-"""Smallest interquartile range, as a share of the quartiles: returns with three equal digits are not unusual."""
+"""Smallest interquartile range, as a share of the quartiles: returns with three equal digits are no outliers."""
 
 _Key = tuple[FailureKind, *tuple[str, ...]]
 """Kind of an episode, and the causes of its end: for each key, one episode is kept per iteration."""
@@ -60,7 +60,7 @@ _Key = tuple[FailureKind, *tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True)
 class KeptEpisode:
-    """The last steps of a failed or unusual episode, in memory, before they are written to a file."""
+    """The last steps of a failed or outlier episode, in memory, before they are written to a file."""
 
     value: float
     """Rank of the episode: the episode with the lowest value of its kind is kept."""
@@ -82,7 +82,7 @@ class FailureBatch:
     remove: list[str]
     """Names of files to remove."""
     returns: list[float]
-    """Returns of recent episodes, from which a resumed training recognises unusual returns."""
+    """Returns of recent episodes, with which a resumed training recognises outliers."""
 
 
 class _RecentReturns(BaseModel):
@@ -94,7 +94,7 @@ class _RecentReturns(BaseModel):
 
 
 class FailureRecorder(StepObserver):
-    """Observer that records the last steps of failed and unusual episodes of a training on a CPU.
+    """Observer that records the last steps of failed and outlier episodes of a training on a CPU.
 
     Args:
         env: the environment; its engine is set to keep the last seconds.
@@ -215,7 +215,7 @@ class FailureRecorder(StepObserver):
                 self._diverging[divergence.env] = trace_calls(self._env, divergence, pending)
 
     def on_step(self, record: StepRecord) -> None:
-        """Write the step into the ring buffers, and keep the failed and the unusual episodes that end in this step."""
+        """Write the step into the ring buffers, and keep the failed and outlier episodes that end in this step."""
         slot = self._step % self._slots
         for name, value in (
             ("observations", record.obs["policy"]),
@@ -230,9 +230,10 @@ class FailureRecorder(StepObserver):
         self._diverging.clear()
 
     def _choose(self, ended: Episodes) -> None:
-        """Keep the ended episodes that diverged, have an unusual return, or were terminated.
+        """Keep some of the ended episodes that diverged, have an outlier return, or were terminated.
 
-        One episode of each kind is kept per iteration: the first that diverged, else the one with the lowest value.
+        One episode of each kind is kept per iteration: the first that diverged for a cause, the outlier with the lowest
+        and with the highest return, and for each set of terminations the episode with the lowest return.
         """
         returns, rest = ended.returns.detach().numpy().copy(), ~ended.truncated.numpy()
         self._returns.append(returns)
@@ -267,7 +268,7 @@ class FailureRecorder(StepObserver):
 
         Args:
             key: kind of the episode, and the causes of its end.
-            value: value of each ended episode.
+            value: rank of each ended episode, as in `KeptEpisode`.
             mask: whether an ended episode is of this kind.
             ended: the ended episodes.
         """
@@ -304,7 +305,7 @@ class FailureRecorder(StepObserver):
         self._pending[key] = KeptEpisode(value, key[0], episode, trace, tensors, self._engine.own_constants)
 
     def _fences(self) -> tuple[float, float]:
-        """Return the bounds of usual returns, from the quartiles of recent returns: (lowest, highest)."""
+        """Return the lowest and the highest return that is no outlier, from the quartiles of recent returns."""
         if self._quartiles is None:
             return -np.inf, np.inf
         first, third = self._quartiles
@@ -321,7 +322,10 @@ class FailureRecorder(StepObserver):
             self._quartiles = (first, third)
 
     def _evict(self) -> None:
-        """While there are more files than `keep` of the settings, drop the oldest one of the most frequent kind."""
+        """Drop files until there are at most `autopsy.keep` of the agent's settings.
+
+        Each time the oldest file of the most frequent kind is dropped, so that every kind of failure stays.
+        """
         self._files = dict(sorted(self._files.items()))  # a resumed run reads the folder in this order
         while len(self._files) > self._keep:
             counts = Counter(self._files.values())
@@ -371,7 +375,7 @@ class FailureRecorder(StepObserver):
 def open_failure_recorder(
     env: Environment, config: AutopsyConfig | None, folder: Path, step: int | None
 ) -> FailureRecorder | None:
-    """Return a recorder of failed and unusual episodes; None without a configuration, and on a GPU.
+    """Return a recorder of failed and outlier episodes; None without a configuration, and on a GPU.
 
     Steps on a GPU cannot be replayed. The arguments are those of `FailureRecorder`.
     """

@@ -108,7 +108,7 @@ def read_state(env: VecEnv) -> dict[str, Tensor]:
 def replay_episodes(
     recording: Trajectory, env: VecEnv, episodes: Iterable[int], before_step: Callable[[int], None] = lambda step: None
 ) -> Replay:
-    """Apply the recorded actions again; compare every state and reward of some episodes with the recorded ones.
+    """Apply the actions of a recording again; compare every state and reward of some episodes with the recorded ones.
 
     Args:
         recording: the recording.
@@ -207,7 +207,15 @@ class ReplayWorld:
         return None
 
     def find_divergence(self, calls: list[Call], first: int) -> DivergencePoint | None:
-        """Simulate engine calls again, from index `first` on; return the first physics step that diverges, or None."""
+        """Simulate engine calls again, one physics step at a time, and find the first physics step that diverges.
+
+        Args:
+            calls: the recorded engine calls.
+            first: index of the call to begin with.
+
+        Returns:
+            The physics step, or None if none diverges.
+        """
         for number, call in enumerate(calls[first:], start=first):
             self.engine.set_state_row(0, call.state)
             for substep in range(call.nstep):
@@ -224,9 +232,11 @@ class ReplayWorld:
         return None
 
     def _diverged_value(self, found: Divergence, before: NDArray[np.float64]) -> tuple[str, str]:
-        """Return the array element, joint or actuator whose value shows a divergence, and this value, as texts.
+        """Return what shows a divergence, as two texts: array element, joint or actuator, and its value.
 
-        `before` is the state before the physics step that diverged.
+        Args:
+            found: the divergence.
+            before: the state before the physics step that diverged.
         """
         warned = WARNING_FIELDS.get(found.cause)
         if warned is None:
@@ -260,7 +270,10 @@ class StagedWorld:
 
 @dataclass(frozen=True, slots=True)
 class Staged:
-    """A failure or crash file with a simulation for each of its environments, built from the installed task."""
+    """Content of a failure or crash file, and a simulation for each of its environments, from the installed task.
+
+    `same_model` tells whether the installed task's model is the recorded one.
+    """
 
     resolved: Resolved
     model: mujoco.MjModel
@@ -271,8 +284,10 @@ class Staged:
 def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
     """Build the task of a failure or crash file, and a simulation for each of the recorded environments.
 
-    `named` is the task on the command line, or None. Its code is used if it is a local file or folder and the recorded
-    task is not installed.
+    Args:
+        trajectory: the file.
+        named: the task on the command line; it replaces the recorded task if both are local files or folders, for
+            example after the task's folder was moved. None: no task was named.
 
     Raises:
         TaskError: if the task is not installed any more.
@@ -303,8 +318,11 @@ def stage(trajectory: Trajectory, named: TaskSource | None = None) -> Staged:
 def replay_calls(trajectory: Trajectory, named: TaskSource | None = None) -> Replay:
     """Simulate every engine call of a failure or crash file again, and compare the states with the recorded ones.
 
-    A state that an event changed between two calls is not compared. `named` is the task on the command line; its code
-    is used if neither it nor the recorded task is installed.
+    A state that an event changed between two calls is not compared.
+
+    Args:
+        trajectory: the file.
+        named: the task on the command line, as in `stage`.
 
     Raises:
         CheckpointError, ConfigError, TaskError: see `stage`.

@@ -48,7 +48,7 @@ FORMAT = 2
 STATE_FIELDS = ("qpos", "qvel", "act", "ctrl")
 """Fields of the simulation state that a recording holds for each step."""
 MAX_SUBSTEPS = 300_000
-"""Physics steps that a replay of engine calls simulates at most."""
+"""Largest number of physics steps that a replay of engine calls simulates."""
 _MAX_BYTES = 2**28
 """Size limit of failure and crash files; a recording has none."""
 
@@ -287,7 +287,7 @@ class Trajectory:
         A failure or crash file gets one environment, in which the calls of each recorded environment are simulated.
 
         Args:
-            named: the task on the command line; it is used if neither it nor the recorded task is installed.
+            named: the task on the command line; it replaces the recorded task if both are local files or folders.
 
         Raises:
             TaskError: if the task is not installed any more.
@@ -306,7 +306,7 @@ class Trajectory:
         return resolved
 
     def mismatch_error(self, error: Exception) -> CheckpointError:
-        """Return the error for a file whose states do not fit the installed task."""
+        """Return the error for a file whose states do not fit the installed task; `error` is the exception with why."""
         message = f"{self.file} does not fit the installed task: {' '.join(str(error).split())}"
         words = ", ".join(f"{key} {value}" for key, value in self.header.task.items() if value is not None)
         return CheckpointError(message, hint=f"install the version of the task that made the file: {words}")
