@@ -16,7 +16,7 @@ __all__ = ["Check", "run_checks"]
 
 
 def run_checks(runs_dir: Path, timeout_s: float = TIMEOUT_S) -> list[Check]:
-    """Run all checks.
+    """Run all checks of `rlcli doctor` and return their results, in the order of its table.
 
     Checks that may hang or crash (drivers, graphics, plugins) run in separate processes, several at a time.
 

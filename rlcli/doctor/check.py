@@ -15,3 +15,4 @@ class Check:
     found: str
     hint: str | None = None
     details: dict[str, Any] = field(default_factory=dict)
+    """Figures behind `found`, such as versions or bytes, as JSON data for `rlcli doctor --json`."""

@@ -32,7 +32,7 @@ REINSTALL = f"pip uninstall -y {' '.join(MUJOCO_PACKAGES)} && {pip_install('mujo
 """Uninstall first: the three packages share files, so upgrading one removes files that another has just written."""
 
 Answer = tuple[dict[str, Any] | None, str]
-"""(result, "") of a separate process; (None, reason) if it returned no result."""
+"""Answer of a check in a separate process: its result as JSON data and "", or None and the reason of the failure."""
 
 
 def check_isolated(timeout_s: float) -> list[Check]:
@@ -47,7 +47,7 @@ def check_isolated(timeout_s: float) -> list[Check]:
 
 
 def compute_checks(answer: dict[str, Any] | None, reason: str) -> list[Check]:
-    """Return the checks that torch and MuJoCo can be imported and compute.
+    """Return the checks whether torch and MuJoCo can be imported and compute, and keep all cores.
 
     Args:
         answer: result of the separate process; None: it failed.
@@ -74,7 +74,11 @@ def compute_checks(answer: dict[str, Any] | None, reason: str) -> list[Check]:
 
 
 def gpu_checks(gpu: Answer | None) -> list[Check]:
-    """Return the checks that the GPU's driver, torch and Warp fit together. `gpu` is None if there is no driver."""
+    """Return the checks whether the GPU's driver, torch and Warp fit together.
+
+    Args:
+        gpu: answer of the separate process, see `isolated_checks._gpu`; None: there is no GPU driver.
+    """
     if gpu is None:
         return [Check("gpu", "ok", "no GPU; the CPU engine needs none")]
     answer, reason = gpu
@@ -155,7 +159,12 @@ _KNOWN = ("enable", "enabled", "on", "true", "1", "glx", "wgl", "cgl")
 
 
 def run_isolated(check_name: str, timeout_s: float) -> Answer:
-    """Run a check of `isolated_checks.py` in a separate process; return (result, ""), or (None, why it failed)."""
+    """Run a check of `isolated_checks.py` in a separate process.
+
+    Args:
+        check_name: compute, gpu, or an OpenGL backend such as egl.
+        timeout_s: time limit [s].
+    """
     command = python_command("-m", "rlcli.doctor.isolated_checks", check_name)
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     try:

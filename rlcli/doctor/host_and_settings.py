@@ -124,7 +124,12 @@ def _variables_check() -> Check:
 
 
 def harmful_variables(variables: dict[str, str], cores: int) -> dict[str, str]:
-    """Return the environment variables whose values make training slower: name -> reason."""
+    """Return the environment variables whose values make training slower: name -> reason.
+
+    Args:
+        variables: name -> value of environment variables.
+        cores: number of cores that this process may use.
+    """
     found = {}
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         if variables.get(name, "").isdecimal() and int(variables[name]) > cores:

@@ -1,4 +1,4 @@
-"""Checks of the installed packages: whether they are present, load, and fit together."""
+"""Checks of the installed packages and plugins: whether they are present, can be loaded, and fit together."""
 
 import platform
 import re
@@ -196,7 +196,12 @@ def _requirements(distribution: str) -> list[tuple[str, str, str | None]]:
 
 
 def _remedy(entry: Entry, reason: str) -> str:
-    """Return how to repair a plugin that cannot be loaded; `reason` is the error of the import."""
+    """Return the hint for a plugin that cannot be loaded: what to reinstall or uninstall.
+
+    Args:
+        entry: the plugin's entry point.
+        reason: the error of its import; after a time-out, the hint also names a longer time limit.
+    """
     if entry.distribution == "rlcli":
         return pip_install("--force-reinstall --no-deps rlcli")
     late = "; if the machine is busy: `rlcli doctor --probe-timeout 120`" if " within " in reason else ""
