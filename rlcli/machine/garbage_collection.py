@@ -3,7 +3,7 @@
 import gc
 
 _SELDOM = (100_000, 10, 10)
-"""Thresholds of `gc.set_threshold` with which collections are rare."""
+"""Arguments of `gc.set_threshold` with which collections are rare."""
 _saved_thresholds: list[tuple[int, int, int]] = []
 
 

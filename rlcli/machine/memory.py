@@ -12,7 +12,7 @@ from rlcli.machine.control_groups import GROUPS, OWN_GROUP, control_groups
 _log = logging.getLogger(__name__)
 
 _NO_LIMIT = 1 << 60
-"""Memory limits [bytes] from this number on mean "no limit": version 1 of control groups writes about 2**63."""
+"""A memory limit of at least this number [bytes] means "no limit": version 1 of control groups writes about 2**63."""
 _NO_MEMORY = re.compile(
     r"(not|n't) allocate memory|not enough memory|bad_alloc|failed to map segment|n't start new thread|unable to mmap"
     r"|out of memory",
@@ -84,7 +84,7 @@ def require_memory(size: int, what: str) -> None:
 
     Args:
         size: the memory [bytes].
-        what: what needs the memory, for the message.
+        what: what needs the memory, a plural noun for the message, such as `1024 environments`.
 
     Raises:
         DeviceError: if less memory is free.

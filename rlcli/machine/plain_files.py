@@ -1,4 +1,4 @@
-"""Reads files without blocking on devices and pipes."""
+"""Reading of files that never blocks on a device or an empty pipe."""
 
 import errno
 import os

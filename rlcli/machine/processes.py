@@ -1,4 +1,4 @@
-"""Starts of Python processes: their command line, and environment variables that they read."""
+"""Command line of Python subprocesses, and environment variables of processes: launchers' numbers, OpenMP settings."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""The processor of this machine, and the kernels that libraries choose for it."""
+"""Model and instruction sets of this machine's processor, by which math libraries choose their kernels."""
 
 import contextlib
 import hashlib
