@@ -38,7 +38,7 @@ def allowed_hosts(port: int) -> tuple[str, ...]:
 
 
 def refusal_reason(port: int, path: str, request_headers: Mapping[str, Sequence[str]]) -> str | None:
-    """Return why a request is refused, or None if it is answered.
+    """Return why a request to the web viewer must be refused, or None if it may be answered.
 
     Args:
         port: the port of the server.

@@ -20,7 +20,10 @@ _EMISSION = 0.4
 
 
 class _Part(NamedTuple):
-    """Shape of a marker from one point to another (num_envs, 3) [m]; both points of a sphere are its centre."""
+    """Arrow, cylinder or sphere of a marker, in every environment.
+
+    It goes from the points `start` to the points `end`, (num_envs, 3) [m] each; for a sphere both are its centre.
+    """
 
     kind: int
     start: Tensor

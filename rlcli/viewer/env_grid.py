@@ -76,7 +76,13 @@ class EnvGrid:
                     geom.pos[:] += offset
 
     def geoms(self, scene: mujoco.MjvScene, shown: int, option: mujoco.MjvOption) -> Iterator[mujoco.MjvGeom]:
-        """Yield copies of the geoms that `add` appends; `scene` is overwritten, and its size limits their number."""
+        """Yield copies of the geoms that `add` appends to a scene: markers and further environments.
+
+        Args:
+            scene: a scene for the computation, which is overwritten; its `maxgeom` limits the number of geoms.
+            shown: index of the shown environment.
+            option: visualisation options of MuJoCo.
+        """
         scene.ngeom = 0
         self.add(scene, shown, option)
         for source in scene.geoms[: scene.ngeom]:

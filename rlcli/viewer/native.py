@@ -22,7 +22,7 @@ KEYS = (
     " Double click, then Ctrl and drag: push a body"
 )
 _REQUESTS = {code: request for request, (code, _) in REQUEST_KEYS.items()}
-"""Key code of GLFW -> request of the playback."""
+"""Key code of GLFW -> name of a request, as in `Playback.requests`."""
 
 
 def run(playback: Playback, *, title: str, num_drawn: int, port: int, ready: Ready) -> None:
@@ -64,7 +64,7 @@ def run(playback: Playback, *, title: str, num_drawn: int, port: int, ready: Rea
 
 
 def press(playback: Playback, code: int) -> None:
-    """Submit the request that belongs to a key, given by its GLFW code; other keys do nothing."""
+    """Submit the request of a pressed key to the playback; other keys do nothing. `code`: the key's code in GLFW."""
     if code in _REQUESTS:
         playback.submit(playback.requests()[_REQUESTS[code]])
 
@@ -94,7 +94,7 @@ def captions(view: View) -> tuple[str, str]:
 
 
 def _require_windows() -> None:
-    """Check that a window can be opened: MuJoCo opens it in a thread and would wait forever.
+    """Check that a window can be opened. Without a display, MuJoCo's thread would wait for its window forever.
 
     Raises:
         MachineError: if the display cannot show a window.

@@ -112,9 +112,12 @@ class Playback:
     # --- in the simulation's thread ---
 
     def advance(self, elapsed: float) -> int:
-        """Execute the requests, then make the steps that are due after `elapsed` seconds; return their number.
+        """Execute the requests, then make the environment steps that are due; return the number of steps made.
 
-        A machine that is too slow falls behind real time and does not catch up later.
+        If the machine is too slow, the playback falls behind real time and does not catch up later.
+
+        Args:
+            elapsed: real time since the last call [s].
         """
         while self._requests:  # only this thread removes requests
             self._requests.popleft()()
@@ -246,7 +249,14 @@ class Playback:
         self.steps += 1
 
     def _step_under_force(self, action: Tensor, push: np.ndarray) -> Any:
-        """Make a step with the viewer's forces on bodies, then remove them where the step has not overwritten them."""
+        """Make an environment step with the forces that the user applies to bodies in the viewer, then remove them.
+
+        Forces that the step itself has set, for example in a reset, stay.
+
+        Args:
+            action: actions of all environments.
+            push: force and torque on each body of the shown environment. (nbody, 6) [N, N m]
+        """
         row = self.env.engine.field("xfrc_applied")[self.shown]
         before = row.clone()
         pushed = before + torch.from_numpy(push).to(row)

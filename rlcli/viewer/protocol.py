@@ -24,14 +24,15 @@ REQUEST_KEYS: dict[str, tuple[int, str | None]] = {
     "newer checkpoint": (266, "PageUp"), "older checkpoint": (267, "PageDown"), "previous command": (268, None),
     "next command": (269, None), "raise command": (260, None), "lower command": (261, None),
 }  # fmt: skip
-"""Request of the playback -> its key: code in GLFW, name in Dear ImGui (None: the browser's viewer has no such key).
+"""Name of a request to the playback -> its key: code in GLFW (native window), name in Dear ImGui (browser; None: no
+key).
 
 A viewer with other key codes has its own table in its module. The names of the requests are those of
 `Playback.requests`.
 """
 
 Ready = Callable[[Sequence[str], str | None], None]
-"""Receives lines of instructions for the user, and the viewer's address if it has one."""
+"""Type of the callback `ready`: it receives lines of instructions for the user, and the viewer's URL, or None."""
 
 
 class Viewer(Protocol):
@@ -87,7 +88,7 @@ class View:
     follow: bool
     """Whether each new checkpoint is played as soon as it appears."""
     knobs: tuple[Knob, ...]
-    """Columns of commands that the user can set."""
+    """Numbers of the task's commands that the user can set, such as the velocity `vx`, each with its range."""
     commands: tuple[float, ...]
     """Value of each knob in the shown environment."""
     held: Mapping[str, float]

@@ -24,7 +24,17 @@ from rlcli.viewer.video_writer import VideoWriter
 def open_video(
     model: mujoco.MjModel, task: TaskConfig, file: Path, env_grid: EnvGrid | None = None
 ) -> Iterator[tuple[Renderer, VideoWriter, int]]:
-    """Context with a renderer, the writer of a video file, and the number of environment steps between two frames."""
+    """Open a video file for a `with` block.
+
+    Args:
+        model: model of the environments.
+        task: the task, with its camera, image size and `render_interval`.
+        file: an .mp4 or .gif.
+        env_grid: further environments to draw in the image; None: only one environment.
+
+    Returns:
+        A renderer of images, the writer that takes them, and the number of environment steps between two frames.
+    """
     stride = max(1, task.sim.render_interval // task.decimation)
     with Renderer(model, task.viewer, env_grid) as renderer, VideoWriter(file, stride * task.step_dt) as writer:
         yield renderer, writer, stride
@@ -67,7 +77,18 @@ def record_episode(
 def film_replay(
     recording: Trajectory, env: VecEnv, episodes: Iterable[int], filmed: int, file: Path
 ) -> tuple[Replay, int]:
-    """Replay episodes of a recording and film episode `filmed`; return the comparison and the number of frames."""
+    """Replay episodes of a recording, compare them with it, and film one of them.
+
+    Args:
+        recording: the recording.
+        env: an environment with the recorded configuration.
+        episodes: indices of the episodes to replay.
+        filmed: index of the episode to film.
+        file: the video, an .mp4 or .gif.
+
+    Returns:
+        The result of the comparison, and the number of frames.
+    """
     episode = recording.header.episodes[filmed]
     with open_video(env.engine.model, env.config, file) as (renderer, writer, stride):
 

@@ -73,7 +73,7 @@ def load() -> SimpleNamespace:
 
 
 def incompatible_viewer(why: str) -> DependencyError:
-    """Return the error for a version of MuJoCo whose web viewer is not supported."""
+    """Return the error for an installed MuJoCo whose web viewer is not supported; `why` is what differs."""
     return DependencyError(
         f"the browser's viewer does not work with the installed mujoco {mujoco.__version__}: {' '.join(why.split())}",
         hint=f"{pip_install('mujoco==4.0.*')}, or use --video FILE.mp4, or --viewer none",
@@ -102,7 +102,14 @@ def listen(port: int, socket_class: type[socket.socket] = socket.socket) -> sock
 
 @contextlib.contextmanager
 def secured_server(studio: SimpleNamespace, listener: socket.socket) -> Iterator[None]:
-    """Context in which a new viewer listens on `listener`, refuses requests of other pages, and prints nothing."""
+    """Replace functions of MuJoCo's web viewer in a `with` block.
+
+    A viewer that starts in the block listens on `listener`, refuses requests of other pages, and prints nothing.
+
+    Args:
+        studio: the viewer's modules, from `load`.
+        listener: a listening socket, from `listen`.
+    """
     server, viewer = studio.web_server, studio.web_viewer
     port = listener.getsockname()[1]
     replacements: list[tuple[Any, str, Any]] = [
@@ -224,7 +231,10 @@ def _is_own_socket(peer: object) -> bool:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Context that sends the viewer's warnings to stderr, and drops other messages, as those of closed browsers."""
+    """Send the warnings of MuJoCo's web viewer to stderr in a `with` block, and drop its other messages.
+
+    Dropped are also errors of connections that a browser closes.
+    """
     log, loop = logging.getLogger("WebServer"), logging.getLogger("asyncio")
     level, streams = log.level, [(h, h.stream) for h in log.handlers if isinstance(h, logging.StreamHandler)]
     log.setLevel(logging.WARNING)

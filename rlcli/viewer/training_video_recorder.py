@@ -43,7 +43,12 @@ class TrainingVideos(StepObserver):
         return iteration % self._interval == 0
 
     def record(self, policy: Callable[[], Policy], step: int) -> Path | None:
-        """Write a video and return its file; None if that failed. `policy` makes a copy of the policy for it."""
+        """Film an episode and return the video's file; None if that failed, which is logged, or training is stopping.
+
+        Args:
+            policy: returns a copy of the policy, so that filming does not change the trained one.
+            step: environment steps so far, which name the file.
+        """
         file = self._folder / f"{step:012d}.mp4"
         try:
             with undisturbed():

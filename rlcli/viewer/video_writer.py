@@ -109,7 +109,11 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
 
 
 def gif_stride(period: float) -> int:
-    """Return n such that a GIF gets every n-th image, for a period [s] between images (see `VideoWriter`)."""
+    """Return the number n such that a GIF that contains every n-th image plays at the right speed (see `VideoWriter`).
+
+    Args:
+        period: time between two images [s].
+    """
     strides = range(1, 64)
     return next(
         (k for k in strides if (n := round(100 * period * k)) >= 2 and abs(n / (100 * period * k) - 1) < 0.02), 1

@@ -28,7 +28,7 @@ _WIDTH = 310.0
 _NARROW = 2.0 * _WIDTH
 """Width of a page below which the panel covers the lower part of the page, as on a phone [pixels]."""
 _LAST = 0
-"""Priority of event handlers that run after those of MuJoCo."""
+"""Priority, in `messages.handler` of MuJoCo, of event handlers that run after MuJoCo's own."""
 
 Method = TypeVar("Method", bound=Callable[..., None])
 
