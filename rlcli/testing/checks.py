@@ -1,5 +1,6 @@
-"""Runner of the checks of a task's contract: what trainers and checkpoints rely on (shapes, seeds, resets ...).
+"""Runner of the checks of `rlcli check`, which test a task's contract.
 
+The contract is what trainers and checkpoints rely on: shapes, seeds, resets and others.
 An error in a check becomes a finding, and the other checks still run.
 """
 
@@ -23,7 +24,7 @@ Check = Callable[[TaskUnderTest], Iterable[Finding]]
 OnCheck = Callable[[str, "list[Finding] | None"], None]
 """Function that receives the name of each check and its findings; None: the check did not run."""
 OnNote = Callable[[str, str], None]
-"""Function that receives the name of a check and a remark of it that is no finding."""
+"""Function that receives the name of a check and a text that is no finding, such as a measured speed."""
 
 _files, _episodes, _equivalence = step_and_file_checks, episode_checks, equivalence_checks
 _IN_ORDER: tuple[Check, ...] = (
@@ -106,8 +107,10 @@ def record_layout(
 ) -> Path:
     """Record the columns of a task's observations and actions beside its configuration, for the check `layout`.
 
+    The arguments are those of `check_task`.
+
     Returns:
-        The file.
+        The written file, `task.layout.json` for `task.yaml`.
 
     Raises:
         ConfigError: if the task is not valid.

@@ -1,4 +1,7 @@
-"""Checks of episodes: seeds, start states, ends and partial resets. Each function checks one clause of the contract."""
+"""Checks of `rlcli check` about episodes: seeds, start states, ends and partial resets.
+
+Each function checks one requirement that every task must meet.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ _LIMITS = (6, 9)
 """Two episode lengths [steps]; an end that occurs at both follows the limit."""
 
 Trajectory = list[dict[str, Tensor]]
-"""Outputs of each step by name."""
+"""Outputs of each step: name, such as `reward` -> tensor with one row for each environment."""
 MakeFinding = Callable[[str, str, str], Finding]
 """`error_at` or `warning_at`."""
 
@@ -68,7 +71,15 @@ def compare_trajectories(
 
 
 def _difference(env: VecEnv, output: str, a: Tensor, b: Tensor, when: str) -> tuple[str, str]:
-    """Return two texts: where two tensors of the output `output` differ first, and both values there."""
+    """Return two texts for a finding: the first place at which two tensors differ, and both values there.
+
+    Args:
+        env: an environment with the layout of the tensors.
+        output: name of the tensors, such as `observation 'policy'`.
+        a: a tensor with one row for each environment.
+        b: the tensor to compare it with.
+        when: the step, for the text.
+    """
     index = (a != b).nonzero()[0].tolist()
     row, column = index[0], index[1:]
     group = output.split("'")[1] if "'" in output else ""
@@ -92,7 +103,7 @@ def start_states(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 def _start(env: VecEnv, obs: dict[str, Tensor]) -> Tensor:
-    """Return observations and engine state, one row for each environment. (num_envs, values)"""
+    """Return the observations of a reset and the engine's state as one tensor. (num_envs, number of values)"""
     parts = [*obs.values(), *engine_state(env).values()]
     return torch.cat([part.reshape(env.num_envs, -1).double() for part in parts], dim=1)
 
@@ -113,7 +124,7 @@ class _EnvPair:
             env.reset(seed=env.seed)
 
     def step(self, count: int = 1) -> tuple[StepResult, StepResult]:
-        """Make steps with the next actions; return the results of the last one."""
+        """Step both environments with the next random actions; return their results of the last step."""
         for _ in range(count):
             action = next(self._actions)
             self._steps += 1
@@ -125,7 +136,10 @@ class _EnvPair:
 
 
 def _env_pair(subject: TaskUnderTest) -> _EnvPair:
-    """Return two environments in equal states; in the next step some episodes of `ended` end, of `kept` none."""
+    """Return two environments in equal states, for checks of partial resets.
+
+    In the next step the episodes of the environments `_ENDING` end in `ended`, and none ends in `kept`.
+    """
     pair = _EnvPair(subject)
     pair.step(5)
     expire_episodes(pair.ended, _ENDING)
@@ -266,7 +280,7 @@ def termination(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 def _declared(subject: TaskUnderTest, cause: str) -> bool:
-    """Return whether the task declares a termination as a time-out."""
+    """Return whether the task declares a termination as a time-out; `cause` is the name of its term."""
     term = subject.resolved.task.terminations.get(cause)
     return bool(term.time_out) if term is not None else cause == "time_out"
 

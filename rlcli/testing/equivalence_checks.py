@@ -1,4 +1,4 @@
-"""Checks that a task gives equal results with other threads, numbers of environments, engines, after a restore.
+"""Checks of `rlcli check`: equal results with other threads, numbers of environments and engines, and after a restore.
 
 Further checks: the shipped policy fits the task, the columns are as recorded, no Python loop runs over environments.
 """
@@ -310,7 +310,11 @@ def captured(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 def _warp_env(subject: TaskUnderTest, decimation: int) -> VecEnv:
-    """Return an environment with a few worlds on MuJoCo Warp's CPU device.
+    """Return a task's environment on the GPU engine (MuJoCo Warp), with two environments, on Warp's CPU device.
+
+    Args:
+        subject: the task.
+        decimation: number of physics steps in an environment step.
 
     Raises:
         NotRunError: if MuJoCo Warp is not installed, or cannot run this model.

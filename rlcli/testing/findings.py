@@ -12,7 +12,7 @@ from rlcli.machine.memory import memory_error
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Violation of the contract: the check, the place, what was found, and what to do."""
+    """Violation of a requirement that `rlcli check` tests: the check, the place, what was found, and what to do."""
 
     check: str
     """Name of the check."""
@@ -41,7 +41,7 @@ class NotRunError(Exception):
 
 
 def task_error_text(error: Exception) -> str:
-    """Return the message of an error of the task as one line.
+    """Return the type and the message of an error that a task raised in a check, as one line for a finding.
 
     Raises:
         MachineError: for an error that means too little memory, which no change of the task corrects.

@@ -20,7 +20,7 @@ from rlcli.testing.task_under_test import TaskUnderTest, element_names
 MAX_STEPS = 1000
 """Longest rollout if no duration is given [steps]."""
 FixedPolicy = Callable[[int], Tensor]
-"""Step -> action (num_envs, a)."""
+"""Function from the index of a step to the actions of all environments. (num_envs, a)"""
 
 SWITCH_S = 0.25
 """Mean time between sign changes of the bang-bang policy [s]."""
@@ -69,7 +69,7 @@ FIXED_POLICIES: dict[str, Callable[[VecEnv, float], FixedPolicy]] = {
     "bang-bang": bang_bang,
     "sine": sine,
 }
-"""Name -> factory of the policy, in the order in which they run."""
+"""Name of a policy -> function that makes it for an environment and an action bound, in the order of the rollouts."""
 
 
 @dataclass(slots=True)
@@ -91,7 +91,8 @@ class Rollout:
     unfinished: list[int]
     """Lengths of the episodes that the end of the rollout has cut off."""
     limited: dict[str, float]
-    """Name of a limited quantity -> share of the steps in which it was at its limit; only under random actions."""
+    """Name of an effort, a control or an action column -> share of the steps in which it was at its limit. It is
+    recorded only for the policy `random`."""
     speed: Tensor
     """Root mean square of each velocity. (nv,)"""
     diverged: int
@@ -99,7 +100,14 @@ class Rollout:
 
 
 def record_rollout(env: VecEnv, policy: str, bound: float, steps: int) -> Rollout:
-    """Reset, run a policy of `FIXED_POLICIES` for some steps or until an error, and record the rollout."""
+    """Reset an environment, run a fixed policy for some steps or until an error, and record the rollout.
+
+    Args:
+        env: the environment.
+        policy: a key of `FIXED_POLICIES`.
+        bound: largest absolute action.
+        steps: number of steps.
+    """
     act, limits = FIXED_POLICIES[policy](env, bound), policy == "random"
     steps_of: defaultdict[str, list[Tensor]] = defaultdict(list)
     terms: defaultdict[str, list[Tensor]] = defaultdict(list)
@@ -159,7 +167,8 @@ class _PhysicsObserver(StepObserver):
         self.squares: Tensor | None = None
         """Sum over the steps of each squared velocity, averaged over the environments. (nv,)"""
         self.shares: defaultdict[str, float] = defaultdict(float)
-        """Name of a limited quantity -> sum over the steps of the share of environments at its limit."""
+        """Name of an effort, control or action column -> sum over the steps of the share of environments at its
+        limit."""
 
     def after_physics(self) -> None:
         env, model = self._env, self._env.engine.model
@@ -198,7 +207,7 @@ class _PhysicsObserver(StepObserver):
 
 
 class RolloutEvidence:
-    """Data that lint rules read: rollouts of the fixed policies, recorded on first use; and new environments."""
+    """Data that the lint rules read: a rollout of each fixed policy, recorded on first use, and new environments."""
 
     def __init__(self, subject: TaskUnderTest, seconds: float | None) -> None:
         self.subject = subject

@@ -227,7 +227,10 @@ def observation_scale(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 def _angles_without_limits(env: VecEnv) -> set[str]:
-    """Return the observation columns that are angles of hinges without limits, and that are not wrapped."""
+    """Return the observation columns with angles of hinges without limits that are not wrapped to +-pi.
+
+    Such an angle grows by 2 pi in each turn. The columns are named as `observation_parts` names them.
+    """
     found: set[str] = set()
     if not isinstance(env, ManagedEnv):
         return found
@@ -247,7 +250,10 @@ def _angles_without_limits(env: VecEnv) -> set[str]:
 
 
 def _columns(evidence: RolloutEvidence) -> Iterator[tuple[str, Tensor]]:
-    """Yield each observation column or image, and its values in all rollouts. (columns, steps)"""
+    """Yield the name of each observation column or image, and its values in all rollouts.
+
+    The values are (columns, steps): 1 row for a column, a row for each pixel and channel of an image.
+    """
     env = evidence.rollouts[0].env
     for group in env.layout.observations:
         rollouts = [rollout.obs[group] for rollout in evidence.rollouts if group in rollout.obs]
@@ -310,7 +316,8 @@ def _state_after(env: VecEnv, start: dict[str, Tensor], action: Tensor, steps: i
 
 
 DRIFT, RATIO = 0.2, 1.5
-"""Largest usual relative energy error, and ratio of speeds, between the time step and half of it."""
+"""Largest usual difference between simulations with the time step and with half of it: relative error of the energy,
+and ratio of speeds."""
 
 
 def timestep(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -389,7 +396,7 @@ def horizon(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 _LARGEST_ANGLES = {"limit_angle": math.pi, **dict.fromkeys(("roll", "pitch", "yaw", "heading"), 2.0 * math.pi)}
-"""Parameter of a term -> largest usual angle [rad]: a limit of a tilt cannot be above pi."""
+"""Parameter of a term -> largest sensible angle [rad]; above it the angle may be in degrees. A tilt is at most pi."""
 
 
 def degrees(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -433,7 +440,12 @@ The first line of a rule's docstring is the rule."""
 
 
 def _quantile(values: Tensor, share: float) -> float:
-    """Return a quantile, of at most about 100,000 evenly spaced values."""
+    """Return a quantile of some values, computed from at most about 100,000 of them at equal distances.
+
+    Args:
+        values: a tensor of any shape.
+        share: the share of the values below the quantile, 0 to 1.
+    """
     sample = values.flatten()[:: max(1, values.numel() // 100_000)]  # torch's quantile limits the number of values
     return float(sample.double().quantile(share))
 

@@ -102,9 +102,14 @@ def dtypes(subject: TaskUnderTest) -> Iterable[Finding]:
 def _check_outputs(
     subject: TaskUnderTest, check: Callable[[str, Tensor, tuple[int, ...]], Iterator[Finding]]
 ) -> list[Finding]:
-    """Check the task's own outputs and, if they have no finding, the outputs of a step; return the findings.
+    """Return the findings about the tensors that the task returns, or else about the outputs of a step.
 
-    `check` receives the name of an output, its tensor and the expected shape.
+    A step's outputs are checked only if the task's own tensors are right, because a defect of these causes another in
+    the step.
+
+    Args:
+        subject: the task.
+        check: function from the name of an output, its tensor and the expected shape to findings.
     """
     recording = subject.recording()
     layout = recording.env.layout
@@ -196,7 +201,10 @@ def constant_columns(subject: TaskUnderTest) -> Iterator[Finding]:
 
 
 def _fixed_command_columns(env: VecEnv, group: str) -> set[str]:
-    """Return the columns of a group that show a command which the task itself keeps fixed: a range [x, x]."""
+    """Return the observation columns that show a command whose range is a single number [x, x].
+
+    Such a column is constant on purpose. The columns are named as `observation_parts` names them.
+    """
     found: set[str] = set()
     if not isinstance(env, ManagedEnv):
         return found

@@ -12,7 +12,7 @@ from rlcli.envs.step_result import StepResult
 from rlcli.envs.vec_env import VecEnv
 
 STEPS = 200
-"""Steps of a recording."""
+"""Number of steps of a recording."""
 
 
 @dataclass(slots=True)
@@ -25,9 +25,9 @@ class Recording:
     obs: list[dict[str, Tensor]] = field(default_factory=list)
     """Copies, beginning with the observations of the reset. [group -> (num_envs, d)]"""
     late_writes: dict[str, int] = field(default_factory=dict)
-    """Name of a tensor that was changed during the next step -> index of the first such step."""
+    """Name of an output that was changed in place during a later step -> index of the first such step."""
     shared: dict[str, int] = field(default_factory=dict)
-    """Name of a tensor that shares memory with its predecessor -> index of the first such step."""
+    """Name of an output that has the memory of the step before's output -> index of the first such step."""
     error: Exception | None = None
 
 
@@ -79,7 +79,7 @@ def extreme_actions(env: VecEnv, bound: float) -> Iterator[Tensor]:
 
 
 def record(env: VecEnv, actions: Iterator[Tensor]) -> Recording:
-    """Step an environment until the actions end or an error is raised."""
+    """Reset an environment, and step it until the actions end or an error is raised; return the recorded steps."""
     recording = Recording(env)
     try:
         obs = env.reset(seed=env.seed)

@@ -76,13 +76,19 @@ class TaskUnderTest:
         return self._recording
 
     def location(self, error: Exception) -> str:
-        """Return the innermost line of the task's own files in an error's traceback; else the task's name."""
+        """Return `file:line` of the innermost frame of an error's traceback in the task's own files.
+
+        Without such a frame, return the name of the task's configuration file.
+        """
         frames = traceback.extract_tb(error.__traceback__)
         own = [f for f in frames if Path(f.filename).is_relative_to(self.source.root)]
         return f"{own[-1].filename}:{own[-1].lineno}" if own else self.source.label
 
     def agents(self) -> dict[str, Resolved]:
-        """Return the task as each of its agents trains it, without agents whose trainer is not installed."""
+        """Return the name of each agent -> the task's configuration with this agent's changes.
+
+        Agents whose trainer is not installed are left out.
+        """
         names = [self._agent] if self._agent else agent_names(self.resolved.layers)
         agents = {}
         for name in names:
@@ -102,7 +108,7 @@ class TaskUnderTest:
 def open_task(
     task: str | Path, agent: str | None, overrides: Sequence[str], config: Path | None, num_envs: int, seed: int
 ) -> TaskUnderTest:
-    """Open a task by its name, or by the path of its folder.
+    """Open a task for checks or lint rules. The arguments are those of `check_task`.
 
     Raises:
         UsageError: for fewer than `NUM_ENVS` environments.

@@ -24,11 +24,16 @@ class Drift:
     """Largest difference between the energy with dt and with dt / 2, relative to the energy that is exchanged between
     potential and kinetic; median over the start states. Infinite if only the simulation with dt diverges."""
     seconds: float
-    """Simulated time."""
+    """Simulated time [s]."""
 
 
 def energy_drift(env: VecEnv, starts: int = 8) -> Drift:
-    """Simulate the model without actuators from the current states of `env`, with dt and with dt / 2."""
+    """Measure the energy error of the time step, without actuators, from the current states of some environments.
+
+    Args:
+        env: the environments.
+        starts: largest number of start states; the result is their median.
+    """
     model, _ = env.world(0)
     dt = float(model.opt.timestep)
     steps = max(1, min(MAX_STEPS, round(PASSIVE_S / dt)))
@@ -41,7 +46,17 @@ def energy_drift(env: VecEnv, starts: int = 8) -> Drift:
 
 
 def _energy(model: mujoco.MjModel, start: mujoco.MjData, dt: float, steps: int, parts: int) -> np.ndarray:
-    """Return potential and kinetic energy after each `parts` steps. (steps + 1, 2) [J]; NaN after a divergence"""
+    """Simulate without actuators; return potential and kinetic energy over time. (steps + 1, 2) [J]
+
+    The energies are NaN after a divergence.
+
+    Args:
+        model: the model.
+        start: the start state.
+        dt: physics time step [s].
+        steps: number of energies after the first one.
+        parts: number of physics steps between two of them.
+    """
     model = copy.copy(model)
     model.opt.timestep = dt
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
@@ -67,7 +82,12 @@ _DIVERGED = [int(w) for w in (_W.mjWARN_BADQPOS, _W.mjWARN_BADQVEL, _W.mjWARN_BA
 
 
 def _difference(coarse: np.ndarray, fine: np.ndarray) -> float:
-    """Return the largest difference of the total energies, relative to the exchanged energy. (steps + 1, 2) each"""
+    """Return the largest difference of the total energies of two simulations, relative to the exchanged energy.
+
+    Args:
+        coarse: potential and kinetic energy with the time step. (steps + 1, 2)
+        fine: the same with half of it.
+    """
     if np.isnan(coarse).any():
         return np.inf
     if np.isnan(fine).any():
