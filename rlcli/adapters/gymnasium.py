@@ -242,7 +242,7 @@ class GymnasiumEnv(gymnasium.Env):
         self.action_space = self._vector.single_action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Start a new episode; return its first observation (d,) float32, and infos."""
+        """Start a new episode; return its first observation (d,) float32, and an empty dict. `options` is not read."""
         super().reset(seed=seed)
         starts_next = self._vector.ended[0] and seed is None  # the `VecEnv` has already reset the environment
         obs, _ = self._vector.reset(seed=seed, options={"reset_mask": [True]} if starts_next else None)
