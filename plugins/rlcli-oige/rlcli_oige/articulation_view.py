@@ -176,7 +176,7 @@ class ArticulationView(XFormPrimView):
         return select_rows(wrench if columns is None else wrench[:, columns], self._index(indices))
 
     def get_force_sensor_forces(self, indices: Any = None, joint_indices: Any = None, clone: bool = True) -> Tensor:
-        """Return joint forces, like `get_measured_joint_forces`."""
+        """Return force and torque between each body and its parent, exactly as `get_measured_joint_forces`."""
         return self.get_measured_joint_forces(indices, joint_indices)
 
     def get_dof_limits(self) -> Tensor:
@@ -282,7 +282,16 @@ class ArticulationView(XFormPrimView):
     # --- helpers ---
 
     def _actuators(self, kind: str, joints: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (columns of the joints with an actuator of a kind, ids of the actuators, factors value -> control)."""
+        """Find the actuators of one kind.
+
+        Args:
+            kind: motor, position or velocity.
+            joints: index of the joint in the entity for each column of the view.
+
+        Returns:
+            Columns of the joints that have such an actuator; ids of these actuators in the model; factors by which a
+            force or target of the joint becomes the actuator's control. (k,) each
+        """
         model, device = self.env.engine.model, self.env.device
         found = {joint: actuator for joint, actuator in self.entity.actuators_of(kind)}
         columns = [column for column, joint in enumerate(joints) if joint in found]
@@ -350,7 +359,19 @@ class ArticulationView(XFormPrimView):
         return torch.arange(self.env.num_envs, device=self.env.device) if index is None else index
 
     def _broadcast(self, values: Any, indices: Any, joint_indices: Any) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (ids of environments, columns of joints, the values as a tensor (environments, columns))."""
+        """Convert the arguments of a setter to tensors.
+
+        Args:
+            values: one number, one for each joint, or one for each environment and joint.
+            indices: indices of the environments; None: all.
+            joint_indices: columns of the joints; None: all.
+
+        Returns:
+            Indices of the environments (n,), columns of the joints (k,), and the values (n, k).
+
+        Raises:
+            TaskError: if the number of values fits neither.
+        """
         rows = self._env_rows(indices)
         columns = self._index(joint_indices)
         columns = torch.arange(self.num_dof, device=self.env.device) if columns is None else columns

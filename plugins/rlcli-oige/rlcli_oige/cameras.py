@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 SENSOR, SEGMENTATION = "oige_camera", "oige_segmentation"
 """Names of the camera sensors in the scene: colours, and ids of bodies."""
 _BACKGROUND, _UNLABELLED, _FIRST_LABELLED = range(3)
-"""Ids of an image of instance segmentation."""
+"""Numbers in an image of instance segmentation: the background, objects without a label, the first labelled object."""
 _APERTURE = 20.955
 """Width of a USD camera's film, if the task does not set it [mm]."""
 _FOCAL_LENGTH = 50.0
@@ -156,12 +156,16 @@ class Annotator(Counterpart):
         self._id_of: Tensor | None = None
 
     def attach(self, render_products: Any, **kwargs: Any) -> None:
-        """Choose the environment whose camera is read."""
+        """Choose the environment whose camera `get_data` reads, from the path of the first render product (camera)."""
         found = re.search(r"/env_(\d+)/", str(render_products[0]))
         self._row = int(found[1]) if found else 0
 
     def get_data(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """Return the ids of the visible objects, (height, width) int32, and the paths of the ids."""
+        """Return an image of instance segmentation as a dict.
+
+        Its entry `data` has the number of the visible object for each pixel, (height, width) int32;
+        `info.idToLabels` maps each number, as text, to the object's prim path.
+        """
         env = self._env
         labelled = {n: p for n, p in enumerate(sorted(env.stage.labelled), _FIRST_LABELLED)}
         if self._id_of is None:  # by body + 1; the first entry: nothing is visible
@@ -198,7 +202,7 @@ class Writer(Counterpart):
 
 
 class Listener(Counterpart):
-    """Replicator's PytorchListener."""
+    """Replicator's PytorchListener, which gives a task the images of its camera in all environments."""
 
     def __init__(self, env: OigeEnv) -> None:
         self._env = env

@@ -140,7 +140,10 @@ class OigeEnv(DirectEnv):
         }
 
     def _mentions(self, names: tuple[str, ...]) -> bool:
-        """Return whether the files of the task's and its views' classes mention one of these methods."""
+        """Return whether the task's code may call one of these methods.
+
+        The source text of the files with the task's class and its views' classes is searched for the names.
+        """
         kinds = [type(self.task), *(type(view) for view in self.handle.world.scene.views.values())]
         files = {
             function.__code__.co_filename
@@ -184,12 +187,12 @@ class OigeEnv(DirectEnv):
         self._log_ignored()
 
     def _class_sets_length(self) -> bool:
-        """Return whether the class may set the episode length, because the user has not set `episode_length_s`."""
+        """Return whether the episode length in the task's class counts: `episode_length_s` was not set by the user."""
         origin = self.resolved.layers.origin(("episode_length_s",))
         return origin is not None and origin.layer == "task" and is_oige_file(self.resolved.source.config)
 
     def _import_task(self, reference: str) -> Any:
-        """Import the class of the task; its file may belong to a package."""
+        """Import the class of the task by `FILE.py:CLASS`; its file may belong to a package."""
         file, _, name = reference.rpartition(":")
         path = Path(file)
         top = next((folder for folder in path.parents if folder.name == "omniisaacgymenvs"), None)
@@ -227,7 +230,15 @@ class OigeEnv(DirectEnv):
                 found.clear()
 
     def queue_forces(self, view: RigidPrimView, rows: Tensor, forces: Tensor) -> None:
-        """Apply forces in the next step. Forces that the task sets in that step replace them."""
+        """Store forces of the domain randomization, which act in the next step.
+
+        Forces that the task sets in that step replace them.
+
+        Args:
+            view: the view of the bodies.
+            rows: rows of the view.
+            forces: forces at the centres of mass, world frame. (rows, 3) [N]
+        """
         self._queued_forces.append((view, rows, forces))
 
     def contact_force(self, body: int) -> Tensor:
@@ -282,7 +293,10 @@ class OigeEnv(DirectEnv):
         return failed, timed_out | (self.episode_length_buf >= self.max_episode_length)
 
     def _split_reset_flags(self) -> tuple[Tensor, Tensor]:
-        """Return where the task terminated, and where it timed out. (num_envs,) bool each"""
+        """Split `reset_buf` of the task; return where the episode is terminated and where it is truncated.
+
+        Both are (num_envs,) bool. How they are told apart is described in `RLTask`.
+        """
         task = self.task
         done = task.reset_buf != 0
         length = getattr(task, "_max_episode_length", self.max_episode_length)
@@ -380,7 +394,7 @@ class OigeEnv(DirectEnv):
 
 
 def _set_ground_material(scene: Scene, material: Mapping[str, Any]) -> None:
-    """Apply the YAML's default material to contacts with the ground."""
+    """Apply the YAML's `default_physics_material` (friction, restitution) to contacts with the ground."""
     geom = scene.spec.geom("ground") if scene.config.ground is not None else None
     if geom is None or not material:
         return

@@ -1,4 +1,4 @@
-"""Format of OmniIsaacGymEnvs' tasks: how rlcli recognizes and reads a folder or a YAML file of it."""
+"""Entry point of the plugin (`rlcli.formats`): how rlcli recognizes and reads tasks of OmniIsaacGymEnvs."""
 
 from __future__ import annotations
 
@@ -101,7 +101,16 @@ def _config(folder: Path) -> Path | None:
 
 
 def _task(root: Path, config: Path, name: str) -> TaskSource:
-    """Return the task of a YAML file."""
+    """Return the location of a task of OmniIsaacGymEnvs: its YAML, and the file and name of its class.
+
+    Args:
+        root: folder of the YAML.
+        config: the YAML.
+        name: name of the task.
+
+    Raises:
+        TaskError: if no class of the task is found in the Python files, or several.
+    """
     from rlcli.errors import TaskError
     from rlcli.registry import TaskSource
     from rlcli_oige.task_class import find_class

@@ -44,7 +44,13 @@ def compose(document: Document, file: FilePath, label: str) -> Document:
 
 
 def label_at(document: Document, path: Path, label: str) -> str:
-    """Return the name, for messages, of the YAML file that set the key at a path; `label` if there is one file only."""
+    """Return the name, for messages, of the YAML file that sets the key at a path.
+
+    Args:
+        document: the YAML, which may be composed of several files.
+        path: path of the key.
+        label: name of the file if the document is not composed.
+    """
     if not isinstance(document, Composed):
         return label
     while path and path not in document.labels:

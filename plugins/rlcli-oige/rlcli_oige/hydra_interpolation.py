@@ -21,7 +21,7 @@ RESOLVERS: Mapping[str, tuple[int, Callable[..., Any]]] = {
     "if": (3, lambda condition, yes, no: yes if condition else no),
     "resolve_default": (2, lambda default, value: default if value in ("", None) else value),
 }
-"""Name -> number of arguments, function."""
+"""Name of a resolver, as in `${NAME:...}` -> number of its arguments, and its function."""
 
 
 class InterpolationError(ValueError):
@@ -34,7 +34,15 @@ class InterpolationError(ValueError):
 
 
 def evaluate(tree: Mapping[str, Any], at: Path = ()) -> tuple[Any, list[InterpolationError]]:
-    """Return the subtree at `at` with all interpolations evaluated, and the errors. Failed values are None."""
+    """Evaluate all interpolations in a part of a YAML's data.
+
+    Args:
+        tree: the whole data, to which interpolations may refer.
+        at: path of the part; empty: the whole data.
+
+    Returns:
+        The part with evaluated values (None for one that cannot be evaluated), and the errors.
+    """
     evaluator = _Evaluator(tree)
     return evaluator.evaluate(at, evaluator.look_up(at)), evaluator.errors
 
@@ -143,7 +151,16 @@ class _Evaluator:
 
 
 def _closing(path: Path, text: str, start: int) -> int:
-    """Return the position of the brace that closes an interpolation."""
+    """Return the position of the brace that closes an interpolation.
+
+    Args:
+        path: key of the text, for the error.
+        text: the text.
+        start: position after the opening `${`.
+
+    Raises:
+        InterpolationError: if no brace closes it.
+    """
     depth = 1
     for position in range(start, len(text)):
         if text.startswith("${", position) or (text[position] == "{" and text[position - 1] != "$"):

@@ -1,4 +1,7 @@
-"""`rlcli import oige`: writes a task of OmniIsaacGymEnvs as a folder of rlcli. The task's Python class is kept."""
+"""Conversion for `rlcli import oige`: a task of OmniIsaacGymEnvs becomes a task folder of rlcli.
+
+The code of the task's Python class is kept, except for its import lines.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ _LONGEST_NAME = 100
 
 
 def convert(files: list[Path], output: Path | None) -> Imported:
-    """Write `task.yaml` and the Python files of the task's class, with changed import lines.
+    """Write a folder with `task.yaml` and the Python files of the task's class, with changed import lines.
 
     Args:
         files: the task's YAML and, optionally, the rl_games YAML of its agent; the default is `<Task>PPO.yaml`

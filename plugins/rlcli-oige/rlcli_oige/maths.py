@@ -95,7 +95,7 @@ def rad2deg(x: Tensor) -> Tensor:
 
 
 def matmul(matrix_a: Tensor, matrix_b: Tensor) -> Tensor:
-    """Return the matrix product."""
+    """Return the product of two matrices, or of batches of matrices."""
     return torch.matmul(matrix_a, matrix_b)
 
 
@@ -135,7 +135,7 @@ def as_type(data: Tensor, dtype) -> Tensor:
 
 
 def convert(data, device=None, dtype="float32") -> Tensor:
-    """Return tensor-like data as a tensor on a device."""
+    """Return a tensor, array, list or number as a tensor of a data type on a device."""
     return torch.as_tensor(data, dtype=_dtype(dtype), device=device)
 
 
@@ -150,7 +150,7 @@ def clone_tensor(data: Tensor, device=None) -> Tensor:
 
 
 def expand_dims(data: Tensor, axis: int) -> Tensor:
-    """Insert a dimension."""
+    """Insert a dimension of size 1 at the position `axis`."""
     return torch.unsqueeze(data, axis)
 
 

@@ -1,4 +1,7 @@
-"""Changes of a robot's model: the settings of an actor in the YAML, and the USD schemas that a task has applied."""
+"""Changes of a robot's MJCF model: settings of an actor in the YAML, and attributes of USD that a task has set.
+
+An actor is a robot or object in OmniIsaacGymEnvs' words. A USD schema is a group of attributes, such as `DriveAPI`.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ FRAME, FORCE, TORQUE = ".frame", ".joint_force", ".joint_torque"
 
 
 _STIFF = 10.0
-"""Drives are stiff if their implicit inertia is this many times that of the joint."""
+"""A drive is stiff if its implicit inertia (dt kd + dt^2 kp) is more than this many times that of the joint."""
 
 
 def apply_schemas(prim: Prim, dt: float) -> bool:
@@ -124,7 +127,12 @@ def _inertia(child: mujoco.MjSpec, joint: str) -> float:
 
 
 def apply_settings(prim: Prim, child: mujoco.MjSpec) -> None:
-    """Apply the settings of an actor to its model."""
+    """Apply the settings of an actor to its model, such as mass, density and collisions.
+
+    Args:
+        prim: the actor's prim, with its `settings`.
+        child: the model, which is changed.
+    """
     settings = prim.settings
     for geom in child.geoms:
         if settings.get("collisions") is False:

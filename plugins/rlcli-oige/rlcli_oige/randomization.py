@@ -28,7 +28,7 @@ _CONSTANTS = ("body_masses", "body_inertias", "mass", "density", "inertia", "joi
 
 
 class Randomizer:
-    """`self._dr_randomizer` of a task. It reads the YAML's block; the environment calls it.
+    """Domain randomization of a task, which finds it as `self._dr_randomizer`; the environment calls its methods.
 
     A task may call `set_up_domain_randomization`, `dr.physics_view.step_randomization` and the like. They do nothing:
     the environment randomizes at the right moments.
@@ -66,15 +66,21 @@ class Randomizer:
         """Do nothing: the environment randomizes in each step."""
 
     def get_initial_dr_distribution_parameters(self, *path: str) -> np.ndarray:
-        """Return the `distribution_parameters` of the YAML; `path` has the keys that lead to them."""
+        """Return the `distribution_parameters` of the YAML, a pair of numbers or of lists.
+
+        `path` has the keys of the YAML below `randomization_params`, such as `("observations", "on_reset")`.
+        """
         return np.array(self.active_domain_randomizations[self._check_path(path)])
 
     def get_dr_distribution_parameters(self, *path: str) -> Any:
-        """Return the current `distribution_parameters`; `path` has the YAML's keys that lead to them."""
+        """Return the current `distribution_parameters`; `path` as in `get_initial_dr_distribution_parameters`."""
         return self._parameters[self._check_path(path)]
 
     def set_dr_distribution_parameters(self, distribution_parameters: Any, *path: str) -> None:
-        """Replace `distribution_parameters` during the training; `path` has the YAML's keys that lead to them."""
+        """Replace `distribution_parameters` during the training.
+
+        `path` is as in `get_initial_dr_distribution_parameters`.
+        """
         self._parameters[self._check_path(path)] = np.asarray(distribution_parameters).tolist()
 
     # --- called by the environment ---
@@ -155,7 +161,7 @@ class Randomizer:
                         self._sample_noise(entry, kind, all_ids, step)
 
     def add_action_noise(self, action: Tensor) -> Tensor:
-        """Return the action with noise."""
+        """Return a copy of the action with the noise of `actions:`; without such noise the action itself."""
         return self._add_noise("actions", action.clone()) if self._noise["actions"] else action
 
     def add_observation_noise(self, obs: Tensor) -> None:
@@ -164,7 +170,7 @@ class Randomizer:
             self._add_noise("observations", obs)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the tensors that keep their values between steps."""
+        """Return the tensors that a checkpoint holds: the current noise, and the values from which episodes start."""
         found = {f"held.{name}": value.clone() for name, value in self._episode_noise.items()}
         found |= {f"noisy.{name}": value.clone() for name, value in self._step_noise.items()}
         for path, field in self._fields.items():

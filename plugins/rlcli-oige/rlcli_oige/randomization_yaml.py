@@ -77,7 +77,7 @@ ATTRIBUTES: Mapping[str, Mapping[str, tuple[Status, str]]] = {
         "rest_offset": ("ignored", "the MJCF's margin sets where contacts begin"),
     },
 }  # fmt: skip
-"""Kind of view -> attribute -> how it is translated."""
+"""Kind of view -> attribute that can be randomized -> status of its translation, and a note for the user."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,10 @@ class Randomization:
 
 
 def read_randomizations(block: Mapping[str, Any]) -> list[Randomization]:
-    """Return the randomizations of a block that `check` has accepted, without those that rlcli ignores."""
+    """Return the randomizations of a `domain_randomization:` mapping, without those that rlcli ignores.
+
+    `check` must have accepted the mapping.
+    """
     found = []
     for at, params in _entries(block):
         path = at[1:-1]
@@ -135,7 +138,13 @@ def read_randomizations(block: Mapping[str, Any]) -> list[Randomization]:
 def check(
     block: Any, problem: Callable[[Path, str, str | None], None], note: Callable[[Path, Status, str], None]
 ) -> None:
-    """Check a `domain_randomization:` block: call `problem` for each mistake, and `note` for each translated key."""
+    """Check a `domain_randomization:` mapping.
+
+    Args:
+        block: the mapping.
+        problem: called with the path, the message and a hint (or None) for each mistake.
+        note: called with the path, the status and a text for each translated key.
+    """
     base: Path = ("domain_randomization",)
     if not isinstance(block, dict):
         problem(base, "expected a mapping", "write {randomize: true, randomization_params: {...}}")
@@ -237,7 +246,10 @@ def _check_numbers(at: Path, entry: Mapping[str, Any], problem: Callable[[Path, 
 
 
 def _entries(block: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield (path in the block, value) of every key at the level of `on_reset`, such as `on_startup`."""
+    """Yield each randomization of a `domain_randomization:` mapping that is not checked yet: its path, and its value.
+
+    The last step of the path is the trigger (`on_startup`, `on_reset` or `on_interval`), or a wrong key in its place.
+    """
     params = block.get("randomization_params")
     for key, content in params.items() if isinstance(params, dict) else ():
         base: tuple[str, ...] = ("randomization_params", key)

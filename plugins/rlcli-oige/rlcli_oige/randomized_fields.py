@@ -52,12 +52,12 @@ class RandomizedField:
         self._started = False
 
     def restore(self, ids: Tensor) -> None:
-        """Restore the values after start-up."""
+        """Write the values after start-up back in the environments `ids`; attributes of the state stay."""
         if not self._is_state:
             self.write(ids, self.first[ids])
 
     def restore_episode_start(self, ids: Tensor) -> None:
-        """Restore the values at the start of the episode."""
+        """Write the values at the start of the episode back in the environments `ids`, except those of the state."""
         if not self._is_state:
             self.write(ids, self.base[ids])
 
@@ -71,7 +71,7 @@ class RandomizedField:
 
 
 def apply_operation(operation: str, current: Tensor, sample: Tensor) -> Tensor:
-    """Return values after an operation: additive, scaling or direct."""
+    """Return `current + sample` for the operation additive, `current * sample` for scaling, `sample` for direct."""
     if operation == "additive":
         return current + sample
     return current * sample if operation == "scaling" else sample
@@ -87,7 +87,7 @@ def _apply_rotation(operation: str, current: Tensor, sample: Tensor) -> Tensor:
 
 
 def make_field(path: tuple[str, ...], env: OigeEnv) -> RandomizedField:
-    """Return the field of a randomized attribute.
+    """Return the reader and writer of a randomized attribute.
 
     Args:
         path: (simulation, gravity) or (kind of view, view, attribute).
@@ -228,7 +228,11 @@ def _mass_field(bodies: Tensor, mass: bool, env: OigeEnv) -> RandomizedField:
 
 
 def _friction_field(bodies: list[int], env: OigeEnv) -> RandomizedField:
-    """Return the field of static friction, dynamic friction and restitution of bodies. MuJoCo has one friction."""
+    """Return the attribute `material_properties` of bodies: static friction, dynamic friction, restitution.
+
+    MuJoCo has one friction: both columns read the sliding friction of the geoms, and the dynamic one is written.
+    Restitution reads 0 and is not written.
+    """
     model = env.engine.model
     geoms = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in bodies]
     columns, friction = torch.tensor(geoms, device=env.device), env.engine.expand("geom_friction")

@@ -29,7 +29,7 @@ _IGNORED = {
     "OmniGlass": "the model has the materials",
     "DifferentialController": "tasks set the speeds of wheels themselves",
 }
-"""Name -> why its calls have no effect."""
+"""Name of a class or function -> why its calls have no effect."""
 _REASONS = {
     "omni.isaac.core.prims.soft": "PhysX simulates deformable bodies on its GPU; rlcli simulates rigid bodies",
     "omni.isaac.core.materials.deformable_material": "PhysX simulates deformable bodies on its GPU",
@@ -89,7 +89,7 @@ def find_hydra(name: str, file: str = "") -> ModuleType | None:
 
 
 def refuse(name: str, file: Path) -> None:
-    """Check that a module of the user's package can be imported.
+    """Raise an error for a module of the user's package whose tasks rlcli cannot run; other modules pass.
 
     Raises:
         TaskError: with the reason, and the line of the first import that has no counterpart.

@@ -104,7 +104,7 @@ class Ingenuity(Robot):
 
 
 class RigidPrim(XFormPrim):
-    """A frame whose model is loaded separately."""
+    """A rigid object on the stage; its model is that of the USD file which the task has loaded at its path."""
 
 
 class _Shape(XFormPrim):
@@ -203,7 +203,7 @@ class Cloner(Counterpart):
         self.spacing = spacing
 
     def generate_paths(self, root_path: str, num_paths: int) -> list[str]:
-        """Return numbered paths."""
+        """Return the paths `root_path_0` to `root_path_N`, N = `num_paths` - 1."""
         return [f"{root_path}_{number}" for number in range(num_paths)]
 
     def define_base_env(self, base_env_path: str) -> None:

@@ -1,4 +1,7 @@
-"""Stage and prims that a task builds its scene from. Each robot, object and shape becomes an entity of the scene."""
+"""Stage and prims (USD's words for a scene and its objects) with which a task builds its scene.
+
+Each robot, object and shape becomes an entity of rlcli's scene.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +63,7 @@ class Prim(Counterpart):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings of the actor that the prim belongs to."""
+        """Settings of the actor (robot or object) that the prim belongs to, such as `mass`."""
         return self.owner._settings
 
     @property
@@ -215,7 +218,7 @@ class Stage(Counterpart):
         return prim
 
     def DefinePrim(self, path: Any, kind: str = "Xform") -> Prim:  # noqa: N802
-        """Add a prim without a model."""
+        """Add a prim without a model; `kind` is its type in USD, such as `Camera`."""
         prim = self.define(str(path), None, None)
         prim.kind = kind
         return prim
@@ -421,7 +424,7 @@ def find_matching_prim_paths(prim_path_regex: str) -> list[str]:
 
 
 def define_prim(prim_path: str, prim_type: str = "Xform", **kwargs: Any) -> Prim:
-    """Add a frame."""
+    """Add a prim without a model, such as a frame."""
     return get_current_stage().DefinePrim(prim_path, prim_type)
 
 
@@ -433,7 +436,7 @@ def add_reference_to_stage(usd_path: str, prim_path: str, prim_type: str = "Xfor
 
 
 def get_assets_root_path(*args: Any, **kwargs: Any) -> str:
-    """Return the start of USD paths. It is empty: nothing is downloaded."""
+    """Return an empty text in place of the server that Isaac Sim's assets are on: nothing is downloaded."""
     return ""
 
 

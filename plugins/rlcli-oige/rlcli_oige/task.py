@@ -39,7 +39,7 @@ ACTOR_DEFAULTS: Mapping[str, Any] = {
 
 
 class SimConfig(Counterpart):
-    """The task's YAML, evaluated, with the methods that OmniIsaacGymEnvs' tasks call."""
+    """The task's YAML, with evaluated interpolations, and the methods by which OmniIsaacGymEnvs' tasks read it."""
 
     def __init__(self, config: dict[str, Any] | None = None) -> None:
         self._config = {} if config is None else config
@@ -74,12 +74,12 @@ class SimConfig(Counterpart):
         return {**self._sim_params, **self._physx_params}
 
     def parse_actor_config(self, actor_name: str) -> dict[str, Any]:
-        """Return the settings of an actor; -1 means the value of its model."""
+        """Return the settings of an actor (robot or object) in `sim:` of the YAML; -1 means the value of its model."""
         settings = self._cfg.get("sim", {}).get(actor_name, {})
         return {**ACTOR_DEFAULTS, **{key: value for key, value in settings.items() if key in ACTOR_DEFAULTS}}
 
     def apply_articulation_settings(self, name: str, prim: Prim, cfg: Mapping[str, Any]) -> None:
-        """Record an actor's settings; they are applied to its model when the scene is complete."""
+        """Store an actor's settings at its prim; they are applied to its model when the scene is complete."""
         for key, value in cfg.items():
             if value is not None and not (isinstance(value, int | float) and value == -1):
                 prim.settings[key] = value
@@ -120,7 +120,7 @@ class SimConfig(Counterpart):
 
 
 class SceneRegistry(Counterpart):
-    """Registry of views: the argument of `set_up_scene`."""
+    """Registry of a task's views and objects by name; it is the argument `scene` of `set_up_scene`."""
 
     def __init__(self) -> None:
         self.views: dict[str, XFormPrimView] = {}
@@ -327,7 +327,7 @@ class RLTask(DirectTask):
         self.cleanup()
 
     def cleanup(self) -> None:
-        """Create the buffers."""
+        """Create the buffers, such as `obs_buf`, with their initial values."""
         n, device = self._num_envs, self._device
         self.obs_buf = torch.zeros(n, self._num_observations, device=device)
         self.states_buf = torch.zeros(n, self._num_states, device=device)
@@ -422,7 +422,7 @@ class RLTask(DirectTask):
         """Fill `extras`, the values that the trainer logs."""
 
     def reset(self, selection: Any = None) -> None:
-        """Set all reset flags."""
+        """Set the reset flags `reset_buf` of all environments; `selection` has no effect."""
         self.reset_buf = torch.ones_like(self.reset_buf)
 
     def post_physics_step(self) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:

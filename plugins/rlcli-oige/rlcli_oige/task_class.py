@@ -47,7 +47,13 @@ def _classes(file: Path) -> list[tuple[str, list[str]]]:
 
 
 def class_constant(file: Path | None, name: str | None, attribute: str) -> float | None:
-    """Return the number that a class assigns to `self.<attribute>`; None if there is none."""
+    """Return the number that a class assigns to an attribute of `self` in its source; None if there is none.
+
+    Args:
+        file: file of the class; None: there is none.
+        name: name of the class.
+        attribute: name of the attribute, such as `_max_episode_length`.
+    """
     if file is None:
         return None
     for owner in parse_file(file).body:

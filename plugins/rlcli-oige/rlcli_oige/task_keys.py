@@ -1,4 +1,7 @@
-"""Keys of OmniIsaacGymEnvs' task YAML, and the translation of each key."""
+"""Keys of OmniIsaacGymEnvs' task YAML.
+
+Each key has a status (mapped, approximated, ignored, or task: only the task's class reads it) and a note for the user.
+"""
 
 from __future__ import annotations
 

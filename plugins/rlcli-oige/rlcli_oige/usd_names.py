@@ -57,7 +57,10 @@ class Missing(type):
 
 
 class Ignored:
-    """A call, or the result of a call, that has no effect in MuJoCo."""
+    """Replacement of a class or function of Omniverse that has no effect in MuJoCo.
+
+    Calls are recorded and return the object itself; so does each of its attributes.
+    """
 
     def __init__(self, name: str, reason: str) -> None:
         self._name, self._reason = name, reason
@@ -183,7 +186,13 @@ class UsdContext:
 
 
 def missing(module: str, name: str, reason: str = "it belongs to Omniverse") -> Any:
-    """Return a name that can be imported and whose use raises an error."""
+    """Return the replacement of a name that rlcli does not have: it can be imported, and its use raises a TaskError.
+
+    Args:
+        module: module of Omniverse or USD that the task imports from.
+        name: the name.
+        reason: why rlcli does not have it, for the error.
+    """
     if name.startswith("__"):
         raise AttributeError(name)
     return Missing(name, (), {"reason": reason, "__module__": module})

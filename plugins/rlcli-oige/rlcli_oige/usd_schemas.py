@@ -41,11 +41,11 @@ _REFUSED = {
     "Particle": "PhysX simulates particles on its GPU; rlcli simulates rigid bodies",
     "Attachment": "attachments belong to deformable bodies, which rlcli does not simulate",
 }
-"""Part of a schema's name -> why it is refused."""
+"""Part of the name of a schema -> why rlcli raises an error for it."""
 
 
 class Attribute:
-    """An attribute of a prim."""
+    """An attribute of a prim: its value, and how USD names it (schema, instance of the schema, name)."""
 
     def __init__(self, prim: Prim, schema: str, instance: str, name: str) -> None:
         self.prim, self.schema, self.instance, self.name = prim, schema, instance, name

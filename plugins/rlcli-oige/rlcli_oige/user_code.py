@@ -1,4 +1,4 @@
-"""Search for the line of the user's code that calls this package, and errors for what this package lacks."""
+"""Location of the user's code that is running, for messages, and errors for names that this package lacks."""
 
 from __future__ import annotations
 
@@ -41,7 +41,10 @@ class MissingAttributeError(TaskError, AttributeError):
 
 
 class Counterpart:
-    """Base of classes that replace one of Isaac Sim: a missing attribute is reported as missing in rlcli."""
+    """Base of the classes that replace a class of Isaac Sim.
+
+    The use of an attribute that the replacement lacks raises an error with the user's line.
+    """
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):

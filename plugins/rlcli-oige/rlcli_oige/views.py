@@ -76,7 +76,7 @@ class XFormPrimView(Counterpart):
         self._bind()
 
     def _bind(self) -> None:
-        """Look up what a subclass needs."""
+        """Look up what a subclass needs from the simulation, such as joints; `bind` calls it at its end."""
 
     def initialize(self, physics_sim_view: Any = None) -> None:
         """Do nothing: the environment binds views."""
@@ -343,12 +343,12 @@ class RigidPrimView(XFormPrimView):
         return select_rows(forces, self._index(indices))
 
     def enable_gravities(self, indices: Any = None) -> None:
-        """Turn gravity on."""
+        """Turn gravity on for the bodies of some rows (indices); None: all rows."""
         if self.env.engine.model.ngravcomp:  # else the model has no gravity compensation, so gravity is on
             self._set_gravity_compensation(0.0, indices)
 
     def disable_gravities(self, indices: Any = None) -> None:
-        """Turn gravity off."""
+        """Turn gravity off for the bodies of some rows (indices); None: all rows."""
         self._set_gravity_compensation(1.0, indices)
 
     def _set_gravity_compensation(self, compensation: float, indices: Any) -> None:

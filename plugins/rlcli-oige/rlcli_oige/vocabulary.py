@@ -56,7 +56,7 @@ from rlcli_oige.usd_names import (
 from rlcli_oige.views import RigidPrimView, XFormPrimView
 
 MATHS = [*TENSOR_NAMES, *ROTATION_NAMES]
-"""Names that `import *` of a module of Omniverse defines."""
+"""Names of tensor functions, which `from MODULE import *` defines for every module of Omniverse."""
 
 NAMES = [
     *MATHS,

@@ -14,7 +14,7 @@ from rlcli_oige.hydra_defaults import label_at
 
 @dataclass(slots=True)
 class YamlTranslator:
-    """Base of a translator of one file: the settings found so far, their keys in the file, notes and mistakes."""
+    """Base of a translator of one YAML file: the settings translated so far, and notes and mistakes for the user."""
 
     document: Document
     label: str
@@ -43,9 +43,15 @@ class YamlTranslator:
         return document_origins(self.document, label_at(self.document, path, self.label), "task")(path)
 
     def note(self, path: Path, status: Status, text: str = "") -> None:
-        """Record how a key was translated."""
+        """Record how a key was translated.
+
+        Args:
+            path: path of the key in the file.
+            status: mapped, approximated, ignored, or task (the task's class reads it).
+            text: where the value went, or why it has no effect.
+        """
         self.notes.append(Note(self.where(path), ".".join(str(step) for step in path), status, text))
 
     def problem(self, path: Path, message: str, hint: str | None = None) -> None:
-        """Record a mistake."""
+        """Record a mistake at the key with this path in the file."""
         self.problems.append(Problem(self.where(path), ".".join(str(step) for step in path), message, hint))
