@@ -84,7 +84,7 @@ class GymnasiumTask(DirectTask):
     # --- implemented by each task ---
 
     def columns(self) -> list[Tensor]:
-        """Return the parts of the observation. (num_envs, k) each"""
+        """Return tensors whose columns, one after the other, are the observation. (num_envs, k) each"""
         raise NotImplementedError
 
     def compute_reward(self) -> Tensor:
@@ -142,7 +142,7 @@ def float32_sum(values: Tensor) -> Tensor:
 
 
 def square_sum(values: Tensor) -> Tensor:
-    """Return the sum of squares of each environment. values (num_envs, ...) -> (num_envs,)"""
+    """Return the sum of all squared values in each environment. (num_envs, ...) -> (num_envs,)"""
     return values.square().flatten(1).sum(dim=1)
 
 
