@@ -1,4 +1,7 @@
-"""Velocity tracking on Unitree's Go1 and G1. The user provides the models. This module imports nothing heavy."""
+"""Velocity tracking on Unitree's Go1 and G1. The user provides the robots' MJCF models.
+
+rlcli reads the `TaskSpec`s of this module when it lists tasks, so the module imports nothing heavy.
+"""
 
 from rlcli.task import TaskSpec
 
