@@ -1,4 +1,4 @@
-"""RSL-RL's settings, in the form of a `RslRlOnPolicyRunnerCfg` or of RSL-RL 5.
+"""Schema of RSL-RL's settings, in the form of Isaac Lab's `RslRlOnPolicyRunnerCfg` or of RSL-RL 5.
 
 The module imports neither torch nor RSL-RL, so that a YAML is checked fast.
 """
@@ -278,7 +278,7 @@ class RunnerConfig(AgentConfig):
 
     @property
     def networks(self) -> tuple[ModelConfig, ModelConfig]:
-        """Return actor and critic in the form of RSL-RL 5."""
+        """The actor's and the critic's settings in the form of RSL-RL 5, also if the user wrote the older `policy`."""
         policy = self.policy
         if policy is None:
             actor = self.actor or ModelConfig()
@@ -306,7 +306,10 @@ class RunnerConfig(AgentConfig):
 
     @property
     def memory(self) -> list[int] | None:
-        """Return the cells of each recurrent layer of the actor; None: no recurrent layers."""
+        """Number of cells in each recurrent layer of the actor.
+
+        The list is empty if only the critic is recurrent; None: neither network is.
+        """
         actor, critic = self.networks
         if "RNNModel" not in (actor.class_name, critic.class_name):
             return None
@@ -314,12 +317,15 @@ class RunnerConfig(AgentConfig):
 
     @property
     def not_read(self) -> list[str]:
-        """Return the settings that have no effect, each with what to use instead."""
+        """The settings that are set but have no effect, each with what to use instead, as in `seed: use --seed`."""
         return [f"{key}: use {flag}" for key, (default, flag) in _ELSEWHERE.items() if getattr(self, key) != default]
 
 
 def _tuples(data: dict[str, Any]) -> dict[str, Any]:
-    """Turn lists into tuples: pydantic's strict mode accepts only tuples from a validator."""
+    """Return an agent's settings with `actor.distribution_cfg.std_range` as a tuple instead of a list.
+
+    A validator that runs before the field's own check must give a tuple, because the model is strict.
+    """
     try:
         distribution = data["actor"]["distribution_cfg"]
         pair = tuple(distribution["std_range"])

@@ -141,7 +141,10 @@ class RslRlTrainer(BaseTrainer):
         load_rng_state(state.tensors["rng"])
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normalizer; the critic keeps its own."""
+        """Load the weights of a saved policy and its observation normalizer into the actor; the critic keeps its own.
+
+        `policy` maps the names of a saved policy, as `policy_tensors` returns them, to tensors.
+        """
         actor = self.alg.get_policy()
         weights = actor.state_dict()
         for theirs, ours in self._names().items():
@@ -213,7 +216,7 @@ class RslRlTrainer(BaseTrainer):
         return getattr(normalizer, "disc_avg", None)
 
     def _names(self) -> dict[str, str]:
-        """Return RSL-RL's name of each weight of the actor -> its name in a saved policy."""
+        """Return the name of each weight of RSL-RL's actor -> the weight's name in a saved policy of rlcli."""
         names = {}
         for name in self.alg.get_policy().state_dict():
             if name.startswith("mlp."):
@@ -245,7 +248,7 @@ class RslRlTrainer(BaseTrainer):
 
 
 def _policy_spec(env: Environment, config: RunnerConfig) -> PolicySpec:
-    """Return the structure of the trained policy."""
+    """Return the structure of the trained policy (sizes, layers, activation), as `policy.json` stores it."""
     actor, _ = config.networks
     memory = config.memory or []
     return PolicySpec(
@@ -334,7 +337,15 @@ def _network(config: Any) -> dict[str, Any]:
 
 
 def _mirror(env: Environment, reference: str) -> Any:
-    """Load the function `module:name` that mirrors observations and actions."""
+    """Import the user's function that mirrors observations and actions (`data_augmentation_func`).
+
+    Args:
+        env: the environment.
+        reference: `module:function` of the task's package or a plugin, or `file.py:function` beside the task.
+
+    Raises:
+        ConfigError: if the module may not be named, or has no such function.
+    """
     module, _, name = reference.rpartition(":")
     if not module:
         module, _, name = reference.rpartition(".")
