@@ -112,7 +112,7 @@ class KnownFormat:
     """Regular expressions: a file of this format matches none of them."""
 
     def matches(self, file: Path) -> bool:
-        """Return whether a file looks like one of this format."""
+        """Return whether the text of a file matches `all_of` and not `none_of`; False for a file that is unreadable."""
         try:
             if not file.is_file() or file.stat().st_size > _LARGEST:
                 return False

@@ -116,7 +116,11 @@ def _inside(folder: Path, file: str, what: str) -> Path:
 
 
 def _menagerie_models(robot: str) -> list[Path]:
-    """Return a robot's folder in MENAGERIE_ROOT, then those that mujoco-menagerie has downloaded, newest first."""
+    """Return the folders that may have the model of a robot of MuJoCo Menagerie, such as `unitree_go1`.
+
+    First the robot's folder in MENAGERIE_ROOT, then those that the package mujoco-menagerie has downloaded, newest
+    first.
+    """
     if not robot or set(robot) & set("*?[]"):
         return []
     import platformdirs

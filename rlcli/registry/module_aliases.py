@@ -60,7 +60,7 @@ class _KnownFileLoader(Loader):
         self._known, self._spec = known, known.__spec__
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """Return the known module."""
+        """Return the module object of the earlier import."""
         return self._known
 
     def exec_module(self, module: ModuleType) -> None:
@@ -243,13 +243,17 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def _import_folder_above(name: str, inner: str, file: Path) -> None:
-    """Import as a package the folder `name` above a task file, or a folder in one of the folders above the file.
+    """Import the folder of a task's repository that an import statement `import name.inner` means, as a package.
 
-    Such a folder is a package, or has the file of the module `name.inner`.
+    The folder is one of the folders above the importing file, or `name` or `name/name` in one of these. It is imported
+    only if no installed package has the name. So files can import modules by their path in the repository
+    (`source.robot.mdp`), from a distribution of the repository that is not installed
+    (`source/robot_assets/robot_assets`), and from a package beside their own.
 
-    Such files import modules by their path in the repository, for example `source.robot.mdp`, from another
-    distribution of the repository that is not installed, for example `source/robot_assets/robot_assets`, or from a
-    package beside their own.
+    Args:
+        name: first part of the imported module's name.
+        inner: the rest of the name; empty if there is none.
+        file: the importing file.
     """
     found = [parent for parent in file.parents if parent.name == name]
     if not found:
@@ -269,7 +273,9 @@ def _import_folder_above(name: str, inner: str, file: Path) -> None:
 
 
 def _above_alias(form: Format, name: str, file: str) -> Any:
-    """Return the package `a` of a module `a.b.c`, with the format's module for `a.b` as its member.
+    """Return what `import a.b.c` binds to the name `a`, if a format replaces `a.b` but not `a`.
+
+    The result is a copy of the package `a` in which the format's module takes the place of `a.b`.
 
     Args:
         form: the format that replaces the module.

@@ -193,7 +193,7 @@ def _restore_built_in(before: dict[str, Any], is_callable: Callable[[object], bo
     if lost:
         _BUILT_IN.update(before)
         names = listing(lost, limit=3)
-        _log.warning("code that was imported has deleted or broken the built-in functions %s; undone", names)
+        _log.warning("imported code has deleted or replaced the built-in functions %s; rlcli has restored them", names)
 
 
 _TORCH_DEFAULTS = ("torch.float32", "cpu", True)
@@ -214,7 +214,9 @@ def _restore_torch(dtype: str, device: str, records: bool) -> None:
     torch.set_default_dtype(getattr(torch, dtype.removeprefix("torch.")))
     torch.set_default_device(None if device == "cpu" else device)
     torch.set_grad_enabled(records)
-    _log.warning("code that was imported has changed torch's default type, default device or gradient mode; undone")
+    _log.warning(
+        "imported code has changed torch's default type, default device or gradient mode; rlcli has restored it"
+    )
 
 
 def error_location(error: BaseException) -> str:

@@ -65,7 +65,8 @@ class Shard(FileModel):
     def _check_not_empty(self) -> Self:
         if self.start >= self.stop:
             raise ValueError(
-                f"rows {self.start} to {self.stop}: start must be below stop; use an older checkpoint: RUN@step:N"
+                f"the manifest is damaged: start ({self.start}) is not below stop ({self.stop}); use an older"
+                " checkpoint: RUN@step:N"
             )
         return self
 
@@ -86,7 +87,8 @@ class _Log(FileModel):
     def _check_order(self) -> Self:
         if self.first > self.stop:
             raise ValueError(
-                f"rows {self.first} to {self.stop}: first must not be above stop; use an older checkpoint: RUN@step:N"
+                f"the manifest is damaged: first ({self.first}) is above stop ({self.stop}); use an older checkpoint:"
+                " RUN@step:N"
             )
         return self
 
@@ -161,7 +163,7 @@ class Checkpoint:
         return check_json(_Iteration, self.manifest, self.folder / "manifest.json").iteration
 
     def json(self, name: str) -> dict[str, Any]:
-        """Read a JSON file of the checkpoint."""
+        """Return the content of a JSON file of the checkpoint, such as `policy.json`."""
         return parse_json(self._data(name, JSON_LIMIT), self.folder / name)
 
     def tensors(self, part: str, limit: int | None = None) -> dict[str, Tensor]:

@@ -148,9 +148,11 @@ class _Formula(_Record):
         if value is not None:
             check_formula(value)
         if closed and value is None:
-            raise ValueError("the manifest is damaged: a closed term has no formula in 'value'; use another checkpoint")
+            raise ValueError(
+                "the manifest is damaged: 'closed' is true, but 'value' has no formula; use another checkpoint"
+            )
         if not closed and isinstance(self, ObservationFormula) and not _is_external_input(value):
-            raise ValueError("'value' must be {'given': 'observation/NAME'}, because 'closed' is false")
+            raise ValueError(f"'closed' is false, but 'value' is not {{'given': 'observation/NAME'}}; {_DAMAGED}")
         return self
 
 

@@ -62,7 +62,8 @@ class RunLock:
                 raise
             is_ours = False
         if not is_ours:
-            message = f"this process has lost {self.folder}: {self._file.name} was deleted or the folder was replaced"
+            cause = f"{self._file.name} was deleted or the folder was replaced"
+            message = f"this process has lost the lock of {self.folder}: {cause}"
             hint = "wait for the end of any other process that writes there"
             raise MachineError(f"{message}, and nothing more is written", hint=hint)
 

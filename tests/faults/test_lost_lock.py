@@ -81,7 +81,7 @@ LOSSES = [delete_lock, replace_lock, replace_folder]
 def assert_lost(ended):
     assert ended.code == 10, (ended.code, ended.err)
     assert ended.err.count("error:") == 1, ended.err
-    assert "this process has lost runs/cartpole/" in ended.err
+    assert "this process has lost the lock of runs/cartpole/" in ended.err
     assert "continue with `rlcli train --resume runs/cartpole/" in ended.err
     assert "Traceback" not in ended.err
 

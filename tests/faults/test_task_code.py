@@ -158,7 +158,7 @@ def test_import_that_breaks_built_in_functions_is_an_error(coin, tmp_path, start
     _, err = process.communicate()
     assert process.returncode == 4, err
     assert "Traceback" not in err
-    assert "broken the built-in functions" in err
+    assert "replaced the built-in functions" in err
     assert "coin/task.py" in err.splitlines()[-1] + err.splitlines()[-2]
 
 

@@ -252,7 +252,7 @@ def test_plugin_that_changes_settings_of_torch_changes_no_training(plugins, comm
 
     plugins("sets", f"import torch\n{change}\n{SPEC}", files=FILES)
     done = command("train", "sets-task", "--num-envs", "2", "--max-iterations", "1", "--logger", "none", "--json")
-    assert "has changed torch's default type, default device or gradient mode; undone" in done.stderr
+    assert "has changed torch's default type, default device or gradient mode; rlcli has restored it" in done.stderr
     assert document(done)["state"] == "finished"
     assert (torch.get_default_dtype(), str(torch.get_default_device())) == (torch.float32, "cpu")
     assert torch.is_grad_enabled()

@@ -68,7 +68,7 @@ def test_run_precedes_the_shipped_policy(cli, folder, only_run):
         (("play", "cartpole-direct", "--checkpoint", "GIFT"), 2, "is a policy for cartpole, not for cartpole-direct"),
         (("play", "cartpole", "decimation=4"), 5, "step_dt  0.0166666667 s     0.0333333333 s"),
         (("export", "cartpole", "--format", "torch"), 2, "--output FILE"),
-        (("autopsy", "GIFT", "3"), 2, "a bundle has no episodes of training"),
+        (("autopsy", "GIFT", "3"), 2, "a bundle holds a policy, not the recorded episodes of its training"),
     ],
 )
 def test_invalid_policy_reference_is_refused(cli, coin, copied, words, code, message):
@@ -85,7 +85,10 @@ def test_bundle_is_accepted_as_a_checkpoint(cli, copied):
     said = cli("stress", "--checkpoint", copied, "--sweep", "body_mass=1:2:2", "--episodes", 4, "--json").json
     assert said["checkpoint"] == str(copied)
     assert said["nominal"]["success"]["rate"] == 1.0
-    assert "no episode was recorded: a bundle has no episodes of training" in cli("autopsy", copied).err
+    assert (
+        "no episode was recorded: a bundle holds a policy, not the recorded episodes of its training"
+        in cli("autopsy", copied).err
+    )
 
 
 @pytest.mark.parametrize("reference", ["shipped", "GIFT"])
