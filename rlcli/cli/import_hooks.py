@@ -10,11 +10,14 @@ from rlcli.machine.memory import require_address_space
 
 
 class AddressSpaceCheck:
-    """Import hook that calls `require_address_space` before a large library is imported."""
+    """Import hook that checks the memory limit `ulimit -v` before numpy, mujoco or torch is imported.
+
+    With too low a limit, such a library ends the process without a message.
+    """
 
     @staticmethod
     def find_spec(name: str, *_: object) -> None:
-        """Check the limit for a large library, and return None: the next finder of `sys.meta_path` finds the module.
+        """Check the limit if the module is one of these libraries; return None, so that another finder finds it.
 
         Raises:
             MachineError: if the limit is too low for this library.
@@ -31,7 +34,7 @@ class MatplotlibFinder:
 
     @staticmethod
     def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Return the specification of matplotlib; None for other modules."""
+        """Return a specification of matplotlib whose loader changes the current folder meanwhile; else None."""
         spec = PathFinder.find_spec(name, path, target) if name == "matplotlib" else None
         if spec is None or spec.loader is None or spec.origin is None:
             return None

@@ -91,7 +91,7 @@ def _refuse_bundle(folder: str, case: int | None) -> None:
 
     open_bundle(Path(folder))
     why = (
-        "a bundle has no episodes of training; to record new ones, run"
+        "a bundle holds a policy, not the recorded episodes of its training; to record new ones, run"
         f" `rlcli eval --checkpoint {folder} --record FILE --record-mode failed`"
     )
     if case is not None:
@@ -105,7 +105,13 @@ def _print_no_cases(folder: str, why: str) -> None:
 
 
 def _print_list(run: Run, cases: list[FailureCase], sort: str) -> None:
-    """Print a table of the recorded episodes."""
+    """Print a table of the recorded episodes of a run, or why there are none.
+
+    Args:
+        run: the run.
+        cases: its recorded episodes, in the order of training.
+        sort: key of `_SORT_KEYS`: the order of the rows.
+    """
     from rlcli.replay.failure_cases import why_no_cases
 
     if not cases:
@@ -186,7 +192,7 @@ def _print_facts(case: FailureCase, number: int) -> None:
 
 
 def _print_rewards(case: FailureCase) -> None:
-    """Print each reward term over the recorded steps."""
+    """Print one row for each reward term and for the reward: its curve over the recorded steps, and statistics."""
     console.data("")
     rows = []
     for name, values in [*case.columns("reward_terms").items(), ("reward", case.values("rewards"))]:
@@ -197,7 +203,7 @@ def _print_rewards(case: FailureCase) -> None:
 
 
 def _print_steps(case: FailureCase, steps: int) -> None:
-    """Print observations, actions and rewards of the last steps."""
+    """Print observations, actions and rewards of the last `steps` recorded steps, one column per step."""
     kept, times = case.episode.kept, case.times
     last = range(max(0, kept - steps), kept)
     rows = [["", "end of step [s]", *(f"{times[i]:.4g}" for i in last)]]

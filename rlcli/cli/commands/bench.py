@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _PROFILED = 5.0
 """Duration of the measurement of `bench --profile` [s]."""
 _MAX_LOAD = 0.5
-"""Load average per core before the measurements above which a warning is printed."""
+"""Load of the machine, in running processes per core, above which the command warns before it measures."""
 
 
 def command(

@@ -118,7 +118,10 @@ def _task(side: Side, agent: str | None) -> Resolved | None:
 
 
 def _compare_configurations(one: Resolved | Run, other: Resolved | Run, left: Side, right: Side) -> bool:
-    """Print the differences of two configurations, in their values, model files and code; return whether none exist.
+    """Print the differences of two configurations, in their values, model files and code.
+
+    Returns:
+        Whether the configurations are equal, except for cosmetic differences.
 
     Args:
         one: configuration of a task, or a run.

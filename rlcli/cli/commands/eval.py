@@ -81,7 +81,7 @@ def command(
 
 
 def _compare(request: PolicyRequest, episodes: int, limits: Sequence[Limit]) -> None:
-    """Compare the policies that are given as arguments, in the place of a task and its overrides."""
+    """Run `rlcli eval --compare`, whose arguments are policies, not a task and overrides."""
     from rlcli.cli.ui.evaluation_tables import show_comparison
     from rlcli.evaluation.comparison import compare, find_policies
     from rlcli.evaluation.limits import failures, require_success

@@ -75,7 +75,7 @@ def command(
 
 
 def _print_exported(done: Exported) -> None:
-    """Print the check of an exported file, and the terms that a program must get from the task's code."""
+    """Print how exactly an exported file equals the policy; warn of terms that only the task's code can compute."""
     from rlcli.deploy.metadata import terms_of_task_code
 
     limit = f"difference <= {done.max_difference:.1e}"

@@ -88,7 +88,9 @@ def _print_calls(trajectory: Trajectory, result: Replay) -> None:
             episode = header.episodes[0]
             console.data(f"  its episode {episode.index} was ended by {', '.join(episode.causes) or 'no named cause'}")
         else:
-            console.data(f"  {point or 'the replay of this environment does not diverge: the file lacks the cause'}")
+            console.data(
+                f"  {point or 'the replay of this environment does not diverge: the file does not contain the cause'}"
+            )
         where = None if point is None else finite_json(point.model_dump())
         environments.append({"env": world.env, "cause": world.cause, "detail": world.detail, "where": where})
     difference, values = result.difference, None

@@ -131,7 +131,10 @@ def _study(request: TrainingRequest, seeds: str | None, jobs: int | None, seed: 
         own = "its own seeds" if given == "--seed" else "one process per seed"
         raise UsageError(f"{study} is a study with {own}", hint=f"leave out {given}")
     if distributed.launched():
-        raise UsageError("several seeds train in one process each", hint="start rlcli without torchrun")
+        raise UsageError(
+            "--seeds starts one process for each seed, so rlcli itself must be a single process",
+            hint="start rlcli without torchrun",
+        )
     return study if seeds is None else read_seeds(seeds)
 
 

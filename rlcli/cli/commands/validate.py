@@ -50,7 +50,10 @@ def command(
     for sentence in missing:
         console.warn(f"model of {sentence}")
     if unchecked:
-        console.warn(f"agents not checked, because their trainer is not installed; install it: {', '.join(unchecked)}")
+        console.warn(
+            f"agents that are not checked, because their trainer is not installed: {', '.join(unchecked)};"
+            " install the trainer to check them"
+        )
     console.document(
         "validate",
         file=str(source.config),

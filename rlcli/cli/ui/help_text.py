@@ -27,7 +27,7 @@ OPTION_PANELS = {
 _MAX_UNGROUPED = 8
 """A command with at most this many options, besides those of "Output", has them all in the panel "Options"."""
 _UNBOUNDED = 10**9
-"""The help does not show the range of an option that ends above this number."""
+"""Largest upper limit of an option that `--help` shows; a higher limit means any number."""
 METAVARS = {int: "INTEGER", float: "FLOAT", Path: "PATH"}
 
 
@@ -57,7 +57,7 @@ class _PanelHelp:
         return ["[OPTIONS]", *repeated, *([self.subcommand_metavar] if hasattr(self, "commands") else [])]
 
     def format_options(self: Any, ctx: Any, formatter: Any) -> None:
-        """Write the panels of commands, arguments and options."""
+        """Write the tables of commands, arguments and options of `--help`; Typer calls this method."""
         panels: dict[str, list[tuple[str, str]]] = defaultdict(list)
         for name, command in getattr(self, "commands", {}).items():
             if not command.hidden:
@@ -80,11 +80,11 @@ class _PanelHelp:
 
 
 class HelpCommand(_PanelHelp, TyperCommand):
-    """Command of typer whose help is in panels."""
+    """Typer's command, whose `--help` groups the options in tables by subject."""
 
 
 class HelpGroup(_PanelHelp, TyperGroup):
-    """Group of typer's commands whose help is in panels."""
+    """Typer's group of commands, whose `--help` groups commands and options in tables by subject."""
 
 
 def _panel(parameter: Any) -> str:

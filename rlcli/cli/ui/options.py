@@ -219,9 +219,10 @@ def _with_strict_number(parameter: inspect.Parameter) -> inspect.Parameter:
 
 
 def budget_keys(max_iterations: int | None, max_steps: int | None) -> dict[str, Any]:
-    """Return the changes for --max-iterations and --max-steps (key -> value); empty without both.
+    """Return --max-iterations and --max-steps as overrides of the agent: dotted key -> value.
 
-    One of them replaces the agent's whole budget.
+    If the user has set one of them, the other becomes None, so that the agent's own budget does not end the training
+    first. Empty if the user has set neither.
     """
     if max_iterations is None and max_steps is None:
         return {}
