@@ -48,13 +48,13 @@ def read_models(words: Iterable[str]) -> dict[str, Any]:
 def given_settings(recorded: Mapping[str, Any], changes: Mapping[Path, Any]) -> tuple[dict[str, Any], dict[Path, Any]]:
     """Return the settings that are passed to a task in Python, whose file may leave models and values open.
 
-    Returns:
-        Name of a robot or object -> its MJCF file (as from `read_models`), and path of a setting -> its value: the
-        values that the run has stored, then the changes.
-
     Args:
         recorded: the configuration that a run has stored; empty without a run.
         changes: path -> value of the changes from the command line.
+
+    Returns:
+        Name of a robot or object -> its MJCF file (as from `read_models`), and path of a setting -> its value: the
+        values that the run has stored, then the changes.
     """
     models = recorded_models(recorded) | {str(path[-1]): value for path, value in changes.items() if path[0] == MODELS}
     return models, {path: value for path, value in leaves(recorded) if path} | dict(changes)

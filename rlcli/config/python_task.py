@@ -453,6 +453,6 @@ def _report_choice(message: str) -> None:
 
 
 def _hint(error: BaseException) -> str | None:
-    """Return the hint of an installed format about an error of a task's code; None if no format has one."""
+    """Return what an installed plugin for another framework's tasks advises about an error; None without advice."""
     hint: str | None = first_result("hint", error)
     return hint

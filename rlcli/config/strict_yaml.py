@@ -233,7 +233,7 @@ def _scalar(event: events.ScalarEvent, *, key: bool) -> Any:
     if not event.implicit[0]:  # quoted or block: always text
         return text
     if key and text == "<<":
-        raise YamlError("merge keys (<<) are not allowed; write the values again", event.start_mark)
+        raise YamlError("merge keys (<<) are not allowed; copy the keys and values", event.start_mark)
     if text in _CONSTANTS:
         return _CONSTANTS[text]
     if _OCTAL.match(text):

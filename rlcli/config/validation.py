@@ -316,7 +316,8 @@ class TaskCheck:
         model = load_entry(replace(entry, value=spec.algorithms[algorithm]), type)
         if not issubclass(model, AgentConfig):
             raise TaskError(
-                f"plugin {entry.distribution} {entry.version}: {model.__name__} is no AgentConfig; report it"
+                f"plugin {entry.distribution} {entry.version}: {model.__name__} is no subclass of AgentConfig;"
+                " report it to the plugin's authors"
             )
         return spec, model
 

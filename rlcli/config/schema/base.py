@@ -81,7 +81,7 @@ Seconds = Annotated[float, Field(gt=0), _FractionString(), _Limits(0.0, 1e9)]
 Count = Annotated[int, Field(ge=1), _Limits(1, 2**31 - 1)]
 """Whole number of at least 1."""
 Width = Annotated[int, Field(ge=1, le=2**24)]
-"""Number of columns of a layer of a network."""
+"""Number of units of a layer of a network."""
 Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=100)]
 """Widths of the layers of a network."""
 Threads = Annotated[int, Field(ge=1, le=4096)]

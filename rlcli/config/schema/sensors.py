@@ -65,7 +65,7 @@ class RaySensorConfig(StrictModel):
     pattern: GridPatternConfig | Annotated[list[Direction], Field(min_length=1)]
     """A grid of parallel rays, or a list of directions of rays that start in one point, in the sensor's frame."""
     offset: Vec3 = (0.0, 0.0, 0.0)
-    """Position of the sensor in its frame [m]."""
+    """Position of the sensor relative to the body, along the axes of `alignment` [m]."""
     alignment: Literal["base", "yaw", "world"] = "base"
     """Axes of the sensor's frame. base: the axes of the body; yaw: the body's heading with z up; world: the world's
     axes."""

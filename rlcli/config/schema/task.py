@@ -33,7 +33,7 @@ _Iterations = Annotated[Count, Field(le=100_000)]
 
 
 class SimConfig(StrictModel):
-    """Physics simulation."""
+    """Settings of the physics: time step, engine, solver and precision."""
 
     dt: Annotated[float, Field(gt=0, le=0.1), _FractionString(), _Limits(1e-9, 0.1)]
     """Physics time step [s]."""

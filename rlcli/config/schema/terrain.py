@@ -30,7 +30,7 @@ class NoisePatchConfig(PatchConfig):
     kind: Literal["noise"]
     """Kind of ground: always noise."""
     height: Range = (0.02, 0.1)
-    """Heights are drawn from +-`height` [m], which is [at difficulty 0, at difficulty 1]."""
+    """Largest random height above and below the mean [m]: [at difficulty 0, at difficulty 1]."""
     spacing: Positive = 0.2
     """Distance between two random heights [m]; heights between them are interpolated linearly."""
 
@@ -115,7 +115,7 @@ class GridPatchConfig(PatchConfig):
     cell: Positive = 0.5
     """Edge length of a cell [m]."""
     height: Range = (0.02, 0.15)
-    """Heights are drawn from +-`height` [m], which is [at difficulty 0, at difficulty 1]."""
+    """Largest random height above and below the mean [m]: [at difficulty 0, at difficulty 1]."""
     platform: NotNegative = 2.0
     """Edge length of the flat square in the middle [m]."""
     boxes: bool = False
@@ -172,7 +172,7 @@ class TerrainGeneratorConfig(StrictModel):
     @classmethod
     def _check_proportions(cls, value: dict[str, SubTerrainConfig]) -> dict[str, SubTerrainConfig]:
         if sum(patch.proportion for patch in value.values()) <= 0.0:
-            raise ValueError("the proportions of the sub-terrains sum to 0; set at least one above 0")
+            raise ValueError("the `proportion` of every sub-terrain is 0; set at least one above 0")
         return value
 
 
