@@ -29,7 +29,8 @@ _ANSWER_BYTES = 100_000
 _LATE = "no answer within"
 BUSY = "if the machine is busy: `rlcli doctor --probe-timeout 120`"
 REINSTALL = f"pip uninstall -y {' '.join(MUJOCO_PACKAGES)} && {pip_install('mujoco')}"
-"""Uninstall first: the three packages share files, so upgrading one removes files that another has just written."""
+"""Command that repairs MuJoCo. It uninstalls first: MuJoCo's three packages share files, so upgrading one removes files
+that another has just written."""
 
 Answer = tuple[dict[str, Any] | None, str]
 """Answer of a check in a separate process: its result as JSON data and "", or None and the reason of the failure."""

@@ -209,7 +209,10 @@ class FailureRecorder(StepObserver):
     # --- called in every step ---
 
     def on_divergence(self, found: list[Divergence], pending: bool) -> None:
-        """Copy the last engine calls of environments that diverged, for the first divergence of each cause."""
+        """Copy the last engine calls of environments that diverged, for the recording of their episode.
+
+        Only for the first divergence of each cause.
+        """
         for divergence in found:
             if ("diverged", divergence.cause) not in self._pending:
                 self._diverging[divergence.env] = trace_calls(self._env, divergence, pending)

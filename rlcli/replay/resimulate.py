@@ -96,7 +96,7 @@ class StateReader(StepObserver):
         self.state: dict[str, Tensor] = {}
 
     def after_physics(self) -> None:
-        """Copy the state."""
+        """Store a copy of the state as `state`: field name -> values (num_envs, n)."""
         self.state = read_state(self._env)
 
 
@@ -187,7 +187,7 @@ class ReplayWorld:
         self.engine, self.layout = engine, engine.state_layout
 
     def simulate(self, call: Call) -> NDArray[np.float64]:
-        """Return the state after an engine call."""
+        """Simulate a recorded engine call from its recorded state, and return the state after it."""
         self.engine.set_state_row(0, call.state)
         self.engine.step(call.nstep)
         self.engine.diverged()

@@ -33,7 +33,7 @@ _LIMITS = (6, 9)
 Trajectory = list[dict[str, Tensor]]
 """Outputs of each step: name, such as `reward` -> tensor with one row for each environment."""
 MakeFinding = Callable[[str, str, str], Finding]
-"""`error_at` or `warning_at`."""
+"""Type of `error_at` and `warning_at`: (where, message, hint) -> finding."""
 
 
 def same_seed(subject: TaskUnderTest) -> Iterator[Finding]:

@@ -218,7 +218,7 @@ class RolloutEvidence:
 
     @property
     def rollouts(self) -> list[Rollout]:
-        """One rollout of each policy."""
+        """One rollout of each policy of `FIXED_POLICIES`; recorded when it is first read."""
         if self._rollouts is None:
             bound = self.subject.bound
             self._rollouts = [record_rollout(self.env(), name, bound, self.steps) for name in FIXED_POLICIES]

@@ -92,7 +92,7 @@ def early_resets(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 def _weighted_terms(evidence: RolloutEvidence) -> list[str]:
-    """Return the reward terms with a weight other than 0."""
+    """Return the names of the reward terms with a weight other than 0."""
     rewards = evidence.subject.resolved.task.rewards
     env = evidence.rollouts[0].env
     if not isinstance(env, ManagedEnv):
@@ -190,7 +190,8 @@ def dying_pays(evidence: RolloutEvidence) -> Iterator[Remark]:
 
 
 LARGE, SMALL = 100.0, 0.01
-"""Largest and smallest usual size of a column. `cart-double-pendulum` learns well with one above 75 in 1 % of steps."""
+"""Largest and smallest usual size of an observation column. The task `cart-double-pendulum` learns well although a
+column is above 75 in 1 % of the steps."""
 
 
 def constant_observation(evidence: RolloutEvidence) -> Iterator[Remark]:
@@ -368,7 +369,8 @@ def _compare_half_and_double_step(evidence: RolloutEvidence, dt: float, where: s
     twice = record_rollout(evidence.env(16, sim__dt=2 * dt, decimation=decimation), "random", bound, steps)
     if twice.diverged:
         message = (
-            f"with a time step of {2 * dt:g} s the simulation diverges within {steps} steps, so the margin is small"
+            f"with twice the time step, {2 * dt:g} s, the simulation diverges within {steps} steps,"
+            " so the time step is close to the largest stable one"
         )
         yield warning_at(where, message, hint, {"diverged_at_twice": twice.diverged})
 

@@ -27,7 +27,7 @@ class Recording:
     late_writes: dict[str, int] = field(default_factory=dict)
     """Name of an output that was changed in place during a later step -> index of the first such step."""
     shared: dict[str, int] = field(default_factory=dict)
-    """Name of an output that has the memory of the step before's output -> index of the first such step."""
+    """Name of an output whose tensor shares memory with that of the step before -> index of the first such step."""
     error: Exception | None = None
 
 

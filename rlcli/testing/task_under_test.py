@@ -136,7 +136,7 @@ def task_of(env: VecEnv) -> DirectTask:
 
 
 def engine_state(env: VecEnv) -> dict[str, Tensor]:
-    """Return the tensors of the engine's state that have one row for each environment."""
+    """Return the engine's state, such as positions and velocities: name -> tensor with one row per environment."""
     state = env.engine.state_dict()
     return {name: value for name, value in state.items() if value.dim() and len(value) == env.num_envs}
 
