@@ -22,8 +22,8 @@ class GymnasiumTask(DirectTask):
     """One of Gymnasium's MuJoCo tasks.
 
     `observation` (num_envs, k) and `reward` (num_envs,) are the values of the buffers before the cast to float32.
-    `ended` (num_envs,) is true where the task terminates the episode; it is computed once per step, also for the
-    reward.
+    `ended` (num_envs,) is true where the task terminates the episode; it is computed before the reward, which may
+    depend on it.
     """
 
     motors = False
@@ -61,22 +61,22 @@ class GymnasiumTask(DirectTask):
             self.before.copy_(self.progress())
 
     def get_observations(self) -> None:
-        """Fill obs_buf."""
+        """Fill obs_buf with the columns of `columns`, as float32."""
         torch.cat(self.columns(), dim=1, out=self.observation)
         self.obs_buf.copy_(self.observation)
 
     def calculate_metrics(self) -> None:
-        """Fill rew_buf."""
+        """Fill `ended`, then rew_buf with the result of `compute_reward`, as float32."""
         self.check_termination()
         self.reward.copy_(self.compute_reward())
         self.rew_buf.copy_(self.reward)
 
     def is_done(self) -> None:
-        """Fill reset_buf."""
+        """Fill reset_buf, which marks terminated episodes, with `ended`."""
         self.reset_buf.copy_(self.ended)
 
     def reset(self, selection: Selection) -> None:
-        """Write the initial state."""
+        """Write the initial state of `start` to the environments that reset."""
         qpos, qvel = self.start(selection)
         selection.write(self.field.qpos, qpos)
         selection.write(self.field.qvel, qvel)
@@ -88,7 +88,7 @@ class GymnasiumTask(DirectTask):
         raise NotImplementedError
 
     def compute_reward(self) -> Tensor:
-        """Return the reward. (num_envs,)"""
+        """Return the reward of the step, in the engine's dtype. (num_envs,)"""
         raise NotImplementedError
 
     def check_termination(self) -> None:

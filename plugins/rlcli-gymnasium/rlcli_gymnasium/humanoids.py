@@ -43,7 +43,7 @@ class _Humanoid(GymnasiumTask):
         ]
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Sample a uniform initial state."""
+        """Sample positions and velocities uniformly around the default state. (rows, nq), (rows, nv)"""
         return self.uniform_start(selection, self.params.reset_noise_scale)
 
     def control_cost(self) -> Tensor:
@@ -81,7 +81,7 @@ class Humanoid(_Humanoid):
     params: Params
 
     def post_reset(self) -> None:
-        """Start to track the centre of mass."""
+        """Compute the bodies' shares of the mass, from which `progress` computes the centre of mass."""
         mass = torch.tensor(self.env.engine.model.body_mass, dtype=torch.float64)
         self.share = (mass / mass.sum()).to(self.env.engine.field("qpos"))
         super().post_reset()

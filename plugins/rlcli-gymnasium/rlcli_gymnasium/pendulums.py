@@ -42,7 +42,7 @@ class InvertedPendulum(GymnasiumTask):
         torch.gt(self.observation[:, 1].abs(), 0.2, out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Sample a uniform initial state."""
+        """Sample positions and velocities uniformly around the default state. (rows, nq), (rows, nv)"""
         return self.uniform_start(selection, self.params.reset_noise_scale)
 
 
@@ -87,7 +87,7 @@ class InvertedDoublePendulum(GymnasiumTask):
         torch.le(self.field.site_xpos[:, 0, 2], 1, out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Sample uniform positions and Gaussian velocities."""
+        """Sample positions uniformly, velocities from a Gaussian, around the default state. (rows, nq), (rows, nv)"""
         return self.gaussian_start(selection, self.params.reset_noise_scale)
 
 

@@ -43,7 +43,7 @@ class Ant(GymnasiumTask):
     params: Params
 
     def post_reset(self) -> None:
-        """Start to track the torso."""
+        """Store the index of the torso's body, whose x is the progress."""
         self.torso = 1
         super().post_reset()
 
@@ -77,7 +77,7 @@ class Ant(GymnasiumTask):
         torch.logical_not(self.healthy(), out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Sample uniform positions and Gaussian velocities."""
+        """Sample positions uniformly, velocities from a Gaussian, around the default state. (rows, nq), (rows, nv)"""
         return self.gaussian_start(selection, self.params.reset_noise_scale)
 
 
@@ -110,7 +110,7 @@ class HalfCheetah(GymnasiumTask):
         return params.forward_reward_weight * self.speed() - self.action_cost(params.ctrl_cost_weight)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Sample uniform positions and Gaussian velocities."""
+        """Sample positions uniformly, velocities from a Gaussian, around the default state. (rows, nq), (rows, nv)"""
         return self.gaussian_start(selection, self.params.reset_noise_scale)
 
 
@@ -137,7 +137,7 @@ class Swimmer(HalfCheetah):
         return [self.field.qpos[:, 2:], self.field.qvel]
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Sample a uniform initial state."""
+        """Sample positions and velocities uniformly around the default state. (rows, nq), (rows, nv)"""
         return self.uniform_start(selection, self.params.reset_noise_scale)
 
 
@@ -185,7 +185,7 @@ class Walker2d(GymnasiumTask):
         torch.logical_not(self.healthy(), out=self.ended)
 
     def start(self, selection: Selection) -> tuple[Tensor, Tensor]:
-        """Sample a uniform initial state."""
+        """Sample positions and velocities uniformly around the default state. (rows, nq), (rows, nv)"""
         return self.uniform_start(selection, self.params.reset_noise_scale)
 
 

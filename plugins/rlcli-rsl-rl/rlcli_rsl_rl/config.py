@@ -32,7 +32,7 @@ class PolicyConfig(StrictModel):
     noise_std_type: Literal["scalar", "log"] = "scalar"
     """scalar: train the standard deviation; log: train its logarithm."""
     state_dependent_std: Literal[False] = False
-    """The standard deviation does not depend on the state."""
+    """Only false: the standard deviation does not depend on the state."""
     actor_obs_normalization: bool | None = None
     """Normalize the actor's observations by running mean and standard deviation; null: use empirical_normalization."""
     critic_obs_normalization: bool | None = None
@@ -133,7 +133,7 @@ class RndConfig(StrictModel):
 
 
 class SymmetryConfig(StrictModel):
-    """Symmetry of the task (Mittal et al. 2024)."""
+    """Use of the task's mirror symmetry in the update (Mittal et al. 2024)."""
 
     data_augmentation_func: str
     """`module:function` of the task's package or a plugin's, or `file.py:function` beside the task, called as
@@ -267,7 +267,7 @@ class RunnerConfig(AgentConfig):
     @model_validator(mode="after")
     def _relations(self) -> RunnerConfig:
         if self.policy is not None and (self.actor is not None or self.critic is not None):
-            raise ValueError("policy is the older form of actor and critic: remove policy, or both others")
+            raise ValueError("policy is the older form of actor and critic: remove policy, or actor and critic")
         if self.algorithm.symmetry_cfg is not None and self.memory is not None:
             raise ValueError("RSL-RL does not support symmetry for recurrent networks: remove one of the two")
         if self.algorithm.schedule == "adaptive" and self.algorithm.desired_kl is None:
