@@ -17,7 +17,11 @@ from rlcli_oige.views import XFormPrimView, select_rows
 
 
 class ArticulationView(XFormPrimView):
-    """Robots: one in each environment. Columns are the hinge and slide joints, breadth first."""
+    """Robots: one in each environment. Columns are the hinge and slide joints, breadth first.
+
+    In shapes, n is the number of environments that `indices` selects, and k the number of columns that `joint_indices`
+    selects (None: all).
+    """
 
     def __init__(
         self, prim_paths_expr: str, name: str = "articulation_prim_view", reset_xform_properties: bool = True,

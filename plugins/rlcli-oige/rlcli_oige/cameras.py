@@ -49,7 +49,7 @@ class Replicator:
         self.AnnotatorRegistry = SimpleNamespace(get_annotator=self._annotator)
 
     def listener(self, *args: Any, **kwargs: Any) -> Listener:
-        """Return a new listener."""
+        """Return a new `Listener`, from which the task gets the images of its camera."""
         return Listener(self._env)
 
     def _render_product(self, camera: Any, resolution: tuple[int, int], **kwargs: Any) -> str:
@@ -208,7 +208,7 @@ class Listener(Counterpart):
         self._env = env
 
     def get_rgb_data(self) -> Tensor:
-        """Return the images of the current state, 0 to 255. (num_envs, 3, height, width) uint8"""
+        """Return the images of the task's camera in the current state. (num_envs, 3, height, width) uint8"""
         camera = self._env.sensors[SENSOR]
         assert isinstance(camera, CameraSensor)
         return camera.image.permute(0, 3, 1, 2).to(self._env.device)

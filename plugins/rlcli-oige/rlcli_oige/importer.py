@@ -137,7 +137,10 @@ def _copy_code(class_file: Path, home: Path, folder: Path) -> list[Path]:
 
 
 def _used_files(start: Path, home: Path) -> list[Path]:
-    """Return a file and all files of its package that it imports, directly or not, but no names of `rlcli_oige`."""
+    """Return a file, and the files of its package whose classes and functions it imports, directly or not.
+
+    Names that `rlcli_oige` defines count as imported from there, not from a file of the package.
+    """
     words = [node for file in _VOCABULARY for node in ast.walk(parse_file(file))]
     own = {getattr(node, "name", getattr(node, "value", None)) for node in words if isinstance(node, _WORDS)}
     deepest_first = sorted(home.rglob("*.py"), key=lambda file: (-len(file.parts), file))[-500:]

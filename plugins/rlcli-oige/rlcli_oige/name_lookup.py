@@ -27,9 +27,7 @@ def find(name: str, known: Iterable[str]) -> Any:
         if name in _definitions(file):
             return getattr(load_module(str(file)), name)
     near = did_you_mean(name, known)
-    raise AttributeError(
-        f"rlcli_oige has no name '{name}'; {near or 'docs/guides/omniisaacgymenvs.md lists the names'}"
-    )
+    raise AttributeError(f"rlcli_oige has no name '{name}'; {near or 'rlcli_oige.vocabulary.NAMES lists the names'}")
 
 
 def used_names(known: Iterable[str]) -> list[str]:

@@ -429,7 +429,10 @@ def define_prim(prim_path: str, prim_type: str = "Xform", **kwargs: Any) -> Prim
 
 
 def add_reference_to_stage(usd_path: str, prim_path: str, prim_type: str = "Xform") -> Prim:
-    """Record the USD file of a path. Its model is loaded when an object is created there."""
+    """Record that a prim refers to a USD file, and return the prim; `prim_type` has no effect.
+
+    The model is loaded when the task creates a robot or object at the path of the prim.
+    """
     stage = get_current_stage()
     stage.references[str(prim_path)] = str(usd_path)
     return Prim(stage, str(prim_path))

@@ -99,15 +99,15 @@ class SimConfig(Counterpart):
         prim.settings["make_kinematic"] = self._value(name, "make_kinematic", value)
 
     def set_density(self, name: str, prim: Prim, value: float | None = None) -> None:
-        """Set the density of all geoms of an actor [kg/m^3]."""
+        """Set the density of all geoms of an actor [kg/m^3]; None: the density in the YAML."""
         prim.settings["density"] = self._value(name, "density", value)
 
     def set_mass(self, name: str, prim: Prim, value: float | None = None) -> None:
-        """Set the total mass of an actor [kg]."""
+        """Set the total mass of an actor [kg]; None: the mass in the YAML."""
         prim.settings["mass"] = self._value(name, "mass", value)
 
     def set_position_iteration(self, name: str, prim: Prim, value: float | None = None) -> None:
-        """Do nothing: MuJoCo's solver iterates until it converges."""
+        """Do nothing: MuJoCo has no such setting. The setters of other PhysX settings below are this function too."""
 
     set_velocity_iteration = set_articulation_position_iteration = set_position_iteration
     set_articulation_velocity_iteration = set_max_depenetration_velocity = set_position_iteration
@@ -238,7 +238,7 @@ class World(SimulationContext):
 
     @property
     def prim_path(self) -> str:
-        """Path of the physics settings."""
+        """Path of the prim that holds the settings of the physics."""
         return "/physicsScene"
 
     @property
@@ -353,7 +353,7 @@ class RLTask(DirectTask):
 
     @property
     def num_states(self) -> int:  # type: ignore[override]
-        """Number of columns of states_buf."""
+        """Number of columns of states_buf, the privileged observations of the critic."""
         return self._num_states
 
     @property
@@ -415,7 +415,7 @@ class RLTask(DirectTask):
         self.is_extension = is_extension
 
     def get_states(self) -> Any:
-        """Fill states_buf, if the task has states."""
+        """Fill states_buf, if the task has privileged observations of the critic."""
         return self.states_buf
 
     def get_extras(self) -> Any:

@@ -40,7 +40,7 @@ class Missing(type):
     reason: str
 
     def __call__(cls, *args: Any, **kwargs: Any) -> Any:
-        """Raise the error of a call."""
+        """Raise a TaskError: the called name has no counterpart in rlcli."""
         raise cls._error()
 
     def __getattr__(cls, name: str) -> Any:
@@ -53,7 +53,8 @@ class Missing(type):
         name = f"{base.__module__}.{base.__name__}{attribute}"
         if base is not cls:
             name = f"{cls.__name__}, a {name}"
-        return TaskError(f"{user_location()}rlcli has no counterpart of {name}: {base.reason}")
+        hint = "change the task so that it does not use this name"
+        return TaskError(f"{user_location()}rlcli has no counterpart of {name}: {base.reason}", hint=hint)
 
 
 class Ignored:
@@ -66,7 +67,7 @@ class Ignored:
         self._name, self._reason = name, reason
 
     def __call__(self, *args: Any, **kwargs: Any) -> Ignored:
-        """Record the call."""
+        """Record the call, and return the object itself."""
         note_ignored(self._name, self._reason)
         return self
 

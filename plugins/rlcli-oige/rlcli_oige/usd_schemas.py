@@ -174,7 +174,7 @@ class Xformable(Schema):
     """The pose of a prim."""
 
     def ComputeLocalToWorldTransform(self, time: Any = 0) -> Any:  # noqa: N802
-        """Return the pose in the world, with the joints of the model at 0."""
+        """Return the pose of the prim in the world, with all joints of its model at 0."""
         from rlcli_oige.usd_names import Transform
 
         return Transform(self._prim)

@@ -53,4 +53,5 @@ class Counterpart:
         text = f"rlcli's {own} has no '{name}'"
         if own != type(self).__name__:
             text = f"{type(self).__name__} has no '{name}', and {text}"
-        raise MissingAttributeError(f"{user_location()}{text}")
+        hint = "remove the line, or compute what it does with the methods that the class has"
+        raise MissingAttributeError(f"{user_location()}{text}", hint=hint)

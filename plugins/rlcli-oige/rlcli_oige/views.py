@@ -1,8 +1,9 @@
 """Tensor views of frames and bodies, with OmniIsaacGymEnvs' names, orders and conventions.
 
 Joints and bodies are in breadth-first order. World positions include the environment's position on the grid.
-Quaternions are (w, x, y, z). Every getter returns a new tensor. A setter may be called any number of times per step.
-Getters of a robot's root and joints return the new values immediately.
+Quaternions are (w, x, y, z). In shapes, n is the number of rows that the argument `indices` selects (None: all).
+Every getter returns a new tensor. A setter may be called any number of times per step. Getters of a robot's root and
+joints return the new values immediately.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class XFormPrimView(Counterpart):
         """Look up what a subclass needs from the simulation, such as joints; `bind` calls it at its end."""
 
     def initialize(self, physics_sim_view: Any = None) -> None:
-        """Do nothing: the environment binds views."""
+        """Do nothing: the environment connects every view to the simulation by `bind`."""
 
     def post_reset(self) -> None:
         """Do nothing."""
