@@ -34,7 +34,7 @@ def command(
     agent: Agent = None,
     runs_dir: RunsDir = None,
 ) -> None:
-    """Show the differences of two runs or configurations. Each is marked as physics, MDP, agent or cosmetic.
+    """Show the differences of two runs or configurations, each marked as physics, MDP, agent or cosmetic.
 
     Options:
         words: Each side is a run (RUN, RUN@step:N, RUN@best, a checkpoint folder, latest), or a task (a name, a

@@ -39,7 +39,7 @@ def command(
 
     Options:
         compare: Compare several runs in the same episodes: eval --compare RUN1 RUN2. Further policies: shipped,
-            lqr, zero, random. Limits apply to the first.
+            lqr, zero, random. --fail-under and --fail-over apply to the first run.
         episodes: Number of episodes. By default each has its own environment (at most 8192 at a time); with --num-envs
             N each environment runs its share of them.
         fail_under: Exit with code 9 if a mean is below X. Keys: success, return, length, reward_terms.NAME,

@@ -36,7 +36,7 @@ def command(
         output: File to write, FILE.png, .svg or .pdf. [default: plots/curves.png in a single run, else curves.png]
         metrics: Names separated by commas: return, success, length, rewards, terminations, a metric of the runs
             (Loss/value), or a group of metrics (Loss). [default: return, success, length, rewards, terminations]
-        x: steps, iterations or time (of training [s]).
+        x: Quantity on the x axis: steps, iterations or time (of training [s]).
 
     Examples:
         rlcli plot latest

@@ -56,8 +56,8 @@ def command(
             as in success=0.97. [default: train the whole budget]
         gpus: Number of processes on this machine, one GPU each; each has its own num_envs environments. [default: 1
             process]
-        logger: tensorboard, wandb, mlflow, trackio or none; repeatable. [default: the settings' loggers, or
-            tensorboard]
+        logger: Where metrics are logged: tensorboard, wandb, mlflow, trackio or none; repeatable. [default: the
+            settings' loggers, or tensorboard]
         video_every: Film an episode every N iterations, in a separate environment, into RUN/videos; 0: never.
             [default: 0, or the value of the resumed run]
         resume: Resume a run: RUN, RUN@step:N or latest. Needs no TASK.

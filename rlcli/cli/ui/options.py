@@ -43,7 +43,7 @@ _TASK = typer.Argument(
 )
 _POLICY_TASK = "Task: its newest run is used, else the policy shipped with the task. Not needed with --checkpoint."
 _OVERRIDES = "Overrides of settings; agent.KEY=VALUE changes the chosen agent."
-_AGENT = "Agent of the task. [default: the task's]"
+_AGENT = "Agent of the task: a trainer and its settings. [default: the task's]"
 _CONFIG = "YAML file merged over the task; its key `agent` changes the chosen agent."
 _FEW_ENVS = "Number of environments, whatever scene.num_envs is; at least 8."
 _SEED = "Seed of all random numbers; -1 picks a random one and records it."
@@ -51,6 +51,9 @@ _TASK_FOLDER = "Folder of the task's code, if the task is not installed and its 
 _RUNS_DIR = "Folder of runs. [default: RLCLI_RUNS_DIR, the settings' runs_dir, or runs]"
 _RECORD_MODE = "Episodes to record: all, succeeded, failed, or separate (one file each for the last two)."
 _CHECKPOINT = "RUN, RUN@best, RUN@step:N, latest, a checkpoint folder, a bundle, or shipped (the task's own policy)."
+_DEVICE = "Device of simulation and training: auto (a GPU, if one can be used), cpu, cuda or cuda:N."
+_POLICY = "trained, zero or random actions, or lqr (a linear-quadratic regulator)."
+_PROBE_TIMEOUT = "Time limit for loading each task; in doctor also for each trainer and graphics driver [s]."
 TaskName = Annotated[str, _TASK]
 OptionalTask = Annotated[str | None, _TASK]
 TaskOfPolicy = Annotated[str | None, typer.Argument(autocompletion=tasks, metavar="TASK", help=_POLICY_TASK)]
@@ -58,10 +61,10 @@ Overrides = Annotated[list[str] | None, typer.Argument(metavar="KEY.PATH=VALUE",
 RunRef = Annotated[str, typer.Argument(autocompletion=runs, metavar="RUN", help="Folder or name of a run, or latest.")]
 ConfigFile = Annotated[Path | None, typer.Option(metavar="FILE", help=_CONFIG)]
 Agent = Annotated[str | None, typer.Option(autocompletion=agents, metavar="NAME", help=_AGENT)]
-NumEnvs = Annotated[int | None, typer.Option(help="Sets scene.num_envs. [default: the task's]")]
+NumEnvs = Annotated[int | None, typer.Option(help="Number of environments (scene.num_envs). [default: the task's]")]
 FewEnvs = Annotated[int, typer.Option("--num-envs", help=_FEW_ENVS)]
 Seed = Annotated[int, typer.Option(min=-1, max=MAX_SEED, callback=random_if_minus_one, help=_SEED)]
-Device = Annotated[str, choice("DEVICE", "auto", "cpu", "cuda", help="auto, cpu, cuda or cuda:N.")]
+Device = Annotated[str, choice("DEVICE", "auto", "cpu", "cuda", help=_DEVICE)]
 RunName = Annotated[str | None, typer.Option(help="Text at the end of the run folder's name.")]
 MaxIterations = Annotated[int | None, typer.Option(help="Iterations of each training. [default: the agent's]")]
 MaxSteps = Annotated[int | None, typer.Option(help="Environment steps of each training. [default: the agent's]")]
@@ -70,11 +73,11 @@ RunsDir = Annotated[Path | None, typer.Option(help=_RUNS_DIR)]
 Record = Annotated[Path | None, typer.Option(metavar="FILE", help="Record the episodes to FILE, for rlcli replay.")]
 RecordMode = Annotated[str, choice("MODE", "all", "succeeded", "failed", "separate", help=_RECORD_MODE)]
 CheckpointRef = Annotated[str | None, typer.Option(autocompletion=checkpoints, metavar="CHECKPOINT", help=_CHECKPOINT)]
-Policy = Annotated[str, choice("POLICY", "trained", "zero", "random", "lqr", help="trained, zero, random or lqr.")]
+Policy = Annotated[str, choice("POLICY", "trained", "zero", "random", "lqr", help=_POLICY)]
 Stochastic = Annotated[bool, typer.Option("--stochastic", help="Sample actions as in training.")]
 ProbeTimeout = Annotated[
     float,
-    typer.Option("--probe-timeout", help="Time limit per task; doctor: also per trainer and graphics driver [s]."),
+    typer.Option("--probe-timeout", help=_PROBE_TIMEOUT),
 ]
 Headless = Annotated[bool, typer.Option("--headless", hidden=True, help="Open no viewer unless --viewer is given.")]
 
