@@ -230,7 +230,7 @@ class OigeEnv(DirectEnv):
                 found.clear()
 
     def queue_forces(self, view: RigidPrimView, rows: Tensor, forces: Tensor) -> None:
-        """Store forces of the domain randomization, which act in the next step.
+        """Store forces of the domain randomisation, which act in the next step.
 
         Forces that the task sets in that step replace them.
 

@@ -1,4 +1,4 @@
-"""Entry point of the plugin (`rlcli.formats`): how rlcli recognizes and reads tasks of OmniIsaacGymEnvs."""
+"""Entry point of the plugin (`rlcli.formats`): how rlcli recognises and reads tasks of OmniIsaacGymEnvs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Domain randomization with OmniIsaacGymEnvs' syntax, through the engine's per-environment model fields.
+"""Domain randomisation with OmniIsaacGymEnvs' syntax, through the engine's per-environment model fields.
 
 `on_startup` changes the model once. `on_reset` starts from the result of `on_startup` and holds for an episode.
 `on_interval` starts from the values at the start of the episode. The second parameter of a gaussian is its standard
@@ -28,10 +28,10 @@ _CONSTANTS = ("body_masses", "body_inertias", "mass", "density", "inertia", "joi
 
 
 class Randomizer:
-    """Domain randomization of a task, which finds it as `self._dr_randomizer`; the environment calls its methods.
+    """Domain randomisation of a task, which finds it as `self._dr_randomizer`; the environment calls its methods.
 
     A task may call `set_up_domain_randomization`, `dr.physics_view.step_randomization` and the like. They do nothing:
-    the environment randomizes at the right moments.
+    the environment randomises at the right moments.
     """
 
     def __init__(self, env: OigeEnv) -> None:
@@ -57,13 +57,13 @@ class Randomizer:
     # --- called by tasks ---
 
     def apply_on_startup_domain_randomization(self, task: Any) -> None:
-        """Do nothing: the environment applies the startup randomization."""
+        """Do nothing: the environment applies the startup randomisation."""
 
     def set_up_domain_randomization(self, task: Any) -> None:
-        """Do nothing: the environment sets up the randomization."""
+        """Do nothing: the environment sets up the randomisation."""
 
     def step_randomization(self, reset_inds: Any = None) -> None:
-        """Do nothing: the environment randomizes in each step."""
+        """Do nothing: the environment randomises in each step."""
 
     def get_initial_dr_distribution_parameters(self, *path: str) -> np.ndarray:
         """Return the `distribution_parameters` of the YAML, a pair of numbers or of lists.
@@ -113,7 +113,7 @@ class Randomizer:
         self._set_constants([entry for entry in self.randomizations if entry.trigger == "on_startup"])
 
     def before_reset(self, ids: Tensor) -> None:
-        """Apply the `on_reset` randomizations of the model, and sample new episodes' noise, before the task's reset."""
+        """Apply the `on_reset` randomisations of the model, and sample new episodes' noise, before the task's reset."""
         if not self.randomizations or self._steps_since_reset is None or not len(ids):
             return
         due = ids[self._steps_since_reset[ids] >= self.min_frequency]
@@ -133,13 +133,13 @@ class Randomizer:
                     self._sample_noise(entry, kind, ids, None)
 
     def after_reset(self, ids: Tensor) -> None:
-        """Apply the `on_reset` randomizations of the state, after the task's reset has written the initial state."""
+        """Apply the `on_reset` randomisations of the state, after the task's reset has written the initial state."""
         for entry in self.randomizations:
             if entry.trigger == "on_reset" and self._acts_on_state(entry) and len(ids):
                 self._apply(entry, ids, None)
 
     def after_step(self) -> None:
-        """Apply the `on_interval` randomizations that are due."""
+        """Apply the `on_interval` randomisations that are due."""
         if not self.randomizations or self._steps_since_reset is None:
             return
         env = self._env
@@ -196,17 +196,17 @@ class Randomizer:
             known = [".".join(p) for p in self.active_domain_randomizations]
             name = ".".join(path)
             raise TaskError(
-                f"the YAML has no randomization of '{name}'",
-                hint=did_you_mean(name, known) or f"randomized: {listing(known)}",
+                f"the YAML has no randomisation of '{name}'",
+                hint=did_you_mean(name, known) or f"randomised: {listing(known)}",
             )
         return path
 
     def _acts_on_state(self, entry: Randomization) -> bool:
-        """Return whether a randomization acts on the state, which the task's reset overwrites, and not on the model."""
+        """Return whether a randomisation acts on the state, which the task's reset overwrites, and not on the model."""
         return entry.path[-1] in VIEW_STATE
 
     def _sample(self, entry: Randomization, ids: Tensor, step: int | None, size: int, shape: tuple[int, ...]) -> Tensor:
-        """Sample the values of one randomization, one row per environment.
+        """Sample the values of one randomisation, one row per environment.
 
         Args:
             entry: attribute and distribution.

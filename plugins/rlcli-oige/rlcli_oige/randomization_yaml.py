@@ -77,12 +77,12 @@ ATTRIBUTES: Mapping[str, Mapping[str, tuple[Status, str]]] = {
         "rest_offset": ("ignored", "the MJCF's margin sets where contacts begin"),
     },
 }  # fmt: skip
-"""Kind of view -> attribute that can be randomized -> status of its translation, and a note for the user."""
+"""Kind of view -> attribute that can be randomised -> status of its translation, and a note for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class Randomization:
-    """One randomization: its attribute, its key (`on_startup`, `on_reset` or `on_interval`) and its distribution."""
+    """One randomisation: its attribute, its key (`on_startup`, `on_reset` or `on_interval`) and its distribution."""
 
     path: tuple[str, ...]
     """(observations,), (actions,), (simulation, gravity) or (kind of view, view, attribute)"""
@@ -98,11 +98,11 @@ class Randomization:
 
     @property
     def name(self) -> str:
-        """Name of the randomization, unique in its task, such as `simulation.gravity.on_reset`."""
+        """Name of the randomisation, unique in its task, such as `simulation.gravity.on_reset`."""
         return ".".join((*self.path, self.trigger))
 
     def strength(self, step: int) -> float:
-        """Return the factor in [0, 1] that the schedule gives the randomization at a training step."""
+        """Return the factor in [0, 1] that the schedule gives the randomisation at a training step."""
         if self.schedule is None or self.schedule_steps <= 0:
             return 1.0
         if self.schedule == "constant":
@@ -111,7 +111,7 @@ class Randomization:
 
 
 def read_randomizations(block: Mapping[str, Any]) -> list[Randomization]:
-    """Return the randomizations of a `domain_randomization:` mapping, without those that rlcli ignores.
+    """Return the randomisations of a `domain_randomization:` mapping, without those that rlcli ignores.
 
     `check` must have accepted the mapping.
     """
@@ -163,7 +163,7 @@ def check(
         elif key == "simulation":
             for attribute in content if isinstance(content, dict) else ():
                 if attribute != "gravity":
-                    problem((*at, attribute), f"'{attribute}' cannot be randomized", "only gravity can")
+                    problem((*at, attribute), f"'{attribute}' cannot be randomised", "only gravity can")
         elif key not in ("observations", "actions"):
             groups = ("observations", "actions", "simulation", *VIEWS)
             problem(at, f"unknown key '{key}'", did_you_mean(key, groups) or f"keys: {listing(groups)}")
@@ -177,7 +177,7 @@ def _check_views(kind: str, views: Any, at: Path, problem: Callable[[Path, str, 
             if attribute not in ATTRIBUTES[kind]:
                 known = ATTRIBUTES[kind]
                 near = did_you_mean(attribute, known) or f"attributes: {listing(known, 40)}"
-                problem((*at, view, attribute), f"'{attribute}' cannot be randomized", near)
+                problem((*at, view, attribute), f"'{attribute}' cannot be randomised", near)
 
 
 def _check_randomization(
@@ -194,7 +194,7 @@ def _check_randomization(
         problem(at, f"unknown key '{trigger}'", did_you_mean(trigger, TRIGGERS) or f"keys: {listing(TRIGGERS)}")
         return
     if trigger == "on_startup" and target[0] not in VIEWS:
-        problem(at, f"{target[0]} cannot be randomized on_startup", "use on_reset or on_interval")
+        problem(at, f"{target[0]} cannot be randomised on_startup", "use on_reset or on_interval")
     if not isinstance(entry, dict):
         problem(at, "expected a mapping", "write {operation: ..., distribution: ..., distribution_parameters: [...]}")
         return
@@ -246,7 +246,7 @@ def _check_numbers(at: Path, entry: Mapping[str, Any], problem: Callable[[Path, 
 
 
 def _entries(block: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield each randomization of a `domain_randomization:` mapping that is not checked yet: its path, and its value.
+    """Yield each randomisation of a `domain_randomization:` mapping that is not checked yet: its path, and its value.
 
     The last step of the path is the trigger (`on_startup`, `on_reset` or `on_interval`), or a wrong key in its place.
     """

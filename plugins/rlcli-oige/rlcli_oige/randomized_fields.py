@@ -1,4 +1,4 @@
-"""Attributes of views and of the model that domain randomization reads and writes."""
+"""Attributes of views and of the model that domain randomisation reads and writes."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _apply_rotation(operation: str, current: Tensor, sample: Tensor) -> Tensor:
 
 
 def make_field(path: tuple[str, ...], env: OigeEnv) -> RandomizedField:
-    """Return the reader and writer of a randomized attribute.
+    """Return the reader and writer of a randomised attribute.
 
     Args:
         path: (simulation, gravity) or (kind of view, view, attribute).

@@ -47,7 +47,7 @@ class XFormPrim(Counterpart):
         self.prim.settings["collisions"] = bool(enabled)
 
     def apply_visual_material(self, *args: Any, **kwargs: Any) -> None:
-        """Do nothing: the model has the colors."""
+        """Do nothing: the model has the colours."""
 
     def set_world_pose(self, position: Any = None, orientation: Any = None) -> None:
         """Place the object in its environment."""

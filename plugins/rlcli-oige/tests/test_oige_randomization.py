@@ -174,7 +174,7 @@ def test_short_episodes_keep_samples_until_min_frequency(tmp_path):
         (arms("damping", on_reset=gate("scaling", "loguniform", [0, 1])), "needs bounds above 0"),
         (arms("damping", on_interval=gate("scaling", "uniform", [1, 2])), "missing keys: frequency_interval"),
         ({"observations": {"on_reset": gate("direct", "uniform", [1, 2])}}, "expected additive or scaling for noise"),
-        ({"simulation": {"dt": {"on_reset": gate("direct", "uniform", [1, 2])}}}, "'dt' cannot be randomized"),
+        ({"simulation": {"dt": {"on_reset": gate("direct", "uniform", [1, 2])}}}, "'dt' cannot be randomised"),
     ],
 )
 def test_invalid_randomization_error_has_key(tmp_path, params, message):

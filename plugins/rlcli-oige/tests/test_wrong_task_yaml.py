@@ -87,20 +87,20 @@ NOISE = f"{BLOCK}.randomization_params.observations.on_reset"
         (
             {"randomization_params": {"simulation": {"wind": {"on_reset": GATE}}}},
             f"{BLOCK}.randomization_params.simulation.wind",
-            "'wind' cannot be randomized",
+            "'wind' cannot be randomised",
             "only gravity can",
         ),
         (
             views("body_mass", on_reset=GATE),
             f"{BLOCK}.randomization_params.articulation_views.arm_view.body_mass",
-            "'body_mass' cannot be randomized",
+            "'body_mass' cannot be randomised",
             "did you mean 'body_masses'",
         ),
         (noise("on_rest"), f"{BLOCK}.randomization_params.observations.on_rest", "unknown key 'on_rest'", "on_reset"),
         (
             noise("on_startup"),
             f"{BLOCK}.randomization_params.observations.on_startup",
-            "observations cannot be randomized on_startup",
+            "observations cannot be randomised on_startup",
             "on_reset or on_interval",
         ),
         ({"randomization_params": {"observations": {"on_reset": 3}}}, NOISE, "expected a mapping", None),

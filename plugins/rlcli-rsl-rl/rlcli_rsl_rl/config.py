@@ -34,9 +34,9 @@ class PolicyConfig(StrictModel):
     state_dependent_std: Literal[False] = False
     """Only false: the standard deviation does not depend on the state."""
     actor_obs_normalization: bool | None = None
-    """Normalize the actor's observations by running mean and standard deviation; null: use empirical_normalization."""
+    """Normalise the actor's observations by running mean and standard deviation; null: use empirical_normalization."""
     critic_obs_normalization: bool | None = None
-    """Normalize the critic's observations; null: use empirical_normalization."""
+    """Normalise the critic's observations; null: use empirical_normalization."""
     actor_hidden_dims: Widths = _WIDE
     """Widths of the actor's hidden layers."""
     critic_hidden_dims: Widths = _WIDE
@@ -76,7 +76,7 @@ class ModelConfig(StrictModel):
     activation: Activation = "elu"
     """Activation between layers."""
     obs_normalization: bool = False
-    """Normalize observations by running mean and standard deviation."""
+    """Normalise observations by running mean and standard deviation."""
     distribution_cfg: DistributionConfig | None = None
     """Distribution of the actions; for the actor only."""
     rnn_type: Literal["lstm"] = "lstm"
@@ -119,7 +119,7 @@ class RndConfig(StrictModel):
     reward_normalization: bool = False
     """Divide the curiosity reward by the standard deviation of its discounted sum."""
     state_normalization: bool = False
-    """Normalize the inputs of the networks."""
+    """Normalise the inputs of the networks."""
     learning_rate: Positive = 1e-3
     """Learning rate of the predictor."""
     num_outputs: Count = 1
@@ -151,7 +151,7 @@ class AlgorithmConfig(StrictModel):
     """Settings of the PPO update."""
 
     class_name: Literal["PPO"] = "PPO"
-    """Proximal policy optimization."""
+    """Proximal policy optimisation."""
     num_learning_epochs: Count = 5
     """Epochs per iteration."""
     num_mini_batches: Count = 4
@@ -159,7 +159,7 @@ class AlgorithmConfig(StrictModel):
     learning_rate: Positive = 1e-3
     """Learning rate."""
     optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
-    """Optimizer."""
+    """Optimiser of both networks."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
     """adaptive: the learning rate follows desired_kl after every minibatch."""
     desired_kl: Positive | None = 0.01
@@ -179,7 +179,7 @@ class AlgorithmConfig(StrictModel):
     max_grad_norm: Positive = 1.0
     """Maximum norm of the gradients; actor and critic are clipped separately."""
     normalize_advantage_per_mini_batch: bool = False
-    """Normalize advantages in each minibatch instead of over the rollout."""
+    """Normalise advantages in each minibatch instead of over the rollout."""
     rnd_cfg: RndConfig | None = None
     """Curiosity reward; null: none."""
     symmetry_cfg: SymmetryConfig | None = None
@@ -224,7 +224,7 @@ class RunnerConfig(AgentConfig):
     critic: ModelConfig | None = None
     """Critic network, in the form of RSL-RL 5."""
     empirical_normalization: bool | None = None
-    """Older form: normalize observations of both networks."""
+    """Older form: normalise observations of both networks."""
     experiment_name: str = ""
     """Ignored: the task and --name set the name of a run."""
     run_name: str = ""

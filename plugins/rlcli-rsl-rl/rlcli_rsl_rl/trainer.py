@@ -141,7 +141,7 @@ class RslRlTrainer(BaseTrainer):
         load_rng_state(state.tensors["rng"])
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load the weights of a saved policy and its observation normalizer into the actor; the critic keeps its own.
+        """Load the weights of a saved policy and its observation normaliser into the actor; the critic keeps its own.
 
         `policy` maps the names of a saved policy, as `policy_tensors` returns them, to tensors.
         """

@@ -120,14 +120,14 @@ def _task(side: Side, agent: str | None) -> Resolved | None:
 def _compare_configurations(one: Resolved | Run, other: Resolved | Run, left: Side, right: Side) -> bool:
     """Print the differences of two configurations, in their values, model files and code.
 
-    Returns:
-        Whether the configurations are equal, except for cosmetic differences.
-
     Args:
         one: configuration of a task, or a run.
         other: the one to compare with; at least one of the two is a task.
         left: what was typed for `one`.
         right: what was typed for `other`.
+
+    Returns:
+        Whether the configurations are equal, except for cosmetic differences.
     """
     from rlcli.runs.config_diff import compare_files, compare_values, run_values, task_values
     from rlcli.runs.provenance import sources

@@ -72,7 +72,7 @@ class TerminationConfig(TermConfig):
 
 
 class EventConfig(TermConfig):
-    """A change of environments at certain times, for example a reset, a push or a randomization."""
+    """A change of environments at certain times, for example a reset, a push or a randomisation."""
 
     mode: Literal["startup", "reset", "interval"]
     """startup: once at the start; reset: when an episode starts; interval: repeatedly."""
