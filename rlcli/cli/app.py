@@ -121,7 +121,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not {"COMP_WORDS", "_TYPER_COMPLETE_ARGS"}.intersection(os.environ) and "complete_" in os.environ.get(
         _COMPLETION_VARIABLE, ""
     ):
-        del os.environ[_COMPLETION_VARIABLE]  # left over from a shell: without its words there is nothing to complete
+        del os.environ[_COMPLETION_VARIABLE]  # left over from a completion: its words are missing
     remember_given([*arguments, *(value for name, value in os.environ.items() if name.startswith("RLCLI_"))])
     console.json, console.debug = "--json" in arguments, "--debug" in arguments
     console.has_document = False  # an earlier command of this process may have printed one
@@ -175,7 +175,7 @@ def _require_words(arguments: list[str]) -> None:
         value: name for name, value in os.environ.items() if name.startswith("RLCLI_")
     }
     for word, place in words.items():
-        if any("\ud800" <= character <= "\udfff" for character in word):  # Python's form of other bytes
+        if any("\ud800" <= character <= "\udfff" for character in word):  # a byte that is not UTF-8
             raise UsageError(f"{place} is not UTF-8: '{word}'", hint="rename the file or folder that it names")
 
 
@@ -328,7 +328,7 @@ def _matching_settings(option: str) -> list[str]:
     key = _SHORT_FOR.get(name, name)
     models: list[dict[str, Any]] = [{"": TaskConfig}, *({"agent": model} for model in _agent_models())]
     keys = list(dict.fromkeys(found for model in models for found in key_locations(model).get(key, [])))
-    return keys if len(keys) <= 3 and name != "task" else []  # the task is an argument
+    return keys if len(keys) <= 3 and name != "task" else []  # `task` is an argument of the commands
 
 
 def _agent_models() -> set[type[BaseModel]]:

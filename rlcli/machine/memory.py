@@ -53,7 +53,7 @@ def available_memory(report: Path = Path("/proc/meminfo")) -> int:
 
 def address_space() -> int | None:
     """Return the limit that `ulimit -v` sets for this process [bytes]; None if there is no limit."""
-    with contextlib.suppress(ImportError):  # Windows
+    with contextlib.suppress(ImportError):  # Windows has no `resource`
         import resource
 
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]

@@ -373,7 +373,7 @@ def content_digest(tensors: Mapping[str, Tensor], document: Mapping[str, Any]) -
     for name in sorted(tensors):
         value = tensors[name].contiguous()
         digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.flatten().view(torch.uint8).numpy().data if value.numel() else b"")  # no copy of it
+        digest.update(value.flatten().view(torch.uint8).numpy().data if value.numel() else b"")  # without a copy
     return digest.hexdigest()
 
 

@@ -76,7 +76,7 @@ class VideoWriter(contextlib.AbstractContextManager["VideoWriter"]):
         self._stride = gif_stride(period) if file.suffix == ".gif" else 1
         self.fps = 1.0 / (period * self._stride)
         self._temporary = file.with_name(f".{file.stem}.tmp{file.suffix}")
-        # duration of a frame: [ms]
+        # a GIF has the duration of a frame [ms]
         settings: dict[str, Any] = {"duration": 10.0 * round(100.0 / self.fps), "loop": 0}
         if file.suffix == ".mp4":
             # H.264 needs an even width and height: macro blocks of 2 pixels keep the size closest
