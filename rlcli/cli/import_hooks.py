@@ -34,7 +34,7 @@ class MatplotlibFinder:
 
     @staticmethod
     def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Return a specification of matplotlib whose loader changes the current folder meanwhile; else None."""
+        """For matplotlib, return a specification whose loader changes the current folder meanwhile; else None."""
         spec = PathFinder.find_spec(name, path, target) if name == "matplotlib" else None
         if spec is None or spec.loader is None or spec.origin is None:
             return None

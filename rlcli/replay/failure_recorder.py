@@ -6,7 +6,8 @@ copied: for each set of terminations the one with the lowest return, the outlier
 the first that diverged for each cause. The thread that writes the next checkpoint writes them to files. When a training
 resumes, files that are newer than the checkpoint are removed, because their episodes are run again.
 
-Recording draws no random numbers and writes nothing to the environment, so that the trained bits stay the same.
+Recording draws no random numbers and writes nothing to the environment, so that the training gives
+the same weights, bit for bit.
 """
 
 import contextlib

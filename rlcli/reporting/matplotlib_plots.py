@@ -20,7 +20,7 @@ from rlcli.safe_text import UNSAFE, shorten
 FORMATS = (".png", ".svg", ".pdf")
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#777777")
-"""The colour-blind safe palette of Okabe and Ito, and two more."""
+"""Colours of lines: the palette of Okabe and Ito, which colour-blind people can distinguish, and two more colours."""
 _STYLES = ("-", "--", ":", "-.")
 """Line styles; the next one is used each time the colours are used up."""
 

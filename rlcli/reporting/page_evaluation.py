@@ -22,7 +22,7 @@ _MAX_VIDEO_BYTES = 24 * 2**20
 
 
 class PageMedia:
-    """Adds the evaluation and the video of a checkpoint to a report. The environment is built when it is needed.
+    """Evaluation and video of a checkpoint, which are added to a report. The environment is built when it is needed.
 
     Args:
         page: the report to which evaluation and video are added.

@@ -1,6 +1,7 @@
 """Summary of each run in a folder, with state, progress and scores, for `rlcli runs`.
 
-It is read from the files of the runs alone, which may be untrusted, and is fast for thousands of runs.
+The summaries are read from the files of the runs alone, which may be untrusted; thousands of runs take little
+time.
 """
 
 import contextlib

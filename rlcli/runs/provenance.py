@@ -1,6 +1,6 @@
 """Record of what may change the results of a run besides its configuration: versions, source code, hardware.
 
-It is stored in run.json, so that a later run can be compared.
+The record is stored in run.json, so that a later run can be compared with this one.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _ASSETS = re.compile(rb"""\bfile\s*=\s*["']([^"']{1,500})["']""")
 _FOLDERS = re.compile(rb"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']{0,500})["']""")
 _MAX_FILES = 256
 _MAX_BYTES = 64 * 1024**2
-"""Size of the files that are hashed for one task [bytes]. The hash of the compiled model covers larger ones."""
+"""Largest total size of a task's files that are hashed [bytes]. The hash of the compiled model covers further files."""
 
 
 def environment_record(resolved: Resolved, engine_threads: int, torch_threads: int) -> dict[str, Any]:

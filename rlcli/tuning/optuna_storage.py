@@ -118,7 +118,7 @@ def _journal(folder: Path, create: bool) -> optuna.storages.BaseStorage:
     lock: Any = FileLock(folder / f".{JOURNAL}")  # the system releases it when the process is killed
 
     class Backend(JournalFileBackend):
-        """Optuna's journal, with repair of lines that a full disk cut short and checks for damage."""
+        """Optuna's journal file. It repairs lines that a full disk cut short, and checks the file for damage."""
 
         def append_logs(self, logs: list[dict[str, Any]]) -> None:
             with lock, disk_errors(file):

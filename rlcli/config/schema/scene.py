@@ -40,7 +40,7 @@ class DomeLightConfig(StrictModel):
     """Ambient light from all directions."""
 
     color: Color = (0.9, 0.9, 0.9)
-    """Red, green, blue in [0, 1]."""
+    """Colour of the light: red, green, blue in [0, 1]."""
     intensity: NotNegative = 500.0
     """Strength, from 0 to 1000; a larger number has no further effect. At 1000 a white surface is fully white."""
 
@@ -174,7 +174,7 @@ class EntityConfig(StrictModel):
     friction: NotNegative = 1.0
     """Coefficient of sliding friction of a shape."""
     color: Color = (0.55, 0.6, 0.65)
-    """Red, green, blue of a shape in [0, 1]."""
+    """Colour of a shape: red, green, blue in [0, 1]."""
     pos: Vec3 | None = None
     """Start position of the root in the environment's frame [m]; null: that in the MJCF, and 0 for a shape. The root is
     the first body of the MJCF, or the shape. It starts there if it can move, and is fixed there otherwise; the rest of

@@ -13,7 +13,7 @@ class TouchedConfig(StrictModel):
     """The bodies of an entity with which a contact sensor measures contacts (its key `against`)."""
 
     entity: str
-    """Name of an entity."""
+    """Entity whose bodies are touched."""
     bodies: Names | None = None
     """Names or regexes of its bodies; null: all bodies."""
 
@@ -24,7 +24,7 @@ class ContactSensorConfig(StrictModel):
     kind: Literal["contact"]
     """Kind of sensor: always contact."""
     entity: str = "robot"
-    """Name of an entity."""
+    """Entity that has the sensor's bodies."""
     bodies: Names
     """Names or regexes of its bodies. Each body has one column, in this order. A body without a geom that can touch
     anything reads 0; at least one must have such a geom."""
@@ -59,7 +59,7 @@ class RaySensorConfig(StrictModel):
     kind: Literal["rays"]
     """Kind of sensor: always rays."""
     entity: str = "robot"
-    """Name of an entity."""
+    """Entity to which the sensor is attached."""
     body: str | None = None
     """The body to which the sensor is attached; null: the root body."""
     pattern: GridPatternConfig | Annotated[list[Direction], Field(min_length=1)]

@@ -94,7 +94,7 @@ class TaskConfig(StrictModel):
     summary: str = ""
     """One line that describes the task."""
     sim: SimConfig
-    """Physics simulation."""
+    """Settings of the physics."""
     decimation: Annotated[Count, Field(le=10_000)]
     """Number of physics steps in an environment step; step_dt = dt x decimation."""
     episode_length_s: Seconds
