@@ -113,7 +113,7 @@ def replay_episodes(
     Args:
         recording: the recording.
         env: an environment with the recorded configuration.
-        episodes: numbers of the episodes to compare.
+        episodes: indices of the episodes to compare, from 0.
         before_step: called with the index of each step.
 
     Raises:

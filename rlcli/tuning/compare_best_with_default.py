@@ -167,9 +167,9 @@ def compare(
 
 @contextmanager
 def _request_of_sweep(sweep: Sweep, request: TrainingRequest) -> Iterator[TrainingRequest]:
-    """Copy a request for a `with` block, with the settings that all trials of a sweep share, except their budget.
+    """Return a copy of a training's request for a `with` block, with the settings that all trials of a sweep share.
 
-    A temporary file has the content of the sweep's `--config` file.
+    The copy keeps the budget of the request. A temporary file has the content of the sweep's `--config` file.
     """
     from rlcli.runs.restore import recorded_task
 

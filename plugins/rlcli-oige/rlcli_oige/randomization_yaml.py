@@ -217,7 +217,7 @@ def _check_randomization(
         if isinstance(count, bool) or not isinstance(count, int | float) or count != int(count) or count < minimum:
             problem((*at, key), f"expected a whole number >= {minimum}, found {count!r}", None)
     if entry["operation"] == "direct" and target[0] in ("observations", "actions"):
-        problem((*at, "operation"), "operation: expected additive or scaling for noise", None)
+        problem((*at, "operation"), f"expected additive or scaling for noise of {target[0]}, found direct", None)
     _check_numbers((*at, "distribution_parameters"), entry, problem)
     status: tuple[Status, str] = ("mapped", "")
     if target[0] in VIEWS:

@@ -173,7 +173,10 @@ def test_short_episodes_keep_samples_until_min_frequency(tmp_path):
         (arms("damping", on_reset=gate("scaling", "uniform", [2, 1])), "a lower bound is above its upper bound"),
         (arms("damping", on_reset=gate("scaling", "loguniform", [0, 1])), "needs bounds above 0"),
         (arms("damping", on_interval=gate("scaling", "uniform", [1, 2])), "missing keys: frequency_interval"),
-        ({"observations": {"on_reset": gate("direct", "uniform", [1, 2])}}, "expected additive or scaling for noise"),
+        (
+            {"observations": {"on_reset": gate("direct", "uniform", [1, 2])}},
+            "expected additive or scaling for noise of observations, found direct",
+        ),
         ({"simulation": {"dt": {"on_reset": gate("direct", "uniform", [1, 2])}}}, "'dt' cannot be randomised"),
     ],
 )
