@@ -149,11 +149,11 @@ def _compare_runs(left: str, right: str, runs: Path, only: list[str] | None) -> 
     from rlcli.runs.run_diff import SECTIONS, compare
 
     one, step = _find(left, runs)
-    other, twin = _find(right, runs)
-    if step is not None and twin is not None and step != twin:
-        message = f"{left} is at step {step}, but {right} is at step {twin}"
+    other, other_step = _find(right, runs)
+    if step is not None and other_step is not None and step != other_step:
+        message = f"{left} is at step {step}, but {right} is at step {other_step}"
         raise UsageError(message, hint="compare checkpoints of the same step: RUN@step:N")
-    until = step if step is not None else twin
+    until = step if step is not None else other_step
     if until is not None:
         for run in (one, other):
             _require_step(run, until)

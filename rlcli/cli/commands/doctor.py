@@ -31,8 +31,8 @@ def command(
         if check.hint:
             console.data(f"{check.state}: {check.name}: {check.hint}")
     broken, warnings = ([check.name for check in checks if check.state == state] for state in ("broken", "warning"))
-    verdict = [f"{word}: {', '.join(names)}" for word, names in (("broken", broken), ("warnings", warnings)) if names]
-    console.data("; ".join(verdict) or "all good")
-    console.document("doctor", healthy=not broken, all_good=not verdict, checks=[asdict(check) for check in checks])
+    faults = [f"{word}: {', '.join(names)}" for word, names in (("broken", broken), ("warnings", warnings)) if names]
+    console.data("; ".join(faults) or "all good")
+    console.document("doctor", healthy=not broken, all_good=not faults, checks=[asdict(check) for check in checks])
     if broken:
         raise typer.Exit(9)

@@ -66,11 +66,11 @@ def command(
     reference = _open_reference(chosen, saved, file, task) if verify else None
     done = export(saved, file, format, None if reference is None else reference.deployment)
     _print_exported(done)
-    verdict = None if reference is None else _verify(reference, saved, done, format, episodes)
+    result = None if reference is None else _verify(reference, saved, done, format, episodes)
     entries = {"observations": done.observations, "max_difference": done.max_difference, "metadata": done.metadata}
-    verified = None if verdict is None else verdict.record()
+    verified = None if result is None else result.record()
     _report(chosen.folder, format, done.file, done.file.stat().st_size, **entries, verified=verified)
-    if verdict is not None and not verdict.holds:
+    if result is not None and not result.holds:
         raise typer.Exit(9)
 
 
@@ -124,33 +124,33 @@ def _verify(
     """Run the exported file in plain MuJoCo, and print the comparison with the run's evaluation."""
     from rlcli.deploy.closed_loop import verify
 
-    verdict = verify(reference, saved, exported, format_, episodes)
-    for source, terms in (("formulas of the metadata", verdict.by_metadata), ("the task's code", verdict.by_task)):
+    result = verify(reference, saved, exported, format_, episodes)
+    for source, terms in (("formulas of the metadata", result.by_metadata), ("the task's code", result.by_task)):
         if terms:
             console.info(f"terms that are computed by {source}: {', '.join(terms)}")
-    if any(term.startswith("force ") for term in verdict.by_task):
+    if any(term.startswith("force ") for term in result.by_task):
         console.info(
-            f"{verdict.program.name} applies no forces: they belong to the environment's code; compute them in your"
+            f"{result.program.name} applies no forces: they belong to the environment's code; compute them in your"
             " program and write them to the MjData before each mj_step"
         )
     rows = [
         [name, f"{found:.2e}", f"{allowed:g}", "holds" if held else "FAILS"]
-        for name, found, allowed, held in verdict.rows()
+        for name, found, allowed, held in result.rows()
     ]
     console.table(["", "FOUND", "ALLOWED", ""], rows)
-    if verdict.differing:
-        console.info(f"the exported file and the task differ in {listing(verdict.differing[:_MAX_KEYS])}")
+    if result.differing:
+        console.info(f"the exported file and the task differ in {listing(result.differing[:_MAX_KEYS])}")
     console.info(
-        f"{verdict.episodes} episodes, mean return {verdict.plain_return:.6g} in plain MuJoCo,"
-        f" {verdict.evaluation_return:.6g} in the run's evaluation"
+        f"{result.episodes} episodes, mean return {result.plain_return:.6g} in plain MuJoCo,"
+        f" {result.evaluation_return:.6g} in the run's evaluation"
     )
-    if verdict.synchronized_return is not None:
+    if result.synchronized_return is not None:
         console.info(
-            f"observations and actions agree, but returns differ by {verdict.return_difference:.2%}: rounding errors"
+            f"observations and actions agree, but returns differ by {result.return_difference:.2%}: rounding errors"
             " grow chaotically; re-synchronised after every step, the mean return is"
-            f" {verdict.synchronized_return:.6g}, and the states disagree after {verdict.disagreeing_steps} steps"
+            f" {result.synchronized_return:.6g}, and the states disagree after {result.disagreeing_steps} steps"
         )
-    return verdict
+    return result
 
 
 def _report(checkpoint: Path, format_: str, file: Path, size: int, **entries: Any) -> None:
