@@ -1,4 +1,4 @@
-"""Termination terms: where an episode ends. (num_envs,) bool each."""
+"""Termination terms. Each returns the environments whose episode ends, (num_envs,) bool."""
 
 from __future__ import annotations
 

@@ -176,7 +176,7 @@ def stand_still_joint_deviation_l1(
 def joint_vel_limits(
     env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", soft_ratio: float = 1.0
 ) -> Tensor:
-    """Sum of joint speeds' excess over `soft_ratio` x `velocity_limit`, each at most 1 [m/s or rad/s]. (num_envs,)"""
+    """Sum of max(speed - `soft_ratio` x `velocity_limit`, 0) over joints, each at most 1 [m/s or rad/s]. (num_envs,)"""
     excess = entity.data.joint_vel_of(joints).abs() - entity.data.joint_vel_limits[joints] * soft_ratio
     return excess.clamp_(0.0, 1.0).sum(dim=1)
 
