@@ -142,7 +142,7 @@ class Learner:
             self._kl_sum += self._minibatch_kl
 
     def compute_gradient(self, minibatch_gradient: MinibatchGradient, batch: Samples, number: int) -> LossResult:
-        """Return the loss of a minibatch; its gradient and its KL divergence are then in `gradient_and_kl`."""
+        """Return the loss of a minibatch, and write its gradient and its KL divergence to `gradient_and_kl`."""
         config, old_std = self.config, self.collector.rollout.old_std[number]
         obs, critic_obs = self.network_inputs(batch, number)
         advantage = batch.advantage
