@@ -1,4 +1,4 @@
-"""rl_games' settings in the form of a train YAML, under `params`.
+"""Settings of the rl_games trainer: the mapping `params` of rl_games' own YAML files.
 
 The module imports neither torch nor rl_games, so that a YAML is checked fast.
 """
@@ -15,7 +15,7 @@ from rlcli.trainers import TrainerSpec
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Activation = Literal["elu", "relu", "tanh", "swish"]
-"""Activations that a saved policy supports too; swish is SiLU."""
+"""Activations of rl_games that a saved policy supports as well; swish is SiLU."""
 Initializer = dict[str, str | int | float]
 """`{name: default}`, or another initializer of rl_games with its parameters."""
 Nothing = Literal["None"] | None
@@ -71,7 +71,7 @@ class MlpConfig(StrictModel):
     regularizer: dict[str, Any] | None = None
     """Ignored, as in rl_games."""
     d2rl: Literal[False] = False
-    """Only the first layer receives the input."""
+    """Whether every hidden layer also receives the input (a D2RL network): not supported."""
 
 
 class ContinuousConfig(StrictModel):
@@ -240,7 +240,8 @@ class PpoSettings(_Settings):
     @model_validator(mode="after")
     def _minibatch(self) -> PpoSettings:
         if (self.minibatch_size is None) == (self.minibatch_size_per_env is None):
-            raise ValueError("no minibatch size: give minibatch_size or minibatch_size_per_env")
+            found = "neither" if self.minibatch_size is None else "both"
+            raise ValueError(f"give one of minibatch_size and minibatch_size_per_env; found {found}")
         return self
 
 
