@@ -17,7 +17,7 @@ def entity_name(collection: str, item: str) -> str:
 
 
 class CollectionData:
-    """State of a collection: `object_X` is the attribute `root_X` of each object. (num_envs, objects, ...)"""
+    """State of a collection: `object_X` has the attribute `root_X` of all its objects. (num_envs, objects, ...)"""
 
     def __init__(self, objects: list[Asset]) -> None:
         self._objects = objects
@@ -66,7 +66,10 @@ class RigidObjectCollection:
     )  # fmt: skip
 
     def _each(self, values: Tensor, object_ids: Any) -> list[tuple[Asset, Tensor]]:
-        """Return (object, its values) of each object; `values` may lack the dimension of environments."""
+        """Return (object, values of the object) for each object of `object_ids`; None: all objects.
+
+        `values` is (rows, objects, ...); without the first dimension, they are for all environments.
+        """
         values = values if values.dim() == 3 else values[None]
         ids = list(range(self.num_objects))
         if object_ids is not None and not isinstance(object_ids, slice):

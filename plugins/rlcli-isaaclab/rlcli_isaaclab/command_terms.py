@@ -1,6 +1,6 @@
-"""Command classes with Isaac Lab's interface, for the user's subclasses and for code that reads their attributes.
+"""Command classes with Isaac Lab's interface, for the user's subclasses and for terms that read their attributes.
 
-Elsewhere Isaac Lab's own commands become rlcli's built-in commands.
+Otherwise a command of Isaac Lab is replaced by rlcli's built-in command.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rlcli_isaaclab.utils.math import (
 
 
 class _RobotCommand(CommandTerm):
-    """Base of commands to one robot."""
+    """Base class of commands for one robot."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)

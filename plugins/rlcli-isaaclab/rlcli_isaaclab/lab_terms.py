@@ -1,4 +1,4 @@
-"""Terms of Isaac Lab that are written here in its form, because no built-in term of rlcli has their parameters."""
+"""Terms of Isaac Lab, written again in its form, because no built-in term of rlcli has their parameters."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from rlcli_isaaclab.utils.math import quat_apply_inverse, sample_uniform
 
 @dataclass(frozen=True, slots=True)
 class LabTerm:
-    """A term of Isaac Lab that is run by a function of this module."""
+    """Term of Isaac Lab that a function or class of this module replaces."""
 
     function: Any
     needed: Callable[[Mapping[str, Any]], bool]
-    """Whether these parameters need the function; otherwise the built-in term of the same name is used."""
+    """Function from the term's parameters to whether they need `function`, not the built-in term of the same name."""
 
 
 def last_action_of_term(env: Any, action_name: str) -> Tensor:
