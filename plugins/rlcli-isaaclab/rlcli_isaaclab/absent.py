@@ -44,7 +44,7 @@ _REASONS = {
 
 
 def reason_of(name: str) -> tuple[str, str]:
-    """Return (why rlcli does not have a name of Isaac Lab or Isaac Sim, what to do instead)."""
+    """Return the reason why rlcli does not have a name of Isaac Lab or Isaac Sim, and a hint what to do instead."""
     top = name.partition(".")[0]
     library = "trimesh" if top == "trimesh" else LIBRARIES.get(top)
     if library is not None:
@@ -143,7 +143,7 @@ class AbsentValue:
     __ror__ = __add__ = __radd__ = __or__
 
     def __call__(self, *args: Any, **settings: Any) -> Any:
-        """Raise TaskError: rlcli does not have this name."""
+        """Raise TaskError: rlcli does not have the class or function that this object replaces."""
         raise absence(self.absent_name)
 
     def __repr__(self) -> str:
@@ -171,13 +171,13 @@ class AbsentModule(ModuleType):
         return module_of(f"{self.__name__}.{name}", "")
 
     def __call__(self, *args: Any, **settings: Any) -> Any:
-        """Raise TaskError: rlcli does not have this name."""
+        """Raise TaskError: rlcli does not have the class or function that this object replaces."""
         raise absence(self.__name__)
 
 
 @functools.cache
 def absent_module(name: str) -> AbsentModule:
-    """Return the stand-in of a module."""
+    """Return an object that replaces a module of Isaac Lab or Isaac Sim that rlcli does not have."""
     module = AbsentModule(name)
     module.__path__ = []
     return module
@@ -189,12 +189,12 @@ def absent_class(name: str) -> type:
 
 
 def absent_value(name: str) -> AbsentValue:
-    """Return the stand-in of a constant."""
+    """Return an object that replaces a constant of Isaac Lab that rlcli does not have."""
     return AbsentValue(name)
 
 
 def absent_function(name: str) -> AbsentValue:
-    """Return the stand-in of a function."""
+    """Return an object that replaces a function of Isaac Lab that rlcli does not have."""
     return AbsentValue(name)
 
 

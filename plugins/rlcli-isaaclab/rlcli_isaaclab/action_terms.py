@@ -18,7 +18,7 @@ _OWN = "rlcli_isaaclab"
 
 
 class AffineActionTerm(ActionTerm):
-    """Base class of actions of the form clip(raw x scale + offset).
+    """Base class of actions of the form clip(action x scale + offset).
 
     scale, offset: a number, or a mapping from regular expressions of element names to numbers.
     """
@@ -87,7 +87,7 @@ class JointAction(AffineActionTerm):
 
 
 class JointPositionAction(JointAction):
-    """Position targets of joints [m or rad]."""
+    """Action whose columns are position targets of joints, after scale and offset [m or rad]."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -114,7 +114,7 @@ class RelativeJointPositionAction(JointAction):
 
 
 class JointVelocityAction(JointAction):
-    """Velocity targets of joints [m/s or rad/s]."""
+    """Action whose columns are velocity targets of joints, after scale and offset [m/s or rad/s]."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -127,7 +127,7 @@ class JointVelocityAction(JointAction):
 
 
 class JointEffortAction(JointAction):
-    """Efforts of joints [N or N m]."""
+    """Action whose columns are efforts of joint motors, after scale and offset [N or N m]."""
 
     def apply_actions(self) -> None:
         """Write the efforts of the joints."""

@@ -178,7 +178,7 @@ def merge_joint_settings(
     Args:
         settings: settings of the joints, from `read_actuators`.
         model: names and values of the entity's MJCF, from `SceneReader`.
-        driven: joint -> what an action commands: effort, velocity or position.
+        driven: joint -> the quantity that an action sets: effort, motor, velocity or position.
         name: name of the entity.
         report: receives what is approximated.
     """

@@ -223,7 +223,7 @@ class PhysxView:
 
     @property
     def max_shapes(self) -> int:
-        """Number of geoms."""
+        """Number of collision shapes (geoms) of the asset."""
         return len(self._entity.ids["Geoms"])
 
     def get_material_properties(self) -> Tensor:
@@ -241,7 +241,7 @@ class PhysxView:
         self._write_model("geom_friction", friction, indices, "Geoms")
 
     def get_dof_limits(self) -> Tensor:
-        """Return position limits of the joints. (num_envs, joints, 2) [m or rad]"""
+        """Return lower and upper position limits of the joints. (num_envs, joints, 2) [m or rad]"""
         limits = self._entity.data.joint_pos_limits
         return limits.expand(self._env.num_envs, *limits.shape[-2:]).clone()
 
@@ -265,7 +265,7 @@ class PhysxView:
         return torch.stack([jacobian(positions[:, i + 1]) for i, jacobian in enumerate(self._jacobians)], dim=1)
 
     def get_generalized_mass_matrices(self) -> Tensor:
-        """Return the inertia of the joints. (num_envs, joints, joints) [kg, kg m^2]"""
+        """Return the mass matrix of the asset in joint coordinates. (num_envs, joints, joints) [kg or kg m^2]"""
         inertia, motion = self._composite_inertia(), self._motion()
         forces = (inertia @ motion[..., None])[..., 0]
         matrix = torch.einsum("eid,ejd->eij", forces, motion) * self._is_below

@@ -30,7 +30,7 @@ class CollectionData:
 
 
 class RigidObjectCollection:
-    """Several rigid objects under one name."""
+    """Collection of rigid objects: one asset that reads and writes several objects at once."""
 
     def __init__(self, cfg: Any, objects: dict[str, Asset]) -> None:
         self.cfg, self.object_names = cfg, list(objects)
@@ -50,7 +50,7 @@ class RigidObjectCollection:
         self.write_object_velocity_to_sim(object_state[..., 7:], env_ids, object_ids)
 
     def write_object_pose_to_sim(self, object_pose: Tensor, env_ids: Any = None, object_ids: Any = None) -> None:
-        """Set positions [m] and quaternions (w, x, y, z), world frame. (rows, objects, 7)"""
+        """Set the poses of objects: positions [m] and quaternions (w, x, y, z), world frame. (rows, objects, 7)"""
         for item, values in self._each(object_pose, object_ids):
             item.write_root_pose_to_sim(values, env_ids)
 

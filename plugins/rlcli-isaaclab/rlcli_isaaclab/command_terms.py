@@ -53,7 +53,7 @@ class UniformVelocityCommand(_RobotCommand):
 
     @property
     def command(self) -> Tensor:
-        """Velocity. (num_envs, 3)"""
+        """Commanded velocities: forwards, to the left [m/s], and yaw rate [rad/s]. (num_envs, 3)"""
         return self.vel_command_b
 
     def _update_metrics(self) -> None:
@@ -111,7 +111,7 @@ class UniformPoseCommand(_RobotCommand):
 
     @property
     def command(self) -> Tensor:
-        """Position [m] and quaternion (w, x, y, z). (num_envs, 7)"""
+        """Commanded position [m] and quaternion (w, x, y, z), in the robot's root frame. (num_envs, 7)"""
         return self.pose_command_b
 
     def _update_metrics(self) -> None:
@@ -141,7 +141,7 @@ class UniformPose2dCommand(_RobotCommand):
 
     @property
     def command(self) -> Tensor:
-        """Position [m] and heading [rad]. (num_envs, 4)"""
+        """Vector to the commanded position [m], and angle to the heading [rad], in the root frame. (num_envs, 4)"""
         return torch.cat([self.pos_command_b, self.heading_command_b[:, None]], dim=1)
 
     def _update_metrics(self) -> None:

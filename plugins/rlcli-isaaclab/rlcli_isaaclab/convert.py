@@ -79,7 +79,7 @@ def task(
 
 
 _OPTIONAL = ("events", "terminations", "curriculum", "commands")
-"""Sections that may be empty."""
+"""Sections of a manager-based configuration that may be missing."""
 
 
 def _own_members(value: Any, section: str, report: Report) -> Any:

@@ -79,7 +79,8 @@ class ChangedSetting:
         changed = set(self._numbers(_moved(self.start)).items()) - set(self._numbers(self.start).items())
         names = sorted(name for name, _ in changed)
         self.addresses = [(f"address_{index}", name) for index, name in enumerate(names)]
-        """Parameter of the curriculum term -> address of a setting of rlcli that depends on the value."""
+        """Pairs of a parameter of the curriculum term and the address of a setting of rlcli, such as
+        `rewards.alive.weight`, that depends on the value."""
 
     def translate(self, value: Any) -> list[Any]:
         """Return the values of rlcli's settings for a value of Isaac Lab's setting, in the order of `addresses`."""
@@ -87,7 +88,7 @@ class ChangedSetting:
         return [found[name] for _, name in self.addresses]
 
     def write(self, env: Any, value: Any) -> None:
-        """Set the value in the user's own term."""
+        """Write a value into the term of the environment that runs the user's own code."""
         bound = env.managed._bound.get(self.section, [])
         if self.section == "observations":
             bound = env.managed._observations[self.term[0]]
@@ -130,7 +131,10 @@ def _is_number(value: Any) -> bool:
 
 
 def _moved(value: Any) -> Any:
-    """Return a value with 1 added to every number: settings of rlcli that change with it depend on the value."""
+    """Return a setting with 1 added to each of its numbers.
+
+    Settings of rlcli that differ after a translation of the changed value depend on this setting.
+    """
     if isinstance(value, list | tuple):
         return type(value)(_moved(item) for item in value)
     return value + 1.0

@@ -109,4 +109,4 @@ LAB_TERMS: dict[str, LabTerm] = {
     "action_l2_clamped": LabTerm(action_l2_clamped, _always),
     "action_rate_l2_clamped": LabTerm(action_rate_l2_clamped, _always),
 }
-"""Isaac Lab's name -> term."""
+"""Isaac Lab's name of a term -> its copy in this module, and the condition under which the copy is used."""

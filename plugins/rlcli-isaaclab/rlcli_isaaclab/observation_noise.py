@@ -15,7 +15,7 @@ class NoNoise:
     """Noise model without noise, and base class of the other noise models."""
 
     def __call__(self, data: Tensor) -> Tensor:
-        """Return the data unchanged; a noise model returns the data with noise."""
+        """Return the observation `data` unchanged; subclasses return it with noise. (num_envs, d)"""
         return data
 
     def reset(self, env_ids: Any) -> None:
@@ -29,7 +29,7 @@ class NoiseModel(NoNoise):
         self._cfg = cfg
 
     def __call__(self, data: Tensor) -> Tensor:
-        """Return the data with noise."""
+        """Return the observation `data` with noise. (num_envs, d)"""
         return _with_noise(self._cfg.noise_cfg, data)
 
 
@@ -42,7 +42,7 @@ class NoiseModelWithAdditiveBias(NoiseModel):
         self._per_component = bool(getattr(cfg, "sample_bias_per_component", True))
 
     def __call__(self, data: Tensor) -> Tensor:
-        """Return the data with noise."""
+        """Return the observation `data` with noise. (num_envs, d)"""
         if self._per_component and self._bias.shape[1] != data.shape[1]:
             self._bias = self._bias.repeat(1, data.shape[1])
             self.reset(slice(None))

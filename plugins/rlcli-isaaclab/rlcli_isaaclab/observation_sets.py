@@ -59,7 +59,7 @@ def _names(sets: Mapping[str, Any], observations: Mapping[str, Any], *keys: str)
 
 
 def _merged(groups: list[str], observations: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the group `policy` with the terms of several groups, each with the settings of its own group."""
+    """Return one observation group with the terms of several groups; each term keeps the settings of its group."""
     merged: dict[str, Any] = {"enable_corruption": True, "history": None}
     if "policy" not in groups:
         merged |= dict.fromkeys(_terms(observations["policy"]))

@@ -64,7 +64,7 @@ class OperationalSpaceController:
         return self.target_dim + _GAINS[self.cfg.impedance_mode]
 
     def reset(self) -> None:
-        """Forget the targets."""
+        """Remove the targets of the last command."""
         self.desired_ee_pose_b = self.desired_ee_wrench_b = None
 
     def set_command(

@@ -83,7 +83,10 @@ class EventParameters:
         return {} if names is None else {parameter: names}
 
     def sampling(self, operation: str, distribution: str = "uniform") -> TermConfig:
-        """Return `operation` and `distribution` of rlcli's term; the arguments are Isaac Lab's defaults."""
+        """Return the keys `operation` and `distribution` for rlcli's term, from Isaac Lab's parameters.
+
+        The arguments are the values that Isaac Lab uses if the parameters are not set.
+        """
         operation = self.params.get("operation", operation)
         distribution = self.params.get("distribution", distribution)
         return {
