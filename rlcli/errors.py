@@ -54,7 +54,7 @@ class Problem:
     message: str
     """What is wrong, and what is allowed."""
     hint: str | None = None
-    """What to do."""
+    """What the user can do about the mistake."""
 
     def __post_init__(self) -> None:
         """Make each part one line of limited length."""

@@ -73,7 +73,7 @@ _LOADERS = {registry.TASKS: describe, registry.TRAINERS: try_trainer, registry.F
 
 
 def main(arguments: list[str]) -> None:
-    """Append a description of each named plugin to a file, or print the index of a distribution."""
+    """Append a description of each named plugin to a file, or print the `index.json` of a distribution's plugins."""
     parser = argparse.ArgumentParser(prog="python -m rlcli.envs.describe_plugins", description=__doc__)
     parser.add_argument("--index", metavar="DISTRIBUTION", help="print the index.json of this distribution")
     parser.add_argument("group", nargs="?", choices=_LOADERS)

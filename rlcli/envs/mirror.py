@@ -87,7 +87,7 @@ def mirror_maps(resolved: Resolved, groups: Iterable[str], *, tolerance: float) 
 
 
 def _pairs_on_a_plane(resolved: Resolved) -> Resolved:
-    """Return the task with 2 x `_PAIRS` environments, and a plane instead of a terrain."""
+    """Return the task as `_MirrorTest` needs it: with 2 x `_PAIRS` environments, and a plane instead of a terrain."""
     scene = resolved.task.scene
     sensors = {
         name: config.model_copy(update={"lookup": False}) if isinstance(config, RaySensorConfig) else config

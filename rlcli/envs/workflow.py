@@ -51,7 +51,7 @@ class Workflow(Environment):
 
     @abstractmethod
     def _compute_rewards_and_dones(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return reward, terminated and truncated. (num_envs,) each"""
+        """Return reward, terminated and truncated of the step, before any reset. (num_envs,) each"""
 
     @abstractmethod
     def _compute_final_obs(self) -> dict[str, Tensor]:

@@ -39,7 +39,7 @@ class Regulator:
     """LQR as a policy: action = -gain (observation - rest), clamped to the bound."""
 
     gain: Matrix
-    """(actions, observations)"""
+    """Gain matrix K of the regulator. (actions, observations)"""
     rest: Matrix
     """The observation of the equilibrium. (observations,)"""
     bound: float | None

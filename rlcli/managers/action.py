@@ -24,7 +24,7 @@ class CommandMap:
     """
 
     scale: tuple[float, ...]
-    """Factor of each column."""
+    """Factor on each column of the action."""
     offset: tuple[float, ...]
     """Number that is added to each scaled column, in the command's unit."""
     clip: tuple[tuple[float, float], ...] | None

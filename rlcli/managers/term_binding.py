@@ -49,7 +49,9 @@ class BoundTerm:
     stream: np.uint64
     """Index of the term's random stream."""
     memory: AttributeState | None = None
-    """Saver of the attributes, for a term that is a class in the task's code and has no `state_dict`; else None."""
+    """Object that saves the term's attributes in checkpoints, for a class in the task's code without `state_dict`.
+
+    None for other terms, which have a `state_dict` or no state."""
 
     @property
     def instance(self) -> Any:

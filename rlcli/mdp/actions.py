@@ -84,7 +84,7 @@ class _ScaledJointAction(_JointAction):
 
 @dataclass(kw_only=True, eq=False)
 class _AffineJointAction(_ScaledJointAction):
-    """Base class of actions of the form raw x scale + offset, which exported policies can contain as a formula."""
+    """Base class of actions of the form action x scale + offset, which exported policies can contain as a formula."""
 
     offset: float | dict[str, float] = 0.0
 
@@ -115,7 +115,7 @@ class _AffineJointAction(_ScaledJointAction):
 
 @dataclass(kw_only=True, eq=False)
 class _AffineAboutDefault(_AffineJointAction):
-    """Base class of actions of the form raw x scale + offset + default value of the joint.
+    """Base class of actions of the form action x scale + offset + default value of the joint.
 
     `use_default_offset: false` omits the default value.
     """
@@ -132,14 +132,14 @@ class _AffineAboutDefault(_AffineJointAction):
 
 
 class JointEffort(_AffineJointAction):
-    """Efforts of joint motors: raw x scale + offset [N or N m]. Isaac Lab: JointEffortAction."""
+    """Efforts of joint motors: action x scale + offset [N or N m]. Isaac Lab: JointEffortAction."""
 
     actuator = "motor"
     unit = "N or N m"
 
 
 class JointPosition(_AffineAboutDefault):
-    """Targets of position actuators: raw x scale + offset + default position [m or rad].
+    """Targets of position actuators: action x scale + offset + default position [m or rad].
 
     `use_default_offset: false` omits the default position. Isaac Lab: JointPositionAction.
     """
@@ -150,7 +150,7 @@ class JointPosition(_AffineAboutDefault):
 
 
 class JointVelocity(_AffineAboutDefault):
-    """Targets of velocity actuators: raw x scale + offset + default velocity [m/s or rad/s].
+    """Targets of velocity actuators: action x scale + offset + default velocity [m/s or rad/s].
 
     `use_default_offset: false` omits the default velocity. Isaac Lab: JointVelocityAction.
     """
@@ -161,7 +161,7 @@ class JointVelocity(_AffineAboutDefault):
 
 
 class RelativeJointPosition(_ScaledJointAction):
-    """Targets of position actuators: the current joint position + raw x scale [m or rad].
+    """Targets of position actuators: the current joint position + action x scale [m or rad].
 
     Isaac Lab: RelativeJointPositionAction.
     """
@@ -175,9 +175,9 @@ class RelativeJointPosition(_ScaledJointAction):
 
 @dataclass(kw_only=True, eq=False)
 class JointPositionToLimits(_ScaledJointAction):
-    """Targets of position actuators: raw x scale, clipped to [-1, 1] and mapped linearly to the soft limits [m or rad].
+    """Targets of position actuators: action x scale, clipped to [-1, 1] and mapped to the soft limits [m or rad].
 
-    With `rescale_to_limits: false` raw x scale is the target itself, clipped to the soft limits. Isaac Lab:
+    With `rescale_to_limits: false` action x scale is the target itself, clipped to the soft limits. Isaac Lab:
     JointPositionToLimitsAction.
     """
 
@@ -266,9 +266,9 @@ class _BinaryJoint(_JointAction):
 
 
 class BinaryJointPosition(_BinaryJoint):
-    """Gripper positions: `open_command` where raw >= threshold, else `close_command` [m or rad].
+    """Gripper positions: `open_command` where the action is at least `threshold`, else `close_command` [m or rad].
 
-    raw: the single column of the action. The two commands map joint names or patterns to positions. Isaac Lab:
+    The action has one column. The two commands map joint names or patterns to positions. Isaac Lab:
     BinaryJointPositionAction, and AbsBinaryJointPositionAction with its threshold.
     """
 
@@ -277,9 +277,9 @@ class BinaryJointPosition(_BinaryJoint):
 
 
 class BinaryJointVelocity(_BinaryJoint):
-    """Gripper velocities: `open_command` where raw >= threshold, else `close_command` [m/s or rad/s].
+    """Gripper velocities: `open_command` where the action is at least `threshold`, else `close_command` [m/s or rad/s].
 
-    raw: the single column of the action. The two commands map joint names or patterns to velocities. Isaac Lab:
+    The action has one column. The two commands map joint names or patterns to velocities. Isaac Lab:
     BinaryJointVelocityAction.
     """
 

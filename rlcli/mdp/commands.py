@@ -219,7 +219,7 @@ class UniformPose(EntityTerm):
 
     @property
     def limits(self) -> list[Range]:
-        """Ranges of the position [m]."""
+        """Ranges of the commanded position: x, y and z [m]."""
         return [(low, high) for low, high in self._ranges[:3]]
 
     @property

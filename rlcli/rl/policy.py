@@ -99,7 +99,7 @@ class Normalizer(nn.Module):
     var: Tensor
     """Variance of the observations. (size,)"""
     count: Tensor
-    """Number of observations so far. ()"""
+    """Number of observations so far. (scalar)"""
 
     def __init__(self, size: int | tuple[()], clip: float | None = 10.0) -> None:
         super().__init__()

@@ -95,7 +95,8 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
             warnings.simplefilter("error")  # a set in which another one seems to begin
             regex = re.compile(pattern)
     except (re.error, OverflowError, RecursionError, FutureWarning) as error:
-        raise NameProblem(f"'{pattern}' is neither a {what} nor a regular expression ({error}); correct it") from None
+        message = f"'{pattern}' is neither the name of a {what} nor a regular expression ({error}); correct it"
+        raise NameProblem(message) from None
     found = [position for position, name in enumerate(names) if regex.fullmatch(name)]
     if not found:
         suggestion = did_you_mean(pattern, names)
@@ -123,7 +124,7 @@ class _Part:
         return max(self._most[0], self.repeats), max(self._most[1], self.options)
 
     def next_alternative(self) -> None:
-        """Begin to read the next alternative."""
+        """Start the counts for the next alternative of the pattern, after a `|`."""
         self._most = self.most()
         self.repeats = self.options = 0
         self.varies, self.last_varies = True, False

@@ -83,7 +83,7 @@ def check_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False) ->
 
 @dataclass(slots=True)
 class ModelsTogether:
-    """Models of one scene, which may be too large together, one for each entity.
+    """Models of the entities of one scene, and their cost together, which is limited.
 
     Models of installed packages are not counted.
     """

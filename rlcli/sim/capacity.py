@@ -75,7 +75,7 @@ def _upper_bound(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 def _contact_rows(model: mujoco.MjModel, condim: int) -> int:
-    """Return the number of constraint rows of a contact."""
+    """Return the number of constraint rows of a contact with the dimension `condim` and the model's friction cone."""
     pyramidal = model.opt.cone == int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
     return 1 if condim == 1 else 2 * (condim - 1) if pyramidal else condim
 

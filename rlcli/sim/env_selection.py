@@ -88,7 +88,7 @@ class Selection(Protocol):
         """Add to the selected environments' rows of a (num_envs, ...) tensor."""
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean of a (num_envs,) tensor over the selected environments. ()"""
+        """Return the mean of a (num_envs,) tensor over the selected environments. (scalar)"""
 
     def where(self, mask: Field) -> Selection | None:
         """Return a selection of the rows where `mask` (num_envs,) is true; None if it is known to be empty."""
@@ -196,7 +196,7 @@ class IdSelection:
         _as_array(field)[_index(self.ids, columns)] += _as_array(values)
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean of a (num_envs,) tensor over the selected environments. ()"""
+        """Return the mean of a (num_envs,) tensor over the selected environments. (scalar)"""
         return self.read(values).float().mean()
 
     def where(self, mask: Field) -> IdSelection | None:

@@ -40,7 +40,7 @@ class MaskSelection:
 
     @property
     def count(self) -> Tensor:
-        """Number of selected environments. ()"""
+        """Number of selected environments. (scalar)"""
         return self.mask.sum()
 
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
@@ -91,7 +91,7 @@ class MaskSelection:
         self.write(field, part + values, columns)
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean of a (num_envs,) tensor over the masked rows; 0 for no rows. ()"""
+        """Return the mean of a (num_envs,) tensor over the masked rows; 0 for no rows. (scalar)"""
         return torch.where(self.mask, values.float(), 0.0).sum() / self.count.clamp(min=1)
 
     def where(self, mask: Tensor) -> MaskSelection:

@@ -26,7 +26,7 @@ class TensorState:
 
 
 def mean_of(values: Tensor) -> Tensor:
-    """Return the mean of all values; if all values are equal, exactly this value, without rounding. ()"""
+    """Return the mean of all values; if all values are equal, exactly this value, without rounding. (scalar)"""
     values = values.flatten().float()
     return torch.where((values == values[0]).all(), values[0], values.mean())
 

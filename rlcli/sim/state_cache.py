@@ -43,7 +43,7 @@ class SimData:
         self.stamp = 0
         """Number of updates of the state so far; a value that was cached at a smaller number is out of date."""
         self.command_stamp = 0
-        """Number of updates of the commands so far; a value that `once_per_goal` cached before is out of date."""
+        """Number of updates of the commands so far. With each update, the values that `once_per_goal` caches expire."""
         self._goals: dict[tuple[object, ...], tuple[tuple[int, int, int], Tensor]] = {}
         self._saved_at, self._summed = -1, (-1, 0.0)
         self._moved: Selection | None = None

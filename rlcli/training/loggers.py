@@ -34,7 +34,7 @@ class LoggerKind:
     factory: str
     """`module:name` of the class."""
     title: str
-    """Name in messages."""
+    """Name of the logger in messages."""
 
 
 LOGGERS = {

@@ -19,7 +19,7 @@ class Threshold:
     """Threshold of the option `--until KEY=X`: mean that an evaluation must reach."""
 
     key: str
-    """success, return or length."""
+    """Metric of the evaluation: success, return or length."""
     value: float
 
     def reached_by(self, row: Mapping[str, Any]) -> bool:

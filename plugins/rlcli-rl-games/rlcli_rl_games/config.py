@@ -33,9 +33,9 @@ IGNORED: Mapping[str, str] = {
     "num_actors": "use scene.num_envs",
     "score_to_win": "training runs until its limit of iterations or steps",
     "save_best_after": "use save_interval",
-    "print_stats": "",
+    "print_stats": "rlcli prints its own statistics",
     "player": "use rlcli play",
-    "games_to_track": "",
+    "games_to_track": "rlcli averages over at least 100 episodes",
     "max_frames": "use --max-steps",
     "seq_length": "sequences of recurrent networks are whole rollouts",
     "num_seed_steps": "rl_games itself does not read it",
@@ -56,7 +56,7 @@ class Named(StrictModel):
     """Reference to an algorithm or a model of rl_games by its name."""
 
     name: str
-    """Name in rl_games."""
+    """Name of the algorithm or model in rl_games."""
 
 
 class MlpConfig(StrictModel):

@@ -32,7 +32,7 @@ class ReplayBuffer(VectorizedReplayBuffer):
         self.vec = vec
 
     def add(self, obs: Tensor, action: Tensor, reward: Tensor, next_obs: Tensor, done: Tensor) -> None:
-        """Store a step of every environment."""
+        """Store one transition of every environment: a step from `obs` to `next_obs`."""
         step = self.vec.result
         assert step is not None
         if step.final_obs is not None:

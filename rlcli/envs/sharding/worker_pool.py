@@ -96,7 +96,7 @@ class Worker:
         return self._process.pid
 
     def has_ended(self) -> bool:
-        """Return whether the process has ended."""
+        """Return whether the worker process has ended."""
         return self._process.poll() is not None
 
     def disconnect(self) -> None:

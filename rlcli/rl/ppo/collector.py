@@ -84,7 +84,7 @@ class Collector:
         self.initial_hidden_state = {name: state.clone() for name, state in self.hidden_state.items()}
         """Hidden states at the beginning of the rollout."""
         self.explained_variance = torch.zeros((), device=device)
-        """Explained variance of the critic: 1 - Var(target - value) / Var(target). ()"""
+        """Explained variance of the critic: 1 - Var(target - value) / Var(target). (scalar)"""
 
     # --- the rollout ---
 

@@ -186,7 +186,7 @@ class RlGamesReader:
                     self.problem(inner, f"val: expected a number between -{_MAX_ABS_LOG_STD} and {_MAX_ABS_LOG_STD}")
                     continue
                 self.put(("init_std",), math.exp(log_std), inner)
-                self.note(inner, "mapped", "init_std")
+                self.note(inner, "mapped", "the key `init_std` of ppo")
             elif key == "fixed_sigma" and value is not True:
                 self.note(inner, "approximated", "the standard deviation never depends on the state")
             else:
