@@ -85,7 +85,7 @@ class Activation(NamedTuple):
     """Activation and its gradient on preallocated tensors."""
 
     forward: Callable[[Tensor, Tensor], object]
-    """forward(inputs, out)"""
+    """forward(inputs, out) writes the activations of the inputs to `out`."""
     backward: Callable[[Tensor, Tensor, Tensor], object]
     """backward(gradient, inputs, outputs) replaces the gradient of the outputs by the gradient of the inputs."""
 

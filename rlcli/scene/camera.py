@@ -221,7 +221,7 @@ class RendererPool:
 
     @property
     def count(self) -> int:
-        """Number of threads."""
+        """Number of threads that render."""
         return len(self._threads)
 
     def run(self, work: Sequence[Callable[[CameraRenderer], None]]) -> None:

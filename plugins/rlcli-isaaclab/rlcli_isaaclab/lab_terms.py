@@ -23,7 +23,7 @@ class LabTerm:
 
 
 def last_action_of_term(env: Any, action_name: str) -> Tensor:
-    """Last raw action of one action term. (num_envs, k)"""
+    """Last action of the policy for one action term, before scaling. (num_envs, k)"""
     return env.action_manager.get_term(action_name).raw_actions
 
 

@@ -22,7 +22,7 @@ from rlcli_isaaclab.utils.math import (
 _TARGETS = {"pose_abs": 7, "pose_rel": 6, "wrench_abs": 6}
 """Kind of target -> number of columns."""
 _GAINS = {"fixed": 0, "variable_kp": 6, "variable": 12}
-"""Impedance mode -> number of columns of gains."""
+"""Impedance mode -> number of the command's columns that are gains."""
 
 
 class OperationalSpaceController:

@@ -66,7 +66,7 @@ class CartpoleTask(DirectTask):
         self.cartpoles.set_joint_efforts(efforts)
 
     def get_observations(self) -> dict[str, dict[str, Tensor]]:
-        """Write the observations to `obs_buf`."""
+        """Write the observations to `obs_buf`; return them as {view's name: {"obs_buf": observations}}."""
         position = self.cartpoles.get_joint_positions(clone=False)
         velocity = self.cartpoles.get_joint_velocities(clone=False)
         self.obs_buf[:, 0] = position[:, self.cart]
