@@ -280,9 +280,9 @@ def _terms_index() -> Iterator[str]:
     yield "`rlcli terms PATTERN` prints the same in the terminal; `rlcli terms --task TASK` adds a task's own terms.\n"
     yield "A description ends with the shape of the term's value, such as `(num_envs, 3)`: one row per environment. The"
     yield "*root* is the topmost body of an entity. *Soft limits* are its joint limits, narrowed by"
-    yield "[`soft_joint_pos_limit_factor`](../task-schema.md#entityconfig). `joints` or `actuators` of an entity set the"
-    yield "`velocity_limit` of a joint. The *origin* of an environment is its start position on the terrain, and 0 without"
-    yield "a terrain.\n"
+    yield "[`soft_joint_pos_limit_factor`](../task-schema.md#entityconfig). A joint's `velocity_limit` is a key of"
+    yield "`joints` or `actuators` of the entity. The *origin* of an environment is its start position on the terrain;"
+    yield "without a terrain it is 0.\n"
     yield "```{toctree}\n:hidden:\n\n" + "\n".join(SECTIONS) + "\n```\n"
     yield "| section | terms | contents |\n| --- | ---: | --- |"
     counts: dict[str, int] = {}
