@@ -69,8 +69,8 @@ TRAINERS = {
 """Built-in trainers -> the modules with their `SPEC`."""
 SECTIONS = {
     "observations": "Values that the policy or the critic receives, one row per environment.",
-    "actions": "Conversions of raw policy outputs into actuator targets.",
-    "rewards": "The reward is the sum of weight x value x length of a step [s] over all terms.",
+    "actions": "Conversions of the policy's action into targets or efforts of actuators.",
+    "rewards": "Values whose sum is the reward; each is multiplied by its weight and the length of a step [s].",
     "terminations": "Conditions that end an episode.",
     "events": "Changes at startup, at resets or at intervals.",
     "randomization": "Events that sample properties of the model.",
@@ -278,6 +278,11 @@ def _terms_index() -> Iterator[str]:
     yield "# Terms\n"
     yield "After reading this page you can find every term that a task file may name in `func`, and what it computes."
     yield "`rlcli terms PATTERN` prints the same in the terminal; `rlcli terms --task TASK` adds a task's own terms.\n"
+    yield "A description ends with the shape of the term's value, such as `(num_envs, 3)`: one row per environment. The"
+    yield "*root* is the topmost body of an entity. *Soft limits* are its joint limits, narrowed by"
+    yield "[`soft_joint_pos_limit_factor`](../task-schema.md#entityconfig). A joint's `velocity_limit` is a key of"
+    yield "`joints` or `actuators` of the entity. The *origin* of an environment is its start position on the terrain;"
+    yield "without a terrain it is 0.\n"
     yield "```{toctree}\n:hidden:\n\n" + "\n".join(SECTIONS) + "\n```\n"
     yield "| section | terms | contents |\n| --- | ---: | --- |"
     counts: dict[str, int] = {}

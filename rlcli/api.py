@@ -52,7 +52,7 @@ def make(
     Raises:
         TaskError: if the task is not found.
         ConfigError: if an override or the configuration of the task is not valid.
-        UsageError: if `seed` is not an integer from 0 to 2^62, or `overrides` is one text.
+        UsageError: if `seed` is not an integer from 0 to 2^62, or `overrides` is a string instead of a list.
     """
     _check(seed, overrides)
     resolved = resolve(find_task(task), overrides=list(overrides), flags=flags(scene__num_envs=num_envs))
@@ -86,9 +86,9 @@ def train(
         device: `auto`, `cpu` or `cuda`.
         overrides: list of `key.path=value`; `agent.key=value` changes the agent.
         runs_dir: folder of the runs; None: the environment variable RLCLI_RUNS_DIR, else `runs`.
-        name: part of the name of the run's folder.
-        resume: run to resume.
-        on_progress: receives the progress after each iteration.
+        name: text to add to the name of the run's folder, to recognise the run.
+        resume: folder of a run to resume.
+        on_progress: called with a `Progress` (iteration, steps, metrics) after each iteration.
 
     Raises:
         RlcliError: in every case in which `rlcli train` would end with an error.
@@ -132,21 +132,22 @@ def evaluate(
     overrides: Sequence[str] = (),
     runs_dir: Path | str | None = None,
 ) -> dict[str, Any]:
-    """Evaluate a policy and return the summary that `rlcli eval --json` prints.
+    """Evaluate a policy; return its results (returns, success, lengths) as the dict that `rlcli eval --json` prints.
 
     Args:
-        checkpoint: run or checkpoint; None takes the newest run of the task, else the policy shipped with the task.
+        checkpoint: folder of a run or checkpoint; None takes the newest run of the task, else the policy shipped with
+            the task.
         task: task to evaluate in; None takes the task of the run.
         episodes: number of episodes.
         num_envs: number of environments; None takes the task's own.
         seed: seed of the episodes.
         stochastic: sample actions instead of taking the mean.
-        overrides: `key.path=value`.
+        overrides: list of `key.path=value`.
         runs_dir: folder of the runs.
 
     Raises:
         CheckpointError: if there is no such checkpoint.
-        UsageError: if `episodes` is below 1, `seed` is not an integer from 0 to 2^62, or `overrides` is one text.
+        UsageError: if `episodes` is below 1, `seed` is not an integer from 0 to 2^62, or `overrides` is a string.
     """
     _check(seed, overrides)
     if not isinstance(episodes, SupportsIndex) or operator.index(episodes) < 1:
@@ -169,11 +170,12 @@ def load_policy(
 ) -> Callable[[Tensor], Tensor]:
     """Return a trained policy as a function: observations (num_envs, obs_size) -> actions (num_envs, action_size).
 
-    The function keeps the hidden state of a recurrent policy and resets it with the episodes of `env`.
+    The function keeps the hidden state of a recurrent policy, and resets it where an episode of `env` ends.
 
     Args:
         env: environment in which the policy acts.
-        checkpoint: run or checkpoint; None takes the newest run of the task, else the policy shipped with the task.
+        checkpoint: folder of a run or checkpoint; None takes the newest run of the task, else the policy shipped with
+            the task.
         stochastic: sample actions instead of taking the mean.
         runs_dir: folder of the runs.
 
@@ -191,7 +193,7 @@ def export(
     """Write a policy to one file and check that the file computes the same actions.
 
     Args:
-        checkpoint: run or checkpoint.
+        checkpoint: folder of a run or checkpoint.
         file: path to write; missing folders are created.
         format: `onnx`, `torch` or `numpy`.
         runs_dir: folder of the runs.
@@ -207,16 +209,18 @@ def export(
 
 
 def _check(seed: object, overrides: object) -> None:
+    """Check two arguments that several functions of this module have."""
     if not isinstance(seed, SupportsIndex) or not 0 <= operator.index(seed) <= MAX_SEED:
         raise UsageError(f"seed is {shorten(repr(seed), 40)}; give an integer from 0 to 2^62")
     if isinstance(overrides, str):
         raise UsageError(
-            f"overrides must be a list, found the text '{shorten(overrides, 40)}'",
+            f"overrides must be a list, found the string '{shorten(overrides, 40)}'",
             hint='write a list, such as overrides=["sim.dt=0.005"]',
         )
 
 
 def _find(checkpoint: Path | str | None, task: str | None, runs_dir: Path | str | None) -> Path:
+    """Return the folder of a checkpoint; without `checkpoint`, of the newest one of the task."""
     source = None if task is None else find_task(task)
     return choose(None if checkpoint is None else str(checkpoint), Path(runs_dir or default_runs_dir()), source).folder
 

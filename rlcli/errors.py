@@ -15,7 +15,7 @@ from rlcli.safe_text import message_line, shorten
 INTERRUPTED, STOPPED = 130, 75
 """Exit codes after Ctrl-C, and after another signal that stops a run."""
 _UNPINNED = ("rlcli[trackio]",)
-"""Extras that conflict with the versions in `constraints.txt`: trackio needs pillow < 13."""
+"""Extras that `pip_install` installs without `constraints.txt`, because of a conflict: trackio needs pillow < 13."""
 
 
 class RlcliError(Exception):
@@ -54,7 +54,7 @@ class Problem:
     message: str
     """What is wrong, and what is allowed."""
     hint: str | None = None
-    """What to do."""
+    """What the user can do about the mistake."""
 
     def __post_init__(self) -> None:
         """Make each part one line of limited length."""
@@ -156,8 +156,8 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str | None:
 def pip_install(package: str) -> str:
     """Return the command that installs packages, or an extra such as `rlcli[plot]`, in the tested versions.
 
-    rlcli and the plugins of its repository are not on a package index: they are installed from their folders if rlcli
-    runs from a checkout, else from a folder with their wheels, for which the command has the word WHEELS.
+    rlcli and the plugins of its repository are not on a package index. If rlcli runs from a checkout, the command
+    installs them from the checkout's folders, else from a folder with their wheels, which the command calls WHEELS.
 
     Args:
         package: arguments of `pip install`, separated by spaces.
@@ -176,11 +176,11 @@ def pip_install(package: str) -> str:
 
 
 def error_text(error: BaseException) -> str:
-    """Return the message of an error; why there is none, if its `__str__` fails, as it may in the code of a task."""
+    """Return the message of an error. If its `__str__` raises, as that of a task's class may, say so instead."""
     try:
         return str(error)
     except BaseException as failed:
-        return f"its text cannot be made: {type(failed).__name__}"
+        return f"its message cannot be read: __str__ raises {type(failed).__name__}"
 
 
 def error_with_type(error: BaseException) -> str:
@@ -209,7 +209,7 @@ def require_known(name: str, names: Sequence[str], what: str, plural: str) -> No
     Args:
         name: the name that the user typed.
         names: the valid names.
-        what: what has the name, for the message, such as `policy`.
+        what: the kind of thing that has the name, for the message, such as `policy`.
         plural: the plural of `what`, for the hint.
 
     Raises:

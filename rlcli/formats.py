@@ -39,19 +39,19 @@ class FormatSpec:
             code of the task.
         read: `(document: Document, source: TaskSource) -> Translation | None`. Translate a YAML document of this format
             into the data of a task; None for a document of another format.
-        key: the top-level key of a task file whose content only the format's environment reads.
+        key: a top-level key of task files, such as `isaaclab:`. Only the format's environment reads its content.
         check: `(block: Mapping) -> Iterable[(path, message, hint)]`. Yield the mistakes in the content of `key`;
             `path` has the keys from the block to the wrong value.
-        open_scene: the format's environment adds entities to the scene, so a task file may have no entities.
+        open_scene: whether a task file may have no entities, because the format's environment adds them.
         environment: the `VecEnv` class that runs a task whose file has content at `key`.
         importer: the function of the command `rlcli import NAME`, which returns an `Imported`. Its parameters have
             Typer's annotations.
         hint: `(error: BaseException) -> str | None`. Return what to do about an error of a task's code.
-        agents_beside: `(folder: Path) -> Iterable[Path]`. Yield Python files that may have agents of a configuration
-            in the folder.
-        models: dotted key in a task's data that `--model NAME=FILE` sets, with `{name}` in the place of NAME; empty:
-            the configuration is a Python object with a method `__rlcli_task__(root: Path, models: Mapping)`, which
-            returns it as data of a task, with the given models; `root` is the folder of the task.
+        agents_beside: `(folder: Path) -> Iterable[Path]`. Yield the Python files that may define agents for a task
+            whose configuration is in the folder.
+        models: dotted key of the task that `--model NAME=FILE` sets, with `{name}` in the place of NAME. Empty: the
+            configuration is a Python object whose method `__rlcli_task__(root: Path, models: Mapping)` returns the
+            content of a `task.yaml`; `root` is the folder of the task, `models` has NAME -> FILE.
         agent_file: `(file: Path, library: str, notes: list[Note]) -> dict | None`. Return the settings of an agent
             that a registration with Gymnasium names by a file; None if the format does not read the library's files.
         agent_order: libraries of agents, best first; the first one for which a registration with Gymnasium has an agent
@@ -92,7 +92,7 @@ class Translation:
     data: dict[str, Any]
     """Content of an equivalent `task.yaml`."""
     origin: Callable[[tuple[str | int, ...]], Origin]
-    """Function that returns the place in the source file of the value at a path (keys and list indices) in `data`."""
+    """Function from a path in `data` (keys and list indices) to the place in the source file that sets the value."""
     notes: list[Note]
     """How each key was translated."""
     agents: dict[str, Any] = field(default_factory=dict)

@@ -2,7 +2,7 @@
 
 `gym.make_vec("rlcli.gym:rlcli/cartpole", num_envs=8)` imports this module by itself. The code of a task is imported
 when its environment is made. If two plugins offer the same name, the ids are `rlcli/DISTRIBUTION.NAME`. The id
-`rlcli/task` takes the folder of a task as its argument `task`.
+`rlcli/task` makes a task that is not installed: its argument `task` is the folder of the task.
 """
 
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Progress of long work: a library function reports it with `track`, and the command line shows it."""
+"""Progress of long operations: a library function reports it with `track`, and the command line shows it."""
 
 import contextlib
 import threading
@@ -13,25 +13,25 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class Work:
-    """State of one piece of work, such as the episodes of an evaluation: its name, its size and how much is done."""
+    """Progress of one operation, such as an evaluation: what is counted, how many there are, and how many are done."""
 
     what: str
-    """Name of the work, or of its parts, such as `episodes`."""
+    """Name of the operation, or of the things that are counted, such as `episodes`."""
     total: int | None = None
     """Number of parts; None: unknown."""
     done: int = 0
     """Number of parts that are done."""
     share: float = 0.0
-    """Second estimate of the done share, from 0 to 1; the larger one counts. It is set for parts that run at the same
-    time, such as episodes in parallel environments: `done` stays 0 until the first of them ends."""
+    """Second estimate of the done share, from 0 to 1; the view shows the larger estimate. Operations whose parts run
+    at the same time set it, such as episodes in parallel environments: `done` stays 0 until the first of them ends."""
     has_own_view: bool = False
-    """Whether this work shows its own progress, so that nothing else may be drawn."""
+    """Whether the operation shows its own progress, so that no second progress bar may be drawn."""
     begin: float = field(default_factory=time.monotonic)
     """Start of the work, by `time.monotonic` [s]."""
     changed: float = field(default_factory=time.monotonic)
     """Time of the last progress, by `time.monotonic` [s]; at first the start."""
     thread: int = field(default_factory=threading.get_ident)
-    """Thread that does the work. Works of several threads run at the same time; none is a part of another."""
+    """Thread of the operation. Operations of different threads run at the same time; none is a part of another."""
 
     def advance(self, count: int = 1) -> None:
         """Add `count` to the number of parts that are done."""
@@ -48,19 +48,23 @@ class Work:
 
 _running: list[Work] = []
 view: Callable[[list[Work]], AbstractContextManager[object]] | None = None
-"""Function from a list of nested work, the outermost first, to a context that shows it; None: nothing is shown."""
+"""Function from a list of nested operations, the outermost first, to a context manager that shows their progress.
+
+None: nothing is shown.
+"""
 
 
 @contextlib.contextmanager
 def track(what: str, total: int | None = None, *, has_own_view: bool = False) -> Iterator[Work]:
-    """Report a piece of work, which is done in the `with` block, so that its progress can be shown.
+    """Report the progress of the operation in the `with` block.
 
-    Work inside of other work is shown together with it.
+    The block calls `advance` or `update` of the `Work` that it receives. A nested operation is shown below the outer
+    one.
 
     Args:
         what: what is counted, such as `episodes`.
         total: the number of parts; None: unknown.
-        has_own_view: whether the work shows its own progress, so that nothing else may be drawn.
+        has_own_view: whether the operation shows its own progress, so that no second progress bar may be drawn.
     """
     work = Work(what, total, has_own_view=has_own_view)
     shown = view(_running) if view is not None and not _running else contextlib.nullcontext()
@@ -73,9 +77,12 @@ def track(what: str, total: int | None = None, *, has_own_view: bool = False) ->
 
 
 def tracked(items: Iterable[T], what: str, total: int) -> Iterator[T]:
-    """Yield the items one by one, and report the progress: an item is done when the next one is requested.
+    """Yield items and report their number as progress; an item counts as done when the next one is requested.
 
-    `what` is what is counted, `total` the number of items.
+    Args:
+        items: the items.
+        what: name of the items, such as `episodes`.
+        total: number of items.
     """
     with track(what, total) as work:
         for item in items:

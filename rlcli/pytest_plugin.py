@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 def rlcli_check() -> Callable[..., list[Finding]]:
     """Return a function that runs the checks of `rlcli check` on a task.
 
-    It fails the test if there are errors, and returns the warnings.
+    The function fails the test if a check finds errors, and returns the warnings.
 
-    Its arguments are those of `rlcli.testing.check_task`: the name or folder of a task, `agent`, `overrides`, `only`.
+    The function has the arguments of `rlcli.testing.check_task`: the name or folder of a task, `agent`, `overrides`
+    and `only`.
     """
 
     def check(

@@ -46,9 +46,9 @@ def mix(x: Keys) -> Keys:
 
 
 def row_keys(seed: int, env_ids: NDArray[np.int64], counters: NDArray[np.int64]) -> Keys:
-    """Return the key of each row, from the seed, its environment and its counter (episode or step number). (n,)
+    """Return a key for each pair of an environment and a counter (episode or step number). (n,)
 
-    All random numbers of a row are computed from its key.
+    All random numbers of the pair are computed from its key.
     """
     keys = mix(env_ids.astype(np.uint64) * _GOLDEN + start(seed))
     keys += counters.astype(np.uint64) * _GOLDEN
@@ -56,7 +56,14 @@ def row_keys(seed: int, env_ids: NDArray[np.int64], counters: NDArray[np.int64])
 
 
 def bits(keys: Keys, stream: np.uint64, index: int, count: int) -> Keys:
-    """Return `count` random 64-bit words for each key: number `index` and the following ones of a stream. (n, count)"""
+    """Return random 64-bit words for each key. (n, count)
+
+    Args:
+        keys: keys from `row_keys`. (n,)
+        stream: number of the random stream, from `stream(name)`.
+        index: index in the stream of the first word to return.
+        count: number of words for each key.
+    """
     offsets = _offsets(int(stream), index, count)
     if count > _NARROW:
         return mix(keys[:, None] + offsets)
@@ -100,9 +107,9 @@ def integers(keys: Keys, stream: np.uint64, index: int, count: int, high: int) -
 
 
 def derive(seed: int, name: str) -> int:
-    """Return a 31-bit seed for another random generator, from a seed and the generator's purpose (`name`).
+    """Return a 31-bit seed for a further random generator, such as torch's, from a seed and the generator's purpose.
 
-    Seeds with different names are independent.
+    `name` is the purpose. Seeds for different purposes are independent.
     """
     return int(mix(_word(seed) ^ stream(name))[0] >> np.uint64(33))
 

@@ -1,7 +1,7 @@
-"""Helpers for text from files and command lines.
+"""Helpers for text from files and command lines: numbers, unsafe characters, and short messages about long inputs.
 
-They find unsafe characters, shorten long text, remember long inputs, so that `message_line` can cut their repetition in
-a message, and read numbers.
+A message that repeats a long input would hide what is wrong. Long inputs are remembered, and `message_line` shortens
+them in messages.
 """
 
 import math
@@ -14,7 +14,7 @@ UNSAFE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2028
 change the direction of text, and single surrogates."""
 
 MAX_SEED = 2**62
-"""Largest seed that a command line or a program may give."""
+"""Largest seed that the command line and the Python API accept."""
 
 
 def shorten(value: object, limit: int, mark: str = "...") -> str:
@@ -65,7 +65,7 @@ def message_line(text: str) -> str:
 
 
 def _without_echoes(line: str) -> str:
-    """Return a line in which every part that repeats over `_MAX_ECHO` characters of an input in one piece is cut."""
+    """Return a line with every copy of more than `_MAX_ECHO` consecutive characters of an input shortened."""
     size = _MAX_ECHO + 1
     if len(line) < size or not _inputs:
         return line

@@ -40,7 +40,7 @@ def create(
 
     Args:
         name: name of the task.
-        flavour: which template; not used with `robot`.
+        flavour: the template: `yaml` (manager-based task) or `direct`; not used with `robot`.
         folder: folder of the package; None: a folder with the task's name.
         robot: model and YAML of a task for a robot of the user (`rlcli new --robot`).
 
@@ -48,7 +48,8 @@ def create(
         The folder of the package, and its files relative to that folder.
 
     Raises:
-        UsageError: if the name is not valid for a task, a distribution and a package, or if the folder is not empty.
+        UsageError: if the name is not valid for a task, a distribution and a Python package, or if the folder is not
+            empty.
         MachineError: if the files cannot be written.
     """
     if robot is None:
@@ -136,7 +137,7 @@ def _write(folder: Path, files: dict[str, str], package: str, assets: Mapping[st
     Args:
         folder: the target folder.
         files: path within the folder -> text.
-        package: name of the Python package, for which the JSON Schema of its task is written, too.
+        package: name of the Python package; the JSON Schema of its task is written as well.
         assets: path within the folder -> file to copy, such as a mesh.
     """
     from rlcli.config.dump import json_schema

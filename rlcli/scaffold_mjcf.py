@@ -50,7 +50,8 @@ class Robot:
         self.dt = model.opt.timestep if model.opt.timestep <= 0.01 else 0.005
         self.decimation = min(max(1, round(_CONTROL_DT / self.dt)), _MAX_DECIMATION)
         self.tempo = round3(min(1.0, _MAX_DECIMATION * self.dt / _CONTROL_DT))
-        """Factor of all times of the task: less than 1 if the decimation would be too large."""
+        """Factor of all durations of the task, such as the episode length; below 1 if the decimation would exceed
+        `_MAX_DECIMATION`."""
         self.gravity = float(np.linalg.norm(model.opt.gravity))
         """Gravity of the file, in the units of the file [m/s^2]."""
         balls = [model.joint(j).name for j in range(model.njnt) if model.jnt_type[j] == int(mujoco.mjtJoint.mjJNT_BALL)]
@@ -82,7 +83,7 @@ class Robot:
     def kind(self) -> str:
         """Return the kind of task that fits the robot: velocity, reach or balance.
 
-        They mean: follow velocity commands, move the last body to a goal, keep the default pose.
+        velocity: follow velocity commands; reach: move the last body to a goal; balance: keep the default pose.
         """
         legged = self.free and self.gravity > 0.0 and self.feet()
         if legged and len(self.driven) >= max(4, len(self.passive) + 1):
@@ -206,7 +207,7 @@ class Robot:
     def _touching(self, height: float, *, absolute: bool = False) -> list[int]:
         """Return the ids of the bodies with a colliding geom below z = 0 if the root is moved.
 
-        The root is raised by `height` [m] from its place in the default pose; with `absolute`, it is at this height.
+        The z coordinate of the root is `height` [m] above its present value; with `absolute`, it is `height`.
         """
         model, data = self.model, mujoco.MjData(self.model)
         data.qpos[:] = self.data.qpos
@@ -220,6 +221,7 @@ class Robot:
         return list(dict.fromkeys(found))
 
     def _inertia(self) -> dict[int, float]:
+        """Return joint id -> diagonal element of the mass matrix in the default pose [kg or kg m^2]."""
         matrix = np.zeros((self.model.nv, self.model.nv))
         mujoco.mj_fullM(self.model, self.data, matrix)
         return {j: float(matrix[self.model.jnt_dofadr[j], self.model.jnt_dofadr[j]]) for j in self.joints}
@@ -259,9 +261,10 @@ class Robot:
 
 
 def _default_pose(spec: mujoco.MjSpec) -> np.ndarray | None:
-    """Return the robot's default pose as `qpos`: of the keyframe home or stand, else of the first keyframe.
+    """Return the robot's default pose as `qpos` (nq,), or None if the MJCF has no default pose.
 
-    Without a keyframe it is the numeric `init_qpos`; None if there is none.
+    It is the pose of the keyframe `home` or `stand`, else of the first keyframe, else the value of the element
+    `numeric` with the name `init_qpos`.
     """
     keys = sorted(spec.keys, key=lambda key: key.name not in ("home", "stand", "standing"))
     start = next((numeric for numeric in spec.numerics if numeric.name == "init_qpos"), None)  # a habit of Gymnasium
@@ -271,10 +274,10 @@ def _default_pose(spec: mujoco.MjSpec) -> np.ndarray | None:
 
 
 def _remove_scene_elements(spec: mujoco.MjSpec) -> None:
-    """Remove ground, lights and keyframes, which the task's scene has; name all bodies, joints and actuators.
+    """Remove ground, lights and keyframes, which the task defines itself; name all bodies, joints and actuators.
 
-    Welds and connections to mocap bodies are removed, too: a task does not move them, so they would hold the robot.
-    If all actuators pull at tendons, they are removed, and the task drives the joints themselves.
+    Welds and connections to mocap bodies are removed, too: a task does not move mocap bodies, so they would hold the
+    robot. If all actuators pull at tendons, they are removed, and the task drives the joints directly.
     """
     if all(actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON for actuator in spec.actuators):
         measured = [sensor for sensor in spec.sensors if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR]
@@ -302,9 +305,10 @@ def _remove_scene_elements(spec: mujoco.MjSpec) -> None:
 
 
 def _put_robot_first(tree: ElementTree.Element, model: mujoco.MjModel) -> None:
-    """Make the top-level body with most driven joints the first one: rlcli takes the first body as the root.
+    """Make the top-level body with most driven joints the first one, because rlcli takes the first body as the root.
 
-    A free body is placed at the origin, and gets a level parent if its z axis does not point up.
+    If the body has a free joint, it is placed at the origin. If its z axis does not point up, `_insert_level_root`
+    gives it a parent whose z axis does.
     """
     joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     driven = model.actuator_trnid[joint_actuator, 0] if model.nu else np.flatnonzero(np.isin(model.jnt_type, SCALAR))

@@ -36,7 +36,7 @@ class RobotTask:
     task: dict[str, Any]
     """The task as data of its YAML."""
     found: dict[str, list[str]]
-    """Elements of the MJCF: joints, actuators, sensors and keyframes -> their names."""
+    """Names of the elements of the MJCF, under the keys `joints`, `actuators`, `sensors` and `keyframes`."""
     has_pose: bool
     """Whether the MJCF has a default pose: a keyframe, or the element `numeric` with the name `init_qpos`."""
 
@@ -107,7 +107,7 @@ _SUMMARIES = {
 
 
 def _fill(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the data of a YAML template in which each value `$key` is replaced by `values[key]`."""
+    """Return the data of the YAML template `name`, with each value `$key` replaced by `values[key]`."""
 
     def filled(node: Any) -> Any:
         if isinstance(node, dict):
@@ -186,7 +186,14 @@ def _balance(robot: Robot) -> dict[str, Any]:
 
 
 def _balance_conditions(robot: Robot, held: dict[float, list[str]]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return success conditions and terminations: of the tilt of a floating base, else of the joints to hold."""
+    """Return the sections `success` and `terminations` of a balance task.
+
+    They limit the tilt of a floating base; for a fixed base, the deviation of the joints from the default pose.
+
+    Args:
+        robot: the robot.
+        held: position in the default pose [m or rad] -> names of the joints that the task holds at this position.
+    """
     hold = {"at_most": 0.2, "hold_s": robot.tempo}
     if robot.free:
         success: dict[str, Any] = {"upright": {"func": "root_tilt", **hold}}

@@ -39,5 +39,5 @@ def use_settings(settings: Mapping[str, Any]) -> Iterator[None]:
 
 
 def setting(key: str) -> Any:
-    """Return a setting of the user; None if the file does not set it, and outside of the command line."""
+    """Return a setting of the user by its key; None if the file does not set it, or rlcli is used as a library."""
     return _current.get(key)

@@ -13,7 +13,7 @@ class TaskSpec:
     """A task of a plugin. An entry point of the group `rlcli.tasks` names an object of this class.
 
     The module that defines the object must be cheap to import. The name of the task is the name of the entry point, and
-    its owner is the distribution; neither is repeated here.
+    its owner is the distribution (the installed package) that declares the entry point.
 
     Attributes:
         package: the package that holds the YAML and the models, usually `__name__`.

@@ -13,5 +13,5 @@ def test_text_of_an_error_without_text(failure):
                 raise failure
             return 5
 
-    assert "its text cannot be made" in error_text(Textless())
-    assert "its text cannot be made" in one_line(Textless())
+    assert "its message cannot be read" in error_text(Textless())
+    assert "its message cannot be read" in one_line(Textless())

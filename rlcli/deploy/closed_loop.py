@@ -1,9 +1,9 @@
-"""Check of an exported policy (`export --verify`): it controls plain MuJoCo and is compared with the environment.
+"""Check of an exported policy in plain MuJoCo, without the environment (`export --verify`).
 
-The generated program `run_policy.py` computes observations and controls from an MjData, and `mj_step` advances it. No
-code of the environment takes part in that loop. The environment is the reference: it resets, samples commands and
-disturbances, reads the resulting states, and computes rewards and terminations. Both sides run the same episodes: once
-as the run's evaluation, once in plain MuJoCo.
+The generated program `run_policy.py` computes observations and controls from an MjData, and `mj_step` advances the
+MjData. No code of the environment takes part in that loop. The environment is the reference: it resets, samples
+commands and disturbances, reads the resulting states, and computes rewards and terminations. The same episodes run
+twice: once as an evaluation in the environment, once in plain MuJoCo.
 
 In a legged robot rounding errors grow until two simulations of one episode have nothing in common. If every observation
 and action agrees but the returns differ, the episodes are run again and re-synchronised: plain MuJoCo and the engine
@@ -48,7 +48,7 @@ _log = logging.getLogger(__name__)
 CLOSE = 1e-4
 """Largest accepted difference of an observation or a control, relative to max(1, |value|)."""
 ROUNDING = 1e-3
-"""Largest difference of actions and states after one step that rounding may explain."""
+"""Largest difference of actions and of states after one step that counts as rounding."""
 RETURN = 0.02
 """Largest accepted difference of the mean return, relative to the evaluation's mean |return|."""
 _SEED = 42
@@ -80,7 +80,7 @@ class ClosedLoopResult:
     episodes: int
     steps: int
     differences: dict[str, float]
-    """action, observation, control -> largest difference."""
+    """Largest difference of `action`, `observation` and `control`."""
     evaluation_return: float
     """Mean return of the run's evaluation."""
     plain_return: float
@@ -90,9 +90,11 @@ class ClosedLoopResult:
     by_metadata: list[str]
     """Terms that the generated program computed from formulas in the metadata."""
     by_task: list[str]
-    """Terms without a formula, and forces. The task's own code computed them from the states of plain MuJoCo."""
+    """Terms without a formula, and forces, which the task's own code computed from the states of plain MuJoCo."""
     synchronized_return: float | None = None
-    """Mean return of the re-synchronised episodes; None: they were not needed."""
+    """Mean return of episodes in which plain MuJoCo gets the environment's state after every step.
+
+    None: `plain_return` agrees with the evaluation, so these episodes were not needed."""
     disagreeing_steps: int = 0
     """Re-synchronised steps after which the states of the two sides differed by more than rounding."""
 
@@ -121,7 +123,7 @@ class ClosedLoopResult:
         return all(row[3] for row in self.rows())
 
     def record(self) -> dict[str, Any]:
-        """Return the result as JSON data."""
+        """Return the result as data for JSON."""
         synchronized = None
         if self.synchronized_return is not None:
             synchronized = {"return": self.synchronized_return, "parted": self.disagreeing_steps}
@@ -148,9 +150,9 @@ def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | N
     """Build the environment that a policy was trained for, without observation noise, bias and delays.
 
     Args:
-        choice: the policy, as chosen on the command line.
-        checkpoint: its checkpoint.
-        named: the task on the command line, if there is one.
+        choice: the policy that the user has chosen.
+        checkpoint: the checkpoint of the policy.
+        named: the task that the user has named; None: the task of the run.
     """
     configure = partial(resolve, choice.source(named), agent=choice.agent, play=True)
     resolved = configure()
@@ -170,15 +172,15 @@ def open_reference(choice: Choice, checkpoint: Checkpoint, named: TaskSource | N
 def verify(
     reference: ReferenceEnv, checkpoint: Checkpoint, exported: Exported, format_: str, episodes: int
 ) -> ClosedLoopResult:
-    """Evaluate the policy in its environment, then run the same episodes with the file in plain MuJoCo.
+    """Evaluate a policy in its environment, then run the same episodes with the exported file in plain MuJoCo.
 
-    The model and the program that runs the file are written to the folder of the file.
+    The MuJoCo model, and the program that runs the policy on it, are written to the folder of the file.
 
     Args:
-        reference: the run's environment.
+        reference: the environment for which the policy was trained.
         checkpoint: the policy's checkpoint.
-        exported: the exported policy.
-        format_: its format.
+        exported: the exported file.
+        format_: format of the file.
         episodes: number of episodes.
 
     Raises:
@@ -235,7 +237,7 @@ def verify(
 
 
 def _may_randomize(env: VecEnv) -> bool:
-    """Return whether the task may randomise gains or initial states: a direct task, or events other than resets."""
+    """Return whether gains or initial states may be random: in a direct task, or with events other than `reset_...`."""
     events = [event for event in env.config.events.values() if event is not None]
     return isinstance(env, DirectEnv) or not all(event.func.startswith("reset_") for event in events)
 
@@ -280,9 +282,10 @@ class _PlainMujocoRunner:
         """Fields of forces that the task's code has set in its steps."""
 
     def act(self, obs: Tensor) -> Tensor:
-        """Return the actions of the exported policy in the plain simulations.
+        """Return the actions of the exported policy for the states of plain MuJoCo. (num_envs, a)
 
-        It replaces the policy in the evaluation. `obs` are the environment's observations, which are compared.
+        The evaluation calls this function as its policy. `obs` are the environment's observations, with which those of
+        the generated program are compared. (num_envs, d)
         """
         is_first = (self._env.episode_length_buf == 0).tolist()
         for i, controller in enumerate(self._controllers):
@@ -305,7 +308,7 @@ class _PlainMujocoRunner:
         return torch.where(agree[:, None], expected, actions)
 
     def physics(self) -> None:
-        """Simulate one environment step in every plain simulation: it replaces the physics of the engine."""
+        """Simulate one environment step of every environment in plain MuJoCo, instead of the engine."""
         ctrl = self._engine.field("ctrl").numpy()
         allowed = np.clip(ctrl, *self._bounds)  # the program clips its controls; MuJoCo clips those of the engine later
         pairs = (torch.from_numpy(values[:, self._closed]) for values in (self._ctrl, allowed))
@@ -343,9 +346,9 @@ class _PlainMujocoRunner:
             self._engine.copy_data(i, self._datas[i])
 
     def _synchronize_states(self) -> None:
-        """Give plain MuJoCo and the engine the same state after a step of both.
+        """Set plain MuJoCo and the engine to the same state after a step of both.
 
-        If the two agree within rounding, it is the engine's state; otherwise it is that of plain MuJoCo.
+        If their states agree within rounding, both get the engine's state; otherwise both get that of plain MuJoCo.
         """
         disagreeing = []
         for i, data in enumerate(self._datas):
@@ -361,7 +364,7 @@ class _PlainMujocoRunner:
         self.disagreeing_steps += len(disagreeing)
 
     def terms(self, *, closed: bool) -> list[str]:
-        """Return the terms that the generated program computes itself (`closed`), or those that it cannot compute."""
+        """Return the names of the terms that the generated program can compute (`closed`), or of the others."""
         kinds = {"observation": self._plan["observations"], "control": self._plan["controls"]}
         named = [f"{kind} {t['name']}" for kind, terms in kinds.items() for t in terms if t["closed"] is closed]
         return named if closed else [*named, *(f"force data.{name}" for name in sorted(self._forces))]
@@ -389,7 +392,7 @@ class _PlainMujocoRunner:
         mujoco.mj_setState(self._models[i], self._datas[i], row, int(mujoco.mjtState.mjSTATE_INTEGRATION))
 
     def _inputs(self, i: int, obs: Tensor) -> dict[str, np.ndarray]:
-        """Return the inputs of the program for environment `i`: commands, and observations without a formula."""
+        """Return the inputs of the program for environment `i`, by name: commands, observations without a formula."""
         commands = getattr(self._env, "command_manager", None)
         inputs = {
             f"command/{term.name}": term.instance.command[i].numpy()

@@ -1,4 +1,4 @@
-"""Torch module that is exported in every format: the policy, followed by the scaling of the action terms."""
+"""Torch module that is exported to all file formats: the policy, and the scaling of its action to commands."""
 
 import copy
 import math
@@ -13,7 +13,7 @@ from rlcli.runs.policy_interface import ActionColumns
 
 
 class DeployedPolicy(nn.Module):
-    """Policy with the input `obs` and the outputs `action` and `command`.
+    """Policy with the input `obs` and the outputs `action` (argument of `env.step`) and `command` (for actuators).
 
     A recurrent policy also has the inputs `h_in` and `c_in` and the outputs `h_out` and `c_out`: hidden and cell state
     of its layers, (layers, n, cells) float32 each. They are zeros when an episode begins.
@@ -66,7 +66,7 @@ class DeployedPolicy(nn.Module):
         return {**self.with_command(action), "h_out": torch.stack(after[::2]), "c_out": torch.stack(after[1::2])}
 
     def with_command(self, action: Tensor) -> dict[str, Tensor]:
-        """Return the outputs `action` and `command`: the action scaled, shifted and clipped as by the action terms."""
+        """Return `action` and `command`: the command is the action, scaled, shifted and clipped by the action terms."""
         command = action * self.scale + self.offset if self.scaled else action.clone()
         for bounds in (self.clip, self.limits):
             if bounds is not None:

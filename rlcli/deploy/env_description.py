@@ -103,13 +103,13 @@ def _describe_direct(env: DirectEnv) -> tuple[dict[str, Any], list[dict[str, Any
 
 
 def _bind(env: DirectEnv, section: str, number: int, entry: Mapping[str, Any]) -> BoundTerm:
-    """Check one entry of a direct task's `in_terms`, and return it as a term of this environment.
+    """Check one entry of the terms that a direct task returns in `in_terms`, and bind it to the environment.
 
     Args:
         env: the environment.
-        section: observations or actions.
+        section: `observations` or `actions`.
         number: index of the entry.
-        entry: name of the term and its parameters.
+        entry: `func`, the name of a term of `rlcli.mdp`, and the term's parameters.
     """
     path = (section, f"{entry['func']}_{number}")
     signature = env.resolved.vocabulary.find(section, entry["func"])
@@ -138,7 +138,7 @@ def _observation(
 
 
 def _controls(env: VecEnv, terms: Iterable[BoundTerm]) -> list[dict[str, Any]]:
-    """Describe action terms, which take consecutive columns of the action."""
+    """Return a description (name, columns, formula, ...) of each action term; terms use consecutive columns."""
     controls, begin = [], 0
     for term in terms:
         controls.append(_control(env, term, (begin, begin + term.instance.size)))
@@ -165,14 +165,14 @@ def _control(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> dict[str
 
 
 def _processed_formula(env: VecEnv, term: BoundTerm, width: int, bound: float | None = None) -> Formula | None:
-    """Return the formula of an observation term with its modifiers, clip and scale; None if it has no formula.
+    """Return the formula of an observation term with its modifiers, clip and scale; None if the term has no formula.
 
-    Noise, bias, delay and history are not part of it.
+    The formula omits noise, bias, delay and history.
 
     Args:
         env: the environment.
         term: the term.
-        width: number of its columns.
+        width: number of columns of the term.
         bound: limit of the absolute value; None: no limit.
     """
     value, config = observation_formula(env, term), term.config

@@ -78,7 +78,7 @@ def check_target(format_: str, output: Path | None) -> None:
 
 
 def _export_obstacle(spec: PolicySpec) -> str | None:
-    """Return why a policy cannot be exported, as text after `its policy has`; None if it can be exported."""
+    """Return why a policy cannot be exported, as the end of `its policy has ...`; None if it can be exported."""
     if len(set(spec.memory)) > 1:
         return f"recurrent layers of different sizes ({', '.join(map(str, spec.memory))})"
     return None
@@ -93,8 +93,8 @@ def export(
         checkpoint: the checkpoint.
         file: the file to write.
         format_: one of `FORMATS`.
-        deployment: the description of the environment (`rlcli.deploy.env_description.describe`), which is used if the
-            checkpoint has none.
+        deployment: description of the environment (`rlcli.deploy.env_description.describe`) for a checkpoint that does
+            not contain one.
 
     Raises:
         UsageError: for an unknown format, a wrong suffix, or a policy that cannot be exported.
@@ -133,7 +133,7 @@ def relative_difference(found: Tensor, expected: Tensor) -> Tensor:
 
 
 def _observations(checkpoint: Checkpoint, size: int) -> Tensor:
-    """Return test inputs: observations recorded in training (if any), random ones, and both x 1000. (n, size)"""
+    """Return test observations: those recorded in training (if any), random ones, and both times 1000. (n, size)"""
     random = torch.randn(_RANDOM, size, generator=torch.Generator().manual_seed(0))
     has_trainer = "trainer.safetensors" in checkpoint.manifest["files"]  # a bundle has none
     recorded = checkpoint.tensors("trainer").get("observations") if has_trainer else None
@@ -145,11 +145,11 @@ def _observations(checkpoint: Checkpoint, size: int) -> Tensor:
 def _require_equal(run: PolicyFunction, graph: DeployedPolicy, observations: Tensor, file: Path) -> float:
     """Check that an exported file and the policy give the same outputs; return the largest difference.
 
-    They are compared with batches of 1, 7 and all observations. For a recurrent policy the batches are successive steps
-    of episodes, and each side has its own hidden state.
+    The outputs are compared for batches of 1, 7 and all observations. For a recurrent policy the batches are successive
+    steps of episodes; the file and the policy each keep a hidden state.
 
     Args:
-        run: the function of the file.
+        run: the exported policy as a function, read from the file.
         graph: the policy.
         observations: the test inputs.
         file: the file, for the message.

@@ -26,7 +26,7 @@ _ONNX_ADDRESS_SPACE = 3 << 29
 """Limit of a process [bytes] below which onnxruntime ends it without a message."""
 
 PolicyFunction = Callable[[dict[str, Tensor]], dict[str, Tensor]]
-"""Inputs by name -> outputs by name."""
+"""Exported policy as a function: inputs by name -> outputs by name."""
 
 
 def write(format_: str, graph: DeployedPolicy, metadata: str, extra_properties: dict[str, str]) -> bytes:
@@ -36,7 +36,7 @@ def write(format_: str, graph: DeployedPolicy, metadata: str, extra_properties: 
         format_: one of `FORMATS`.
         graph: the policy.
         metadata: the metadata as JSON text.
-        extra_properties: further metadata properties; only ONNX files have them.
+        extra_properties: further metadata, name -> text; only ONNX files store them.
     """
     if format_ == "onnx":
         return _onnx_bytes(graph, {KEY: metadata, **extra_properties})
@@ -179,7 +179,7 @@ def _read_torch(file: Path) -> tuple[PolicyFunction, str]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the exporters: they print progress on stdout, and log and warn about missing features."""
+    """Suppress output of torch's exporters, which print progress, and log and warn about missing features."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

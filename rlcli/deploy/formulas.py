@@ -1,7 +1,7 @@
-"""Formulas of observation and action terms, from which a program without rlcli computes them.
+"""Formulas of observation and action terms, with which a program without rlcli computes observations and controls.
 
-A formula is plain data (JSON); such a program evaluates it with the values of MjData. A formula is one of these. Every
-value is a row of float32.
+A formula is data for JSON. A program evaluates the formula with the values of an MjData; every value is a row of
+float32. A formula is one of these:
 
 - A list of numbers.
 - `{"field": NAME, "at": [...]}`: elements of a flattened field of MjData.
@@ -31,11 +31,11 @@ Formula = Any
 
 
 class NoFormula(Exception):
-    """Error for a term without a formula, because it depends on something that MjData does not contain."""
+    """Error for a term that depends on values that MjData does not contain, so that it has no formula."""
 
 
 def observation_formula(env: VecEnv, term: BoundTerm) -> Formula | None:
-    """Return the formula of an observation term, without its modifiers, clip and scale; None if it has none."""
+    """Return the formula of an observation term, without its modifiers, clip and scale; None if no formula exists."""
     function = getattr(term.call, "func", None)
     make = _OBSERVATIONS.get(getattr(function, "__name__", "")) if _is_defined_in(observations, function) else None
     if make is None:
@@ -54,7 +54,7 @@ def control_formula(env: VecEnv, term: BoundTerm, columns: tuple[int, int]) -> t
     Args:
         env: the environment.
         term: the action term.
-        columns: begin and end of its columns in the policy's action.
+        columns: first column of the term in the policy's action, and the column after its last.
     """
     action = term.instance
     make = _ACTIONS.get(type(action).__name__) if _is_defined_in(actions, type(action)) else None
@@ -95,10 +95,10 @@ def _is_defined_in(module: Any, function: Any) -> bool:
 
 
 def _shared(values: Tensor) -> Formula:
-    """Return the constant formula for a quantity (num_envs, k).
+    """Return the constant formula for a quantity that is equal in all environments. (num_envs, k)
 
     Raises:
-        NoFormula: if it differs between environments.
+        NoFormula: if the quantity differs between environments.
     """
     if not bool((values == values[:1]).all()):
         raise NoFormula
@@ -162,10 +162,10 @@ def _down(entity: Entity) -> Formula:
 
 
 def _require_no_terrain(env: VecEnv) -> None:
-    """Check that an environment has no terrain: then its origin, from which positions count, is that of the world.
+    """Check that an environment has no terrain, so that its origin, to which positions relate, is the world's origin.
 
     Raises:
-        NoFormula: if it has terrain.
+        NoFormula: if the environment has a terrain.
     """
     if env.terrain is not None:
         raise NoFormula

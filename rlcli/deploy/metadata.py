@@ -15,7 +15,7 @@ SCHEMA = 2
 def metadata_of(
     checkpoint: Checkpoint, graph: DeployedPolicy, layout: LayoutRecord, deployment: DeploymentRecord | None
 ) -> dict[str, Any]:
-    """Return the metadata of an exported policy, as plain JSON.
+    """Return the metadata of an exported policy, as data for JSON.
 
     Args:
         checkpoint: the checkpoint of the policy.
@@ -94,9 +94,9 @@ def metadata_of(
 
 
 def required_inputs(metadata: dict[str, Any]) -> dict[str, int]:
-    """Return the inputs that `Controller.act` of `run_policy.py` needs, with their numbers of values.
+    """Return name -> number of values of the inputs that `Controller.act` of `run_policy.py` needs.
 
-    They are the commands, and the observations that only the task's code computes, because they have no formula.
+    The inputs are the commands, and the observations without a formula, which only the task's code can compute.
     """
     deployment = metadata["deployment"] or {"commands": [], "observations": []}
     sizes = {f"command/{command['name']}": command["size"] for command in deployment["commands"]}
@@ -168,7 +168,7 @@ def _entry(value: object) -> str:
 
 
 def _with_columns(terms: Sequence[ObservationColumns | ActionColumns]) -> list[dict[str, Any]]:
-    """Return the layout of terms as plain JSON, each with `columns`: its first column and the one after its last."""
+    """Return the layout of terms as data for JSON; `columns` is a term's first column and the column after its last."""
     entries, begin = [], 0
     for term in terms:
         entries.append({**term.model_dump(mode="json"), "columns": [begin, begin + term.size]})

@@ -41,7 +41,7 @@ def numpy_bytes(graph: DeployedPolicy, metadata: str) -> bytes:
 
 
 def read_numpy(file: Path) -> tuple[Any, str]:
-    """Execute an exported Python file; return its function, and its metadata as JSON text.
+    """Execute an exported Python file; return the policy as a `PolicyFunction`, and the metadata as JSON text.
 
     Call it only with a file that this process has written.
     """
@@ -56,12 +56,12 @@ def read_numpy(file: Path) -> tuple[Any, str]:
 
 
 def literal(value: object) -> str:
-    """Return plain data as Python source code in ASCII."""
+    """Return JSON-like data (dicts, lists, numbers, strings) as Python source code in ASCII."""
     return pprint.pformat(value, width=110, sort_dicts=False).encode("ascii", "backslashreplace").decode()
 
 
 def substitute(template: str, values: Mapping[str, str]) -> str:
-    """Return a text with each key of `values` replaced, in one pass: a value that has the text of a key keeps it."""
+    """Replace each key of `values` in a text by its value, in one pass: keys inside of values are not replaced."""
     return re.sub("|".join(map(re.escape, values)), lambda found: values[found[0]], template)
 
 

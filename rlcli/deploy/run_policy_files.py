@@ -1,4 +1,4 @@
-"""Files that `export --verify` writes beside a policy: the trained model, and a program that runs the policy on it."""
+"""Files that `export --verify` writes beside a policy: the MuJoCo model, and a program that runs the policy on it."""
 
 import contextlib
 import ctypes
@@ -21,7 +21,7 @@ BINARY_MODEL = "model.mjb"
 _MARK = "<!-- written by rlcli export -->\n"
 """First line of an exported model. A model file with this line may be overwritten."""
 _PROGRAM_MARK = b'"""Runs an exported policy on its robot in MuJoCo'
-"""First bytes of the program. A binary model may be overwritten if such a program beside it loads it."""
+"""First bytes of the program. A binary model may be overwritten if a program with these bytes beside it loads it."""
 _TEMPLATE = Path(__file__).parent / "deployed" / PROGRAM
 _OPEN = {
     "onnx": """        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
@@ -53,9 +53,9 @@ _CHECK = """        sizes = SIZES
                 way = "an observation is the value of one step, with its modifiers, clip and scale applied"
                 raise ValueError(f"{needed}; {way}")
 """
-"""First lines of `Controller.act` for a policy that needs inputs."""
+"""Lines that are inserted at the start of `Controller.act` for a policy that needs inputs."""
 _LOOP = "    policy, xml = "
-"""Begin of the program's own loop, which runs the policy with all commands zero."""
+"""Start of the program's simulation loop, which runs the policy with all commands zero."""
 _TOLERANCE = {"rtol": 1e-4, "atol": 1e-5}
 """Largest accepted difference of a model that was read from XML, which may have only six digits."""
 
@@ -63,8 +63,8 @@ _TOLERANCE = {"rtol": 1e-4, "atol": 1e-5}
 def generate_program(policy: Path, model: Path, format_: str, metadata: dict[str, Any]) -> str:
     """Return the source code of the program that runs a policy file on a model file.
 
-    The program will be in the same folder as the two files. If only the task's code computes an observation or a
-    control, the program's own loop is replaced by a message; its `Controller` can be used by another loop.
+    The program must be in the same folder as the two files. If only the task's code can compute an observation or a
+    control, the program's simulation loop is replaced by an error message; the class `Controller` still works.
     """
     text = _TEMPLATE.read_text(encoding="utf-8")
     for parts in (_PACKAGES, _IMPORTS, _OPEN):
@@ -97,7 +97,10 @@ def check_overwrites(policy: Path) -> None:
 
 
 def _is_exported(model: Path) -> bool:
-    """Return whether export wrote this model file; a binary file cannot have a mark, so its program is read instead."""
+    """Return whether `rlcli export` wrote this model file.
+
+    An XML has a mark in its first line; a binary file has none, so the program that loads it must be beside it.
+    """
     is_xml = model.name == MODEL
     try:
         with (model if is_xml else model.with_name(PROGRAM)).open("rb") as file:
@@ -147,7 +150,7 @@ def open_model(file: Path) -> mujoco.MjModel:
 
 
 def _model_xml(spec: mujoco.MjSpec, model: mujoco.MjModel) -> str | None:
-    """Return a model as XML; None if the XML would need other files or compiles to another model."""
+    """Return a model as XML; None if the XML would need other files, or does not compile to the same model."""
     assets = [*spec.meshes, *spec.hfields, *spec.textures, *spec.skins]
     if any(getattr(asset, "file", "") or any(getattr(asset, "cubefiles", [])) for asset in assets):
         return None

@@ -16,11 +16,13 @@ from rlcli.sim.rotations import rotate_inverse
 
 
 class ArticulationView:
-    """View of one entity in all environments. Register it with `scene.add`; it works once the environment is built.
+    """View of one entity (a robot or an object) in all environments, with getters and setters of tensors.
 
-    Columns are the hinge and slide joints of the entity, in the order of the model. `indices` selects environments;
-    values then have one row for each index. Positions are in the world frame of each environment's own simulation.
-    Unlike in OmniIsaacGymEnvs, setters may be called several times in a step, and getters return current values.
+    A direct task registers the view with `scene.add`; it can be used once the environment is built. Columns are the
+    hinge and slide joints of the entity, in the order of the model. The argument `indices` (n,) selects environments;
+    values then have one row for each index, else one row for each environment. Positions are in the world frame of each
+    environment's own simulation. Unlike in OmniIsaacGymEnvs, setters may be called several times in a step, and getters
+    return current values.
 
     Args:
         entity: name of the entity in the YAML's scene.
@@ -172,17 +174,17 @@ def _rows(values: Tensor, indices: Tensor | None, clone: bool) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class _Drive:
-    """Actuators of one kind, and the joints that they drive."""
+    """Actuators of one kind (motor, position or velocity) of an entity, and the joints that they drive."""
 
     joints: Columns | None
     """Columns of the driven joints; None: all joints, in order."""
     controls: Columns
-    """Columns of the actuators in the controls."""
+    """Columns of the actuators in MuJoCo's `ctrl`."""
     factor: Tensor | None
     """Factor from the effort or target of a joint to the control. (k,); None: 1."""
 
     def controls_for(self, values: Tensor) -> Tensor:
-        """Return the controls (ctrl) of the k actuators for efforts or targets of the joints. (n, num_dof) -> (n, k)"""
+        """Return the `ctrl` of the k actuators for efforts or targets of all joints. (n, num_dof) -> (n, k)"""
         driven = values if self.joints is None else values[:, self.joints]
         return driven if self.factor is None else driven * self.factor
 

@@ -24,7 +24,7 @@ from rlcli.sim.rotations import rotate_inverse
 from rlcli.sim.state_cache import SimData
 
 __all__ = ["grid"]
-"""Public names of this module; only `VecEnv` uses the other ones."""
+"""Public names of this module; the others are for `VecEnv` alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +51,15 @@ def build_simulation(scene: Scene, binder: Binder, device: torch.device, seed: i
     """Compile a scene and build its simulation, in the default state.
 
     Args:
-        scene: the scene, with everything that the task adds.
-        binder: binder of the task; it collects the names that the model does not have.
+        scene: the scene, with all parts that the task adds to the MJCF.
+        binder: resolver of names in the task's configuration; it collects a problem for each name that the model does
+            not have.
         device: device of the engine.
         seed: seed of the terrain's random numbers.
         streams: index of the random stream of each environment. (num_envs,) int64
 
     Raises:
-        ConfigError: if a model is missing or does not compile, so that further names cannot be looked up.
+        ConfigError: if a model file is missing or does not compile; names cannot be looked up then.
     """
     task = binder.resolved.task
     for problem in scene.problems:

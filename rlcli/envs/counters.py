@@ -22,7 +22,7 @@ _MIN_STATES = 5
 
 
 class SuccessCondition:
-    """Condition of success, with its value in the newest step and the number of steps for which it has held."""
+    """Condition of the task's section `success`: its value in the newest step, and for how many steps it has held."""
 
     def __init__(self, term: BoundTerm, lengths: Tensor, as_field: Callable[[Tensor], Field], step_dt: float) -> None:
         config, first = term.config, first_value(term)
@@ -57,13 +57,13 @@ class SuccessCondition:
         return value >= self._low if self._high is None else (value >= self._low) & (value <= self._high)
 
     def describe(self, env_id: int, step_dt: float) -> str:
-        """Return a text with name, newest value, bound and how long the condition has held in one environment."""
+        """Return the condition in one environment as text, such as `speed 0.21, at most 0.3: has held for 0.4 s`."""
         bound = f" {float(self.value[env_id]):.3g}, {bound_text(self.term.config.model_dump())}" if self.bounded else ""
         held = float(self.steps[env_id]) * step_dt
         return f"{self.name}{bound}: " + (f"has held for {held:.1f} s" if held else "fails")
 
     def count(self) -> None:
-        """Count a step where the condition holds, and set the count to 0 where it does not."""
+        """Add 1 to the number of consecutive steps where the condition holds, and set it to 0 where it does not."""
         self.field += 1.0
         self.field *= self.holds()
 
@@ -74,7 +74,7 @@ class EpisodeCounters(TensorState):
     def __init__(self, shard: Shard, device: torch.device) -> None:
         num_envs = shard.count
         self.ids = torch.arange(shard.first, shard.first + num_envs, device=device)
-        """Numbers of the environments among those of all shards. (num_envs,) int64"""
+        """Indices of these environments among those of all processes. (num_envs,) int64"""
         memory = shard.counters
         if memory is None:
             memory = torch.empty(2, num_envs, dtype=torch.int64, device=device)
@@ -87,14 +87,14 @@ class EpisodeCounters(TensorState):
         """Rewards of the newest step. (num_envs,)"""
 
     def attach(self, engine: Engine) -> None:
-        """Make the attributes `*_field` with `Engine.as_field`: the forms of the tensors that are written fastest."""
+        """Make the attributes `*_field`: the engine's form of each tensor, a numpy array on the CPU for fast writes."""
         self._as_field = engine.as_field
         self.id_field, self.length_field = engine.as_field(self.ids), engine.as_field(self.lengths)
         self.index_field = engine.as_field(self.indices)
         self._common_step = in_place(self.common_step)
 
     def set_success(self, terms: list[BoundTerm], step_dt: float) -> None:
-        """Set the conditions of success."""
+        """Make a `SuccessCondition` for each term of the task's section `success`."""
         self.conditions = [SuccessCondition(term, self.lengths, self._as_field, step_dt) for term in terms]
 
     def tensors(self) -> dict[str, Tensor]:
@@ -112,18 +112,19 @@ class EpisodeCounters(TensorState):
         self._common_step += 1
 
     def count_success(self, reward: Tensor) -> None:
-        """Count a step for each condition of success where it holds, and set its count to 0 where it does not.
+        """Update each condition's number of consecutive steps in which it holds, after a step.
 
-        `reward`, (num_envs,), is kept for `reward_gap`.
+        `reward`, (num_envs,), is stored for `reward_gap`.
         """
         for condition in self.conditions:
             condition.count()
         self.rewards = reward
 
     def reward_gap(self) -> tuple[float, float] | None:
-        """Return the mean reward of the newest step in states of success minus that in other states, and its error.
+        """Return how much the newest rewards depend on success: (difference of means, its standard error).
 
-        None with fewer than five environments of either kind. New episodes do not count.
+        The difference is the mean reward of environments where all conditions of success hold, minus the mean of the
+        others. None with fewer than five environments of either kind. New episodes do not count.
         """
         if not self.conditions:
             return None

@@ -1,4 +1,4 @@
-"""Program that loads plugins and describes them; `rlcli list-tasks` runs it in a process of its own.
+"""Program that loads plugins and describes them; `rlcli list-tasks` runs it in a separate process.
 
 `python -m rlcli.envs.describe_plugins GROUP FILE NAME...` appends a line of JSON to FILE for each named task, trainer
 or format. `--index DISTRIBUTION` prints the `index.json` that a distribution ships for `list-tasks`.
@@ -20,10 +20,10 @@ from rlcli.trainers import TrainerSpec
 
 
 def describe(name: str) -> Details:
-    """Load a task, build one environment of it, and return its description.
+    """Load a task, build an environment of it, and return the task's description.
 
     Raises:
-        RlcliError: if it cannot be built.
+        RlcliError: if the environment cannot be built.
     """
     from rlcli.config.load import resolve
     from rlcli.envs.make import make_env
@@ -43,10 +43,10 @@ def describe(name: str) -> Details:
 
 
 def try_trainer(name: str) -> Details:
-    """Load a trainer's spec, the models of its settings and its class, and return its description.
+    """Load a trainer's `TrainerSpec`, the models of its settings and its class; return the trainer's description.
 
     Raises:
-        RlcliError: if one of them cannot be loaded.
+        RlcliError: if one of these cannot be loaded.
     """
     entry = registry.find_entry(registry.TRAINERS, name, what="trainer")
     spec = registry.load_entry(entry, TrainerSpec)
@@ -56,10 +56,10 @@ def try_trainer(name: str) -> Details:
 
 
 def try_format(name: str) -> Details:
-    """Load a format's spec and every part that it names, and return its description.
+    """Load a format's `FormatSpec` and every function or class that it names; return the format's description.
 
     Raises:
-        RlcliError: if one of them cannot be loaded.
+        RlcliError: if one of these cannot be loaded.
     """
     form = load_format(name)
     spec = form.spec
@@ -73,7 +73,7 @@ _LOADERS = {registry.TASKS: describe, registry.TRAINERS: try_trainer, registry.F
 
 
 def main(arguments: list[str]) -> None:
-    """Append a description of each named plugin to a file, or print the index of a distribution."""
+    """Append a description of each named plugin to a file, or print the `index.json` of a distribution's plugins."""
     parser = argparse.ArgumentParser(prog="python -m rlcli.envs.describe_plugins", description=__doc__)
     parser.add_argument("--index", metavar="DISTRIBUTION", help="print the index.json of this distribution")
     parser.add_argument("group", nargs="?", choices=_LOADERS)

@@ -26,7 +26,7 @@ _RESET = stream("direct.reset")
 
 
 class DirectTask:
-    """Base class of a direct task. The framework owns the buffers; the hooks fill them.
+    """Base class of a direct task: rlcli makes the buffers (`obs_buf`, `rew_buf`, ...), and the hooks fill them.
 
     Order of a step: `pre_physics_step`, physics, `progress_buf += 1`, `get_observations`, `get_states`,
     `calculate_metrics`, `is_done`. If episodes ended, `reset` (or `reset_idx`) runs for their environments. Then
@@ -102,9 +102,9 @@ class DirectTask:
         """
 
     def reset_idx(self, env_ids: Tensor) -> None:
-        """Write start states like `reset`, with the indices of the environments. env_ids (n,) int64, sorted
+        """Write start states like `reset`, for the environments `env_ids`, (n,) int64, sorted.
 
-        This is the form of OmniIsaacGymEnvs.
+        Tasks of OmniIsaacGymEnvs define this hook instead of `reset`.
         """
 
     def pre_physics_step(self, actions: Tensor) -> None:
@@ -123,20 +123,20 @@ class DirectTask:
         raise NotImplementedError
 
     def is_done(self) -> None:
-        """Set reset_buf to 1 where the task ends an episode; the framework adds time-outs."""
+        """Set reset_buf to 1 where the task ends an episode; rlcli adds time-outs."""
         raise NotImplementedError
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]] | None:
-        """Return the observation and the action as terms of `rlcli.mdp`, for exports without the code of the task.
+        """Describe the observation and the action by terms of `rlcli.mdp`, so that an export needs no task code.
 
         `observations` and `actions` are lists of terms like those of a YAML (`func`, its parameters, `scale`, `clip`),
-        in the order of the columns, before `clip_observations` and after `clip_actions`. None: there are no such terms.
-        `rlcli export --verify` compares them with what the hooks compute.
+        in the order of the columns, before `clip_observations` and after `clip_actions`. None: the task cannot be
+        described by such terms. `rlcli export --verify` compares their values with those of the hooks.
         """
         return None
 
     def draws(self, env_ids: Tensor, name: str = "reset") -> IdSelection:
-        """Return a selection for random numbers in running episodes: `draws(ids).uniform(-1, 1, (k,))` is (n, k).
+        """Return an object that draws random numbers for n environments: `draws(ids).uniform(-1, 1, (k,))` is (n, k).
 
         The numbers depend only on the seed, the environment, its episode and `name`.
         """
@@ -146,7 +146,7 @@ class DirectTask:
         return IdSelection(ids, self.env.seed, episodes[ids], key, device, self.env.stream_ids)
 
     def selection(self, mask: Tensor, name: str) -> Selection | None:
-        """Return a selection of the environments where `mask` (num_envs,) is true, for random numbers in an episode.
+        """Return a `Selection` of the environments where `mask` (num_envs,) is true, to draw random numbers for them.
 
         Return None if there is no such environment. The random numbers depend only on the seed, the environment, its
         episode, the step in that episode and `name`. A GPU never returns None, because a test of the mask would force a
@@ -256,7 +256,7 @@ class DirectEnv(VecEnv):
                 yield name, value
 
     def metric_values(self) -> dict[str, Tensor]:
-        """Return the numbers and the tensors of the task's `extras`, by the name of their metric."""
+        """Return the numbers and the tensors of the task's `extras`, as `Task/NAME` -> value."""
         return {f"Task/{name}": value for name, value in self._extra_tensors()}
 
     def step_metrics(self) -> dict[str, Tensor]:
@@ -348,8 +348,8 @@ class DirectEnv(VecEnv):
     def _compute_observations(self) -> dict[str, Tensor]:
         """Return the observations of the current state.
 
-        `_compute_rewards_and_dones` has computed those of running environments; only environments that were just reset
-        are observed again.
+        `_compute_rewards_and_dones` has already computed the observations of running episodes; here they are computed
+        again only for environments that were just reset.
         """
         task, obs, states = self.task, next(self._obs), next(self._states)
         if not self._obs_current:
@@ -384,10 +384,10 @@ class DirectEnv(VecEnv):
         return {"policy": obs, "critic": states} if self.task.num_states else {"policy": obs}
 
     def _reset_stale(self, env_ids: Tensor) -> None:
-        """Replace the task's `reset_idx`, for calls by the task itself.
+        """Reset environments when the task itself calls `reset_idx`, whose place this method takes.
 
-        Tasks of OmniIsaacGymEnvs call it at the start of `pre_physics_step` where `reset_buf` is set. If the framework
-        has just reset an environment, only its `reset_buf` is cleared; all others are reset.
+        Tasks of OmniIsaacGymEnvs call `reset_idx` at the start of `pre_physics_step` where `reset_buf` is set. If the
+        environment loop has just reset an environment, only its `reset_buf` is cleared; all others are reset.
         """
         stale = env_ids[~self._fresh[env_ids]]
         self.task.reset_buf[env_ids] = 0

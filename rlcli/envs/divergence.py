@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class DivergenceGuard:
-    """Checks of a vectorised environment for divergence and values that are not finite; recovery from divergence."""
+    """Checks of an environment loop for divergence and for values that are not finite; recovery from divergence."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
@@ -41,7 +41,7 @@ class DivergenceGuard:
         return self._quarantine_causes + Counter(self._env.engine.divergence_causes)
 
     def metrics(self) -> dict[str, float]:
-        """Return `Sim/diverged/CAUSE` -> number of diverged environments since the last call."""
+        """Return `Sim/diverged/CAUSE` -> number of environments that have diverged since the last call."""
         causes = self.causes
         new, self._logged_causes = causes - self._logged_causes, causes
         return {f"Sim/diverged/{cause.replace(' ', '_')}": float(count) for cause, count in new.items()}
@@ -69,7 +69,7 @@ class DivergenceGuard:
             )
 
     def after_physics(self) -> Tensor | None:
-        """Refresh the state after physics, and return diverged environments to a finite one.
+        """Read the state after physics, and return diverged environments to their last finite state.
 
         Returns:
             Environments that diverged in this step or were quarantined before it, (num_envs,) bool; None: none.
@@ -97,8 +97,8 @@ class DivergenceGuard:
     def quarantine_out_of_bounds(self) -> None:
         """Quarantine the environments that an event or a reset has put out of bounds.
 
-        Until their episode ends with the next step, they are in the state before the event, or in the default state if
-        their episode has just begun. On a GPU the next step finds them: a check here would force a host sync.
+        They return to the state before the event, or to the default state if their episode has just begun; the next
+        step ends their episode. On a GPU the next step finds these environments: a check here would force a host sync.
         """
         env = self._env
         if env.engine.asynchronous:
@@ -113,11 +113,11 @@ class DivergenceGuard:
 
         Args:
             values: (num_envs,) or (num_envs, n)
-            what: name of the values, for the message.
+            what: name of the values for the message, such as `the reward`.
             columns: names of the n columns.
 
         Raises:
-            DivergedError: with the number of environments, and the first column that is not finite.
+            DivergedError: with the number of environments, and the first column with a value that is not finite.
         """
         env = self._env
         if env.engine.asynchronous:
@@ -172,7 +172,7 @@ class DivergenceGuard:
         self._any_quarantined = True
 
     def _describe(self, number: int) -> Divergence:
-        """Describe the first out-of-bounds value that an event or a reset has written in environment `number`."""
+        """Return the first value that an event or a reset has put out of bounds in environment `number`."""
         env = self._env
         columns, field = env.sim.qpos[number], "qpos"
         if bool((columns.abs() <= STATE_LIMIT).all()):

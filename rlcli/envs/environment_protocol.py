@@ -41,7 +41,7 @@ class Environment(Protocol):
     layout: Layout
     """Layout of the observation and action columns."""
     final_obs_of: str
-    """Episodes whose last observations a step returns: `finished`, or only `truncated` ones."""
+    """Which episodes have valid rows in `StepResult.final_obs`: `finished` (all that ended), or only `truncated`."""
     seconds: dict[str, float]
     """Time spent in steps, and in their physics, since the start [s]."""
     observers: Observers
@@ -49,7 +49,7 @@ class Environment(Protocol):
     episode_length_buf: Tensor
     """Steps of the running episode. (num_envs,) int64"""
     episode_index: Tensor
-    """Number of episodes before the running one; the random numbers depend on it. (num_envs,) int64"""
+    """Index of the running episode, from 0; the random numbers depend on it. (num_envs,) int64"""
     default_state: dict[str, Tensor]
     """Joint state at the start of episodes, before reset events. qpos (nq,), qvel (nv,)"""
     engine: EngineView
@@ -59,7 +59,7 @@ class Environment(Protocol):
     def local(self) -> VecEnv:
         """The environments that this process steps, with their terms and managers.
 
-        They are all environments, or this process's share of them if there are several processes.
+        With several processes, these are the environments of the first shard.
         """
 
     @property
@@ -72,8 +72,8 @@ class Environment(Protocol):
 
         Args:
             seed: seed of all random numbers from now on, as in a new environment; None: the random streams continue.
-            episode: with a seed, the index of the episode that begins. The state that earlier episodes would have left
-                in the terms of `episode_dependencies` is missing then.
+            episode: with a seed, the index of the episode that begins, to repeat it without the earlier ones. The
+                episode is the same as in a whole run only if `episode_dependencies()` is empty.
         """
 
     def step(self, action: Tensor, restart: Tensor | None = None) -> StepResult:
@@ -119,7 +119,11 @@ class Environment(Protocol):
         return []
 
     def extras(self) -> dict[str, float]:
-        """Return values to log, by metric: means of the task's `extras` or curriculum, and new divergences by cause."""
+        """Return the values to log, as metric name -> value.
+
+        They are the means of a direct task's `extras` or of the curriculum's values, and the number of divergences
+        since the last call, by cause.
+        """
 
     def step_metrics(self) -> dict[str, Tensor]:
         """Return the values that a direct task wrote to `extras` in this step, by name. (num_envs,) each
@@ -140,13 +144,19 @@ class Environment(Protocol):
         """
 
     def unsaved_state(self) -> list[str]:
-        """Return the state that `state_dict` cannot contain; empty: a resumed run continues exactly."""
+        """Return the names of attributes that `state_dict` cannot save; if there are none, a resumed run is exact."""
 
     def stateful_objects(self) -> list[Any]:
-        """Return the objects whose attributes a step may change: class terms, a direct task."""
+        """Return the objects whose attributes a step may change: terms that are classes, or the direct task.
+
+        A CUDA graph of the step must include these attributes.
+        """
 
     def episode_dependencies(self) -> list[str]:
-        """Return parts of the configuration through which an episode depends on earlier ones; empty: none known."""
+        """Return the parts of the configuration that make an episode depend on earlier ones, such as `scene.terrain`.
+
+        If the list is empty, an episode can be repeated from its seed and index alone.
+        """
 
     def is_playing(self) -> bool:
         """Return False while the environment is paused; `step` then raises an error."""

@@ -67,7 +67,7 @@ class Layout:
         ]
 
     def record(self) -> dict[str, Any]:
-        """Return the layout as plain JSON."""
+        """Return the layout as data for JSON."""
 
         def term(t: TermLayout) -> dict[str, Any]:
             return {

@@ -26,7 +26,7 @@ def make_env(
     shared_streams: int = 0,
     shard: Shard | None = None,
 ) -> VecEnv:
-    """Return the environment of a task, in the task's own workflow.
+    """Return the environment of a task: a `ManagedEnv`, a `DirectEnv`, or the class of the task's format.
 
     Args:
         task: a resolved task, or a `TaskConfig` built in Python.

@@ -33,9 +33,9 @@ from rlcli.sim.markers import Marker
 from rlcli.sim.saved_tensors import require_matching_tensors, substate
 
 _STATELESS = ("functools", "rlcli.mdp.")
-"""Prefixes of the modules of terms that do not make an episode depend on earlier ones.
+"""Prefixes of modules whose terms keep no state from one episode to the next.
 
-Function terms are objects of `functools`: `partial(function, env, ...)`.
+`functools`: a term that is a function is bound as `functools.partial(function, env, ...)`.
 """
 _UNIT = re.compile(r"\[([^\]]+)\]")
 """Pattern of the unit in the first line of a term's docstring."""
@@ -80,7 +80,10 @@ class ManagedEnv(VecEnv):
         self._bind("curriculum")
 
     def _bind(self, section: str, manager: Callable[[list[BoundTerm], EnvContext], Any] | None = None) -> None:
-        """Bind the terms of a section; then create its manager, unless a term of it or of a section before is wrong."""
+        """Resolve the terms of a section such as `rewards`, then create its manager.
+
+        The manager is not created if a term of this section or of an earlier one is wrong.
+        """
         self._bound[section] = self._binder.bind_all(section)
         if manager is not None and not self._binder.problems:
             setattr(self, f"{section.removesuffix('s')}_manager", manager(self._bound[section], self._context))
@@ -104,10 +107,10 @@ class ManagedEnv(VecEnv):
         return [*itertools.chain(*self._bound.values(), *self._observations.values())]
 
     def episode_dependencies(self) -> list[str]:
-        """Return the paths of the terms through which an episode depends on earlier ones.
+        """Return the keys of the terms and parts that make an episode depend on earlier ones.
 
-        Such a term draws random numbers that depend on the training step, keeps state beyond a reset, or is a class of
-        the task, which may do both.
+        Such a term draws random numbers that depend on the training step, keeps state beyond a reset, or is a class in
+        the task's own code, which may do both.
         """
         found = [*super().episode_dependencies(), *(f"actuators.{name}" for name in self.actuators)]
         found += [
@@ -238,7 +241,7 @@ class ManagedEnv(VecEnv):
         return self.observation_manager.recompute_last()
 
     def metric_values(self) -> dict[str, Tensor]:
-        """Return the last values of the curriculum terms."""
+        """Return the last values of the curriculum terms, by name."""
         return self.curriculum_manager.values()
 
     def _workflow_state(self) -> dict[str, Tensor]:
@@ -268,7 +271,7 @@ class ManagedEnv(VecEnv):
         return self.command_manager.markers()
 
     def unsaved_state(self) -> list[str]:
-        """Return the attributes of class terms that cannot be saved."""
+        """Return the names of attributes that cannot be saved, of terms that are classes."""
         memories = [term.memory for term in self._terms() if term.memory]
         return [attribute for memory in memories for attribute in memory.unsaved()]
 

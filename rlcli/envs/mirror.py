@@ -61,11 +61,11 @@ class MirrorMaps:
 
 
 def mirror_maps(resolved: Resolved, groups: Iterable[str], *, tolerance: float) -> MirrorMaps:
-    """Derive the mirror maps of a task, and test them.
+    """Return the mirror maps of a task, after a test that the task is symmetric.
 
     Args:
         resolved: the task.
-        groups: the observation groups that need a map.
+        groups: names of the observation groups that need a map.
         tolerance: largest mean difference between a motion, reward or observation and its mirror image, relative to the
             mean size of its changes.
 
@@ -87,7 +87,7 @@ def mirror_maps(resolved: Resolved, groups: Iterable[str], *, tolerance: float) 
 
 
 def _pairs_on_a_plane(resolved: Resolved) -> Resolved:
-    """Return the task with `_PAIRS` pairs of environments, and a plane instead of a terrain."""
+    """Return the task as `_MirrorTest` needs it: with 2 x `_PAIRS` environments, and a plane instead of a terrain."""
     scene = resolved.task.scene
     sensors = {
         name: config.model_copy(update={"lookup": False}) if isinstance(config, RaySensorConfig) else config
@@ -108,7 +108,7 @@ class _MirrorTest:
         self._action = self._action_map()
 
     def run(self, groups: Iterable[str]) -> MirrorMaps:
-        """Take the steps, compare, and return the maps.
+        """Step both halves, compare them, and return the maps of the action and of the observation groups.
 
         Raises:
             TaskError: with the joint, term or column that is not symmetric.
@@ -168,7 +168,7 @@ class _MirrorTest:
         return ColumnMap(torch.tensor(index), torch.tensor(sign, dtype=torch.float32))
 
     def _write_states(self) -> None:
-        """Write random states, their mirror images, random commands and episode times."""
+        """Write random states, commands and episode times, and their mirror images."""
         env, model = self._env, self._env.engine.model
         qpos, qvel = (env.engine.field(name) for name in ("qpos", "qvel"))
         qpos[:_PAIRS] += 0.3 * self._normal_samples(model.nq)
@@ -247,7 +247,7 @@ class _MirrorTest:
         return mapped
 
     def _term_map(self, name: str, pipeline: Pipeline, own: Tensor, images: Tensor) -> list[tuple[int, float]]:
-        """Return, for each column of a term, the column that its mirror image comes from, and the sign."""
+        """Return, for each column of a term, (index, sign): column i of the image is `sign` x column `index`."""
         if len(pipeline.shape) > 1:
             raise TaskError(f"observation '{name}' is an image, which has no mirror map; remove it from the group")
         rays = _ray_partners(pipeline)
@@ -272,7 +272,7 @@ class _MirrorTest:
 
 
 def _relative(difference: Tensor, values: Tensor) -> Tensor:
-    """Return the mean absolute difference of columns, relative to the mean deviation of the values. (n, d) -> (d,)"""
+    """Return the mean absolute difference of each column, divided by its mean absolute deviation. (n, d) -> (d,)"""
     deviation = (values - values.mean(dim=0)).abs().mean(dim=0)
     return difference.abs().mean(dim=0) / (deviation + 1e-6 * values.abs().mean(dim=0) + 1e-9)
 

@@ -29,8 +29,9 @@ class StepObserver:
         """Run when simulations have diverged, before a reset drops the calls that `engine.recorded_calls` returns.
 
         Args:
-            found: environment and cause of the first ones; see `rlcli.sim.divergence_report.Divergence`.
-            pending: whether an event or a reset wrote bad values with which the next engine call would fail.
+            found: environment and cause of the first few divergences (`rlcli.sim.divergence_report.Divergence`).
+            pending: True: an event or a reset wrote bad values, and no physics step has used them; False: physics
+                diverged.
         """
 
     def on_step(self, record: StepRecord) -> None:
@@ -45,7 +46,7 @@ _Observer = TypeVar("_Observer", bound=StepObserver)
 
 
 class Observers:
-    """Observers of one environment, with the methods that they override, in the order of `add`."""
+    """Observers of one environment; a step calls only the methods that they override, in the order of `add`."""
 
     def __init__(self) -> None:
         self._set(())
@@ -55,7 +56,7 @@ class Observers:
         self._set((*self._observers, observer))
 
     def remove(self, observer: StepObserver) -> None:
-        """Remove an observer if it is present. It may remove itself while it is called."""
+        """Remove an observer if it is present. An observer may remove itself in one of its methods."""
         self._set(tuple(other for other in self._observers if other is not observer))
 
     @contextmanager

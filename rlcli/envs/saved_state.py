@@ -53,7 +53,7 @@ def _state_without_workflow(env: VecEnv) -> dict[str, Tensor]:
 
 
 def _parts(env: VecEnv) -> dict[str, _Stateful]:
-    """Return the parts of an environment that have a state, by the prefix of their keys in it; not the engine."""
+    """Return the actuator models, the terrain and the sensors, by the prefix of their keys in the saved state."""
     parts: dict[str, _Stateful] = {f"actuator.{name}.": model for name, model in env.actuators.items()}
     if env.terrain is not None:
         parts["terrain."] = env.terrain

@@ -25,7 +25,7 @@ class Shard:
     counters: Tensor | None = field(default=None, compare=False)
     """Lengths and indices of this shard's running episodes, written in place; None: new tensors. (2, count) int64"""
     shared: dict[str, Tensor] = field(default_factory=dict, compare=False)
-    """Tensors that `ShardedEnv.share` has made, by name."""
+    """Tensors in memory that all processes share, by name; `ShardedEnv.share` makes them."""
 
     @property
     def rows(self) -> slice:

@@ -14,7 +14,7 @@ class Episodes:
     """Episodes that ended in a step, one in each row."""
 
     ids: Tensor
-    """Numbers of the environments. (n,) int64"""
+    """Indices of the environments. (n,) int64"""
     returns: Tensor
     """Undiscounted sums of the rewards. (n,)"""
     lengths: Tensor
@@ -34,7 +34,7 @@ class Episodes:
     metrics: dict[str, Tensor] = field(default_factory=dict)
     """`command/metric` -> mean over the episode; for a direct task: metric -> value in the last step. (n,) each"""
     mask: Tensor | None = None
-    """Which rows are valid, on a GPU, whose tensors have a row for every environment; None: all. (num_envs,) bool
+    """Which rows are valid, on a GPU, where the tensors have a row for every environment; None: all. (num_envs,) bool
 
     The next step overwrites these tensors; the tensors of `StepResult` stay valid for one step more.
     """
@@ -61,20 +61,20 @@ class StepResult:
     """
 
     obs: dict[str, Tensor]
-    """Group -> observations; of the new episode where one has just begun. (num_envs, d) float32"""
+    """Group -> observations after resets: where an episode ended, the first ones of the next. (num_envs, d) float32"""
     reward: Tensor
     """Reward of the step. (num_envs,) float32"""
     terminated: Tensor
-    """Where the task ended the episode: the value of its last state is 0. (num_envs,) bool"""
+    """Where the task ended the episode: do not bootstrap, the value after the last state is 0. (num_envs,) bool"""
     truncated: Tensor
     """Where the episode timed out: bootstrap from `final_obs`, unless it was terminated as well. (num_envs,) bool"""
     final_obs: dict[str, Tensor] | None
-    """Last observations of the episodes that end, for all environments; None if there is certainly no valid row.
+    """Last observations of the episodes that ended, as group -> (num_envs, d); None if no row is valid.
 
     A row is valid where an episode ended (with `final_obs_of = "truncated"`: where it timed out).
     """
     episodes: Episodes | None
-    """Episodes that ended; None if certainly none did."""
+    """Episodes that ended in this step; None: no episode ended. On a GPU always present: read its `mask`."""
 
 
 @dataclass(frozen=True, slots=True)

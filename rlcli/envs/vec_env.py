@@ -71,14 +71,14 @@ class VecEnv(Workflow):
         self.seconds = {"physics": 0.0, "step": 0.0}
         self.observers = Observers()
         self.physics_override: Callable[[], None] | None = None
-        """Called instead of the engine to step the simulations; it must write their states and derived fields."""
+        """Function that steps the simulations instead of the engine and writes their states and derived fields."""
         self._last_obs: dict[str, Tensor] = {}
         self._read_finals: Field = torch.zeros(self.num_envs, dtype=torch.bool)  # where `final_obs` is valid
         self._counters = EpisodeCounters(self.shard, self.device)
         self.episode_length_buf = self._counters.lengths
         """Steps of the running episode. (num_envs,) int64"""
         self.episode_index = self._counters.indices
-        """Number of episodes before the running one; the random numbers depend on it. (num_envs,) int64"""
+        """Index of the running episode, from 0; the random numbers depend on it. (num_envs,) int64"""
         self._guard = DivergenceGuard(self)
         self._build(shared_streams)
 
@@ -107,7 +107,7 @@ class VecEnv(Workflow):
         self.origins = built.origins
         """Start position of each environment in its world: zeros without a terrain. (num_envs, 3) [m]"""
         self.env_origins = grid(distinct, self.config.scene.env_spacing).to(self.device)[streams]
-        """Position of each environment on a grid, for plugins whose tasks expect one common world. (num_envs, 3) [m]"""
+        """Position of each environment on a grid, for task formats in which all share a world. (num_envs, 3) [m]"""
         self._counters.attach(self.engine)
         self._bind_terms()
         success = self._binder.bind_all("success")
@@ -175,7 +175,7 @@ class VecEnv(Workflow):
         return StepResult(obs, reward, terminated, truncated, final_obs, episodes)
 
     def check_action(self, action: Tensor, shape: tuple[int, int], restart: Tensor | None) -> Tensor:
-        """Return an action with zeros where an environment restarts.
+        """Check an action, and return it with zeros where an environment restarts.
 
         Raises:
             ValueError: for another shape.
@@ -209,8 +209,8 @@ class VecEnv(Workflow):
         """End the episodes that are terminated or truncated; return None three times if none ends.
 
         Returns:
-            A selection of the environments whose episode ends; their last observations, None if they are not
-            needed; and the returns, lengths, ... of the episodes.
+            Selection of the environments whose episode ends; last observations by group, (num_envs, d) each, or None
+            if no trainer or observer needs them; the ended episodes.
         """
         finished, timed_out = self._counters.end(terminated, truncated)
         ended = self._select(finished)
@@ -258,13 +258,13 @@ class VecEnv(Workflow):
             sensor.reset(selection)
 
     def on_moved(self, selection: Selection) -> None:
-        """Update what derives from the state of the selected environments, after a write to it between two steps."""
+        """Mark derived values and sensors of the selected environments as outdated, after a write to their state."""
         self.sim.on_moved(selection)
         for sensor in self.sensors.values():
             sensor.on_moved(selection)
 
     def _observe(self) -> dict[str, Tensor]:
-        """Update commands and events, and return the observations of the resulting state."""
+        """Update commands, run interval events, and return the observations of the resulting state."""
         self._update_commands_and_events()
         self.sim.forward_moved()
         self._guard.quarantine_out_of_bounds()
@@ -293,9 +293,10 @@ class VecEnv(Workflow):
         return {each.name: float((each.steps > 0.0).float().mean()) for each in self._counters.conditions}
 
     def success_reward_gap(self) -> tuple[float, float] | None:
-        """Return how much higher the newest reward is in states of success, and the standard error of this difference.
+        """Return how much the newest rewards depend on success: (difference of means, its standard error).
 
-        None if there are too few states of success, or too few others.
+        The difference is the mean reward of environments where all conditions of success hold, minus the mean of the
+        others. None if too few environments are in either group.
         """
         return self._counters.reward_gap()
 
@@ -324,7 +325,7 @@ class VecEnv(Workflow):
             actuator.compute()
 
     def extras(self) -> dict[str, float]:
-        """Return values to log, by metric: means of the task's `extras` or curriculum, and new divergences by cause."""
+        """Return the values to log, as metric name -> value; see `Environment.extras`."""
         return {**means(self.metric_values()), **self.divergence_metrics()}
 
     def divergence_metrics(self) -> dict[str, float]:

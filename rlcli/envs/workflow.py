@@ -51,7 +51,7 @@ class Workflow(Environment):
 
     @abstractmethod
     def _compute_rewards_and_dones(self, diverged: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Return reward, terminated and truncated. (num_envs,) each"""
+        """Return reward, terminated and truncated of the step, before any reset. (num_envs,) each"""
 
     @abstractmethod
     def _compute_final_obs(self) -> dict[str, Tensor]:
@@ -59,7 +59,7 @@ class Workflow(Environment):
 
     @abstractmethod
     def _episode_returns_and_causes(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-        """Return returns, reward terms and causes (the latter two by name) of the episodes that end. (n,) each"""
+        """Return (returns, reward terms, causes) of the episodes that end, as in `Episodes`. (n,) each"""
 
     def _episode_metrics(self, ended: Selection) -> dict[str, Tensor]:
         """Return `Episodes.metrics` of the episodes that end. (n,) each"""
@@ -96,7 +96,7 @@ class Workflow(Environment):
         return self._compute_observations()
 
     def metric_values(self) -> dict[str, Tensor]:
-        """Return the values of the last step that the training log averages. (num_envs, ...) or any shape
+        """Return name -> values of the newest step, whose mean is logged; their shape is free.
 
         They are the `extras` of a direct task, or the values of the curriculum.
         """
@@ -111,11 +111,11 @@ class Workflow(Environment):
         """Restore the state returned by `_workflow_state`."""
 
     def stateful_objects(self) -> list[Any]:
-        """Return the objects whose attributes a step may change: class terms, a direct task."""
+        """Return the objects whose attributes a step may change: terms that are classes, or the direct task."""
         return []
 
     def episode_dependencies(self) -> list[str]:
-        """Return parts of the configuration through which an episode depends on earlier ones; empty: none known."""
+        """Return parts of the configuration that make an episode depend on earlier ones, such as `scene.terrain`."""
         return ["scene.terrain"] if self.terrain is not None else []
 
     def step_metrics(self) -> dict[str, Tensor]:
@@ -127,7 +127,7 @@ class Workflow(Environment):
         return {}
 
     def unsaved_state(self) -> list[str]:
-        """Return the state that `state_dict` cannot contain; empty: a resumed run continues exactly."""
+        """Return the names of attributes that `state_dict` cannot save; if there are none, a resumed run is exact."""
         return []
 
     def markers(self) -> list[Marker]:

@@ -15,6 +15,7 @@ from rlcli.safe_text import shorten
 if TYPE_CHECKING:
     from rlcli.config.load import Resolved
     from rlcli.evaluation.evaluate import Evaluation
+    from rlcli.registry import TaskSource
 
 METRICS = ("success", "return", "length")
 _WITHOUT_EFFECT = (
@@ -33,7 +34,7 @@ _MISSING = "not set"
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Result of a comparison: the evaluations of several policies in the same episodes."""
+    """Result of `compare`: the evaluations of several policies in the same episodes, and their differences."""
 
     names: list[str]
     policies: list[PolicyInTask]
@@ -43,7 +44,7 @@ class Comparison:
     num_envs: int
 
     def record(self) -> dict[str, Any]:
-        """Return the comparison as JSON."""
+        """Return the comparison as data for JSON (`rlcli eval --compare ... --json`)."""
         rows = zip(self.names, self.policies, self.summaries, strict=True)
         return {
             "compare": self.names,
@@ -68,11 +69,11 @@ class Comparison:
 
 
 def find_policies(names: Sequence[str], request: PolicyRequest) -> list[PolicyInTask]:
-    """Find the policies to compare; zero, random and lqr, which need no run, act in the task of the first run.
+    """Find the policies to compare. Policies without a run (zero, random, lqr) act in the task of the first run.
 
     Args:
-        names: for each policy a run or checkpoint, or shipped, zero, random or lqr.
-        request: the further settings, the same for all policies.
+        names: for each policy a run or checkpoint, or `shipped`, `zero`, `random` or `lqr`.
+        request: the other settings, such as overrides and seed, the same for all policies.
 
     Raises:
         UsageError: for fewer than two policies, if no policy belongs to a run, or if the tasks have different names.
@@ -131,17 +132,23 @@ def _require_same_task(name: str, first: PolicyInTask, other_name: str, other: P
     """
     ours, theirs = first.resolved.source, other.resolved.source
     if (ours.distribution, ours.name) != (theirs.distribution, theirs.name):
-        raise UsageError(f"compare policies of one task: {name} is for {ours.name}, {other_name} for {theirs.name}")
+        tasks = [source.name if ours.name != theirs.name else _name_and_origin(source) for source in (ours, theirs)]
+        raise UsageError(f"compare policies of one task: {name} is for {tasks[0]}, {other_name} for {tasks[1]}")
     left, right = _settings(first.resolved), _settings(other.resolved)
     problems = []
     for path in sorted({*left, *right}):
         ours, theirs = left.get(path, _MISSING), right.get(path, _MISSING)
         if ours != theirs:
-            message = f"this setting is {shorten(theirs, 60)}, but {shorten(ours, 60)} in {name}"
+            message = f"the value is {shorten(theirs, 60)} here, but {shorten(ours, 60)} in {name}"
             problems.append(Problem(other_name, path, message))
     if problems:
         hint = "add KEY.PATH=VALUE to use the same value for both"
         raise ConfigError([*problems[:-1], replace(problems[-1], hint=hint)])
+
+
+def _name_and_origin(source: TaskSource) -> str:
+    """Return the name of a task with its distribution or folder: two tasks may have the same name."""
+    return f"{source.name} ({source.distribution or source.root})"
 
 
 def _settings(resolved: Resolved) -> dict[str, Any]:
@@ -157,9 +164,9 @@ def _settings(resolved: Resolved) -> dict[str, Any]:
 
 
 def _compare_pair(left: Evaluation, right: Evaluation) -> dict[str, Any]:
-    """Return metric -> paired difference of two evaluations, and probability that the left one is better.
+    """Return metric -> paired difference (left - right) of two evaluations, and probability that `left` is better.
 
-    Entry i of both evaluations must be the same episode.
+    Episode i of both evaluations must have the same random numbers.
     """
     from rlcli.rl.confidence import difference, improvement
 

@@ -1,4 +1,4 @@
-"""Evaluation of a policy: a fixed number of episodes of each environment, so that short episodes are not favoured."""
+"""Evaluation of a policy: each environment runs a fixed number of episodes, so that short episodes are not favoured."""
 
 import math
 from collections.abc import Callable
@@ -26,7 +26,7 @@ _COLUMNS = (
 
 @dataclass(slots=True)
 class Evaluation:
-    """Result of an evaluation: each list has one entry for each finished episode, in the order in which they ended."""
+    """Result of an evaluation. Each list has one value for each episode, in the order in which the episodes ended."""
 
     conditions: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Condition of success -> its bounds, as `at_least` and `at_most`."""
@@ -69,9 +69,9 @@ class Evaluation:
         return result
 
     def _condition(self, name: str, bounds: dict[str, Any]) -> dict[str, Any]:
-        """Return the statistics of a condition of success.
+        """Return the statistics of a condition of success, with its bounds.
 
-        `held` is the share of episodes in which it held at the end, `value` its mean value; its bounds are added.
+        `held` is the share of episodes at whose end the condition held, `value` the mean of its last values.
         """
         result = {"held": proportion(sum(self.held[name]), len(self.held[name])), **bounds}
         if name in self.condition_values:
@@ -79,14 +79,14 @@ class Evaluation:
         return result
 
     def part(self, first: int, stop: int) -> Self:
-        """Return the episodes of the environments `first` to `stop` - 1; in the result, `first` is environment 0."""
+        """Return the evaluation of the environments `first` to `stop` - 1, in which `first` has index 0."""
         rows = [row for row, env in enumerate(self.envs) if first <= env < stop]
         return self._rows(rows, first)
 
     def in_environment_order(self) -> Self:
-        """Return the episodes ordered by environment.
+        """Return the evaluation with its episodes ordered by environment.
 
-        At equal positions, two evaluations of the same seed then have episodes with the same random numbers.
+        Episode i of two evaluations with the same seed then has the same random numbers in both.
         """
         return self._rows(sorted(range(len(self.envs)), key=lambda row: self.envs[row]), 0)  # a stable sort
 
@@ -109,16 +109,17 @@ def evaluate(
     on_step: Callable[[StepResult], None] = lambda _: None,
     groups: int = 1,
 ) -> Evaluation:
-    """Run exactly `episodes` episodes with a policy, and return them; each environment runs a fixed number of them.
+    """Run exactly `episodes` episodes with a policy, and return their results.
 
-    Counting the first episodes that finish in any environment would favour short episodes.
+    Each environment runs a fixed number of episodes. Counting the first episodes that finish in any environment would
+    favour short episodes.
 
     Args:
         env: the environments.
-        act: the policy, a function from observations to actions.
-        episodes: number of episodes of each group.
+        act: the policy, a function from observations (num_envs, d) to actions (num_envs, a).
+        episodes: number of episodes in each group.
         on_step: called with the result of every step.
-        groups: number of groups of environments (equal, consecutive parts), each evaluated by itself.
+        groups: number of equal, consecutive parts of the environments; `Evaluation.part` returns the result of one.
 
     Raises:
         ConfigError: if an episode does not end because the task has no time-out.
@@ -152,7 +153,7 @@ def evaluate(
 
 
 def _mean_of_finite(values: list[float]) -> dict[str, float | None]:
-    """Return mean, std, and low and high of the 95 % interval; all are None if one of the values is not finite."""
+    """Return `mean`, `std`, and the ends `low` and `high` of the 95 % interval; all None if a value is not finite."""
     if all(map(math.isfinite, values)):
         return mean(values)
     return {"mean": None, "std": None, "low": None, "high": None}
@@ -175,9 +176,9 @@ class _EpisodeMeans(StepObserver):
             steps += 1.0
 
     def finish(self, ids: Tensor) -> dict[str, list[float]]:
-        """Return metric -> its mean over the episode that has just ended in each of the environments `ids`.
+        """Return metric -> its mean over the episode that has just ended in each environment of `ids`.
 
-        Their sums are reset.
+        The sums of these environments are set to 0 for their next episodes.
         """
         ids, found = ids.cpu(), {}
         for name, sums in self._sums.items():
@@ -188,13 +189,13 @@ class _EpisodeMeans(StepObserver):
 
 
 def _add_episodes(result: Evaluation, ended: Episodes, quota: Tensor, means: _EpisodeMeans) -> None:
-    """Add the episodes that have just ended to a result, unless their environments have run enough of them.
+    """Add the episodes that have just ended to a result, without those of environments that have run enough episodes.
 
     Args:
         result: the evaluation.
         ended: the episodes.
         quota: number of episodes that each environment must still run; reduced here. (num_envs,)
-        means: means of the task's metrics.
+        means: observer with the means of the task's metrics.
     """
     values = {name: column.tolist() for name, column in ended.metrics.items()} | means.finish(ended.ids)
     for row, env in enumerate(ended.ids.tolist()):

@@ -36,13 +36,13 @@ class Limit:
 
     @property
     def end(self) -> str:
-        """End of the 95 % interval that the option can limit, as KEY.low or KEY.high: low for a minimum, else high."""
+        """Which end of the 95 % interval the option can limit, as in `success.low`: low for a minimum, else high."""
         return "low" if self.is_minimum else "high"
 
     def value_in(self, summary: Mapping[str, Any]) -> float | None:
-        """Return the value of the limited metric in the summary of an evaluation.
+        """Return the value of the limited metric in the summary of an evaluation (`Evaluation.summary`).
 
-        It is None if there are too few episodes, or if a value is not finite.
+        Return None if there are too few episodes for an interval, or if a value is not finite.
 
         Raises:
             UsageError: if the evaluation has no such metric.
@@ -102,7 +102,7 @@ def read_limits(fail_under: Sequence[str] | None, fail_over: Sequence[str] | Non
 
 
 def require_success(resolved: Resolved, keys: Iterable[str], instead: str = "--fail-under return=X") -> None:
-    """Check that the task defines success if one of some metrics is the success rate.
+    """Check that the task defines success if one of the metrics `keys` is the success rate.
 
     Args:
         resolved: the task.
@@ -113,11 +113,12 @@ def require_success(resolved: Resolved, keys: Iterable[str], instead: str = "--f
         UsageError: if a metric is `success` and the task does not define success.
     """
     if any(key.partition(".")[0] == "success" for key in keys) and not resolved.task.success:
-        raise UsageError("the task defines no success", hint=f"add `success:` to its YAML, or write {instead}")
+        hint = f"add `success:` to its YAML, or write {instead}"
+        raise UsageError("the task defines no condition of success, so it has no success rate", hint=hint)
 
 
 def failures(summary: Mapping[str, Any], limits: Iterable[Limit]) -> list[str]:
-    """Return a sentence for each limit that the summary of an evaluation fails.
+    """Return a sentence for each limit that the summary of an evaluation (`Evaluation.summary`) fails.
 
     Raises:
         UsageError: if the evaluation has no metric that a limit names.
@@ -144,7 +145,7 @@ def _parse(text: str, is_minimum: bool) -> Limit:
 
 
 def _is_key(limit: Limit) -> bool:
-    """Return whether the key of a limit is well-formed; only an evaluation shows whether there is such a metric."""
+    """Return whether the key of a limit is well-formed; whether the metric exists is known after an evaluation."""
     head, _, rest = limit.key.partition(".")
     if head in _KEYS:
         return rest in ("", limit.end)
@@ -154,9 +155,9 @@ def _is_key(limit: Limit) -> bool:
 
 
 def _find_name(entries: Mapping[str, Any], name: str) -> str | None:
-    """Return the full name of a metric; `metric` stands for `command/metric` if only one command has this metric.
+    """Return the full name of a metric: `name`, or `command/name` if exactly one command has a metric `name`.
 
-    Return None if there is no such metric, or several ones.
+    Return None if there is no such metric, or if several commands have it.
     """
     if name in entries:
         return name

@@ -39,7 +39,7 @@ class Regulator:
     """LQR as a policy: action = -gain (observation - rest), clamped to the bound."""
 
     gain: Matrix
-    """(actions, observations)"""
+    """Gain matrix K of the regulator. (actions, observations)"""
     rest: Matrix
     """The observation of the equilibrium. (observations,)"""
     bound: float | None
@@ -48,7 +48,7 @@ class Regulator:
     """Absolute values of the closed loop's poles, per control step, the largest first; stable below 1."""
 
     def acting(self, env: VecEnv) -> Callable[[Tensor], Tensor]:
-        """Return the regulator as a function from observations to actions, on the device of an environment."""
+        """Return the policy as a function from observations (num_envs, d) to actions, on the device of `env`."""
         gain = torch.from_numpy(self.gain).to(env.device)
         rest = torch.from_numpy(self.rest).to(env.device)
 
@@ -72,7 +72,7 @@ def regulator(resolved: Resolved, bound: float | None) -> Regulator:
         UsageError: if the task has no LQR, with the reason.
     """
     if not resolved.task.success:
-        raise _no_regulator_error(resolved, "the task defines no success, so its target state is unknown")
+        raise _no_regulator_error(resolved, "the task defines no condition of success, so its target state is unknown")
     with contextlib.closing(make_env(resolved.with_num_envs(1).without_randomness())) as env:
         model = env.engine.model
         if model.nq != model.nv:
@@ -121,12 +121,14 @@ def riccati(a: Matrix, b: Matrix, q: Matrix, r: Matrix) -> Matrix | None:
 
 
 def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Make one step from many states near the default state, and return what the linear model is fitted to.
+    """Make one step from many states near the default state, as data for the fit of a linear model.
+
+    The samples come in pairs on opposite sides of the default state. Half the difference of a pair is returned, in
+    which quadratic and other even terms cancel.
 
     Returns:
-        Deviations from the default state, a row for each pair of samples: (state and action, next state, observation);
-        and the observation at the default state. The two samples of a pair are on opposite sides of the default state;
-        half their difference is returned, in which quadratic and other even terms cancel.
+        Four matrices of deviations from the default state. Three have one row for each pair: state and action, next
+        state, observation. The last is the observation at the default state.
 
     Raises:
         UsageError: if the default state is not an equilibrium in which the task succeeds.
@@ -161,16 +163,14 @@ def _sample_steps(env: VecEnv, resolved: Resolved) -> tuple[Matrix, Matrix, Matr
 
 
 def _fit(inputs: Matrix, targets: Matrix) -> tuple[Matrix, Matrix]:
-    """Return the matrix that maps rows of inputs to rows of targets best, by least squares.
-
-    The second result is the relative error of each column of the targets.
-    """
+    """Fit `targets = inputs @ matrix` by least squares; return (matrix, relative error of each column of targets)."""
     found, *_ = np.linalg.lstsq(inputs, targets, rcond=_SINGULAR)
     residual = np.sqrt(np.square(targets - inputs @ found).mean(axis=0))
     return found, residual / np.maximum(np.sqrt(np.square(targets).mean(axis=0)), 1e-9)
 
 
 def _coordinates(env: VecEnv) -> list[str]:
+    """Return a name for each element of the state: joints, then `the velocity of` each joint."""
     model = env.engine.model
     names = [model.joint(int(model.dof_jntid[dof])).name.rpartition("/")[2] for dof in range(model.nv)]
     return [*names, *(f"the velocity of {name}" for name in names)]

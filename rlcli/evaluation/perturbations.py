@@ -1,7 +1,7 @@
-"""Perturbations of a stress test: of the model, of the signals between environment and policy, and pushes.
+"""Perturbations of a stress test: changes of model parameters, noise and delay of observations and actions, and pushes.
 
-Every environment has its own values, so that one set of environments holds many variants of a task. A neutral value
-changes nothing: the environment runs the same episodes as without perturbations.
+Every environment has its own values, so that many variants of a task run at the same time. With a neutral value (factor
+1, noise 0, ...) an environment runs the same episodes as without perturbations.
 """
 
 import math
@@ -34,7 +34,7 @@ class Perturbations(StepObserver):
     Args:
         env: the environment; from now on its steps are perturbed.
         sweeps: the perturbed parameters, such as the mass of a body.
-        values: value of each parameter in every environment; NaN: not changed. (num_envs, sweeps) float64
+        values: value of each parameter in every environment; NaN: not perturbed. (num_envs, number of sweeps) float64
 
     Raises:
         UsageError: for an unknown parameter or element, or if a parameter would change nothing.
@@ -60,7 +60,7 @@ class Perturbations(StepObserver):
         env.observers.add(self)
 
     def around(self, act: Act) -> Act:
-        """Return a policy function that perturbs the observations before, and the actions after, the policy `act`."""
+        """Return the policy `act` with perturbed observations and actions, as a function of observations."""
         if not self._inputs and not self._outputs:
             return act
 
@@ -90,13 +90,13 @@ class Perturbations(StepObserver):
             self._physical.append(ModelPerturbation(env, sweep, values))
 
     def before_step(self) -> None:
-        """Push bodies, and change the model again where an event of the task has undone the perturbation."""
+        """Apply pushes, and perturb the model again where an event of the task has overwritten the perturbed values."""
         self._apply_to_model()
         for push in self._pushes:
             push()
 
     def _apply_to_model(self) -> None:
-        """Change the model for the first time, or after an event of the task has written to it."""
+        """Write perturbed values to the model: at the first call, and wherever an event of the task wrote since."""
         env, changed, derived = self._env, False, None
         for physical in self._physical:
             rows = physical.apply()
@@ -112,7 +112,7 @@ class Perturbations(StepObserver):
 
 
 class _Signal:
-    """Base class of noise and delay: a perturbation of some columns of the observations or of the actions."""
+    """Perturbation of some columns of the observations or actions: base class of noise and delay."""
 
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor, columns: Tensor, of_action: bool) -> None:
         self.env, self.values, self.columns, self.of_action = env, values, columns, of_action
@@ -159,9 +159,9 @@ class _Delay(_Signal):
 
 
 class _Push:
-    """Push of a robot or joint once in an episode, at a random step of its first half.
+    """Push of a robot or joint: it adds a velocity in a random direction, once in an episode.
 
-    It adds a velocity in a random direction.
+    The push comes at a random step of the first half of the longest episode.
     """
 
     def __init__(self, env: VecEnv, sweep: Sweep, values: Tensor) -> None:
@@ -190,7 +190,7 @@ class _Push:
         self._root, self._joint = floating.get(name), joints.get(name)
 
     def __call__(self) -> None:
-        """Push in the environments in which the episode has reached its random step."""
+        """Push in the environments whose episode has reached the random step of its push."""
         env = self._env
         # columns: the step of the push, and its direction
         uniform = random.uniform(_keys(env, env.episode_index), self._stream, 0, 2)
@@ -221,18 +221,18 @@ _STEPS = 1 << 32
 
 
 def _keys(env: VecEnv, counters: Tensor) -> random.Keys:
-    """Return the random keys of all environments: each follows from the environment's stream and a counter.
-
-    (num_envs,)
-    """
+    """Return a random key for each environment, from the index of its random stream and its counter. (num_envs,)"""
     ids = np.arange(env.num_envs) % (env.engine.shared_streams or env.num_envs)
     return random.row_keys(env.seed, ids, counters.cpu().numpy())
 
 
 def _columns(terms: Sequence[TermLayout], pattern: str | None, what: str) -> Tensor:
-    """Return the columns whose term, or `term.element`, matches a pattern; all columns without a pattern. (k,)
+    """Return the indices of columns whose term, or `term.element`, matches a regular expression. (k,) int64
 
-    `what` is observation or action, for messages.
+    Args:
+        terms: layout of the observations or of the actions.
+        pattern: the regular expression; None: all columns.
+        what: `observation` or `action`, for messages.
     """
     total = sum(term.size for term in terms)
     if pattern is None:
@@ -294,7 +294,7 @@ class ModelPerturbation:
         self._affected = ~values.isnan() & ((values != 1.0) | sweep.absolute)
 
     def apply(self) -> Tensor | None:
-        """Perturb the values that the task has written since the last call of `note_values`.
+        """Perturb the model values that the task has written since the last call of `note_values`.
 
         Returns:
             Whether each environment was changed, (num_envs,) bool; None if none was.
@@ -308,12 +308,15 @@ class ModelPerturbation:
         return rows
 
     def note_values(self) -> None:
-        """Store the current values, to detect later writes of the task."""
+        """Store the current model values, so that `apply` detects later writes of the task."""
         for part in self._parts:
             part.held = part.now()
 
     def _targets(self, now: Tensor) -> list[Tensor]:
-        """Return the perturbed values of each part, from the first part's present values. (num_envs, values) each"""
+        """Return the perturbed values of each changed field, (num_envs, values) each.
+
+        `now` are the present values of the first field.
+        """
         value = self._values[:, None]
         if not self._sweep.absolute:
             return [part.now() * value for part in self._parts]
@@ -402,7 +405,7 @@ def _elements(model: mujoco.MjModel, field: str, number: int) -> list[int]:
 
 
 def _axes(env: VecEnv, field: str, sweep: Sweep) -> list[int] | None:
-    """Return which values in a row of a model field a sweep changes, by index; None: all.
+    """Return the indices of the values that a sweep changes in a row of a model field; None: all values.
 
     Raises:
         NameProblem: if a row has several values, and all of them would be set to the same value.
@@ -418,9 +421,15 @@ def _axes(env: VecEnv, field: str, sweep: Sweep) -> list[int] | None:
 
 
 def _require_affine(model: mujoco.MjModel, rows: list[int], names: list[str]) -> None:
-    """Check that the force of actuators is scaled if their gain and bias parameters are scaled.
+    """Check that actuators have an affine gain and bias, so that scaled parameters scale their force.
 
-    `rows` are the actuators in the model, `names` their names.
+    Args:
+        model: the model.
+        rows: ids of the actuators.
+        names: names of the actuators.
+
+    Raises:
+        NameProblem: with the actuators of another type.
     """
     kinds = [(int(model.actuator_gaintype[row]), int(model.actuator_biastype[row])) for row in rows]
     unsupported = [

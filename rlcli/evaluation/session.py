@@ -1,4 +1,4 @@
-"""Preparation of play, eval, stress and report: find a policy and its task, check them, and build the environment."""
+"""Preparation of the commands play, eval, stress and report: find a policy and its task, and build the environment."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MAX_ENVS = 8192
 
 @dataclass(frozen=True, slots=True)
 class PolicyRequest:
-    """Policy and task that the user has named on a command line, before they are found and checked."""
+    """Policy and task as the user has named them on a command line; `find_policy` looks them up."""
 
     task: str | None
     overrides: Sequence[str] = ()
@@ -56,7 +56,7 @@ class PolicyRequest:
 
 @dataclass(frozen=True, slots=True)
 class PolicyInTask:
-    """A policy and its task, found and checked; nothing is built yet."""
+    """Policy and task that `find_policy` has found; no environment is built yet."""
 
     resolved: Resolved
     run: Run | None
@@ -72,7 +72,7 @@ class PolicyInTask:
     """Whether the policy is a checkpoint of a run and the task is configured as in that run."""
 
     def record(self) -> dict[str, Any]:
-        """Return the checkpoint of the policy, why it was chosen, and the kind of policy, as JSON."""
+        """Return data for JSON: `checkpoint`, `chosen` (why this checkpoint) and `policy` (one of POLICIES)."""
         checkpoint = str(self.checkpoint) if self.checkpoint else None
         return {"checkpoint": checkpoint, "chosen": self.reason, "policy": self.kind}
 
@@ -85,7 +85,7 @@ class Session:
     act: Act
     policy: PolicyInTask
     start: tuple[int, Tensor] | None = None
-    """The environment to watch, and the current observations of all; None: the session starts with a reset."""
+    """Index of the environment to show, and observations of all environments; None: start with a reset."""
 
 
 def find_policy(request: PolicyRequest, check: Callable[[Resolved], None] = lambda resolved: None) -> PolicyInTask:
@@ -135,9 +135,9 @@ def find_policy(request: PolicyRequest, check: Callable[[Resolved], None] = lamb
 
 
 def split_overrides(task: str | None, overrides: Sequence[str]) -> tuple[str | None, list[str]]:
-    """Return the task and the overrides of a command line.
+    """Return the task and the overrides of a command line, where TASK is optional and stands before the overrides.
 
-    If the word in place of the task has a `=`, it is an override, and there is no task.
+    If the first word has a `=`, it is an override, and the task is None.
     """
     if task is not None and "=" in task:
         return None, [task, *overrides]
@@ -145,14 +145,14 @@ def split_overrides(task: str | None, overrides: Sequence[str]) -> tuple[str | N
 
 
 def named_task_or_run(task: str, runs_dir: Path | None) -> TaskSource:
-    """Return the task of a name that the user gave as a task; the name of a run is a common mistake.
+    """Return the task that the user has named. If the name is that of a run, a common mistake, the error says so.
 
     Args:
         task: name, file or folder of a task.
-        runs_dir: folder of the runs, to name the right option where `task` is a run; None: the default one.
+        runs_dir: folder in which to look for a run with this name; None: the default one.
 
     Raises:
-        TaskError: if there is no such task. If a run has this name, the message says so.
+        TaskError: if there is no such task.
     """
     from rlcli.runs.trusted_tasks import named_task
 
@@ -196,7 +196,7 @@ def open_session(request: PolicyRequest, check: Callable[[Resolved], None] = lam
 
 
 def one_each(resolved: Resolved, episodes: int) -> Resolved:
-    """Return the task with an environment for each episode, up to `MAX_ENVS`, unless the user set their number."""
+    """Return the task with as many environments as episodes, at most `MAX_ENVS`, unless the user set `num_envs`."""
     from rlcli.config.dump import explicit_values
 
     return (
@@ -205,7 +205,7 @@ def one_each(resolved: Resolved, episodes: int) -> Resolved:
 
 
 def baseline(policy: PolicyInTask, kind: str) -> PolicyInTask:
-    """Return a policy without a checkpoint in the task of another policy. `kind` is zero, random or lqr.
+    """Return a reference policy of this kind (zero, random or lqr) in the task of another policy.
 
     Raises:
         UsageError: if there is no such policy.
@@ -232,9 +232,9 @@ def is_run_name(word: str, runs_dir: Path | None) -> bool:
 
 
 def make_actor(policy: PolicyInTask) -> Callable[[VecEnv], Act]:
-    """Read a policy, and return a function from an environment to the policy's action function in it.
+    """Read a policy once; return a function that makes the policy's action function for any environment of the task.
 
-    The function can be called for several environments; the files of the policy are read only once.
+    An action function maps observations (num_envs, d) to actions (num_envs, a).
     """
     import torch
 
@@ -287,7 +287,7 @@ def check_record(record: Path | None, mode: str) -> None:
 
 
 def recording_files(file: Path, mode: str) -> dict[str, Path]:
-    """Return which episodes are recorded (all, succeeded or failed) -> the file to which they are written.
+    """Return the recordings to write: which episodes (`all`, `succeeded` or `failed`) -> file.
 
     Args:
         file: the FILE of `--record`.
@@ -315,7 +315,10 @@ def run_episodes(
 def save_episodes(
     recorder: EpisodeRecorder | None, record: Path | None, mode: str
 ) -> tuple[list[str], MachineError | None]:
-    """Write recorded episodes; return the files, or the error to raise after the results have been printed."""
+    """Write the recorded episodes; return (paths of the files, error).
+
+    An error is returned, not raised, so that the command prints its results before it ends.
+    """
     if recorder is None or record is None:
         return [], None
     try:
@@ -327,17 +330,17 @@ def save_episodes(
 
 
 def evaluation_record(session: Session, summary: dict[str, Any]) -> dict[str, Any]:
-    """Return the report of `rlcli eval`: the policy, the settings of the evaluation, and the summary."""
+    """Return the data that `rlcli eval --json` prints: the policy, the settings of the evaluation, and the summary."""
     policy = session.policy
     settings = {"stochastic": policy.stochastic, "seed": policy.seed, "num_envs": session.env.num_envs}
     return {**policy.record(), **settings, **summary}
 
 
 def save_evaluation(session: Session, record: dict[str, Any]) -> None:
-    """Write the evaluation of a checkpoint (`record`, its JSON) into its run, where `report` and `runs` read it.
+    """Write an evaluation (`record`, from `evaluation_record`) into the checkpoint's run, for `report` and `runs`.
 
-    It is written only for a deterministic policy in the task as it was trained. If the run cannot be written, a warning
-    is logged.
+    Only evaluations of a deterministic policy in the task as it was trained are written. If the run cannot be written,
+    a warning is logged.
     """
     from rlcli.runs.eval_store import write_evaluation
 

@@ -26,12 +26,12 @@ from rlcli.rl.rng import seed_generators
 _log = logging.getLogger(__name__)
 
 _NEAR = 0.25
-"""Standard deviation of a local search, as a share of the box's edges."""
+"""Standard deviation of the search near the worst variant, as a share of each parameter's range."""
 
 Actor = Callable[[VecEnv], Act]
-"""Opens a policy in an environment, and returns its action function."""
+"""Function from an environment to a policy's action function in it (`session.make_actor`)."""
 Summary = dict[str, Any]
-"""Summary of an evaluation."""
+"""Summary of an evaluation (`Evaluation.summary`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class StressResult:
         return min(self.variants, key=lambda point: score(self.variants[point]))
 
     def failures(self, limits: Sequence[Limit]) -> list[str]:
-        """Return a sentence for each minimum that a variant of the task fails; it names the worst variant."""
+        """Return a sentence for each minimum that a variant of the task misses, with the worst variant's values."""
         found = []
         for limit in limits:
             values = {point: limit.value_in(summary) for point, summary in self.variants.items()}
@@ -76,7 +76,7 @@ class StressResult:
         return found
 
     def record(self, against: str | None) -> dict[str, Any]:
-        """Return the result as JSON; `against` is the name of the reference policy, None without one."""
+        """Return the result as data for JSON; `against` is the kind of the reference policy, None without one."""
         worst = self.worst
         reference = {point: summary for point, summary in self.reference.items() if point is not None}
         return {
@@ -112,13 +112,14 @@ def stress(
 ) -> StressResult:
     """Evaluate a policy in its unchanged task and in many variants of it.
 
-    The variants are all combinations of the sweeps' values (the grid), and further ones near the worst of these.
+    The variants are all combinations of the sweeps' values (the grid), and random ones, half of them near the worst
+    variant of the grid.
 
     Args:
         policy: the policy.
         sweeps: the parameters that are varied, with their values.
         episodes: number of episodes in each variant.
-        worst: number of further variants in the search for a worse one.
+        worst: number of random variants, in which a worse one is searched.
         reference: a policy that is evaluated in the same variants.
 
     Raises:
@@ -186,7 +187,7 @@ def run_points(
 
 
 def search(sweeps: Sequence[Sweep], center: Point, count: int, seed: int) -> list[Point]:
-    """Return at most `count` random points between the lowest and the highest values of the sweeps, each once.
+    """Return at most `count` different random points between the lowest and highest values of the sweeps.
 
     Half of them are near the point `center`, the others are uniformly distributed.
     """

@@ -21,7 +21,7 @@ PHYSICAL = {
     "effort_limit": "actuator_forcerange",
     "gravity": "opt.gravity",
 }
-"""Parameter -> field of the model. The name of a model field is a parameter, too."""
+"""Parameter -> field of MjModel that it changes. Names of MjModel fields, such as `body_mass`, are also parameters."""
 SIGNALS = {
     "action_delay": "control steps",
     "action_noise": "standard deviation, in the units of the policy's actions",
@@ -29,7 +29,7 @@ SIGNALS = {
     "observation_noise": "standard deviation, in the units of the policy's observations",
     "push": "m/s or rad/s",
 }
-"""Parameter -> its unit."""
+"""Parameter that does not change the model -> unit of its values."""
 _INTEGER = ("action_delay", "observation_delay")
 _MAX_POINTS = 1000
 """Largest number of values of a sweep, and of steps of a delay."""
@@ -58,7 +58,7 @@ class Sweep:
 
     @property
     def neutral(self) -> float | None:
-        """The value that changes nothing; None if it is unknown."""
+        """The value that changes nothing: 1 for a factor, 0 for noise, delay and pushes; None for absolute values."""
         return 0.0 if self.parameter in SIGNALS else None if self.absolute else 1.0
 
     @property
@@ -123,12 +123,12 @@ def format_value(value: float) -> str:
 
 
 def by_name(sweeps: Sequence[Sweep], point: Point) -> dict[str, float]:
-    """Return name of each sweep -> its value at a point."""
+    """Return parameter name -> value for a variant (`point`) of the task."""
     return {sweep.name: value for sweep, value in zip(sweeps, point, strict=True)}
 
 
 def describe_point(sweeps: Sequence[Sweep], point: Point) -> str:
-    """Return a point as text: each sweep's name and value."""
+    """Return a variant (`point`) as text, such as `body_mass.pole 0.5, action_delay 2`."""
     return ", ".join(f"{name} {format_value(value)}" for name, value in by_name(sweeps, point).items())
 
 

@@ -18,10 +18,13 @@ from rlcli.sim.saved_tensors import TensorState
 
 @dataclass(frozen=True, slots=True)
 class CommandMap:
-    """Formula of an action term's commands: raw action x scale + offset, then `clip`, then the actuators' limits."""
+    """Formula of the commands that an action term sends to actuators, one command for each column of the action.
+
+    command = action x scale + offset, clipped to `clip`, then to `limits`.
+    """
 
     scale: tuple[float, ...]
-    """Factor of each column."""
+    """Factor on each column of the action."""
     offset: tuple[float, ...]
     """Number that is added to each scaled column, in the command's unit."""
     clip: tuple[tuple[float, float], ...] | None
@@ -31,7 +34,7 @@ class CommandMap:
 
 
 class ActionTerm(Protocol):
-    """Interface of an action term: a class `Name(env, *, ...)`.
+    """Interface of an action term: a class `Name(env, *, ...)` whose keyword arguments are the term's keys in the YAML.
 
     A term whose command is a scaled and clipped action may have a method `command_map() -> CommandMap`. Exported
     policies then contain the formula.
@@ -40,7 +43,7 @@ class ActionTerm(Protocol):
     size: int
     """Number of columns of the policy's action that the term uses."""
     elements: tuple[str, ...]
-    """Name of what each column drives, such as a joint or an axis."""
+    """Name of the joint or axis that each column drives."""
     unit: str
     """Unit of the command to the actuators."""
 
@@ -96,7 +99,7 @@ class ActionManager(TensorState):
             delay.empty(selection)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the actions of this step and of the previous one, and the past values that the delays keep."""
+        """Return the tensors to save: the actions of this step and of the previous one, and delayed values, by name."""
         delays = self._delays.items()
         memories = {f"{name}.{key}": tensor for name, delay in delays for key, tensor in delay.tensors().items()}
         return {"action": self.action, "prev_action": self.prev_action, **memories}

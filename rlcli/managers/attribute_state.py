@@ -1,4 +1,4 @@
-"""State of an object of a task: its attributes that change from step to step, saved in checkpoints and restored.
+"""State of a task's own objects: attributes that change from step to step, saved in checkpoints and restored.
 
 Tensors, arrays and torch generators are always saved, also in dicts, lists and tuples. Plain values, containers of them
 and other random generators are saved only after they have changed. Other attributes that may change cannot be saved;
@@ -32,11 +32,11 @@ class NotSerializableError(TypeError):
 
 
 class AttributeState:
-    """Saver of the attributes of an object and of its helper objects, which are objects of the task's own classes.
+    """Saver of an object's attributes, and of those of its helpers: attributes that are objects of the task's classes.
 
     Args:
-        owner: the object, before the first step.
-        excluded: names of attributes that are not part of its state.
+        owner: the object, before the first step: later values that differ count as changed.
+        excluded: names of attributes that are not saved.
     """
 
     def __init__(self, owner: object, excluded: tuple[str, ...] = ()) -> None:
@@ -174,7 +174,7 @@ def _item(container: object, key: str) -> Any:
 
 
 def _write_into(target: object, value: Tensor) -> bool:
-    """Write a value into its target in place, and return whether type and shape fit."""
+    """Copy a value into a tensor, array or random generator in place; return False if type or shape do not fit."""
     if isinstance(target, torch.Generator):
         target.set_state(value)
     elif isinstance(target, np.ndarray) and target.shape == tuple(value.shape):
@@ -204,7 +204,7 @@ def _tensors(path: str, value: object) -> Iterator[tuple[str, Tensor]]:
 
 
 def _to_json(value: Any) -> Any:
-    """Return a value as plain JSON, from which `_from_json` makes the value again.
+    """Return a value as data for JSON, from which `_from_json` restores the value.
 
     Raises:
         NotSerializableError: for a value that JSON cannot contain.

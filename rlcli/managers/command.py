@@ -19,13 +19,13 @@ from rlcli.sim.markers import Arrow, Frame, Marker, Sphere
 from rlcli.sim.saved_tensors import TensorState
 
 Select = Callable[[Tensor], Selection | None]
-"""Returns a selection of the environments where a mask (num_envs,) is true; None if it is known to be empty."""
+"""Function from a mask (num_envs,) to a `Selection` of the environments where it is true; None if there are none."""
 _COLUMNS = {"start": 3, "end": 3, "center": 3, "position": 3, "quat": 4}
-"""Columns of a marker's fields that have one row for each environment."""
+"""Field of a marker -> number of its columns; these fields have one row for each environment."""
 
 
 class CommandTerm(Protocol):
-    """Interface of a command term: a class `Name(env, *, ...)`.
+    """Interface of a command term: a class `Name(env, *, ...)` whose keyword arguments are the term's keys in the YAML.
 
     Optional members: `metrics() -> dict[str, Tensor]`, errors of following the command, (num_envs,) each, whose means
     over an episode are logged. `reset(selection)`, `state_dict` and `load_state_dict` for further state. `elements`,
@@ -91,11 +91,11 @@ class CommandManager(TensorState):
         self._sums = context.zeros(len(self._measured))
         self._steps = context.zeros()
         self.held: dict[str, float] = {}
-        """Values that replace the drawn values in every environment, by the name of the knob."""
+        """Name of a knob -> value that a person has set; it replaces the drawn values in every environment."""
         self._held_knobs: dict[str, Knob] = {}
 
     def knobs(self) -> list[Knob]:
-        """Return the columns of all commands that a person may set."""
+        """Return a `Knob` for each column of the commands that a person may set."""
         found = []
         for term in self.terms:
             width = term.instance.command.shape[1]
@@ -198,11 +198,11 @@ class CommandManager(TensorState):
             self._resample(number, selection, _FIRST)
 
     def compute(self, select: Select, running: Tensor) -> None:
-        """Count a step of the resampling timers, resample commands that are due, and update all commands.
+        """Count a step of the resampling timers, resample the commands whose timer has ended, and update all commands.
 
         Args:
-            select: returns the environments where a mask is true; their random numbers depend on the current step.
-            running: 1 where an episode is running, 0 where it has just begun: its timer does not count yet. (num_envs,)
+            select: function from a mask to a selection, whose random numbers depend on the current step.
+            running: 0 where an episode has just begun, so that its timer does not count yet, else 1. (num_envs,)
         """
         for number, term in enumerate(self.terms):
             left = self._steps_left[number]
@@ -215,7 +215,7 @@ class CommandManager(TensorState):
             self._by_name[knob.term].instance.command[:, knob.column] = self.held[name]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the resampling timers, the sums of the metrics and the commands."""
+        """Return the tensors to save: resampling timers, sums of metrics, and commands, by name."""
         commands = {f"command.{term.name}": term.instance.command for term in self.terms}
         return {"steps_left": self._steps_left, "sums": self._sums, "steps": self._steps, **commands}
 

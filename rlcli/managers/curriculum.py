@@ -17,8 +17,8 @@ class CurriculumManager(TensorState):
 
     A term is a function `name(env, selection, *, ...)` or a class. It is called with the environments whose episode
     ends, before they are reset. A class may have a method `advance(step)` instead, which is called once in each step
-    with the number of steps so far, so that a schedule does not depend on resets. Both may return a number to log, `()`
-    or (num_envs,); its mean is logged.
+    with the number of steps so far, so that a schedule does not depend on resets. Both may return a value to log, a
+    number or a tensor (num_envs,), of which the mean is logged.
     """
 
     def __init__(self, terms: list[BoundTerm], context: EnvContext) -> None:
@@ -43,7 +43,7 @@ class CurriculumManager(TensorState):
         return {f"Curriculum/{name}": value for name, value in self._values.items()}
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the settings that the curriculum changes."""
+        """Return the current values of the settings that the curriculum changes, by name, to save them."""
         return {f"live.{path}": value for path, value in self._tunable.tensors().items()}
 
     def state_dict(self) -> dict[str, Tensor]:

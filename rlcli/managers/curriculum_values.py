@@ -1,6 +1,6 @@
-"""Numbers of the configuration that a curriculum changes: each is a tensor that the code reads at each use.
+"""Settings that a curriculum changes, such as weights, ranges and limits: each is a tensor, which is read at each use.
 
-So a curriculum can change a weight, a range or a limit on the GPU, also when the step is a captured CUDA graph.
+A curriculum can therefore change them on the GPU, also in a step that is captured as a CUDA graph.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ class TunableValues:
         return self._tensors.get(path, default)
 
     def open(self, address: str) -> Tensor:
-        """Make a setting changeable: return its tensor, in the shape of the setting.
+        """Return the tensor of a setting, through which a curriculum changes it; its shape is that of the setting.
 
         Terms that are bound after this call read the tensor instead of the fixed value.
 
         Args:
-            address: dotted path of the setting, such as `rewards.alive.weight`.
+            address: dotted path of the setting, such as `rewards.alive.weight`, or of an element, `events.a.range.0`.
 
         Raises:
             NameProblem: if the address does not name a number, or a list of numbers, that may change.

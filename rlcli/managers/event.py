@@ -13,7 +13,7 @@ from rlcli.sim.env_selection import Selection
 from rlcli.sim.saved_tensors import TensorState
 
 Select = Callable[[Tensor], Selection | None]
-"""Returns a selection of the environments where a mask (num_envs,) is true; None if it is known to be empty."""
+"""Function from a mask (num_envs,) to a `Selection` of the environments where it is true; None if there are none."""
 Callback = Callable[[Selection], None]
 
 
@@ -43,7 +43,7 @@ class EventManager(TensorState):
 
     @property
     def derives(self) -> bool:
-        """Whether any event changes model fields, such as masses, from which the engine derives constants."""
+        """Whether an event changes model fields, such as masses, from which MuJoCo derives constants."""
         return any(map(_derives, self.terms))
 
     @property
@@ -58,9 +58,9 @@ class EventManager(TensorState):
         self._derive_constants(self._startup, all_envs)
 
     def before_full_reset(self, all_envs: Selection) -> None:
-        """Before a reset of all environments, forget when reset events fired, and draw the timers with `global_time`.
+        """Prepare for a reset of all environments: forget when reset events fired, and draw the `global_time` timers.
 
-        The random numbers of `all_envs` depend on the current step.
+        `all_envs` selects all environments; its random numbers depend on the current step.
         """
         self._fired_at.fill_(_NEVER)
         for term, left in self._intervals:
@@ -88,10 +88,10 @@ class EventManager(TensorState):
         """Count a step of the interval timers, and fire the events that are due.
 
         Args:
-            select: returns the environments where a mask is true; their random numbers depend on the current step.
-            running: 1 where an episode is running, 0 where it has just begun: its timers do not count yet, except
-                those with `global_time`. (num_envs,)
-            fired: called after each event with its environments.
+            select: function from a mask to a selection, whose random numbers depend on the current step.
+            running: 0 where an episode has just begun, so that its timers do not count yet (except those with
+                `global_time`), else 1. (num_envs,)
+            fired: called after each event, with the environments that the event changed.
         """
         for instance in self._updating:
             instance.update(select, running)
@@ -105,7 +105,7 @@ class EventManager(TensorState):
                 fired(due)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the interval timers, and the training steps at which reset events fired last."""
+        """Return the tensors to save: interval timers, and training steps at which reset events fired last."""
         return {"steps_left": self._steps_left, "fired_at": self._fired_at}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:

@@ -1,4 +1,4 @@
-"""Manager of the observation groups. The value of each term passes through a pipeline of noise, scale, delay ..."""
+"""Manager of the observation groups. A pipeline of operations (noise, scale, delay, ...) changes each term's value."""
 
 from __future__ import annotations
 
@@ -30,13 +30,16 @@ class _Group:
 
 
 _FINAL = np.uint64(0x46494E414C)
-"""Salt of the random streams for the last observation of an episode: the next one gets other noise."""
+"""Number that changes the random streams for final observations, so that their noise is that of no other observation.
+
+It is combined with the index of a stream by xor.
+"""
 
 
 class ObservationManager(TensorState):
-    """Manager of the observation terms. A step overwrites the oldest of a group's three results.
+    """Manager of the observation terms: it computes the observations of each group.
 
-    So a result stays valid during the next two steps.
+    Each group has three buffers, which are used in turn, so observations stay valid during the next two steps.
 
     Args:
         groups: the bound terms of each group.
@@ -70,9 +73,13 @@ class ObservationManager(TensorState):
         return result
 
     def compute_final(self, rows: Selection | None = None) -> dict[str, Tensor]:
-        """Return the last observations of episodes, in separate buffers; histories, delays and filters do not advance.
+        """Return the observations of the last states of episodes, by group, in separate buffers. (num_envs, d) each
 
-        rows: the environments whose observations are read; None: all. Random numbers depend on the current step.
+        Histories, delays and filters do not advance.
+
+        Args:
+            rows: the environments to compute; other rows are not valid. Its random numbers depend on the current step.
+                None: all environments.
         """
         draws = self._draws(_FINAL)
         for name, group in self.groups.items():
@@ -104,7 +111,7 @@ class ObservationManager(TensorState):
         return self.groups[group].pipelines
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors of the pipelines, and the last observations of groups that depend on earlier steps."""
+        """Return the tensors to save: those of the pipelines, and the last observations of groups with a history."""
         tensors = {
             f"{name}.{pipeline.term.name}.{key}": tensor
             for name, group in self.groups.items()

@@ -1,7 +1,7 @@
-"""Pipeline of an observation term: operations on its value before the policy gets it.
+"""Pipeline of an observation term: operations on its value before the policy receives it.
 
-The order is modifiers, noise, bias, clip, scale, delay, history. Each works in place on the values of all environments.
-Memories do not advance while the last observation of a finished episode is computed (`advance` is false).
+The order is modifiers, noise, bias, clip, scale, delay, history. Each operation changes the values of all environments
+in place. Filters, delays and histories do not advance while a final observation is computed (`advance` is false).
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from rlcli.managers.term_binding import BoundTerm, CheckedTerm, EnvContext, rese
 from rlcli.sim.env_selection import Selection, in_place
 
 Draws = Callable[[np.uint64], Selection]
-"""Returns a selection of all environments with the random numbers of a stream at the current step."""
+"""Function from a random stream to a selection of all environments, with that stream's numbers of the current step."""
 Sampler = Callable[[Selection], Tensor]
-"""Draws one row for each environment of a selection."""
+"""Function that draws random values for a selection, one row for each of its environments."""
 
 _BIAS, _LAG, _REDRAW, _REDRAWN = (np.uint64(0x4F42_5330 + i) for i in range(4))
-"""Salts of a term's further random streams, for its bias and its delay; a salt is combined with the stream by xor."""
+"""Numbers that make further random streams of a term, for its bias and its delay: stream xor number."""
 
 _FEW_COLUMNS = 64
-"""Largest size of a plain observation: to copy 512 environments takes less time than to select a few of them."""
+"""Largest number of columns for which copying the rows of 512 environments is faster than selecting a few rows."""
 
 
 class Stage:
@@ -38,17 +38,17 @@ class Stage:
 
         Args:
             value: values of all environments.
-            draws: returns a selection of all environments for a random stream.
-            fresh: environments whose episode has just begun; None: there are none.
+            draws: function from a random stream to a selection of all environments.
+            fresh: environments whose episode has just begun; None: no environment.
             advance: whether histories, delays and filters advance by a step.
         """
         raise NotImplementedError
 
     def reset(self, selection: Selection) -> None:
-        """Clear what the stage keeps from earlier episodes of the selected environments."""
+        """Clear values of earlier episodes, such as past inputs of a filter, in the selected environments."""
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors that the stage keeps from step to step; they are written in place."""
+        """Return the tensors that the operation keeps from step to step, by name, to save them."""
         return {}
 
 
@@ -94,7 +94,7 @@ class Pipeline:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the observation is a few columns that are only copied: faster for all environments than for some."""
+        """Whether the observation is a copy of few columns, which is faster for all environments than for some."""
         return not self._stages and self.size <= _FEW_COLUMNS
 
     @property
@@ -119,15 +119,13 @@ class Pipeline:
                 self._frames.copy_(view)
 
     def write_rows(self, view: Tensor, rows: Selection, salt: np.uint64) -> None:
-        """Compute a term for the selected environments only; for terms that do not depend on earlier steps.
-
-        Random numbers come from the streams of the selection.
+        """Compute the observation of a term for some environments only; the term must not depend on earlier steps.
 
         Args:
             view: columns of the term in the observations. (num_envs, size)
-            rows: the selected environments.
-            salt: combined with the stream of each random operation by xor, so that final observations do not get the
-                random numbers of ordinary ones.
+            rows: the environments, and their random numbers.
+            salt: number that changes the random streams (by xor), so that final observations have other random numbers
+                than ordinary ones.
         """
         value = rows.read(self._read().reshape(view.shape)).float()
         for stage in self._stages:
@@ -136,7 +134,7 @@ class Pipeline:
 
     @property
     def resets(self) -> list[Callable[[Selection], None]]:
-        """Functions to call with the environments that start a new episode."""
+        """Return the functions to call with the environments that start a new episode."""
         return [*resets([self.term]), *(stage.reset for stage in self._stages if type(stage).reset is not Stage.reset)]
 
     def tensors(self) -> dict[str, Tensor]:
@@ -149,7 +147,7 @@ class Pipeline:
         return found if self._frames is None else {**found, "history": self._frames}
 
     def _setting(self, key: str, value: object) -> Any:
-        """Return a setting of the term, or the tensor from which it is read if a curriculum changes it."""
+        """Return `value`, the configured value of a setting; if a curriculum changes the setting, its tensor."""
         return self._context.tunable.get((*self.term.path, *key.split(".")), value)
 
     def _columns(self, key: str, value: float | list[float]) -> Tensor:
@@ -177,7 +175,7 @@ class Pipeline:
         return _Constant("add", self._columns(f"{key}.offset", config.offset))
 
     def _sampler(self, key: str, config: schema.NoiseConfig) -> Sampler:
-        """Return a function that draws the noise for the environments of a selection. -> (rows, width)"""
+        """Return a function that draws noise for a selection of environments. -> (rows, width)"""
         shape = (self.width,)
         if isinstance(config, schema.UniformNoiseConfig):
             low, high = (in_place(self._columns(f"{key}.{end}", getattr(config, end))) for end in ("low", "high"))
@@ -240,7 +238,7 @@ class _Clip(Stage):
 
 
 class _Filter(Stage):
-    """Base class of filters. `past`: values of earlier steps, 0 at the start of an episode. (num_envs, m, k)"""
+    """Base class of filters, with m values of earlier steps: `past` (num_envs, m, k), 0 at the start of an episode."""
 
     _past: Tensor
 

@@ -15,7 +15,7 @@ from rlcli.sim.saved_tensors import TensorState
 class RewardManager(TensorState):
     """Manager of the reward terms. Terms with a constant weight of 0 are not called.
 
-    The `divergence_reward`, if configured, is logged as a term of its own.
+    The task's `divergence_reward`, the reward of a step in which the simulation diverges, is logged as one more term.
     """
 
     def __init__(
@@ -56,13 +56,15 @@ class RewardManager(TensorState):
         ]
 
     def compute(self, diverged: Tensor | None = None, terminated: Tensor | None = None) -> Tensor:
-        """Return the reward of this step; `add_to_episodes` adds it to the sums of the episodes. (num_envs,)
-
-        Terms with `while_alive` give 0 where the episode `terminated`. On a CPU a term that is not finite gives 0 where
-        the simulation diverged.
+        """Return the reward of this step, without adding it to the sums of the episodes. (num_envs,)
 
         On a CPU terms are added one after the other, so that the result does not depend on the number of environments:
         the rounding of torch's sum over rows does. On a GPU results are not bit-identical anyway.
+
+        Args:
+            diverged: where the simulation diverged, (num_envs,) bool; None: nowhere. On a CPU a term that is not finite
+                counts as 0 there.
+            terminated: where the episode is terminated, (num_envs,) bool; terms with `while_alive` count as 0 there.
         """
         for call, row in self._active:
             row.copy_(call())
@@ -95,9 +97,13 @@ class RewardManager(TensorState):
         return {term.name: row for term, row in zip(self.terms, self._rows, strict=True)}
 
     def replace_diverged(self, diverged: Tensor, total: Tensor) -> None:
-        """Set `total` to the `divergence_reward` in diverged environments.
+        """Replace the reward of this step by the task's `divergence_reward` in diverged environments.
 
-        The episode sums count it in place of this step's terms. Without a `divergence_reward` nothing changes.
+        Without a `divergence_reward` nothing changes.
+
+        Args:
+            diverged: where the simulation diverged. (num_envs,) bool
+            total: reward of the step, changed in place. (num_envs,)
         """
         if self._divergence_reward is None:
             return
@@ -106,7 +112,7 @@ class RewardManager(TensorState):
         total.masked_fill_(diverged, self._divergence_reward)
 
     def episode(self, ended: Selection) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the returns of the episodes that end, and each term's share of the return, by its name. (n,) each"""
+        """Return (returns, term name -> its part of the return) of the episodes that end. (n,) each"""
         sums = ended.read(self._sums_by_env).contiguous()  # so that rounding does not depend on the number of rows
         shares = {term.name: column for term, column in zip(self.terms, sums.unbind(1), strict=True)}
         returns = sums.sum(dim=1)

@@ -33,7 +33,10 @@ SENSORS = {"ContactSensor": "contact", "RaySensor": "rays", "CameraSensor": "cam
 
 @dataclass(frozen=True, slots=True)
 class BoundTerm:
-    """Term with its parameters resolved. Managers call `call()`, or `call(selection)` for events and curricula."""
+    """Configured term whose parameters are objects and indices instead of names.
+
+    A manager gets the term's value by `call()`; it runs an event or a curriculum term by `call(selection)`.
+    """
 
     name: str
     path: Path
@@ -42,19 +45,21 @@ class BoundTerm:
     """The configuration of the task."""
     call: Callable[..., Any]
     elements: dict[str, list[str]]
-    """Selector parameter -> the names of the selected elements."""
+    """Parameter that selects elements (`joints`, `bodies`, ...) -> names of the selected elements."""
     stream: np.uint64
     """Index of the term's random stream."""
     memory: AttributeState | None = None
-    """State of a class term of a task's own, if the class has no `state_dict`."""
+    """Object that saves the term's attributes in checkpoints, for a class in the task's code without `state_dict`.
+
+    None for other terms, which have a `state_dict` or no state."""
 
     @property
     def instance(self) -> Any:
-        """Object of a class term, or the function of a function term."""
+        """The term itself: an object if the term is a class, else the function with its parameters."""
         return self.call
 
     def error(self, message: str, *keys: str) -> ShapeError:
-        """Return a ShapeError about the term's result; with `keys`, about the setting under these keys of the term."""
+        """Return a ShapeError whose place is the term in the YAML; with `keys`, the setting below these keys."""
         return ShapeError([self.resolved.problem((*self.path, *keys), message)])
 
     def require_finite(self, values: Tensor, what: str) -> None:
@@ -103,7 +108,7 @@ class EnvContext:
 
 
 class TermEnv(Protocol):
-    """Attributes of an environment that `Binder` uses to connect terms with it; terms get the whole environment."""
+    """Interface of the environment for `Binder`; the terms receive the same object as their parameter `env`."""
 
     device: torch.device
 
@@ -117,7 +122,7 @@ class TermEnv(Protocol):
 
 
 class Binder:
-    """Binder of the terms of one environment. It collects all problems before it raises them."""
+    """Resolver of the names in the terms of one environment. It collects problems, and raises all of them at once."""
 
     def __init__(self, env: TermEnv, resolved: Resolved) -> None:
         self.env = env
@@ -128,7 +133,7 @@ class Binder:
         self._open_addresses()
 
     def bind(self, section: str, path: Path, config: TermConfig) -> BoundTerm | None:
-        """Return a configured term with its names resolved to objects and indices; None if one does not exist."""
+        """Return a term with its names resolved to objects and indices; None, with a problem, if a name is unknown."""
         signature = self.signature(section, config)
         params, elements = self._resolve(signature, path, config)
         if params is None:
@@ -298,7 +303,7 @@ _DTYPES = (torch.float32, torch.float64, torch.float16)
 
 
 class CheckedTerm:
-    """Callable that returns a term's value in each step, and checks it: a wrong shape would be broadcast in silence.
+    """Function that returns a term's value in each step and checks it: torch would broadcast a wrong shape silently.
 
     Args:
         term: the term.
@@ -328,7 +333,7 @@ class CheckedTerm:
         return self._require(value)
 
     def _require(self, value: object) -> Tensor:
-        """Return a value that is right, without a gradient, and of a type that numpy has."""
+        """Check a value; return it without a gradient, and as float32 if numpy lacks its type (such as bfloat16)."""
         found = None
         if not isinstance(value, Tensor):
             found = f"a value of type {type(value).__name__}"

@@ -25,7 +25,7 @@ class TerminationManager:
         self.time_outs = self._none.clone()
         """Where the episode timed out in this step. (num_envs,) bool"""
         self.fired: dict[str, Tensor] = {term.name: self._none for term in terms}
-        """Term -> where it fired in this step. (num_envs,) bool each"""
+        """Term name -> where the term fired in this step. (num_envs,) bool each"""
         self._term_resets = resets(terms)
         self._calls = [
             (term.name, CheckedTerm(term, first_value(term), (context.num_envs,), is_mask=True), _is_time_out(term))
@@ -49,7 +49,7 @@ class TerminationManager:
         return functools.reduce(torch.logical_or, masks)
 
     def causes(self, ended: Selection) -> dict[str, Tensor]:
-        """Return, by term, whether it fired in the last step of the episodes that end. (n,) bool each"""
+        """Return term name -> whether the term fired in the last step of the episodes that end. (n,) bool each"""
         return {name: ended.read_view(fired) for name, fired in self.fired.items()}
 
     def reset(self, selection: Selection) -> None:

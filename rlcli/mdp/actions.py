@@ -39,7 +39,7 @@ class _JointAction(JointTerm):
         self._drive = JointCommand(self.entity, self.actuator, columns)
         self.sinks = self._drive.sinks
         self.actuators = self._drive.actuators
-        """MuJoCo's actuator of each joint; None where an actuator model drives it."""
+        """Id of the MuJoCo actuator of each joint; None where an actuator model computes the effort."""
         self.size = len(columns)
         self._clip: tuple[Tensor, Tensor] | None = None
         self.command = torch.zeros(self.env.num_envs, self.size, device=self.env.device)
@@ -57,7 +57,7 @@ class _JointAction(JointTerm):
         raise NotImplementedError
 
     def _per_joint(self, mapping: dict[str, float], default: float) -> Tensor:
-        """Return the value of each joint, `default` for a joint that the mapping lacks. (joints,)"""
+        """Return a value for each joint from a mapping of names or patterns; `default` where none matches. (joints,)"""
         values = [default if v is None else v for v in match_values(mapping, self.elements, "joint")]
         return torch.tensor(values, dtype=torch.float32, device=self.env.device)
 
@@ -84,7 +84,7 @@ class _ScaledJointAction(_JointAction):
 
 @dataclass(kw_only=True, eq=False)
 class _AffineJointAction(_ScaledJointAction):
-    """Base class of the actions raw x scale + offset. Exported policies can contain them."""
+    """Base class of actions of the form action x scale + offset, which exported policies can contain as a formula."""
 
     offset: float | dict[str, float] = 0.0
 
@@ -107,7 +107,7 @@ class _AffineJointAction(_ScaledJointAction):
             self.command += self._offset
 
     def _each(self, value: float | Tensor) -> tuple[float, ...]:
-        """Return a setting as one number for each column; all environments have the same."""
+        """Return a setting, which is the same in all environments, as one number for each column."""
         if isinstance(value, Tensor):
             return tuple((value[0] if value.dim() == 2 else value).tolist())
         return (value,) * self.size
@@ -115,7 +115,10 @@ class _AffineJointAction(_ScaledJointAction):
 
 @dataclass(kw_only=True, eq=False)
 class _AffineAboutDefault(_AffineJointAction):
-    """Base class of the actions raw x scale + offset + default; `use_default_offset: false` omits the default."""
+    """Base class of actions of the form action x scale + offset + default value of the joint.
+
+    `use_default_offset: false` omits the default value.
+    """
 
     default: ClassVar[str]
     """Attribute of `entity.data` that holds the default values."""
@@ -129,14 +132,14 @@ class _AffineAboutDefault(_AffineJointAction):
 
 
 class JointEffort(_AffineJointAction):
-    """Efforts of joint motors: raw x scale + offset [N or N m]. Isaac Lab: JointEffortAction."""
+    """Efforts of joint motors: action x scale + offset [N or N m]. Isaac Lab: JointEffortAction."""
 
     actuator = "motor"
     unit = "N or N m"
 
 
 class JointPosition(_AffineAboutDefault):
-    """Targets of position actuators: raw x scale + offset + default position [m or rad].
+    """Targets of position actuators: action x scale + offset + default position [m or rad].
 
     `use_default_offset: false` omits the default position. Isaac Lab: JointPositionAction.
     """
@@ -147,7 +150,7 @@ class JointPosition(_AffineAboutDefault):
 
 
 class JointVelocity(_AffineAboutDefault):
-    """Targets of velocity actuators: raw x scale + offset + default velocity [m/s or rad/s].
+    """Targets of velocity actuators: action x scale + offset + default velocity [m/s or rad/s].
 
     `use_default_offset: false` omits the default velocity. Isaac Lab: JointVelocityAction.
     """
@@ -158,7 +161,7 @@ class JointVelocity(_AffineAboutDefault):
 
 
 class RelativeJointPosition(_ScaledJointAction):
-    """Targets of position actuators: the current joint position + raw x scale [m or rad].
+    """Targets of position actuators: the current joint position + action x scale [m or rad].
 
     Isaac Lab: RelativeJointPositionAction.
     """
@@ -172,9 +175,9 @@ class RelativeJointPosition(_ScaledJointAction):
 
 @dataclass(kw_only=True, eq=False)
 class JointPositionToLimits(_ScaledJointAction):
-    """Targets of position actuators: raw x scale, clipped to [-1, 1] and mapped linearly to the soft limits [m or rad].
+    """Targets of position actuators: action x scale, clipped to [-1, 1] and mapped to the soft limits [m or rad].
 
-    With `rescale_to_limits: false` raw x scale is the target itself, clipped to the soft limits. Isaac Lab:
+    With `rescale_to_limits: false` action x scale is the target itself, clipped to the soft limits. Isaac Lab:
     JointPositionToLimitsAction.
     """
 
@@ -188,7 +191,7 @@ class JointPositionToLimits(_ScaledJointAction):
         finite = self.entity.data.soft_joint_pos_limits[self.joints].isfinite().all(dim=-1)
         if self.rescale_to_limits and not bool(finite.all()):
             unlimited = self.elements[int((~finite).nonzero()[0, 0])]
-            message = f"joint '{unlimited}' has no limits, to which the action could be mapped"
+            message = f"joint '{unlimited}' has no position limits, but the action is scaled to them"
             raise NameProblem(message, "give the joint a range in the MJCF, or use joint_position")
 
     def _compute_command(self, action: Tensor) -> None:
@@ -207,8 +210,9 @@ class JointPositionToLimits(_ScaledJointAction):
 class EmaJointPositionToLimits(JointPositionToLimits, TensorState):
     """Targets of `joint_position_to_limits`, smoothed by an exponential moving average [m or rad].
 
-    alpha x new target + (1 - alpha) x previous target. An episode starts the average at the joint positions. alpha: one
-    number, or a mapping by joint. Isaac Lab: EMAJointPositionToLimitsAction.
+    Target = alpha x new target + (1 - alpha) x previous target; the first previous target of an episode is the joint
+    position. alpha: one number, or a mapping from joint names or patterns to numbers. Isaac Lab:
+    EMAJointPositionToLimitsAction.
     """
 
     alpha: float | dict[str, float] = 1.0
@@ -262,10 +266,10 @@ class _BinaryJoint(_JointAction):
 
 
 class BinaryJointPosition(_BinaryJoint):
-    """Gripper positions: `open_command` where raw >= threshold, else `close_command` [m or rad].
+    """Gripper positions: `open_command` where the action is at least `threshold`, else `close_command` [m or rad].
 
-    The two commands map joint names or patterns to positions. Isaac Lab: BinaryJointPositionAction, and
-    AbsBinaryJointPositionAction with its threshold.
+    The action has one column. The two commands map joint names or patterns to positions. Isaac Lab:
+    BinaryJointPositionAction, and AbsBinaryJointPositionAction with its threshold.
     """
 
     actuator = "position"
@@ -273,9 +277,10 @@ class BinaryJointPosition(_BinaryJoint):
 
 
 class BinaryJointVelocity(_BinaryJoint):
-    """Gripper velocities: `open_command` where raw >= threshold, else `close_command` [m/s or rad/s].
+    """Gripper velocities: `open_command` where the action is at least `threshold`, else `close_command` [m/s or rad/s].
 
-    The two commands map joint names or patterns to velocities. Isaac Lab: BinaryJointVelocityAction.
+    The action has one column. The two commands map joint names or patterns to velocities. Isaac Lab:
+    BinaryJointVelocityAction.
     """
 
     actuator = "velocity"
@@ -343,9 +348,12 @@ class DifferentialInverseKinematics(_ScaledJointAction):
         torch.add(joints, step if rest is None else rest + step, out=self.command)
 
     def _least_squares(self, columns: Tensor, error: Tensor, rest: Tensor | None) -> Tensor:
-        """Return J^T (J J^T + damping^2 I)^-1 (error - J rest) for the columns of J.
+        """Return the joint displacements J^T (J J^T + damping^2 I)^-1 (error - J rest), by damped least squares. (n, k)
 
-        columns (k, e, n), error (n, e), rest (n, k) -> (n, k)
+        Args:
+            columns: columns of the Jacobian J, one for each of the k joints. (k, e, n)
+            error: pose error of the controlled frame, with e components. (n, e)
+            rest: displacements towards the default pose; None: zero. (n, k)
         """
         size, n = error.shape[1], len(error)
         wanted, others = error, columns

@@ -130,7 +130,7 @@ class UniformVelocity(_VelocityCommand):
         self._heads = torch.zeros(self.env.num_envs, dtype=torch.bool, device=self.env.device)
 
     def resample(self, selection: Selection) -> None:
-        """Draw velocities, headings, and which environments stand."""
+        """Draw velocities, headings, and the environments in which the robot is to stand."""
         for column, bounds in enumerate(self._ranges):
             selection.write(self._drawn[:, column], selection.uniform(*bounds))
         if self.heading is not None:
@@ -151,7 +151,7 @@ class UniformVelocity(_VelocityCommand):
         return [(low, high) for low, high in self._ranges]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the samples of the commands and of the headings."""
+        """Return the tensors to save: sampled velocities and headings, and masks of standing and of headings."""
         return {**super().tensors(), "target": self._target, "heads": self._heads}
 
 
@@ -168,7 +168,7 @@ class NormalVelocity(_VelocityCommand):
     zero_prob: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def resample(self, selection: Selection) -> None:
-        """Draw velocities, which of them are zero, and which environments stand."""
+        """Draw velocities, those that are zero, and the environments in which the robot is to stand."""
         for column, (mean, std, zero) in enumerate(zip(self.mean, self.std, self.zero_prob, strict=True)):
             value = selection.normal(mean, std)
             selection.write(self._drawn[:, column], value * (selection.uniform(0.0, 1.0) >= zero))
@@ -219,7 +219,7 @@ class UniformPose(EntityTerm):
 
     @property
     def limits(self) -> list[Range]:
-        """Ranges of the position [m]."""
+        """Ranges of the commanded position: x, y and z [m]."""
         return [(low, high) for low, high in self._ranges[:3]]
 
     @property
@@ -250,11 +250,12 @@ class UniformPose(EntityTerm):
 
 @dataclass(kw_only=True, eq=False)
 class UniformPose2d(EntityTerm, TensorState):
-    """Uniformly drawn position and heading on the ground, as seen from the root. (num_envs, 4)
+    """Uniformly drawn goal position and heading on the ground, relative to the root. (num_envs, 4)
 
-    The columns are x, y, z in the root's yaw frame [m], and the angle to the heading [rad]. x, y: ranges from the
-    environment's origin [m]. heading: range in the world frame [rad]. With `simple_heading` the heading is the
-    direction from the root to the position. Isaac Lab: UniformPose2dCommand.
+    The columns are the goal's x, y, z in the root's yaw frame (the world frame turned by the root's heading) [m], and
+    the angle from the root's heading to the goal heading [rad]. x, y: ranges from the environment's origin [m].
+    heading: range in the world frame [rad]. With `simple_heading` the goal heading is the direction from the root to
+    the goal position. Isaac Lab: UniformPose2dCommand.
     """
 
     elements = ("ahead", "left", "", "turn")
@@ -279,7 +280,7 @@ class UniformPose2d(EntityTerm, TensorState):
         selection.write(self._target, torch.stack([x, y, height, turn], dim=1))
 
     def update(self) -> None:
-        """Compute the goal as seen from the root."""
+        """Compute the goal relative to the root's present position and heading."""
         data = self.entity.data
         dx, dy, dz = (self._target[:, :3] + self.env.origins - data.root_pos_w).unbind(1)
         yaw = heading(data.root_quat_w)

@@ -14,7 +14,7 @@ from rlcli.sim.env_selection import Selection
 
 @dataclass(kw_only=True, eq=False)
 class Stages(Term):
-    """Schedule that sets a setting (`address`) to the next of the `values` at each of the `steps`.
+    """Schedule that changes a setting (`address`) in stages: at step number `steps[i]` it becomes `values[i]`.
 
     address: path of the setting, such as `rewards.alive.weight`. Before the first step it keeps its value. `steps` are
     numbers of calls of `env.step` since the training began, in rising order. Isaac Lab: modify_reward_weight,
@@ -45,8 +45,8 @@ class Stages(Term):
 class Interpolate(Term):
     """Schedule that moves a setting (`address`) linearly from its configured value to `to`.
 
-    address: path of the setting, such as `rewards.alive.weight`. It moves between `begin` and `end`, which are numbers
-    of calls of `env.step` since the training began. Lists are interpolated element by element.
+    address: path of the setting, such as `rewards.alive.weight`. The change starts at step `begin` and is complete at
+    step `end`, both counted in calls of `env.step` since the training began. Lists are interpolated element by element.
     """
 
     address: Address

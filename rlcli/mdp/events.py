@@ -1,6 +1,6 @@
-"""Event terms. Each acts on a `Selection` of environments.
+"""Event terms. Each changes the environments of a `Selection`, which also draws random numbers for them.
 
-Samples depend only on the seed, the term, the environment, and its episode (interval events: the training step).
+These numbers depend only on the seed, the term, the environment, and its episode (interval events: the training step).
 """
 
 from __future__ import annotations
@@ -284,7 +284,7 @@ def _fixed_bounds(device: torch.device, *pairs: tuple[float, float]) -> tuple[Te
 
 
 def _wrench_columns(entity: Entity, bodies: Bodies) -> Tensor:
-    """Return the columns of the wrenches of bodies in a flattened row of `xfrc_applied`. (6 k,)"""
+    """Return the columns of k bodies' wrenches (force, torque) in a flattened row of `xfrc_applied`. (6 k,)"""
     cache: dict[int, tuple[Bodies, Tensor]] = entity.__dict__.setdefault("_wrench_columns", {})
     if id(bodies) not in cache:
         device = entity.engine.device
@@ -303,5 +303,8 @@ def _write_joints(entity: Entity, selection: Selection, joints: Joints, position
 
 
 def _rows(selection: Selection, values: Tensor) -> Tensor:
-    """Return the selected rows, or the single row of values that all environments share. (rows or 1, k)"""
+    """Return the rows of the selected environments; a single row, which all environments share, is returned itself.
+
+    (num_envs or 1, k) -> (n or 1, k)
+    """
     return values if values.shape[0] == 1 else selection.read_view(values)

@@ -157,8 +157,8 @@ def body_projected_gravity_b(env: ManagedEnv, *, entity: Entity = "robot", bodie
 def body_state_b(env: ManagedEnv, *, entity: Entity = "robot", bodies: Bodies = ".*") -> Tensor:
     """State of each body relative to the root's position, in the root's frame. (num_envs, 13 k)
 
-    Position in m, quaternion (w, x, y, z), linear velocity in m/s, angular velocity in rad/s. The velocities are those
-    in the world, turned into the root's frame.
+    Position in m, quaternion (w, x, y, z), linear velocity in m/s, angular velocity in rad/s. The velocities are
+    relative to the world, with their axes in the root's frame.
     """
     data = entity.data
     position = data.body_pos_w[:, bodies] - data.root_pos_w[:, None]
@@ -207,7 +207,7 @@ def remaining_time_s(env: ManagedEnv) -> Tensor:
 
 
 def sensor_data(env: ManagedEnv, *, entity: Entity = "robot", sensors: Sensors) -> Tensor:
-    """Sensor readings of the MJCF, one after the other, each in its own unit. (num_envs, k)
+    """Sensor readings, one after the other, each in its own unit, of sensors in the MJCF. (num_envs, k)
 
     Forces and accelerations are those of the last substep. mjlab: `builtin_sensor`.
     """
@@ -248,8 +248,8 @@ def height_scan(env: ManagedEnv, *, sensor: RaySensor, offset: float = 0.5) -> T
 def image(env: ManagedEnv, *, sensor: CameraSensor, normalize: bool = True) -> Tensor:
     """Image of a camera, rows from the top: colours, or distances [m]. (num_envs, c, h, w)
 
-    A distance is 0 where nothing is visible. Colours are 0 to 255. With `normalize` they are 0 to 1, minus the mean of
-    each channel of the image. Isaac Lab: channels last.
+    A distance is 0 where nothing is visible. Colours are 0 to 255; with `normalize` they are divided by 255, and the
+    mean of each channel of the image is subtracted. Isaac Lab: channels last.
     """
     image = sensor.image.movedim(-1, 1).float().contiguous()
     if sensor.config.data != "rgb" or not normalize:
@@ -381,5 +381,6 @@ def _offset_xy(env: ManagedEnv, entity: Entity, target: tuple[float, float, floa
 def _reading(entity: Entity, sensors: Sensors, size: int, kind: str) -> Tensor:
     values = entity.data.sensordata[:, sensors]
     if values.shape[1] != size:
-        raise ValueError(f"select one {kind} sensor ({size} columns) in sensors; selected: {values.shape[1]} columns")
+        found = f"`sensors` selects {values.shape[1]} columns of sensor data"
+        raise ValueError(f"{found}; select one {kind} sensor, which has {size}")
     return values

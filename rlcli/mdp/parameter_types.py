@@ -1,8 +1,8 @@
 """Types of the parameters of terms: the environment, and the objects that terms receive for the names in the YAML.
 
-As in `rlcli.task`, the default of an object is a name ("robot"), and the function body uses the object with that name.
-So each type is `Any`, together with the object's class, which a type checker uses for the body. The types are strings:
-importing this module imports no environment.
+A parameter's default is a name (`entity: Entity = "robot"`), but the function body uses the object with that name. Each
+type is therefore `Any | CLASS`: `Any` allows the default, and a type checker uses the class for the body. The types are
+strings, so that importing this module imports no environment.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Base classes of randomisation terms: values are drawn relative to the original ones and written to the model."""
+"""Base classes of randomisation terms, which draw values relative to the original ones and write them to the model."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from rlcli.sim.rotations import from_euler, multiply
 SMALLEST = 1e-9
 """Lower bound of quantities that must be positive."""
 Pair: TypeAlias = Sequence[float] | Tensor
-"""Range of a term: two numbers, or the tensor (2,) to which a curriculum writes them."""
+"""Range of a term: two numbers; if a curriculum changes the range, the tensor (2,) that it writes to."""
 
 
 class Ranges:
-    """Lower and upper ends of several ranges; the ends that a curriculum changes are read at each call of `now`."""
+    """Lower and upper ends of several ranges as tensors; a curriculum may change the ranges between calls of `now`."""
 
     def __init__(self, device: torch.device, *pairs: Pair) -> None:
         self._fixed = _table(device, *((0.0, 0.0) if isinstance(pair, Tensor) else tuple(pair) for pair in pairs))
@@ -96,9 +96,10 @@ class Draw:
 
 
 class DrawingTerm(Term):
-    """Base class of terms that draw values relative to the original ones.
+    """Base class of terms that draw values relative to the original ones, with the settings that `Draw` reads.
 
-    Terms are dataclasses. The attributes below are keys of the YAML; a term that lacks a key uses the value below.
+    A subclass that declares one of these settings as a field has it as a key in the YAML; otherwise the value below
+    holds.
     """
 
     entity: Entity
@@ -108,7 +109,7 @@ class DrawingTerm(Term):
 
 
 class FieldRandomization(DrawingTerm):
-    """Base class of terms that draw values of one model field for the selected elements."""
+    """Base class of terms that draw values of one field of MjModel for the selected elements (bodies, geoms, ...)."""
 
     model_field: str
     """Name of the field in MjModel."""
@@ -154,7 +155,10 @@ class Randomization(RangeKeys, FieldRandomization):
 
 @dataclass(kw_only=True, eq=False)
 class AxisRandomization(DrawKeys, FieldRandomization):
-    """Base class of terms that draw some axes of an element, from one range or from one range for each axis."""
+    """Base class of terms that draw some components (axes) of an element's vector, such as the z of a position.
+
+    `range` is one range for all these axes, or a list with one range for each.
+    """
 
     axes: list[int] | None = None
     range: tuple[float, float] | list[tuple[float, float]]
@@ -189,7 +193,16 @@ class OrientationRandomization(DrawingTerm):
 
 
 def matching_elements(elements: list[Any], params: dict[str, Any], key: str, kind: str) -> list[Any]:
-    """Return the elements that match the patterns under a term's `key`; none for a wrong pattern (reported later)."""
+    """Return the elements of the MjSpec that a term selects; an empty list if a pattern is wrong.
+
+    A wrong pattern is reported when the term is bound.
+
+    Args:
+        elements: all elements of a kind, such as `spec.bodies`.
+        params: parameters of the term.
+        key: the parameter with the names or patterns, such as `bodies`.
+        kind: name of an element for messages, such as `body`.
+    """
     prefix = f"{params['entity']}/"
     of_entity = [element for element in elements if element.name.startswith(prefix)]
     try:
@@ -200,7 +213,7 @@ def matching_elements(elements: list[Any], params: dict[str, Any], key: str, kin
 
 
 def unset_simple(spec: mujoco.MjSpec, params: dict[str, Any], key: str) -> None:
-    """Clear the `simple` flag of bodies: with it, MuJoCo takes the body's frame as the inertial frame.
+    """Clear MuJoCo's `simple` flag of bodies; with the flag, MuJoCo takes the body's frame as the inertial frame.
 
     Args:
         spec: the model.
@@ -227,11 +240,11 @@ def require_supported(
         kind: kind of element, such as `Actuators`.
         index: index of the selected elements.
         supported: whether an element can be randomised, for each element of this kind.
-        problem: what is wrong with an element that cannot, such as `without kp`.
+        problem: property of an element that cannot be randomised, for the message, such as `without kp`.
         hint: what the user can do.
 
     Raises:
-        NameProblem: with the names of the elements that cannot, and of those that can.
+        NameProblem: with the names of the elements that cannot be randomised, and of those that can.
     """
     able = dict(zip(entity.names[kind], supported, strict=True))
     bad = [name for name in element_names(entity, kind, index) if not able[name]]

@@ -1,7 +1,7 @@
 """Base classes of terms that are dataclasses. Their fields are the keys of the term in the YAML.
 
-A term lists JointTerm, GeomTerm or another of these last among its bases that are dataclasses: a dataclass collects the
-fields of its last base first, so `entity` and the selected elements become the first keys.
+Among several base classes, a term lists JointTerm, GeomTerm or another class of this module last: a dataclass collects
+the fields of its last base first, so `entity` and the selected elements become the first keys.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _ELEMENT_KEYS = ("joints", "actuators", "bodies", "geoms", "sites", "tendons", "
 
 @dataclass(eq=False)
 class Term:
-    """Base class of dataclass terms."""
+    """Base class of terms that are dataclasses; `env` is the environment."""
 
     env: ManagedEnv
 
@@ -28,7 +28,7 @@ class Term:
 
 @dataclass(kw_only=True, eq=False)
 class EntityTerm(Term):
-    """Base class of terms of one entity."""
+    """Base class of terms that act on, or observe, one entity (a robot or an object)."""
 
     entity: Entity = "robot"
 

@@ -46,7 +46,11 @@ def all_columns(masks: Tensor) -> Tensor:
 
 
 def single(values: Tensor, kind: str) -> Tensor:
-    """Return the only element of (num_envs, 1, ...); `kind` is its name in the message, such as `site`.
+    """Return `values[:, 0]` of a tensor (num_envs, 1, ...): the values of the only selected element.
+
+    Args:
+        values: values of the selected elements. (num_envs, k, ...)
+        kind: name of an element for the message, such as `site`.
 
     Raises:
         ValueError: if there is not exactly one element.
@@ -57,7 +61,12 @@ def single(values: Tensor, kind: str) -> Tensor:
 
 
 def require_one_per_body(values: Tensor, sensor: ContactSensor, key: str) -> Tensor:
-    """Return values that have one element for each body of the sensor; `key` is the key that selects the elements.
+    """Check that values have one element for each body of a contact sensor, and return the values.
+
+    Args:
+        values: values of the selected elements. (num_envs, k, ...)
+        sensor: the sensor.
+        key: the term's key that selects the elements, such as `sites`.
 
     Raises:
         ValueError: if their numbers differ.
@@ -81,7 +90,7 @@ def column_numbers(index: Columns, count: int) -> list[int]:
 
 @dataclass(kw_only=True, eq=False)
 class HandleTerm(EntityTerm):
-    """Base class of terms of one site of `entity` and of one site, `handle`, of the entity `cabinet`."""
+    """Base class of terms that compare one site of `entity`, such as a gripper, with the site `handle` of `cabinet`."""
 
     sites: Sites
     cabinet: Entity = "cabinet"
@@ -153,7 +162,14 @@ def angle_to_goal(entity: Entity, bodies: Columns, command: Command) -> Tensor:
 
 
 def _once(entity: Entity, command: Command, key: tuple[object, ...], compute: Callable[[], Tensor]) -> Tensor:
-    """Return `compute()`, which runs once for all terms of a step; do not write to the value. `key`: its name."""
+    """Return `compute()`, computed once in a step for all terms that need the same quantity; do not write to it.
+
+    Args:
+        entity: the entity of the quantity.
+        command: the command of the quantity.
+        key: name of the quantity.
+        compute: function that computes the quantity.
+    """
     value: Tensor = entity.sim.once_per_goal((entity.name, id(command), *key), command.command, compute)
     return value
 

@@ -157,8 +157,8 @@ def import_object(reference: str) -> Any:
 def contain_side_effects() -> Iterator[None]:
     """Send what the `with` block prints to stderr, also from C code, and undo its changes of the current folder.
 
-    Changes of torch's default type, default device and gradient mode are undone, too, with a warning: rlcli's own
-    tensors would change with them. So are built-in functions that were deleted or replaced by a value.
+    Two more kinds of changes are undone, with a warning: torch's default dtype, default device and gradient mode, on
+    which rlcli's own tensors depend; and built-in functions that were deleted or replaced by a value.
     """
     built_in = _BUILT_IN.copy()
     folder = _current_folder()
@@ -173,8 +173,9 @@ def contain_side_effects() -> Iterator[None]:
             _restore_built_in(built_in)
             if folder is not None and _current_folder() != folder:
                 os.chdir(folder)
-            if (_torch_settings() or settings) != settings:
-                _restore_torch(*settings)
+            changed = _torch_settings() or settings
+            if changed != settings:
+                _restore_torch(settings, changed)
 
 
 _BUILT_IN = builtins.__dict__
@@ -196,27 +197,31 @@ def _restore_built_in(before: dict[str, Any], is_callable: Callable[[object], bo
         _log.warning("imported code has deleted or replaced the built-in functions %s; rlcli has restored them", names)
 
 
-_TORCH_DEFAULTS = ("torch.float32", "cpu", True)
-"""torch's default type, its default device and whether it records gradients, after its import."""
+_TorchSettings = tuple[str, str, bool]
+"""torch's default dtype, its default device, and whether it records gradients (its gradient mode)."""
+_TORCH_DEFAULTS: _TorchSettings = ("torch.float32", "cpu", True)
+"""The settings of torch after its import."""
 
 
-def _torch_settings() -> tuple[str, str, bool] | None:
-    """Return torch's present settings, in the order of `_TORCH_DEFAULTS`; None if it is not imported."""
+def _torch_settings() -> _TorchSettings | None:
+    """Return the present settings of torch; None if torch is not imported."""
     torch = sys.modules.get("torch")
     if torch is None or not hasattr(torch, "get_default_device"):  # its import may have failed
         return None
     return str(torch.get_default_dtype()), str(torch.get_default_device()), torch.is_grad_enabled()
 
 
-def _restore_torch(dtype: str, device: str, records: bool) -> None:
+def _restore_torch(before: _TorchSettings, changed: _TorchSettings) -> None:
+    """Set the settings of torch to `before`, and warn which of them imported code had changed."""
     import torch
 
+    dtype, device, records = before
     torch.set_default_dtype(getattr(torch, dtype.removeprefix("torch.")))
     torch.set_default_device(None if device == "cpu" else device)
     torch.set_grad_enabled(records)
-    _log.warning(
-        "imported code has changed torch's default type, default device or gradient mode; rlcli has restored it"
-    )
+    rows = zip(("default dtype", "default device", "gradient mode"), before, changed, strict=True)
+    changes = " and ".join(f"{name} from {old} to {new}" for name, old, new in rows if old != new)
+    _log.warning("imported code has changed torch's %s; rlcli has restored it, as its tensors depend on it", changes)
 
 
 def error_location(error: BaseException) -> str:

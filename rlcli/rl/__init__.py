@@ -1,1 +1,1 @@
-"""Policies, networks and trainers."""
+"""Policies, networks, and the trainers `ppo` and `sb3`."""

@@ -11,7 +11,7 @@ from rlcli.envs.environment_protocol import Environment
 from rlcli.rl.policy import Policy
 
 Act = Callable[[Tensor], Tensor]
-"""Observations (num_envs, d) -> actions (num_envs, a)."""
+"""Action function: observations (num_envs, d) -> actions (num_envs, a)."""
 PATIENCE = 10
 """Number of episode lengths after which an evaluation stops an episode that does not end."""
 
@@ -19,7 +19,9 @@ PATIENCE = 10
 def trained_policy(
     env: Environment, policy: Policy, *, stochastic: bool = False, generator: torch.Generator | None = None
 ) -> Act:
-    """Return the action function of a policy, which resets an environment's hidden state at each episode start.
+    """Return a policy as a function from observations (num_envs, d) to actions (num_envs, a).
+
+    The function keeps the hidden state of a recurrent policy, and sets it to zero where an episode begins.
 
     Args:
         env: the environment.

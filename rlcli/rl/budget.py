@@ -13,7 +13,7 @@ from rlcli.rl.trainer import Trainer
 class Budget:
     """Limits of a whole training; at least one is set.
 
-    Work before a resumption counts, so a resumed run trains only what is left.
+    They include iterations and steps before the run was resumed, so a resumed run trains only the rest.
     """
 
     max_iterations: int | None
@@ -26,7 +26,7 @@ class Budget:
         return trainer.iteration >= self.iterations(trainer)
 
     def iterations(self, trainer: Trainer) -> int:
-        """Return the number of iterations of the whole training."""
+        """Return the number of iterations of the whole training, at which the first limit is reached."""
         limits = []
         if self.max_iterations is not None:
             limits.append(self.max_iterations)
@@ -37,7 +37,7 @@ class Budget:
 
 
 def remaining_budget(config: AgentConfig, trainer: Trainer) -> float:
-    """Return the share of an agent's budget that is left, 1 to 0. It does not change during an iteration."""
+    """Return the share of an agent's budget that is left, from 1 to 0, for schedules; constant during an iteration."""
     by_iterations = trainer.iteration / (config.max_iterations or math.inf)
     by_steps = trainer.iteration * trainer.steps_per_iteration / (config.max_steps or math.inf)
     return 1.0 - min(1.0, max(by_iterations, by_steps))

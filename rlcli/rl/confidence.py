@@ -59,9 +59,9 @@ def student_quantile(freedom: int) -> float:
 
 
 def difference(left: Sequence[float], right: Sequence[float]) -> dict[str, float | None]:
-    """Return the `mean` of left - right over pairs, with its percentile bootstrap interval from `low` to `high`.
+    """Return the `mean` of left[i] - right[i], with its percentile bootstrap interval from `low` to `high`.
 
-    The interval (Efron 1979) is None for a single pair.
+    The interval (Efron 1979) is None for a single pair of values.
     """
     gaps = np.asarray(left, dtype=np.float64) - np.asarray(right, dtype=np.float64)
     middle = float(gaps.mean())
@@ -95,7 +95,7 @@ def _exceeds(left: NDArray[np.float64], right: NDArray[np.float64]) -> float:
 
 
 def _resampled(count: int) -> list[NDArray[np.int64]]:
-    """Sample indices with replacement, in blocks of at most `_BLOCK` numbers. (n, count) each"""
+    """Return the indices of all bootstrap samples, drawn with replacement, in blocks of `_BLOCK` numbers. (n, count)"""
     generator = np.random.default_rng(_SEED)
     block = max(1, _BLOCK // count)
     starts = range(0, RESAMPLES, block)

@@ -1,12 +1,11 @@
-"""Recording of repeated work as a CUDA graph, and its replay.
+"""Recording of a repeated function, such as a rollout, as a CUDA graph, and its replay.
 
-The work is a function without arguments, such as a rollout. A graph records its kernel launches on fixed memory
-addresses. The work must not read a value back from the device. Tensors
-that the work keeps from one run to the next must keep their addresses. Tensors that a task rebinds in every step are
-copied back to their first address at the end of the recording. Work that cannot be recorded runs eagerly, after a
-warning.
+A graph records the function's kernel launches on fixed memory addresses. The function has no arguments, must not read a
+value back from the device, and must keep the addresses of tensors that it uses from one call to the next. Tensors that
+a task rebinds in every step are copied back to their first address at the end of the recording. A function that cannot
+be recorded runs eagerly, after a warning.
 
-All work is recorded in one stream: once a process holds one recording with parallel branches, each launch of every
+All kernels are recorded in one stream: once a process holds one recording with parallel branches, each launch of every
 recording takes about a third of a microsecond longer (docs/tutorials/train-on-a-gpu.md).
 """
 
@@ -27,21 +26,23 @@ _log = logging.getLogger(__name__)
 
 
 def capture_on_gpu(work: Work, device: torch.device, holders: Iterable[Any] = ()) -> Work:
-    """Return a `Recording` of `work` on a GPU, and `work` itself on a CPU.
+    """Return a `Recording` of the function `work` on a GPU, and `work` itself on a CPU.
 
     Args:
         work: the function.
-        device: device of the work.
-        holders: objects with attributes that the work keeps from one run to the next: a task, terms with a state.
+        device: device on which the function computes.
+        holders: objects whose attributes the function keeps from one call to the next, such as a direct task or terms
+            with a state.
     """
     return Recording(work, device, list(holders)) if device.type == "cuda" else work
 
 
 class Recording:
-    """Work that runs eagerly at first, is recorded as a CUDA graph, and is then replayed.
+    """Function that runs eagerly in the first calls, is then recorded as a CUDA graph, and is replayed after that.
 
-    Only the first run may synchronise with the device. After a run that neither synchronises nor changes a Python
-    number of the holders, the next run is recorded. Work that cannot be recorded always runs eagerly, after a warning.
+    Only the first call may synchronise with the device. After a call that neither synchronises nor changes a Python
+    number in the attributes of `holders`, the next call is recorded. A function that cannot be recorded always runs
+    eagerly, after a warning.
     """
 
     def __init__(self, work: Work, device: torch.device, holders: list[Any]) -> None:
@@ -51,10 +52,10 @@ class Recording:
         self._warp_capture: Any = None  # keeps the memory alive that Warp allocated during the recording
         self._eager_runs, self._ready = 0, False
         self.refusal: str | None = None
-        """Reason why the work cannot be recorded; None: no such reason was found so far."""
+        """Reason why the function cannot be recorded; None: none was found so far."""
 
     def __call__(self) -> None:
-        """Run the work: eagerly at first, later by replaying its recording."""
+        """Call the function: eagerly at first, later by replaying its recording."""
         if self._graph is not None:
             self._graph.replay()
         elif self.refusal is not None:
@@ -65,7 +66,7 @@ class Recording:
             self._run_eagerly()
 
     def _run_eagerly(self) -> None:
-        """Run without recording. Kernels compile, buffers are allocated, and synchronising calls are detected."""
+        """Call the function without recording: kernels compile, buffers are allocated, host syncs are detected."""
         self._eager_runs += 1
         before = torch.cuda.get_sync_debug_mode()
         numbers = self._numbers()
@@ -128,7 +129,10 @@ class Recording:
 
 
 def _copy_back(tensors: list[tuple[Any, str, Tensor]]) -> None:
-    """Copy the tensors that the work has rebound to their old addresses, which the next replay reads."""
+    """Copy tensors that the function has rebound to their old addresses, which the next replay reads.
+
+    `tensors` has (object, attribute, tensor before the call).
+    """
     for holder, name, old in tensors:
         new = getattr(holder, name)
         if new is not old and isinstance(new, Tensor) and new.shape == old.shape and new.dtype == old.dtype:

@@ -68,14 +68,14 @@ class ProcessGroup:
         return tuple((self.average_(values) * self.world_size).tolist())
 
     def broadcast_object(self, value: object = None) -> Any:
-        """Return the value of rank 0 in every process."""
+        """Return the `value` that rank 0 passes, in every process."""
         values = [value]
         if self.world_size > 1:
             _communicate("broadcast_object_list", values, 0)
         return values[0]
 
     def gather_object(self, value: object) -> list[Any]:
-        """Return the values of all processes by rank, on rank 0; an empty list elsewhere."""
+        """Return the values of all processes in the order of their ranks, on rank 0; an empty list on other ranks."""
         if self.world_size == 1:
             return [value]
         values: list[Any] | None = [None] * self.world_size if self.is_rank_zero else None
@@ -152,8 +152,8 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
     """Run `rlcli ARGUMENTS` in several processes of this machine.
 
     Returns:
-        0; the exit code of a process that failed by itself and not because of another process; or, if a signal stopped
-        the launcher, the exit code for that signal.
+        0 if all succeed; the exit code of a process that failed, and not only because another one had failed; if a
+        signal stopped the launcher, the exit code for that signal.
     """
     import logging
 
@@ -176,9 +176,10 @@ def launch(processes: int, arguments: Sequence[str]) -> int:
 
 
 def _exit_code(codes: Sequence[int]) -> int:
-    """Return the exit code of the run.
+    """Return the exit code of the run, from the exit codes of its processes.
 
-    Ignore processes that the launcher killed (negative codes) and those that lost another process (`MachineError`).
+    Ignore processes that the launcher killed (negative codes) and those that ended because another process was gone
+    (`MachineError`).
     """
     own = [code for code in codes if code > 0 and code != MachineError.exit_code]
     return next(iter(own), MachineError.exit_code)

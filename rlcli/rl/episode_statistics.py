@@ -34,7 +34,7 @@ class EpisodeStatistics:
     - `Success/<condition>`: share of the episodes at whose end the condition of success held;
     - `Success_Value/<condition>`: mean of the condition's value in the last step.
 
-    Sums stay on the device of the episodes, so that adding to them forces no host sync.
+    The sums stay on the environment's device, so that adding to them forces no host sync.
     """
 
     WINDOW = 100
@@ -68,7 +68,7 @@ class EpisodeStatistics:
         self._sums[names].addmv_(matrix, weight)
 
     def all_reduce(self, process_group: ProcessGroup) -> None:
-        """Sum the statistics over all processes; as long as one of them has no finished episode, change nothing."""
+        """Sum the statistics over all processes; before each has finished an episode, change nothing."""
         own = len(self._sums)
         (total,) = process_group.sum(own)
         if own and total == own * process_group.world_size:
@@ -76,7 +76,7 @@ class EpisodeStatistics:
                 process_group.average_(values).mul_(process_group.world_size)
 
     def flush(self) -> dict[str, float]:
-        """Return the metrics of the iteration and reset its sums; a mean over no episodes is left out."""
+        """Return the metrics of the iteration and reset its sums; metrics without an episode are left out."""
         sums: dict[str, float] = {}
         for names, values in self._sums.items():
             for name, value in zip(names.split(","), values.tolist(), strict=True):
@@ -91,7 +91,7 @@ class EpisodeStatistics:
         return {**self._means(), **self._episode_means(sums, count)}
 
     def state(self) -> dict[str, Any]:
-        """Return the sums of the recent iterations as plain JSON; between iterations there is no other state."""
+        """Return the sums of the recent iterations as data for JSON, to save them between two iterations."""
         return {"recent": [list(row) for row in self._recent], "total": self.total}
 
     def load(self, state: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Multilayer perceptrons on a CPU, with the fastest operations that torch, its libraries and numpy offer.
+"""Multilayer perceptrons on a CPU, with the fastest operations of MKL, oneDNN and numpy.
 
 torch uses MKL for matrix products. MKL uses AVX-512 only on Intel processors: on AMD processors oneDNN is twice as
 fast, on Intel processors it is slower. numpy's expm1 is three times as fast as torch's, and its tanh ten times.
@@ -20,19 +20,19 @@ _aten = torch.ops.aten
 _AVX512 = torch.backends.cpu.get_cpu_capability() == "AVX512"
 """Whether the processor has AVX-512; without it numpy's expm1 is not vectorised, and oneDNN is not used."""
 _WORTH, _LARGE = 2**20, 64 * 64
-"""`_WORTH`: number of multiplications from which oneDNN's matrix product is faster. `_LARGE`: the gradient of a layer's
-weights must also have at least this number of elements."""
+"""`_WORTH`: number of multiplications from which oneDNN's matrix product is faster than MKL's. `_LARGE`: number of
+elements that the gradient of a layer's weights must have as well."""
 
 
 _ROWS, _WIDE = 8192, 64
-"""A part of the samples has at most `_ROWS` rows if the widest layer has `_WIDE` outputs, fewer for wider layers: with
-more rows, intermediate results leave the cache."""
+"""Samples are computed in parts of at most `_ROWS` rows if the widest layer has `_WIDE` outputs, and fewer rows for
+wider layers: with more rows, intermediate results do not fit into the cache."""
 _pools: list[ThreadPoolExecutor] = []
 """The thread pool that `use_threads` has made; empty for one thread."""
 
 
 def use_threads(count: int) -> None:
-    """Set the number of threads that compute the outputs of `Mlp` for many samples; torch itself must use one."""
+    """Set the number of threads in which `Mlp` computes its outputs; torch's own number of threads must be 1."""
     for pool in _pools:
         pool.shutdown()
     new = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,)) if count > 1 else None
@@ -46,7 +46,10 @@ def part_rows(layers: Iterable[nn.Module]) -> int:
 
 
 def _onednn() -> Callable[..., Tensor] | None:
-    """Return oneDNN's `x @ weight.T + bias` where it is faster, else None; torch may remove the private operator."""
+    """Return oneDNN's operator for `x @ weight.T + bias`; None if it is slower here, or if torch lacks it.
+
+    The operator is private, so a later torch may not have it.
+    """
     if not _AVX512 or "AMD" not in processor()["model"] or not has_onednn():
         return None
     operator: Any = getattr(torch.ops.mkldnn, "_linear_pointwise", None)
@@ -82,7 +85,7 @@ class Activation(NamedTuple):
     """Activation and its gradient on preallocated tensors."""
 
     forward: Callable[[Tensor, Tensor], object]
-    """forward(inputs, out)"""
+    """forward(inputs, out) writes the activations of the inputs to `out`."""
     backward: Callable[[Tensor, Tensor, Tensor], object]
     """backward(gradient, inputs, outputs) replaces the gradient of the outputs by the gradient of the inputs."""
 
@@ -127,10 +130,10 @@ def is_plain(layers: Iterable[nn.Module]) -> bool:
 class Mlp(nn.Sequential):
     """Multilayer perceptron that uses the fast operations of this module while autograd is off.
 
-    While autograd is on it uses torch's operations. The fast path calls no hooks of the layers. It computes the hidden
-    layers in parts of the samples, which the threads of `use_threads` share. The parts do not depend on the number of
-    threads, and the last layer is computed for all samples at once, since the rounding of a product with one column
-    depends on the number of its rows.
+    While autograd is on it uses torch's operations. The fast operations call no hooks of the layers. The samples are
+    split into parts, whose hidden layers the threads of `use_threads` compute. The parts do not depend on the number of
+    threads. The last layer is computed for all samples at once: the rounding of a product with one column depends on
+    the number of its rows.
     """
 
     def __init__(self, *layers: Any) -> None:

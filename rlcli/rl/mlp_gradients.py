@@ -22,13 +22,16 @@ from torch import Tensor, nn
 from rlcli.rl.mlp import FAST_ACTIVATIONS, affine, input_gradient, part_rows, weight_gradient
 
 _PARTS = 2
-"""Parts of a large minibatch. With two networks they occupy the default number of threads, four. More parts mean
-shorter operations, and a thread waits for Python's lock between two operations."""
+"""Number of parts of a large minibatch. Two networks with two parts each occupy the default number of threads, four.
+More parts mean shorter operations, and a thread waits for Python's lock between two operations."""
 Layers = Iterable[nn.Module]
 OutputGradient = Callable[[slice, Tensor], tuple[Tensor, Tensor]]
-"""Function of the rows of a part and of a network's outputs for them, (n, a). It returns the gradient of the loss with
-respect to the outputs, (n, a), and statistics that are summed over the parts (losses, KL divergence, gradients of the
-standard deviations, ...): at most 3 + 2 a of the actor, one of the critic."""
+"""Function `(rows, outputs) -> (gradient, statistics)` for one part of a minibatch.
+
+`rows` is the slice of the part in the minibatch, `outputs` (n, a) are a network's outputs for the part. `gradient`
+(n, a) is that of the loss with respect to the outputs. `statistics` is a vector whose sum over all parts is needed
+(losses, gradients of the standard deviations, ...): at most 3 + 2 a numbers for the actor, one for the critic.
+"""
 
 
 class PartMemory:
@@ -38,7 +41,8 @@ class PartMemory:
         actor: layers of the actor.
         critic: layers of the critic.
         rows: number of samples of the largest minibatch.
-        tensors: memory with the names and shapes of the attribute `shapes`; None: allocate it.
+        tensors: memory to use, such as shared memory, with the names and shapes of the attribute `shapes`; None:
+            allocate new memory.
     """
 
     def __init__(self, actor: Layers, critic: Layers, rows: int, tensors: Mapping[str, Tensor] | None = None) -> None:
@@ -61,17 +65,23 @@ class PartMemory:
         self._sum_views = _views(self._sum, self._shapes)
 
     def split(self, rows: int) -> list[slice]:
-        """Return the rows of each part of a minibatch; the parts are as even as possible."""
+        """Split a minibatch of `rows` samples into parts of nearly equal size; return the rows of each part."""
         parts = max(1, -(-rows // self._max_rows), min(_PARTS, 2 * rows // self._max_rows))
         ends = [rows * number // parts for number in range(parts + 1)]
         return [slice(start, end) for start, end in itertools.pairwise(ends)]
 
     def tasks(self, rows: int) -> list[tuple[int, int, slice]]:
-        """Return the tasks of a minibatch: (network, part, rows of the part). Network 0 is the actor, 1 the critic."""
+        """Return the units of work for a minibatch of `rows` samples, which threads or processes share.
+
+        A unit is (network, part, rows of the part): network 0 is the actor, 1 the critic; `part` is the part's index.
+        """
         return [(network, part, part_of) for network in range(2) for part, part_of in enumerate(self.split(rows))]
 
     def gradients_of(self, network: int, part: int) -> list[Tensor]:
-        """Return the (transposed) tensors for the gradients of one network (0: actor, 1: critic) and part."""
+        """Return the tensors to which the gradients of one network (0: actor, 1: critic) and part are written.
+
+        They are transposed: (inputs, outputs) for weights.
+        """
         return self._views[part][self._ends[network] : self._ends[network + 1]]
 
     def sum_parts(self, rows: int, out: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -101,7 +111,13 @@ class PartGradients:
     def compute(
         self, task: tuple[int, int, slice], inputs: Sequence[Tensor], output_gradients: Sequence[OutputGradient]
     ) -> None:
-        """Write the gradients of one of `PartMemory.tasks`; both sequences are (the actor's, the critic's)."""
+        """Write the gradients and statistics of one unit of work to the memory.
+
+        Args:
+            task: one of `PartMemory.tasks`.
+            inputs: observations of the actor, and of the critic, for the whole minibatch. (n, d), (n, c)
+            output_gradients: `OutputGradient` of the actor, and of the critic.
+        """
         network, part, rows = task
         mlp = self._passes[network]
         gradient, numbers = output_gradients[network](rows, mlp.forward(inputs[network][rows]))
@@ -131,7 +147,14 @@ class MlpGradients:
     def __call__(
         self, obs: Tensor, critic_obs: Tensor, actor_gradient: OutputGradient, critic_gradient: OutputGradient
     ) -> tuple[Tensor, Tensor]:
-        """Write the gradients of a minibatch; return the sums of both networks' statistics (see `OutputGradient`)."""
+        """Write the gradients of a minibatch to `gradients`; return (the actor's, the critic's) summed statistics.
+
+        Args:
+            obs: inputs of the actor. (n, d)
+            critic_obs: inputs of the critic. (n, c)
+            actor_gradient: gradient of the loss with respect to the actor's outputs, and statistics.
+            critic_gradient: the same for the critic.
+        """
         tasks = deque(self._memory.tasks(len(obs)))
 
         def work(thread: PartGradients) -> None:
@@ -189,6 +212,6 @@ class _Passes:
 
 
 def _views(vector: Tensor, shapes: Sequence[torch.Size]) -> list[Tensor]:
-    """Return consecutive parts of a vector as views of the given shapes."""
+    """Split a vector into consecutive parts, and return them as views of the given shapes."""
     parts = vector.split_with_sizes([shape.numel() for shape in shapes])
     return [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]

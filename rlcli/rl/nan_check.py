@@ -1,4 +1,4 @@
-"""Checks of a learner for NaN and infinity. The error names the first tensor in causal order that is not finite."""
+"""Checks of a learner for NaN and infinity. The error names the first tensor that is not finite: the others follow."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ LEARNER_HINT = "lower learning_rate or max_grad_norm; the last good checkpoint i
 def require_finite(
     tensors: Iterable[tuple[str, Tensor]], iteration: int, axes: tuple[str, ...] = (), hint: str = LEARNER_HINT
 ) -> None:
-    """Check that all tensors are finite.
+    """Check that all tensors are finite, and name the first one that is not, which is the cause of the others.
 
     Args:
-        tensors: names and values in causal order: each tensor after those that it is computed from.
+        tensors: names and values, each tensor after those from which it is computed.
         iteration: index of the iteration, for the message.
         axes: names of the leading axes, such as `("step", "environment")`.
         hint: what the user can do.
@@ -46,7 +46,7 @@ def require_finite(
 
 
 def moments(normalizers: Iterable[tuple[str, Normalizer | None]]) -> list[tuple[str, Tensor]]:
-    """Return mean and variance of each normaliser, with names for the messages of `require_finite`."""
+    """Return (name, value) of mean, variance and count of each normaliser, for `require_finite`."""
     return [
         (f"the {name} normaliser's {moment}", getattr(normalizer, moment))
         for name, normalizer in normalizers
@@ -58,7 +58,7 @@ def moments(normalizers: Iterable[tuple[str, Normalizer | None]]) -> list[tuple[
 def require_finite_learner(
     metrics: Mapping[str, float], modules: Mapping[str, nn.Module], iteration: int, hint: str = LEARNER_HINT
 ) -> None:
-    """Check that the metrics of an update and all weights are finite.
+    """Check that the metrics of an update and all weights are finite, after the update.
 
     Args:
         metrics: metrics that must be finite, by name.

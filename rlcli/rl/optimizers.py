@@ -1,4 +1,4 @@
-"""Saving and loading of optimisers' states as flat tensors of a checkpoint, and an Adam that imports fast."""
+"""Saving and loading of optimisers' states as named tensors of a checkpoint, and an Adam that imports fast."""
 
 from __future__ import annotations
 
@@ -36,7 +36,10 @@ def below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer, prefix: str) -> dict[str, Tensor]:
-    """Return a copy of an optimiser's state; its keys are PREFIX, parameter index and name, as in `0.exp_avg`."""
+    """Return a copy of an optimiser's state as name -> tensor.
+
+    A name is the prefix, the index of a parameter, and the name of Adam's value: `0.exp_avg`.
+    """
     return {
         f"{prefix}{number}.{slot}": torch.as_tensor(value).clone()
         for number, slots in optimizer.state_dict()["state"].items()

@@ -1,4 +1,4 @@
-"""Policy as it is saved, played and exported: it maps raw observations to the actions of `env.step`."""
+"""Policy as it is saved, played and exported: a network from raw observations to the actions of `env.step`."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class PolicySpec(BaseModel):
 class Normalizer(nn.Module):
     """Running mean and variance of observations, merged batch by batch (Chan, Golub and LeVeque 1979).
 
-    It is a part of the policy: it is exported with the policy, and changes only in training.
+    The normaliser is a part of the policy: it is exported with the policy, and changes only in training.
 
     Args:
         size: number of columns.
@@ -99,7 +99,7 @@ class Normalizer(nn.Module):
     var: Tensor
     """Variance of the observations. (size,)"""
     count: Tensor
-    """Number of observations so far. ()"""
+    """Number of observations so far. (scalar)"""
 
     def __init__(self, size: int | tuple[()], clip: float | None = 10.0) -> None:
         super().__init__()
@@ -133,8 +133,9 @@ class Normalizer(nn.Module):
 class WideLinear(nn.Linear):
     """Linear layer with float32 weights that computes in float64.
 
-    Runtimes add products in different orders. In float64 the difference is too small to change a float32 action, also
-    for observations far from the training's observations. So batches of any size and exported graphs agree.
+    Inference libraries add products in different orders. In float64 the difference is too small to change a float32
+    action, also for observations far from those of the training. Batches of any size and exported files therefore give
+    the same actions.
     """
 
     def forward(self, x: Tensor) -> Tensor:
@@ -158,7 +159,10 @@ class Lstm(nn.Module):
         self.cells, self.dtype = list(cells), torch.float64 if wide else torch.float32
 
     def blank(self, rows: int) -> Tensor:
-        """Return zero hidden states: for each layer the output, then the cell state. (rows, 2 x cells of all layers)"""
+        """Return zero hidden states for `rows` samples. (rows, 2 x cells of all layers)
+
+        The columns are h and c of the first layer, then h and c of the next one.
+        """
         return torch.zeros(rows, 2 * sum(self.cells), dtype=self.dtype, device=next(self.parameters()).device)
 
     def forward(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -277,7 +281,9 @@ def load_policy(spec: Mapping[str, object], weights: Mapping[str, Tensor]) -> Po
 
 
 def blank_policy(spec: Mapping[str, object]) -> Policy:
-    """Return a policy without weights, on the meta device: a small untrusted file cannot cause a large allocation.
+    """Return a policy without weights, on torch's meta device, from the content of `policy.json`.
+
+    No memory is allocated, so a small untrusted file cannot cause a large allocation.
 
     Raises:
         CheckpointError: if the specification is not valid.

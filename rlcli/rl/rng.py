@@ -38,7 +38,10 @@ def rng_state() -> dict[str, Tensor]:
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Run the block with one torch thread; then restore the generators and the number of threads."""
+    """Run the `with` block so that it does not change later random numbers.
+
+    The block runs with one torch thread; after it, the global generators and the number of threads are restored.
+    """
     rng, threads = rng_state(), torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -41,8 +41,9 @@ class BaseTrainer(ABC):
         self.statistics = EpisodeStatistics(env.config.episode_length_s)
         """Statistics of the episodes that end in the rollout: call `statistics.add(result.episodes)` in every step."""
         self.recent_obs = torch.zeros(0, env.layout.size("policy"), device=env.device)
-        """Newest observations of the policy, at most 256 rows; `observations` of the group `trainer` in a checkpoint.
-        (n, d)"""
+        """Newest observations of the policy, at most 256 rows. (n, d)
+
+        A checkpoint stores them as `observations` in `trainer.safetensors`; `rlcli export` tests a file with them."""
 
     @abstractmethod
     def policy_tensors(self) -> dict[str, Tensor]:
@@ -80,7 +81,14 @@ def finite_values(metrics: Mapping[str, float]) -> dict[str, float]:
 
 
 def agent_error(env: Environment, path: tuple[str, ...], message: str, hint: str) -> ConfigError:
-    """Return the error for a key of the agent's configuration that does not fit the environment."""
+    """Return the error for a key of the agent's configuration that does not fit the environment.
+
+    Args:
+        env: the environment.
+        path: the key in the agent's configuration, such as ("critic", "hidden").
+        message: what is wrong.
+        hint: what to do.
+    """
     return ConfigError([env.resolved.problem(("agents", env.resolved.agent_name or "", *path), message, hint)])
 
 

@@ -1,6 +1,6 @@
-"""Actuator models, which compute the efforts on joints before each physics step.
+"""Actuator models: PD controllers and DC motors outside of MuJoCo, computed before each physics step.
 
-MuJoCo's own actuators do not use this module: the engine computes them within one call for a whole environment step.
+MuJoCo's own actuators do not use this module: the engine computes them in its call for a whole environment step.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ from rlcli.sim.saved_tensors import TensorState, require_in_range
 POSITION, VELOCITY, EFFORT = range(3)
 """Rows of `ActuatorModel.targets`."""
 Controller = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Returns the efforts before and after limits, (num_envs, k) each, for targets, joint positions and velocities."""
+"""Function (targets, joint positions, joint velocities) -> (efforts before limits, efforts after limits).
+
+Targets are (num_envs, 3, k), all others (num_envs, k).
+"""
 _ROW = {"position": POSITION, "velocity": VELOCITY, "motor": EFFORT}
 
 
@@ -63,7 +66,7 @@ class ActuatorModel(TensorState):
         self._saturation_effort, speed = config.saturation_effort, config.velocity_limit
         self._velocity_limit = values_by_joint(speed, names).to(device) if isinstance(speed, Mapping) else speed
         self.controller: Controller | None = None
-        """Replacement of the PD controller and of its limits."""
+        """Function that replaces the PD controller and its limits; None: the PD controller."""
         self.targets = torch.zeros(n, 3, k, device=device)
         """Position, velocity and effort targets of each joint. (num_envs, 3, k)"""
         self.computed_effort = torch.zeros(n, k, device=device)
@@ -106,7 +109,7 @@ class ActuatorModel(TensorState):
         self.applied_effort.copy_(self.computed_effort.clamp(low, high))
 
     def reset(self, selection: Selection) -> None:
-        """At the start of episodes in the selected environments, set the default pose as target and draw the delays."""
+        """Start episodes in the selected environments: the targets become the default pose, and delays are drawn."""
         selection.write(self.targets, selection.read_view(self._default_targets))
         selection.write(self.computed_effort, 0.0)
         selection.write(self.applied_effort, 0.0)
@@ -121,9 +124,9 @@ class ActuatorModel(TensorState):
         super().load_state_dict(state)
 
     def _delayed_targets(self, history: Tensor) -> Tensor:
-        """Return the position, velocity and effort targets that act now, after the delay. (num_envs, 3, k)
+        """Return the targets from `delay` physics steps ago, or the first targets of the episode. (num_envs, 3, k)
 
-        They are those of `delay` physics steps ago, or the first ones of the episode. `history` has the past targets.
+        `history` has the targets of the last steps. (num_envs, longest delay + 1, 3, k)
         """
         now = self.targets[:, None]
         # the first step of an episode fills the whole history
@@ -171,7 +174,7 @@ class JointCommand:
         self.actuators = [None if c in modelled else native[c] for c in columns]
         """Id of the MuJoCo actuator of each column; None where an actuator model drives the joint."""
         self.sinks = [f"{entity.name}/{entity.joint_names[c]} {kind}" if c in modelled else native[c] for c in columns]
-        """Actuator or joint to which each column writes; two terms must not have the same entry."""
+        """Actuator or joint to which each column writes; two action terms must not write to the same one."""
         sources = [i for i, c in enumerate(columns) if c not in modelled]
         controls = [native[columns[i]] for i in sources]
         gear = torch.tensor(model.actuator_gear[controls, 0], dtype=torch.float32, device=device)

@@ -76,5 +76,5 @@ def _contact_couples(model: mujoco.MjModel) -> bool:
 
 
 def _moves(model: mujoco.MjModel) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return for each body whether physics can move it: it or a parent has degrees of freedom. (nbody,)"""
+    """Return for each body whether physics can move it: the body or a parent has degrees of freedom. (nbody,)"""
     return np.asarray(model.body_treeid >= 0)

@@ -54,7 +54,7 @@ class CameraSensor(LazySensor):
         shape = (config.height, config.width, _CHANNELS[config.data])
         kind = torch.uint8 if config.data == "rgb" else torch.float32
         self.names = [name]
-        """Names of the sensor's columns: only its own name."""
+        """The sensor's name, as a list of one: other sensors have a name for each body or ray."""
         self._image = torch.zeros(engine.num_envs, *shape, dtype=kind)
         self._pixels = self._image.numpy()
 
@@ -81,7 +81,7 @@ class CameraSensor(LazySensor):
         self._renderers.close()
 
     def _render(self, ids: NDArray[np.int64]) -> None:
-        """Render the environments `ids`, an equal share in each thread."""
+        """Render the environments `ids`, an equal number in each thread."""
         engine, config, camera, pixels = self._engine, self.config, self._camera, self._pixels
 
         def render_share(share: NDArray[np.int64], renderer: CameraRenderer) -> None:
@@ -94,7 +94,7 @@ class CameraSensor(LazySensor):
 
 
 class CameraRenderer:
-    """Renderer of one thread: an OpenGL context with its buffers. The same thread must make, use and free it.
+    """Renderer of camera images with an OpenGL context, which one thread must make, use and free.
 
     Args:
         model: model of the scene.
@@ -123,7 +123,7 @@ class CameraRenderer:
         self._option = mujoco.MjvOption()
 
     def load_state(self, engine: ReplayableEngine, env: int) -> None:
-        """Load what affects the image of an environment from its state and its model; `render` draws it."""
+        """Copy an environment's state and own model values (such as colours) into the renderer, before `render`."""
         if engine.expanded_fields():
             if self._model is self._shared_model:
                 self._model = copy.copy(self._shared_model)
@@ -165,7 +165,10 @@ class CameraRenderer:
         out[:] = _downsample(depths[..., None], config.samples)
 
     def _bodies(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return the body of each pixel, whose colour is the number of a geom of the scene, plus 1. (h, w, 1)"""
+        """Return the id of the body at each pixel. (h, w, 1)
+
+        The colour of a pixel is 1 + the index of a geom in the rendered scene.
+        """
         numbers = pixels.astype(np.int64) @ np.array([1, 1 << 8, 1 << 16])
         body_of = np.full(self._scene.ngeom + 2, -1.0, np.float32)
         for geom in self._scene.geoms[: self._scene.ngeom]:
@@ -181,7 +184,7 @@ class CameraRenderer:
 
 
 class RendererPool:
-    """Threads that render images in parallel, each with a `CameraRenderer` of its own.
+    """Threads that render images in parallel; each has a `CameraRenderer`.
 
     Args:
         model: model of the scene.
@@ -218,14 +221,14 @@ class RendererPool:
 
     @property
     def count(self) -> int:
-        """Number of threads."""
+        """Number of threads that render."""
         return len(self._threads)
 
     def run(self, work: Sequence[Callable[[CameraRenderer], None]]) -> None:
-        """Call each function in a thread of its own, with the thread's renderer, and wait for all of them.
+        """Call each function in another thread, with the thread's renderer, and wait for all of them.
 
         Raises:
-            MachineError: after `close`, or in a process that was forked from the one that opened the contexts.
+            MachineError: after `close`, or in a fork of the process that opened the contexts.
         """
         if os.getpid() != self._process:
             message = "cameras render only in the process that made the environment; this process is a fork of it"
@@ -268,13 +271,13 @@ def make_cameras(specs: Mapping[str, CameraSensorSpec], engine: Engine) -> dict[
 
 
 _Orders = queue.SimpleQueue[tuple[Callable[[CameraRenderer], None], Future[None]] | None]
-"""Functions that a rendering thread calls, each with the future of its result; None ends the thread."""
+"""Queue of functions for a rendering thread to call, each with the future for its result; None ends the thread."""
 
 
 def _render_orders(model: mujoco.MjModel, width: int, height: int, orders: _Orders, ready: Future[None]) -> None:
-    """Body of a rendering thread: open an OpenGL context and call the functions in the queue `orders` with it.
+    """Open an OpenGL context and call the functions in the queue `orders` with it: the function of a rendering thread.
 
-    OpenGL requires that one thread makes, uses and frees a context. `ready` gets the error if it cannot be opened.
+    OpenGL requires that one thread makes, uses and frees a context. `ready` gets the error if no context opens.
     """
     try:
         renderer = CameraRenderer(model, width, height)
@@ -339,9 +342,9 @@ def _ray_lengths(height: int, width: int, view: mujoco.MjvGLCamera) -> NDArray[n
 
 
 def _downsample(values: NDArray[Any], samples: int) -> NDArray[Any]:
-    """Return an image of the means of s x s samples, with the top row first instead of last.
+    """Return an image whose pixels are means of `samples` x `samples` samples, with the top row first instead of last.
 
-    s is `samples`. (h s, w s, c) -> (h, w, c)
+    (h x samples, w x samples, c) -> (h, w, c)
     """
     if samples > 1:
         rows = np.stack([values[k::samples] for k in range(samples)]).sum(axis=0, dtype=np.float32)

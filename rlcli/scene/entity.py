@@ -72,7 +72,7 @@ class Entity:
         self._targets: dict[tuple[int, ...], tuple[Columns, Field, Columns]] = {}
         self.data = EntityData(self, sim)
         self.actuators: list[ActuatorModel] = []
-        """Actuator models of its joints; they are added after the entity is made."""
+        """Actuator models of the entity's joints; they are added after the entity is made."""
 
     @property
     def is_floating(self) -> bool:
@@ -82,10 +82,10 @@ class Entity:
     def select(self, alias: str, patterns: str | Sequence[str]) -> tuple[Columns, list[str]]:
         """Find elements (joints, bodies, ...) of this entity by their names.
 
-        Return the index that selects them in the entity's tensors, such as `data.joint_pos`, and their names.
+        Return an index that selects the elements in the entity's tensors, such as `data.joint_pos`, and their names.
 
         Args:
-            alias: the kind of element: Joints, Bodies, ...
+            alias: the kind of element, as a type alias of `rlcli.task`: Joints, Bodies, ...
             patterns: names or regular expressions.
 
         Raises:
@@ -100,9 +100,9 @@ class Entity:
         return self._index(positions), [names[p] for p in positions]
 
     def actuators_of(self, kind: str) -> list[tuple[int, int]]:
-        """Return (index of the joint in the entity, id of the actuator in the model) of every actuator of a kind.
+        """Return (index of the joint in the entity, id of the actuator in the model) of MuJoCo actuators of a kind.
 
-        The kind is motor, position, velocity or other. Actuator models of the configuration do not count.
+        `kind` is motor, position, velocity or other. Actuator models (`scene.entities.*.actuators`) are left out.
         """
         model = self.engine.model
         columns = {joint: column for column, joint in enumerate(self.joint_ids.tolist())}
@@ -137,7 +137,7 @@ class Entity:
 
         Args:
             selection: the environments.
-            linear_w: linear velocity of its `velocity_point`. (rows, 3) [m/s]
+            linear_w: linear velocity of the root's `velocity_point` (origin or centre of mass). (rows, 3) [m/s]
             angular_w: angular velocity. (rows, 3) [rad/s]
         """
         if self.mocap >= 0:
@@ -193,15 +193,16 @@ class Entity:
         return as_index(positions, self.engine.device)
 
     def _target(self, field: Tensor, field_columns: Tensor, joints: Columns) -> tuple[Field, Columns]:
-        """Return where to write values of some joints: the tensor, and the columns in it.
+        """Return (tensor, columns) to which values of some joints are written.
 
         Args:
             field: qpos or qvel of all environments.
-            field_columns: the column of each joint of the entity in it.
+            field_columns: the column of each joint of the entity in `field`.
             joints: which joints, as an index into the entity's joints.
 
         Returns:
-            For consecutive columns a view of them with all its columns; otherwise the field with the joints' columns.
+            For consecutive columns a view of only these columns, with the index of all its columns; otherwise `field`
+            with the joints' columns.
         """
         index = (joints.start, joints.stop, joints.step) if isinstance(joints, slice) else (id(joints),)
         key = (id(field_columns), *index)

@@ -175,7 +175,10 @@ class EntityData:
 
     @property
     def root_lin_vel_w(self) -> Tensor:
-        """Linear velocity of the root's `velocity_point`, world frame. (num_envs, 3) [m/s]"""
+        """Linear velocity of the root's `velocity_point` (its origin or centre of mass), world frame.
+
+        (num_envs, 3) [m/s]
+        """
         return self.root_com_lin_vel_w if self._at_com else self.root_origin_lin_vel_w
 
     @property
@@ -293,7 +296,10 @@ class EntityData:
 
     @property
     def body_lin_vel_w(self) -> Tensor:
-        """Velocities of each body's `velocity_point`, world frame. (num_envs, bodies, 3) [m/s]"""
+        """Velocities of each body's `velocity_point` (its origin or centre of mass), world frame.
+
+        (num_envs, bodies, 3) [m/s]
+        """
         return self._once("body_lin_vel_w", lambda: self.body_lin_vel_of(ALL))
 
     def body_lin_vel_of(self, bodies: Columns, point: str | None = None) -> Tensor:
@@ -401,7 +407,7 @@ class EntityData:
         return middle - half, middle + half
 
     def _columns_of(self, bodies: Columns) -> tuple[Columns, Columns]:
-        """Return the ids in the model of some bodies, and of the roots of their kinematic trees, looked up once."""
+        """Return the model ids of some bodies, and of the root bodies of their kinematic trees; cached."""
         found = self._body_columns.get(id(bodies))
         if found is None:
             model, device = self._entity.engine.model, self._entity.engine.device
@@ -413,13 +419,19 @@ class EntityData:
         return found[1:]
 
     def _velocity_at(self, points: Tensor, bodies: Columns, roots: Columns) -> Tensor:
-        """Return the velocity of a point of each body; `roots` are the roots of their trees. (num_envs, bodies, 3)"""
+        """Return the velocity of a point of each body, world frame. (num_envs, bodies, 3) [m/s]
+
+        Args:
+            points: positions of the points, world frame. (num_envs, bodies, 3) [m]
+            bodies: model ids of the bodies.
+            roots: model ids of the root bodies of their kinematic trees.
+        """
         # MuJoCo's cvel is the velocity at the centre of mass of the body's kinematic tree
         velocity = self._sim.derived_columns("cvel", bodies)
         return velocity[..., 3:] + cross(velocity[..., :3], self._from_tree_com(points, roots))
 
     def _from_tree_com(self, points: Tensor, roots: Columns) -> Tensor:
-        """Return the vectors to points from the centres of mass of kinematic trees, given by their root bodies."""
+        """Return the vectors from the centres of mass of kinematic trees, whose root bodies are `roots`, to points."""
         return points - self._sim.derived_columns("subtree_com", roots)
 
     def _body_force(self, name: str) -> Tensor:
@@ -432,7 +444,7 @@ class EntityData:
         return self._sim.derived_field(name)
 
     def _once(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
-        """Return the value `name`; `compute` is called only if the state has changed since the last call."""
+        """Return `compute()`, cached under `name` until the state changes."""
         stamp, value = self._cache.get(name, (-1, None))
         if stamp != self._sim.stamp or value is None:
             value = compute()

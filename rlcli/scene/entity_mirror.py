@@ -17,7 +17,7 @@ from rlcli.scene.entity import Entity
 
 Points = NDArray[np.float64]
 VECTOR, PSEUDOVECTOR, QUATERNION = (1, -1, 1), (-1, 1, -1), (1, -1, 1, -1)
-"""Signs of the columns of a mirrored quantity."""
+"""Signs by which the columns of a quantity are multiplied to get its mirror image."""
 _TOLERANCE = 1e-3
 """Largest distance of an element from the mirror image of its partner [m], and of two unit axes."""
 
@@ -56,7 +56,10 @@ class EntityMirror:
                 to_qvel[:, to_v] = sign * qvel[:, v]
 
     def _pair(self, body: int) -> None:
-        """Find the mirror image of a body, a child of the mirror image of its parent, and pair the joints of both."""
+        """Find the body that is the mirror image of `body`, and pair the joints of both.
+
+        The mirror image is searched among the children of the mirror image of the body's parent.
+        """
         model, data = self._model, self._data
         partner = body
         if body != self._root:

@@ -24,7 +24,7 @@ FloatArray = NDArray[np.float64]
 def checked_models(
     entities: Mapping[str, EntityConfig], root: Path, *, installed: bool
 ) -> tuple[dict[str, CheckedModel], list[SceneProblem]]:
-    """Check the MJCFs of a scene's entities, each by itself and together, before MuJoCo opens one of them.
+    """Check the MJCFs of a scene's entities, each by itself and all together, before MuJoCo opens any of them.
 
     Args:
         entities: the configurations of the entities.
@@ -32,7 +32,7 @@ def checked_models(
         installed: whether the task is installed: the files of an installed task are trusted.
 
     Returns:
-        The models by entity, without those of shapes and of entities with a problem; and the problems.
+        (name of the entity -> checked model, problems). Shapes, and entities with a problem, have no model.
 
     Raises:
         MissingModelError: if the user has to provide a model.
@@ -71,8 +71,8 @@ def entity_spec(
     Args:
         name: name of the entity.
         entity: configuration of the entity.
-        checked: its MJCF; None for a shape.
-        compiled: whether to check by compiling that MuJoCo accepts the model.
+        checked: the checked MJCF of the entity; None for a shape.
+        compiled: whether to compile the model as well, to check that MuJoCo accepts it.
 
     Raises:
         SceneProblem: if the MJCF cannot be read.

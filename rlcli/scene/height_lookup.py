@@ -19,7 +19,10 @@ class HeightTable:
         self._border = ground.border
 
     def depth(self, px: Tensor, py: Tensor, pz: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the height of points above the ground [m], and whether there is ground at their x and y. (...) each"""
+        """Return the heights of points above the ground [m], and whether there is ground at each point. (...) each
+
+        px, py and pz are the coordinates of the points, world frame [m].
+        """
         half_x, half_y = self._half
         x, y = (px + half_x).div_(self._resolution), (py + half_y).div_(self._resolution)
         i, j = x.floor().clamp_(0, self._nx - 2), y.floor().clamp_(0, self._ny - 2)

@@ -47,10 +47,12 @@ def joint_speed_limits(entity: Entity) -> Tensor:
 
 
 def values_by_joint(value: float | Mapping[str, float], names: Sequence[str]) -> Tensor:
-    """Return the value of each joint in `names`, from one value for all or from a mapping by name or regex. (k,)
+    """Return the value of each joint in `names`. (k,)
+
+    `value` is one value for all joints, or a mapping from names or regular expressions to values.
 
     Raises:
-        NameProblem: if a mapping has no value for a joint, or a key that matches no joint.
+        NameProblem: if the mapping has no value for a joint, or a key that matches no joint.
     """
     if isinstance(value, float | int):
         return torch.full((len(names),), float(value))

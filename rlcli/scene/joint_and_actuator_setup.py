@@ -19,7 +19,7 @@ _KNOWN_ACTUATORS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtDyn.mjDYN_NONE
 
 @dataclass(frozen=True, slots=True)
 class ActuatorNeed:
-    """Actuators that an action term needs: their kind, and the joints of an entity. `path` is the term's key."""
+    """Actuators that an action term needs: their kind (motor, position, velocity), and the joints that they drive."""
 
     entity: str
     joints: str | list[str]
@@ -102,7 +102,7 @@ class SceneJoints:
                 motor.set_to_motor()
 
     def _match(self, path: tuple[str, ...], patterns: str | list[str], names: list[str]) -> list[int]:
-        """Return the indices of the joint names that match; a pattern that does not fit becomes a problem at `path`."""
+        """Return the indices of the names that match; for a wrong pattern, add a problem with the key `path`."""
         try:
             return match(patterns, names, "joint")
         except NameProblem as problem:

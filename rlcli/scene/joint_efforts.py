@@ -67,7 +67,7 @@ class JointEfforts:
         return efforts
 
     def removed_by_limits(self) -> Tensor:
-        """Return by how much the limits reduce the magnitude of each joint's effort, >= 0. (num_envs, k) [N or N m]"""
+        """Return how much limits reduce the magnitude of each joint's effort, at least 0. (num_envs, k) [N or N m]"""
         data = self._entity.data
         excess = (data.computed_effort.abs() - data.joint_effort_limits).clamp_(min=0.0)
         for model in self._entity.actuators:
@@ -89,7 +89,7 @@ class JointEfforts:
         return limits
 
     def _sum_by_joint(self, values: Tensor) -> Tensor:
-        """Return the sum of some values of the actuators over the actuators of each joint. (n, actuators) -> (n, k)"""
+        """Return, for each joint, the sum of the values of its actuators. (n, actuators) -> (n, k)"""
         total = torch.zeros(len(values), len(self._joint_limits), device=values.device)
         return total.index_add_(1, self._columns, values)
 

@@ -21,7 +21,7 @@ class ModelCost:
     elements: float = 0.0
     """Number of elements."""
     stored: dict[str, float] = field(default_factory=dict)
-    """Name -> size of arrays that MuJoCo stores with each element: `nuser_geom` and the like."""
+    """Name -> size of the arrays of user numbers that MuJoCo stores with every element, such as `nuser_geom`."""
     keys: float = 0.0
     """Number of keyframes."""
     assets: float = 0.0
@@ -46,15 +46,16 @@ class ModelCost:
         )
 
     def loading(self, other: ModelCost) -> ModelCost:
-        """Return the cost of a model that also reads the other one, to attach it."""
+        """Return the cost of this model if it also reads the model `other`, to attach it."""
         return replace(self, loads=min(self.loads + other.size + other.loads, ENDLESS))
 
     def times(self, copies: float, *, with_loads: bool = True) -> ModelCost:
         """Return the cost of several copies of the model.
 
         Args:
-            copies: their number.
-            with_loads: whether to keep `loads`, which does not grow with the copies; False if it is counted already.
+            copies: number of copies.
+            with_loads: whether the result has `loads`, which does not grow with the copies; False if the caller has
+                counted it already.
         """
         scaled = {name: min(getattr(self, name) * copies, ENDLESS) for name in ("size", "elements", "keys", "assets")}
         return replace(self, loads=self.loads if with_loads else 0.0, **scaled)
@@ -71,7 +72,10 @@ def stored_arrays(name: str, attributes: dict[str, str]) -> Iterator[tuple[str, 
 
 
 def element_cost(name: str, attributes: dict[str, str]) -> float:
-    """Return the cost of an element with this tag: how many ordinary elements take as much time and memory."""
+    """Return the cost of an MJCF element: how many ordinary elements take as much time and memory to compile.
+
+    `name` is the tag of the element, such as `mesh`.
+    """
 
     def numbers(key: str) -> list[float]:
         return [max(1.0, number_of(word)) for word in attributes.get(key, "").split()]
@@ -109,7 +113,10 @@ def mjcf_number(text: str) -> float:
 
 
 def number_of(text: str | None) -> float:
-    """Return the number in an attribute, which may end in K, M, G, T, P or E (`10M`); 0 for text MuJoCo will refuse."""
+    """Return the number in an attribute, which may end in K, M, G, T, P or E (`10M`); 0 for any other text.
+
+    MuJoCo refuses such text later.
+    """
     text = (text or "").strip()
     factor = {"k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40, "p": 2**50, "e": 2**60}.get(text[-1:].lower(), 1)
     value = mjcf_number(text[:-1] if factor != 1 else text)

@@ -31,12 +31,12 @@ _MAX_LEVELS = 50
 _MAX_ATTRIBUTES = 200
 """Largest number of attributes of an element: MuJoCo compares each attribute with all others. MJCF has up to 60."""
 _MAX_LOOKUPS = 50_000
-"""Largest number of assets times folders in which MuJoCo may look for them."""
+"""Largest product of the number of assets and the number of folders in which MuJoCo may look for them."""
 _TEXT = (".xml", ".mjcf", ".urdf")
 _LARGEST_NUMBER = 1e30
-"""Largest absolute value of a number in MJCF, ranges apart: products of a few larger ones are infinite."""
+"""Largest absolute value of a number in MJCF, except in ranges: products of a few larger numbers are infinite."""
 _NOT_NEGATIVE = ("armature", "frictionloss")
-"""Attributes of joints and tendons that must not be negative, as their `damping`; MuJoCo accepts negative ones."""
+"""Attributes of joints and tendons whose negative values are refused here; MuJoCo accepts them."""
 _PERHAPS_WRONG = re.compile(r"[-+]?(nan|inf)|[eE]\+?\d{2}|\d{30}", re.IGNORECASE)
 """Parts of numbers that may be too large or not finite: nan, inf, an exponent of two digits, thirty digits."""
 _NAMES = {
@@ -56,7 +56,7 @@ class BadModel(ValueError):
 
 @dataclass(slots=True)
 class _Text:
-    """One MJCF file: its cost without other files, and how often each other file is copied into it."""
+    """Content of one MJCF file: its cost without the files that it includes or attaches, and these files."""
 
     cost: float = 0.0
     elements: float = 0.0
@@ -72,16 +72,16 @@ class _Text:
     free_sensors: int = 0
     """Number of sensors without an object, which MuJoCo doubles with every replica."""
     includes: list[tuple[float, Path]] = field(default_factory=list)
-    """Number of copies, and file, of each include."""
+    """(number of copies, file) of each `include`."""
     models: list[tuple[int, str, Path]] = field(default_factory=list)
-    """Line and name of each model that elements `attach` may copy, and its file."""
+    """(line, name, file) of each `model` in the assets, which an element `attach` may copy."""
     attached: dict[str, float] = field(default_factory=dict)
     """Name of a model -> how often it is attached."""
 
 
 @dataclass(slots=True)
 class MjcfScan:
-    """Parser that checks an MJCF (`main`) and all files that it includes or loads, which must lie in `roots`."""
+    """Check of an MJCF (`main`) and of all files that it includes or loads; all must lie in the folders `roots`."""
 
     main: Path
     roots: list[Path]
@@ -106,7 +106,7 @@ class MjcfScan:
         """Parse the model and the files that it refers to, and check the assets that it loads; return its cost.
 
         Raises:
-            BadModel: if anything is refused.
+            BadModel: if the model or one of its files is refused.
         """
         self._read_text(self.main, 0)
         if len(self._assets) > _MAX_FILES:
@@ -135,9 +135,10 @@ class MjcfScan:
             )
 
     def file_of(self, error: str) -> str:
-        """Return the files, as text, that an error message of MuJoCo may be about: with the line and words it names.
+        """Return the names of the files, as text, in which the error of a MuJoCo message may be.
 
-        MuJoCo gives elements of included files the line 0.
+        These files have the words of the message in the line that it names. For elements of included files MuJoCo names
+        line 0; then the whole file is searched.
         """
         place = re.search(r"line (?:number=)?(\d+)", error, re.IGNORECASE)
         number = int(place[1]) if place else 0
@@ -147,7 +148,9 @@ class MjcfScan:
         return " or ".join(found[:3]) or str(self.main)
 
     def _model_cost(self, file: Path, parents: tuple[Path, ...]) -> ModelCost:
-        """Return the cost to compile a model and the models that it attaches. `parents` are the models that attach it.
+        """Return the cost to compile a model together with the models that it attaches.
+
+        `parents` are the models that attach this one, directly or indirectly.
 
         Raises:
             BadModel: if the model attaches itself, on which MuJoCo would crash.
@@ -183,7 +186,10 @@ class MjcfScan:
         return cost
 
     def _included(self, file: Path, copies: float, parents: tuple[Path, ...]) -> list[tuple[Path, float, _Text]]:
-        """Return (path, number of copies, content) of a file and of those that it includes; `parents` include it."""
+        """Return (path, number of copies, content) of a file and of the files that it includes.
+
+        `parents` are the files that include this one, directly or indirectly.
+        """
         if file in parents:
             raise BadModel(f"{file}: the file includes itself; remove this include")
         text = self._texts[file]
@@ -195,7 +201,7 @@ class MjcfScan:
         return found
 
     def _read_text(self, file: Path, level: int) -> None:
-        """Parse a file and the files that it includes or attaches. `level`: how deep the file itself is included."""
+        """Parse a file and the files that it includes or attaches; `level` is the depth of includes of the file."""
         if file.suffix.lower() not in _TEXT:
             allowed = ", ".join(_TEXT)
             raise BadModel(f"{file}: not MJCF; give a text file ({allowed}): compiled models (.mjb) are not opened")
@@ -343,7 +349,7 @@ def _has_words(file: Path, number: int, words: Sequence[str]) -> bool:
 
 
 def _check_numbers(file: Path, line: int, name: str, attributes: dict[str, str]) -> None:
-    """Check the attributes of an element: no size and no number too large; only a range may be infinite."""
+    """Check that no number in the attributes of an element is too large or, except in a range, infinite."""
     for key, value in attributes.items():
         limit = MAX_MEMORY if key == "memory" else 1_000_000
         if name == "size" and number_of(value) > limit:

@@ -1,4 +1,4 @@
-"""Fields of the MuJoCo model, such as body_mass, whose values may differ between environments (randomisation)."""
+"""Fields of MjModel, such as body_mass, whose values may differ between environments (domain randomization)."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ class ModelField:
         entity: the entity that has the elements.
         name: name of the field.
         elements: which bodies, joints and so on of the entity, as an index; None for a field of the whole model.
-        axes: which values of each element, for example [2] for z; None: all.
+        axes: indices of the values of each element, for example [2] for z; None: all values.
 
     Raises:
-        ValueError: for a field that cannot differ between environments, or an axis that it does not have.
+        ValueError: if the field cannot differ between environments, or does not have an axis.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Matching of names and regular expressions in a configuration against the names of joints, bodies, ... of a model."""
+"""Search for the elements of a model (joints, bodies, ...) whose names match a name or regular expression."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class NameProblem(ValueError):
 
 
 class SceneProblem(NameProblem):
-    """Error in the scene's configuration: a part that does not fit the models; `path` is its key in the YAML."""
+    """Error for a part of the scene's configuration that does not fit the models; `path` is the key in the YAML."""
 
     def __init__(self, path: tuple[str, ...], message: str, hint: str | None = None) -> None:
         super().__init__(message, hint)
@@ -43,7 +43,7 @@ class SceneProblem(NameProblem):
 def match(patterns: str | Sequence[str], names: Sequence[str], what: str) -> list[int]:
     """Return the indices of the names that match one of the patterns completely.
 
-    They are in the order of the patterns; the matches of one regular expression are in the order of `names`.
+    The indices are in the order of the patterns; matches of one regular expression are in the order of `names`.
 
     Args:
         patterns: names or regular expressions.
@@ -95,7 +95,8 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
             warnings.simplefilter("error")  # a set in which another one seems to begin
             regex = re.compile(pattern)
     except (re.error, OverflowError, RecursionError, FutureWarning) as error:
-        raise NameProblem(f"'{pattern}' is neither a {what} nor a regular expression ({error}); correct it") from None
+        message = f"'{pattern}' is neither the name of a {what} nor a regular expression ({error}); correct it"
+        raise NameProblem(message) from None
     found = [position for position, name in enumerate(names) if regex.fullmatch(name)]
     if not found:
         suggestion = did_you_mean(pattern, names)
@@ -106,7 +107,7 @@ def _search(pattern: str, names: Sequence[str], what: str) -> list[int]:
 
 @dataclass(slots=True)
 class _Part:
-    """State of the check of a regular expression, or of one group in it, which reads from left to right."""
+    """Quantifiers counted so far in a regular expression, or in one group of it, which is read from left to right."""
 
     repeats: int = 0
     """Number of quantifiers * + {m,n} in the present alternative."""
@@ -123,7 +124,7 @@ class _Part:
         return max(self._most[0], self.repeats), max(self._most[1], self.options)
 
     def next_alternative(self) -> None:
-        """Begin to read the next alternative."""
+        """Start the counts for the next alternative of the pattern, after a `|`."""
         self._most = self.most()
         self.repeats = self.options = 0
         self.varies, self.last_varies = True, False

@@ -33,10 +33,10 @@ View = TypeVar("View")
 
 
 class Scene:
-    """Scene of a task while its model is built from the configuration.
+    """Scene of a task while its MuJoCo model is built from the configuration.
 
-    `spec` is the model; a direct task may change it in `set_up_scene`, until it is compiled. Mistakes of the
-    configuration are collected in `problems`.
+    `spec` is the model, an MjSpec, which a direct task may change in `set_up_scene`, before it is compiled. `problems`
+    collects the mistakes in the configuration.
     """
 
     def __init__(self, config: SceneConfig, sim: SimConfig, root: Path, *, installed: bool = False) -> None:
@@ -90,7 +90,7 @@ class Scene:
         return model
 
     def broken_models(self) -> Iterator[SceneProblem]:
-        """Compile the model of each entity by itself, and yield a problem, with the file, for each broken one."""
+        """Compile the model of each entity by itself; yield a problem, with the file, for each that fails."""
         for name, checked in self._models.items():
             try:
                 entity_spec(name, self.config.entities[name], checked, compiled=True)

@@ -27,9 +27,9 @@ _DRAWN_GROUPS = (0, 1, 2)
 
 @dataclass(frozen=True, slots=True)
 class ContactSensorSpec:
-    """Contact sensor, as it was added to the model: its bodies, and the names of the MJCF sensors of each body.
+    """Contact sensor, as it was added to the model.
 
-    The forces of the sensors of a body are added up.
+    `bodies` are the names of its bodies, `sensors` the names of the MJCF sensors of each body, whose forces are added.
     """
 
     config: ContactSensorConfig
@@ -39,7 +39,10 @@ class ContactSensorSpec:
 
 @dataclass(frozen=True, slots=True)
 class RaySensorSpec:
-    """Ray sensor, as it was added to the model: the full name of its body, and the geom groups it sees (None: all)."""
+    """Ray sensor, as it was added to the model: the full name of its body, and the geom groups that rays hit.
+
+    groups: None: all groups.
+    """
 
     config: RaySensorConfig
     body: str
@@ -109,7 +112,7 @@ class SensorBuilder:
     def _contact_partners(
         self, config: ContactSensorConfig, path: tuple[str, ...]
     ) -> list[tuple[mujoco.mjtObj, str] | None]:
-        """Return type and name of each element whose contacts with the sensor's bodies count; None: any element."""
+        """Return (type, name) of each element whose contacts with the bodies are measured; None: any element."""
         against = config.against
         if against is None:
             return [None]
@@ -157,7 +160,7 @@ class SensorBuilder:
         return CameraSensorSpec(config, prefix + config.camera)
 
     def _body(self, entity: str, pattern: str | None, path: tuple[str, ...]) -> str:
-        """Return the full name, `entity/body`, of the one body that a pattern matches; without one, of the root."""
+        """Return the full name, `entity/body`, of the only body that a pattern matches; of the root without one."""
         bodies = self._bodies(entity, ".*" if pattern is None else pattern, path, "body")
         if pattern is not None and len(bodies) > 1:
             short = listing([body.removeprefix(f"{entity}/") for body in bodies])
@@ -165,7 +168,10 @@ class SensorBuilder:
         return bodies[0]
 
     def _bodies(self, entity: str, patterns: str | list[str], path: tuple[str, ...], key: str) -> list[str]:
-        """Return the full names, `entity/body`, of the bodies that patterns match; `key` names them in messages."""
+        """Return the full names, `entity/body`, of the bodies that patterns match.
+
+        `path` is the sensor's key in the configuration, `key` the key of the patterns below it, for messages.
+        """
         if entity not in self._entities:
             hint = did_you_mean(entity, self._entities) or f"entities: {listing(self._entities)}"
             raise SceneProblem((*path, "entity"), f"no entity '{entity}' in the scene", hint)

@@ -109,7 +109,10 @@ class ContactSensor(TensorState):
         return {name: getattr(self, name) for name in _STATE_NAMES}
 
     def _measure(self, sensordata: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the net force on each body (rows, k, 3), and whether it is in contact (rows, k), from readings."""
+        """Return the net force on each body (rows, k, 3), and whether the body is in contact (rows, k).
+
+        `sensordata` has the readings of all MJCF sensors. (rows, nsensordata)
+        """
         values = torch.unflatten(sensordata[:, self._columns], 1, (-1, self._others, 4))  # count, force
         total = values[:, :, 0]
         for other in range(1, self._others):
@@ -205,7 +208,12 @@ class RaySensor(LazySensor):
     def _rays(self, position: Tensor, quat: Tensor, selection: Selection | None = None) -> tuple[Tensor, ...]:
         """Cast the rays from poses of the sensor's body.
 
-        Return distances, misses, sensor positions, and x, y and z of the end points, in the order of `_buffers`.
+        Return distances, misses, sensor positions, and x, y and z of the end points: the new values of `_buffers`.
+
+        Args:
+            position: position of the body, world frame. (rows, 3) [m]
+            quat: orientation of the body. (rows, 4)
+            selection: environments of the rows; None: all.
         """
         self._sim.forward_moved()
         axes = self._axes(quat)
@@ -227,7 +235,7 @@ class RaySensor(LazySensor):
     def _down_from(self, position: Tensor, axes: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Return x and y of the start points of rays straight down, (rows, r) each, and their height (rows, 1) [m].
 
-        `position` and `axes` are those of the sensor in the world.
+        `position` is that of the sensor's body, `axes` as in `_axes`.
         """
         ahead, left, _ = self._starts.unbind(1)
         x, y, z = position[:, None].unbind(2)
@@ -299,7 +307,7 @@ def _line(size: float, resolution: float) -> Tensor:
 def _rotated(axes: Tensor | None, vectors: Tensor) -> Tensor:
     """Rotate vectors from the sensor's frame to the world frame. (r, 3) -> (rows, r, 3)
 
-    `axes` are the sensor's axes in the world, for each environment; None: those of the world, with a single row.
+    `axes` are the sensor's axes in the world, for each environment; None: the world's axes, and the result has one row.
     """
     if axes is None:
         return vectors[None]

@@ -1,4 +1,4 @@
-"""Shapes of ground (stairs, slopes, waves, ...): the heights of one patch of terrain, or the blocks it is built of.
+"""Kinds of ground (stairs, slopes, waves, ...): heights of one patch of terrain, or the blocks of which it consists.
 
 A patch is an array of heights [m] at the corners of its cells, with x along the first axis. The heights along its edges
 are 0, so that any two patches fit together.
@@ -30,7 +30,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class PatchSite:
-    """Size, resolution, difficulty and random generator of one patch of terrain, whatever its kind of ground."""
+    """Size, resolution, difficulty and random generator of one patch of terrain: the same for all kinds of ground."""
 
     size: tuple[float, float]
     """Extent along x and y [m]."""
@@ -96,13 +96,13 @@ def _with_border(config: schema.PatchConfig, site: PatchSite, cells: int) -> Pat
 
 
 def shifted(block: Block, offset: tuple[float, float]) -> Block:
-    """Return a block at another place."""
+    """Return a block moved by `offset`, (x, y) [m]."""
     x, y = offset
     return Block((block.low[0] + x, block.low[1] + y), (block.high[0] + x, block.high[1] + y), block.top)
 
 
 def ring(outer: Block, inner: Block) -> list[Block]:
-    """Return four blocks that fill the area between an outer and an inner rectangle, at the height of the outer one."""
+    """Return four blocks that fill the area between two rectangles; their height is that of the outer rectangle."""
     (x0, y0), (x1, y1) = outer.low, outer.high
     (left, front), (right, back) = inner.low, inner.high
     return [

@@ -31,7 +31,7 @@ _MAX_HEIGHTS = 1 << 24
 _MAX_HEADER = 10_000
 """Largest header of a NumPy file [bytes]."""
 _MAX_PARTS = 2000
-"""Most steps, cells or random heights along one edge of a patch."""
+"""Largest number of steps, cells or random heights along one edge of a patch."""
 _START, _MOVE = random.stream("terrain.start"), random.stream("terrain.move")
 _SCATTER = random.stream("terrain.scatter")
 _SPAWN_HALF_WIDTH = 0.5
@@ -65,7 +65,7 @@ class Ground:
 
 
 def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProblem]:
-    """Yield the mistakes in a terrain's configuration. `root` is the task's folder, in which a file of heights is."""
+    """Yield the mistakes in a terrain's configuration; `root` is the task's folder, which has files of heights."""
     if isinstance(config, schema.TerrainHeightsConfig):
         yield from _file_problems(config, root)
         return
@@ -85,7 +85,7 @@ def terrain_problems(config: TerrainConfig, root: Path) -> Iterator[TerrainProbl
         edge = min(config.patch) - 2.0 * round(patch.border / config.resolution) * config.resolution
         if edge < 2.0 * config.resolution - 1e-6:
             where = ("sub_terrains", name, "border")
-            message = f"a border of {patch.border:g} m leaves no ground inside"
+            message = f"a border of {patch.border:g} m covers the whole patch"
             yield where, message, f"set less than {min(config.patch) / 2:g}"
             continue
         for key, text, advice in _patch_problems(patch, edge, config.resolution):
@@ -222,7 +222,10 @@ class Terrain:
 def _choose_patch(
     config: schema.TerrainGeneratorConfig, row: int, column: int, draw: np.random.Generator
 ) -> tuple[schema.PatchConfig, float]:
-    """Return the kind of ground and the difficulty (0 to 1) of the patch at a row and a column; `draw` is random."""
+    """Return the kind of ground and the difficulty (0 to 1) of the patch at a row and a column.
+
+    `draw` is the generator of random numbers.
+    """
     kinds = list(config.sub_terrains.values())
     shares = np.cumsum([kind.proportion for kind in kinds])
     low, high = config.difficulty
@@ -236,7 +239,7 @@ def _choose_patch(
 
 
 def _spawn_height(heights: Heights, resolution: float) -> float:
-    """Return the height at which environments start: that of the highest point in the middle of a patch [m]."""
+    """Return the height of the origin of a patch: that of the highest point near its middle [m]."""
     reach = round(_SPAWN_HALF_WIDTH / resolution)
     x, y = (n // 2 for n in heights.shape)
     return float(heights[max(0, x - reach) : x + reach + 1, max(0, y - reach) : y + reach + 1].max())

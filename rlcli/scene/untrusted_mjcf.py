@@ -43,7 +43,7 @@ MUJOCO_ERRORS = (ValueError, RuntimeError, MemoryError, mujoco.FatalError, mujoc
 
 @dataclass(frozen=True, slots=True)
 class CheckedModel:
-    """MJCF that is checked, and not yet opened by MuJoCo."""
+    """MJCF that `check_mjcf` has checked, and that MuJoCo has not opened yet."""
 
     file: Path
     cost: ModelCost
@@ -83,7 +83,10 @@ def check_mjcf(file: Path, roots: Sequence[Path], *, installed: bool = False) ->
 
 @dataclass(slots=True)
 class ModelsTogether:
-    """Models of one scene, each once for every entity; those of installed packages are not counted."""
+    """Models of the entities of one scene, and their cost together, which is limited.
+
+    Models of installed packages are not counted.
+    """
 
     cost: ModelCost = field(default_factory=ModelCost)
     _models: list[CheckedModel] = field(default_factory=list)
@@ -105,10 +108,10 @@ class ModelsTogether:
             )
 
     def compile_expensive(self) -> None:
-        """Compile expensive models as one scene in a subprocess, once while their files do not change.
+        """If the models are expensive, compile them as one scene in a subprocess, unless that was done before.
 
         Raises:
-            BadModel: if they cannot be compiled within the limits of the subprocess.
+            BadModel: if the models cannot be compiled within the limits of the subprocess.
         """
         files = [model.file for model in self._models]
         versions = (*files, *(version for model in self._models for version in model.scan.versions.items()))
@@ -144,11 +147,11 @@ def open_mjcf(checked: CheckedModel, *, compiled: bool = False) -> mujoco.MjSpec
 
 
 def model_roots(root: Path, model: str) -> list[Path]:
-    """Return the folders that a model may read: those of its task or of its package.
+    """Return the folders from which a model may load files: those of its task or of its package.
 
     Args:
         root: the task's folder.
-        model: the model as in the YAML: a file of the task, or `package:...` and the like, as for `model_file`.
+        model: the value of `model` in the YAML: a file of the task, or a reference such as `package:FILE`.
     """
     task, _, inner = chosen_model(root, model).rpartition(":")
     if not task:
@@ -216,7 +219,7 @@ def _compile_in_subprocess(files: Sequence[Path]) -> None:
 
 
 def _named(files: Sequence[Path]) -> str:
-    """Return the names of files, each once, and the number of models if there are several."""
+    """Return file names as text for a message, each name once, with the number of models if there are several."""
     names = listing(list(dict.fromkeys(map(str, files)))[:5])
     return names if len(files) == 1 else f"{names} ({len(files)} models together)"
 

@@ -1,4 +1,4 @@
-"""Physics engines that step many worlds of one model, one per environment.
+"""Physics engines. An engine steps many worlds (simulations) of one model, one for each environment.
 
-A `Selection` is some of these worlds, such as those to reset.
+A `Selection` is a part of the worlds, such as those to reset, with random numbers for them.
 """

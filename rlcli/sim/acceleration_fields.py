@@ -9,7 +9,7 @@ ACCELERATION_FIELDS = {
     *("qacc", "qacc_smooth", "actuator_force", "qfrc_actuator", "qfrc_smooth", "qfrc_constraint", "qfrc_inverse"),
     *("act_dot", "cacc", "cfrc_int", "cfrc_ext"),
 }
-"""Fields of MjData that the acceleration stage writes. They keep the values of the last substep."""
+"""Fields of MjData that the acceleration stage writes. After a step they have the values of the last physics step."""
 _BODY_FORCE_SENSORS = [
     int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}"))
     for kind in ("ACCELEROMETER", "FORCE", "TORQUE", "FRAMELINACC", "FRAMEANGACC")
@@ -28,7 +28,7 @@ def add_body_forces(spec: mujoco.MjSpec) -> None:
 
 
 def force_sensor_columns(model: mujoco.MjModel) -> list[int]:
-    """Return the columns of `sensordata` that the acceleration stage computes, such as those of force sensors."""
+    """Return the columns of `sensordata` that the acceleration stage computes: forces and accelerations."""
     acceleration = int(mujoco.mjtStage.mjSTAGE_ACC)
     return sensor_columns(model, np.flatnonzero(model.sensor_needstage == acceleration).tolist())
 

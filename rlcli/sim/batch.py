@@ -26,7 +26,10 @@ from rlcli.sim.saved_tensors import substate
 from rlcli.sim.skippable_work import FIELDS_OF_SKIPPED_WORK
 
 _MOTION_FIELDS = {"time", "qpos", "qvel", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"}
-"""Fields of a state in which a physics step changes only positions, velocities, time and the warm start."""
+"""Fields of the integration state of models without activations, plugins and the like.
+
+If a model has only these, a physics step changes only positions, velocities, time and the warm start.
+"""
 _NONE, _VEL, _ACC = (
     int(s) for s in (mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL, mujoco.mjtStage.mjSTAGE_ACC)
 )
@@ -67,10 +70,10 @@ class BatchEngine(BatchWorlds):
             self.state_layout, self._rows, self._batch.warning, self._expanded, self._max_velocity
         )
         self._bound_inputs: list[NDArray[np.float64]] = []
-        """Fields of the state that are in use and that terms may write, except positions and velocities."""
+        """Fields of the state, other than positions and velocities, that code has requested and may write."""
         self._substep_fields = config.derived_fields == "substep"
         self.step_stage = _NONE
-        """Stage (mjtStage) that is computed after the last substep, for the fields in use."""
+        """Stage (mjtStage) up to which derived fields are computed after the last physics step of a call."""
         # start states get everything that `mj_forward` computes, including the warm start
         self._forward_stage = _ACC if self._substep_fields else _NONE
         self._forward_rows = forward_of(self._batch)
@@ -93,7 +96,7 @@ class BatchEngine(BatchWorlds):
         """Do nothing: a CPU has no streams."""
 
     def field(self, name: str) -> Tensor:
-        """Return a live view of an MjData field. From now on `step` computes it, if it is a derived one (xpos, ...)."""
+        """Return a live view of an MjData field. A derived field (xpos, ...) is computed by every later `step`."""
         if name not in self._fields:
             if name not in DATA_FIELDS:
                 hint = did_you_mean(name, DATA_FIELDS) or "see mujoco/mjdata.h"
@@ -138,7 +141,7 @@ class BatchEngine(BatchWorlds):
             self._compute_external_forces(self._external.numpy())
 
     def _compute_external_forces(self, forces: NDArray[np.float64]) -> None:
-        """Compute `cfrc_ext` of the last substep; it is 0 in a world without contacts, forces and equalities."""
+        """Compute `cfrc_ext` of the last physics step; it is 0 in worlds without contacts, forces and equalities."""
         has_forces = self._contact_counts.reshape(-1) > 0
         if "xfrc_applied" in self._fields:
             has_forces |= self._fields["xfrc_applied"].numpy().any(axis=(1, 2))
@@ -178,7 +181,10 @@ class BatchEngine(BatchWorlds):
         return torch.from_numpy(bad)
 
     def _find_diverged(self, finite: bool) -> tuple[NDArray[np.bool_], NDArray[np.object_]]:
-        """Return which worlds diverged, and the cause of each; clear the warning counters."""
+        """Return (which worlds diverged, the cause of each), and clear the warning counters.
+
+        `finite` says that the state of every world is known to be finite.
+        """
         counts = self._batch.warning[:, :, 1]
         for name, kind in report.OTHER_WARNINGS.items():
             self.warnings[name] += int((counts[:, kind] > 0).sum())
@@ -217,7 +223,7 @@ class BatchEngine(BatchWorlds):
             field[index] = values
 
     def _forces(self, selection: Selection) -> list[tuple[Tensor, Any]]:
-        """Return each field in use with forces or accelerations, and the index of the selected worlds' values in it."""
+        """Return (field, index of the selected worlds' values) for each requested field of forces or accelerations."""
         ids = ids_of(selection)
         return [
             (field, ids if name in ACCELERATION_FIELDS else (ids[:, None], self._force_sensors))
@@ -226,7 +232,7 @@ class BatchEngine(BatchWorlds):
         ]
 
     def reset(self, selection: Selection) -> None:
-        """Put the selected worlds into the default state, including controls and warm start."""
+        """Set the selected worlds to the default state, including controls and warm start."""
         ids = ids_of(selection)
         self._rows[ids] = self._default
         self.history.start_episodes(ids)
@@ -292,7 +298,7 @@ class BatchEngine(BatchWorlds):
         """Do nothing: Python frees threads and memory."""
 
     def _forward_all(self) -> None:
-        """Compute the derived fields in use of every world from its state; forces stay those of the last substep."""
+        """Compute the requested derived fields of every world from its state; forces keep their values."""
         saved = {name: value.clone() for name, value in self._fields.items() if self._of_substep(name)}
         with engine_call():
             self._batch.forward(stage=self._forward_stage)
@@ -306,7 +312,7 @@ class BatchEngine(BatchWorlds):
         return name in ACCELERATION_FIELDS
 
     def _of_substep(self, name: str) -> bool:
-        """Return whether the field, such as a force, is one of the last substep: the state does not determine it."""
+        """Return whether a field has values of the last physics step, such as forces, which no state determines."""
         if name in ACCELERATION_FIELDS or (name == "sensordata" and self._force_sensors):
             return True
         return bool(self._substep_fields) and name not in STATE_FIELDS

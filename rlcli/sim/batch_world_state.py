@@ -38,7 +38,7 @@ _FLAGS = {
 }
 """Integer fields of a model that are flags: no value of them can make MuJoCo read outside of its arrays."""
 _MIN_STATES_PER_ENV = 3
-"""Least memory of an environment, as a number of integration states; the built-in tasks need 3.3 to 16."""
+"""Smallest memory of an environment, as a number of integration states; the built-in tasks need 3.3 to 16."""
 
 
 class BatchWorlds:
@@ -57,11 +57,11 @@ class BatchWorlds:
         self.threads = threads
         self._disable_flags = model.opt.disableflags
         self._skipped = skippable_flags(model)
-        """Disable flags (mjtDisableBit) of the work that steps skip because it does not change the state."""
+        """Disable flags (mjtDisableBit) set for computations that steps skip because they do not change the state."""
         self._batch = make_batch(model, num_envs, threads, disable_flags=self._skipped, persistent=persistent)
         self._expanded = expanded_fields(self._batch)
         self.own_constants = False
-        """Whether `set_constants` has been called."""
+        """Whether each world has its own values of the constants that MuJoCo derives (`set_constants`)."""
         columns = state_columns(self._batch)
         self.state_layout = StateLayout(model, columns)
         self._sizes = {name: size for name, (_, size) in columns.items()}
@@ -71,7 +71,7 @@ class BatchWorlds:
         mujoco.mj_getState(model, mujoco.MjData(model), self._default, INTEGRATION_STATE)
         self.history = StateHistory(self._rows, self.state_layout.columns("ctrl").stop, self._default, 1)
         self._fields: dict[str, Tensor] = {}
-        """Fields of MjData that are in use (requested with `field`)."""
+        """Fields of MjData that have been requested with `field`, by name."""
         self._worlds: dict[int, tuple[mujoco.MjModel, mujoco.MjData]] = {}
 
     def can_expand(self, name: str) -> bool:
@@ -79,7 +79,7 @@ class BatchWorlds:
         return name in MODEL_FIELDS
 
     def expand(self, name: str) -> Tensor:
-        """Give every world its own values of a model field; return them, live and writable. (num_envs, ...)"""
+        """Give every world its own values of a model field; return a writable view of the values. (num_envs, ...)"""
         if name not in MODEL_FIELDS:
             hint = did_you_mean(name, MODEL_FIELDS) or f"fields that can: {listing(sorted(MODEL_FIELDS))}"
             raise ValueError(f"model field '{name}' cannot differ between environments; {hint}")
@@ -189,7 +189,7 @@ class BatchWorlds:
             self.set_constants()
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return the model and the data of a world after `mj_forward`; a later call for it updates the same objects."""
+        """Return (model, data) of a world after `mj_forward`; a later call for the same world updates these objects."""
         is_new = env not in self._worlds
         if is_new:
             self._worlds[env] = (copy.copy(self.model), self._batch.get_data(env))
@@ -208,7 +208,7 @@ class BatchWorlds:
         self.history = StateHistory(self._rows, width, self._default, calls, memory=memory, count=count)
 
     def _skip_nothing(self) -> None:
-        """Stop skipping work: from now on, compute everything that the flags of the original model do not disable."""
+        """Stop skipping computations: from now on, only the disable flags of the original model hold."""
         if self._skipped:
             self._skipped = 0
             expand_disable_flags(self._batch)[:] = self._disable_flags
@@ -216,7 +216,7 @@ class BatchWorlds:
 
 @contextlib.contextmanager
 def engine_call() -> Iterator[None]:
-    """Turn MuJoCo's profiler off during a call of `mujoco.batch`.
+    """Turn MuJoCo's profiler off in the `with` block, and convert errors of `mujoco.batch`.
 
     Raises:
         DivergedError: for an error of `mujoco.batch`.

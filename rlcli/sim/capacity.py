@@ -43,7 +43,7 @@ class Capacity:
 def required_capacity(model: mujoco.MjModel, contacts: int | None = None, constraints: int | None = None) -> Capacity:
     """Return the numbers of contacts and constraint rows for which each world of a model needs memory.
 
-    Each is the smaller one of an upper bound and a multiple of the maximum in random simulations.
+    Each number is an upper bound, or three times the maximum in random simulations if that is smaller.
 
     Args:
         model: the compiled model.
@@ -58,7 +58,7 @@ def required_capacity(model: mujoco.MjModel, contacts: int | None = None, constr
 
 
 def _upper_bound(model: mujoco.MjModel) -> tuple[int, int]:
-    """Return upper bounds of the number of contacts and of constraint rows in a world."""
+    """Return upper bounds of (contacts, constraint rows) in a world."""
     contacts = rows = 0
     for a, b in colliding_pairs(model):
         kinds = tuple(sorted((_G(model.geom_type[a]), _G(model.geom_type[b])), key=int))
@@ -75,13 +75,13 @@ def _upper_bound(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 def _contact_rows(model: mujoco.MjModel, condim: int) -> int:
-    """Return the number of constraint rows of a contact."""
+    """Return the number of constraint rows of a contact with the dimension `condim` and the model's friction cone."""
     pyramidal = model.opt.cone == int(mujoco.mjtCone.mjCONE_PYRAMIDAL)
     return 1 if condim == 1 else 2 * (condim - 1) if pyramidal else condim
 
 
 def _sampled_maximum(model: mujoco.MjModel) -> tuple[int, int]:
-    """Return the largest numbers of contacts and rows in short simulations with random velocities and controls.
+    """Return the largest (contacts, constraint rows) in short simulations with random velocities and controls.
 
     Half of the simulations begin with random joint positions, half of them at a random point of a height field.
     """

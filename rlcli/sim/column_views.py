@@ -1,4 +1,4 @@
-"""Indices of columns (of joints, ...) in a tensor: slices where possible, since they give views instead of copies."""
+"""Indices of columns in a tensor, such as those of some joints: slices where possible, which give views, not copies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def as_index(positions: Sequence[int], device: torch.device | None = None) -> Co
 
 
 def evenly_spaced(positions: Sequence[int], device: torch.device | None = None) -> Columns:
-    """Return positions as a slice if they are evenly spaced, or all the same (one column), else as a tensor."""
+    """Return column positions as a slice if they are evenly spaced, or are all the same column, else as a tensor."""
     steps = {after - before for before, after in itertools.pairwise(positions)} or {1}
     if len(positions) and len(steps) == 1 and min(steps) >= 0:
         return slice(positions[0], positions[-1] + 1, min(steps) or 1)
@@ -36,7 +36,7 @@ def evenly_spaced(positions: Sequence[int], device: torch.device | None = None) 
 
 @functools.lru_cache(maxsize=4096)
 def _consecutive(first: int, stop: int) -> slice:
-    """Return the same slice object for the same columns, so that all terms share the cached view of `CachedViews`."""
+    """Return a slice, the same object for the same columns: terms then share a view, which `CachedViews` caches."""
     return slice(first, stop)
 
 
@@ -52,7 +52,7 @@ class CachedViews:
         self._views: dict[int, tuple[Columns, Tensor, Tensor]] = {}
 
     def of(self, values: Tensor, joints: Columns) -> Tensor:
-        """Return `values[:, joints]`."""
+        """Return `values[:, joints]`; if `joints` is a slice, the view is made at the first call and cached."""
         cached = self._views.get(id(joints))
         if cached is not None and cached[0] is joints and cached[1] is values:
             return cached[2]

@@ -21,9 +21,9 @@ TOO_FAST = "qvel out of bounds"
 HISTORY_MEMORY = 64 * 2**20
 """Default memory limit of a `StateHistory` [bytes]."""
 MORE_MEMORY = "if the contact arena is full, set a larger <size memory=...> in the MJCF"
-"""Hint for an engine error."""
+"""Hint for an engine error, whose usual cause is too little memory for contacts."""
 WARNING_FIELDS = {"BADCTRL": "ctrl", "BADQPOS": "qpos", "BADQVEL": "qvel", "BADQACC": "qacc"}
-"""Warning of a divergence -> field into which the index points that MuJoCo stores with the warning."""
+"""Warning of a divergence -> field of MjData; the index that MuJoCo stores with the warning is one of this field."""
 DIVERGENCE_WARNINGS = {name: int(getattr(mujoco.mjtWarning, f"mjWARN_{name}")) for name in WARNING_FIELDS}
 """Warnings after which MuJoCo resets a world or ignores its controls; the first of several is the cause."""
 OTHER_WARNINGS = {
@@ -36,10 +36,10 @@ _INPUTS_FIRST = (
     *("mocap_pos", "mocap_quat", "ctrl", "xfrc_applied", "qfrc_applied", "act", "eq_active", "userdata", "history"),
     *("plugin_state", "plastic", "qpos", "qvel", "qacc_warmstart", "time"),
 )
-"""Fields of the integration state in the order in which a bad one is looked for: the simulation's inputs first."""
+"""Fields of the integration state, inputs first: the first one that is not finite is the likely cause of others."""
 
 States = NDArray[np.float64]
-"""Integration states, with a row for each environment; or one of them."""
+"""Integration states, one row for each environment, or the state of one environment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +73,10 @@ class Call:
 class StateHistory:
     """Ring buffer of the states before the last calls of `Engine.step`, from which replays start.
 
-    Only the first `width` columns are recorded; the environment does not change the others from `default`.
+    Only the first `width` columns are recorded; in the others every state equals `default`.
 
     Args:
-        state: state rows of the engine, live. (n, nstate)
+        state: the engine's integration states, a live view. (n, nstate)
         width: number of leading columns that are recorded.
         default: the state after a reset. (nstate,)
         calls: number of calls to record, if they fit.
@@ -128,7 +128,7 @@ class StateHistory:
         return self.calls_between(env, int(self._episode_start[env]), self.count)
 
     def calls_between(self, env: int, first: int, stop: int) -> list[Call]:
-        """Return the calls number `first` to `stop` - 1 of an environment, as far as the buffer still has them."""
+        """Return the calls with the numbers `first` to `stop` - 1 of an environment that are still in the buffer."""
         first = max(first, self._oldest, self.count - self.calls)
         numbers = range(first, min(stop, self.count))
         return [Call(self._state_before(env, number), self._nstep[number % self.calls]) for number in numbers]
@@ -166,7 +166,7 @@ class StateLayout:
         return [name for name in names if not np.isfinite(state[self._columns[name]]).all()]
 
     def element_at(self, name: str, index: int) -> str:
-        """Return the element of the model to which an index of a field belongs, as `joint 'swing'`."""
+        """Return the element of the model to which entry `index` of field `name` belongs, such as `joint 'swing'`."""
         m = self._model
         if name == "qpos" and 0 <= index < m.nq:
             joint = int(np.searchsorted(m.jnt_qposadr, index, side="right")) - 1
@@ -184,9 +184,9 @@ class DivergenceReporter:
 
     Args:
         layout: columns of the integration state.
-        states: state rows of the engine, live. (n, nstate)
-        warnings: MuJoCo's warning counters, live: last index and count by kind. (n, kinds, 2)
-        model_fields: model fields that differ between worlds, live: name -> (n, ...)
+        states: the engine's integration states, a live view. (n, nstate)
+        warnings: MuJoCo's warning counters, a live view: last index and count of each kind. (n, kinds, 2)
+        model_fields: model fields that differ between worlds, name -> live view (n, ...).
         max_velocity: limit of the velocities [m/s, rad/s].
     """
 
@@ -197,7 +197,7 @@ class DivergenceReporter:
     max_velocity: float
 
     def nonfinite_field(self, env: int) -> str:
-        """Return the name of the first field that is not finite: a model field of the world, or one of its state."""
+        """Return the name of the first field of a world that is not finite, of its model or of its state."""
         return [*self._nonfinite_model_fields(env), *self.layout.nonfinite_fields(self.states[env])][0]
 
     def describe(self, env: int, cause: str, before: States, error: str) -> Divergence:

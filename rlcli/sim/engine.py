@@ -33,7 +33,7 @@ class EngineView(Protocol):
     shared_streams: int
     """Worlds i and i % shared_streams draw the same random numbers; 0: every world has its own stream."""
     asynchronous: bool
-    """Whether reading a value in Python waits for a device; if so, no code of a step may read one."""
+    """Whether the engine computes on a GPU, so that reading a value in Python forces a host sync: not in a step."""
     forces_after_reset: bool
     """Whether `forward` computes fields of the acceleration stage; if not, `reset` sets them to 0."""
 
@@ -72,7 +72,7 @@ class ReplayableView(EngineView, Protocol):
 
     @property
     def own_constants(self) -> bool:
-        """Whether `set_constants` has been called."""
+        """Whether each world has its own values of the constants that MuJoCo derives (`set_constants`)."""
 
     @property
     def history(self) -> StateHistory:
@@ -106,13 +106,13 @@ class Engine(EngineView, Protocol):
         """First divergences that the last call of `diverged` found; on a GPU, the first one since the start."""
 
     def use_torch_stream(self) -> None:
-        """Launch on torch's current CUDA stream from now on; called before a step."""
+        """Launch GPU kernels on torch's current CUDA stream from now on; called before a step."""
 
     def can_expand(self, name: str) -> bool:
         """Return whether a model field may differ between worlds."""
 
     def expand(self, name: str) -> Tensor:
-        """Give every world its own values of a model field; return them, live and writable. (num_envs, ...)
+        """Give every world its own values of a model field; return a writable view of the values. (num_envs, ...)
 
         After a write to masses, inertias, positions and the like, call `set_constants`.
         """
@@ -131,9 +131,9 @@ class Engine(EngineView, Protocol):
         """Advance every world by `nstep` physics steps; then, with `derive`, update derived fields such as xpos."""
 
     def diverged(self, motion_is_finite: bool = False) -> Tensor | None:
-        """Return the worlds that diverged in the last `step`, (num_envs,) bool; None for none. Call it once per step.
+        """Return the worlds that diverged in the last `step`, (num_envs,) bool, or None. Call it once per step.
 
-        A GPU engine has already put these worlds back into the state that they had before the step.
+        A GPU engine has already restored the state that these worlds had before the step.
 
         Args:
             motion_is_finite: whether the caller has checked that all positions and velocities are finite.
@@ -143,13 +143,13 @@ class Engine(EngineView, Protocol):
         """Compute the derived fields (xpos, ...) of the selected worlds from their state."""
 
     def reset(self, selection: Selection) -> None:
-        """Put the selected worlds into the default state; `forward` then computes their derived fields."""
+        """Set the selected worlds to the default state; `forward` then computes their derived fields."""
 
     def set_default_state(self, qpos: Tensor, qvel: Tensor) -> None:
         """Set the joint state that `reset` restores. (nq,), (nv,)"""
 
     def as_field(self, tensor: Tensor) -> Field:
-        """Return a tensor as selections write it fastest: on a CPU as a NumPy array of the same memory."""
+        """Return a tensor in the form that `Selection.write` writes fastest: on a CPU, a NumPy array of its memory."""
 
     def select(self, mask: Field, seed: int, counters: Field) -> Selection | None:
         """Return a selection of the worlds where `mask` is true; None if it is known to be empty.
@@ -174,7 +174,10 @@ class Engine(EngineView, Protocol):
         """
 
     def check_finite(self, values: Tensor, what: str) -> None:
-        """Start a check of whether all values are finite, without waiting for its result; `what` names the values."""
+        """Start a check that values are finite, without a host sync; `report_nonfinite` returns the result.
+
+        `what` is the name of the values for messages.
+        """
 
     def report_nonfinite(self) -> list[str]:
         """Return the names of the values for which `check_finite` failed since the last call."""

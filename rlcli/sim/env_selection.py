@@ -1,4 +1,4 @@
-"""Selections of environments for resets and events, with operations on their rows.
+"""Selections of environments for resets and events, with random numbers, and reads and writes of their rows.
 
 On a CPU a selection is a short list of ids. In a CUDA graph it must be a mask over all environments. A term that uses
 only the methods of `Selection` runs on both.
@@ -20,8 +20,8 @@ from rlcli import random
 Columns: TypeAlias = slice | Tensor
 """Index of some columns."""
 Field: TypeAlias = Any
-"""A (num_envs, ...) tensor, or the result of the engine's `as_field` for it. `as_field` takes as long as reading a few
-rows, so a term that reads in every step calls it once."""
+"""A (num_envs, ...) tensor, or `Engine.as_field` of this tensor, which is faster to read and write. A term that reads
+the tensor in every step calls `as_field` once, because the call takes as long as reading a few rows."""
 Groups: TypeAlias = tuple[int, ...] | None
 """Geom groups; None: all."""
 ALL = slice(None)
@@ -32,9 +32,10 @@ _FEW_ROWS, _AHEAD = 16, 8
 
 
 def in_place(tensor: Tensor) -> Any:
-    """Return the same memory in the form that is fastest for small operations in place.
+    """Return a tensor's memory in the form that is fastest for small operations in place.
 
-    On a CPU this is a numpy array, whose calls take half the time of torch's. `+=`, `*=` and `[...] =` work on both.
+    On a CPU this is a numpy array, whose operations take half the time of torch's; on a GPU the tensor itself. `+=`,
+    `*=` and `[...] =` work on both.
     """
     return tensor.numpy() if tensor.device.type == "cpu" else tensor
 
@@ -43,7 +44,7 @@ def one_column(columns: Columns, count: int, parameter: str) -> int:
     """Return the single column that an index into `count` columns selects; `parameter` is its name in the message.
 
     Raises:
-        ValueError: if it selects no column or several.
+        ValueError: if the index selects no column, or several.
     """
     found = torch.arange(count)[columns if isinstance(columns, slice) else columns.cpu()].tolist()
     if len(found) != 1:
@@ -52,9 +53,10 @@ def one_column(columns: Columns, count: int, parameter: str) -> int:
 
 
 class Selection(Protocol):
-    """Some of the environments, such as those to reset. Each selected environment is one row of a result.
+    """Some of the environments, such as those to reset, with random numbers for them.
 
-    `shape` is the shape of the random numbers of one row.
+    Results have one row for each selected environment (on a GPU: for each environment, and only the selected rows are
+    valid). `shape` is the shape of one row of random numbers.
     """
 
     @property
@@ -86,7 +88,7 @@ class Selection(Protocol):
         """Add to the selected environments' rows of a (num_envs, ...) tensor."""
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean of a (num_envs,) tensor over the selected environments. ()"""
+        """Return the mean of a (num_envs,) tensor over the selected environments. (scalar)"""
 
     def where(self, mask: Field) -> Selection | None:
         """Return a selection of the rows where `mask` (num_envs,) is true; None if it is known to be empty."""
@@ -102,12 +104,12 @@ class Selection(Protocol):
 
 
 def _as_array(values: Any) -> Any:
-    """Return a CPU tensor as an array of the same memory; return any other value unchanged."""
+    """Return a CPU tensor as a numpy array of the same memory; return any other value unchanged."""
     return values.numpy() if isinstance(values, Tensor) else values
 
 
 def _on_host(value: Tensor | float) -> Any:
-    """Return a tensor on any device as an array; return a number unchanged."""
+    """Return a tensor on any device as a numpy array; return a number unchanged."""
     return value.numpy(force=True) if isinstance(value, Tensor) else value
 
 
@@ -152,7 +154,7 @@ class IdSelection:
     _keys: random.Keys | None = field(default=None, init=False)
     _drawn: int = field(default=0, init=False)
     _ready: tuple[int, NDArray[np.float32] | None] = field(default=(0, None), init=False)
-    """Uniform numbers of each row that are computed already, and the index of the first of them. (rows, n)"""
+    """(index of the first number, uniform numbers computed in advance for each row). (rows, n)"""
 
     @property
     def count(self) -> int:
@@ -194,7 +196,7 @@ class IdSelection:
         _as_array(field)[_index(self.ids, columns)] += _as_array(values)
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean of a (num_envs,) tensor over the selected environments. ()"""
+        """Return the mean of a (num_envs,) tensor over the selected environments. (scalar)"""
         return self.read(values).float().mean()
 
     def where(self, mask: Field) -> IdSelection | None:
@@ -207,7 +209,7 @@ class IdSelection:
         return self._with(self.ids[chosen], self.counters[chosen], self.stream_key)
 
     def union(self, other: IdSelection) -> IdSelection:
-        """Return a selection of the rows of this and another one; rows of both keep the counters of this one."""
+        """Return a selection of the rows of this selection or of `other`; common rows keep the counters of this one."""
         ids, first = np.unique(np.concatenate([self.ids, other.ids]), return_index=True)
         counters = np.concatenate([self.counters, other.counters])[first]
         return self._with(ids, counters, self.stream_key)

@@ -21,9 +21,9 @@ _ADDRESS_SPACE = 2 << 30
 
 
 def opengl_import_error(error: BaseException) -> MachineError | None:
-    """Return an error with a hint if the import of MuJoCo failed because of MUJOCO_GL; None for any other error.
+    """Return an error with a hint if `error`, from importing MuJoCo, is due to MUJOCO_GL; None for any other error.
 
-    MuJoCo loads the library that MUJOCO_GL names when it is imported, even if nothing is rendered.
+    When MuJoCo is imported, it loads the OpenGL library that MUJOCO_GL names, even if nothing is rendered.
     """
     chosen = os.environ.get("MUJOCO_GL", "").strip()
     raised_in = [frame.filename for frame in traceback.extract_tb(error.__traceback__) if frame.name == "<module>"]
@@ -45,7 +45,7 @@ def has_display() -> bool:
 
 
 def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[Any, str]:
-    """Open an OpenGL context, make it current and return it with the name of its backend.
+    """Open an OpenGL context and make it current; return (context, name of its backend).
 
     Args:
         width: width of the images [pixels].
@@ -54,7 +54,7 @@ def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[A
             then tried last.
 
     Raises:
-        MachineError: if no backend works; the message has all that were tried and the packages to install.
+        MachineError: if no backend works; the message has the backends that were tried and the packages to install.
     """
     require_address_space(_ADDRESS_SPACE)
     tried = []
@@ -79,7 +79,7 @@ def open_context(width: int, height: int, *, in_thread: bool = False) -> tuple[A
 
 
 def _has_window() -> bool:
-    """Return whether GLFW opened a window: it raises no error if it cannot."""
+    """Return whether GLFW opened a window; GLFW raises no error if it fails."""
     import glfw
 
     return bool(glfw.get_current_context())
@@ -104,7 +104,7 @@ def candidates() -> list[str]:
 
 
 def _unload_opengl() -> None:
-    """Remove PyOpenGL from the imported modules: it chooses its platform at import, for one backend only."""
+    """Remove PyOpenGL from the imported modules, to import it again for another backend: it is fixed at import."""
     os.environ.pop("PYOPENGL_PLATFORM", None)
     backends = ("mujoco.egl", "mujoco.osmesa", "mujoco.glfw")
     for name in [name for name in sys.modules if name.partition(".")[0] == "OpenGL" or name in backends]:

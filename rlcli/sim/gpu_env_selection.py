@@ -17,10 +17,10 @@ from rlcli.sim.env_selection import ALL, DEFAULT_STREAM, Columns
 
 @dataclass(eq=False)
 class MaskSelection:
-    """Selection of the environments where a mask is true.
+    """Selection of the environments where a mask is true, for a GPU.
 
-    All rows take part in the arithmetic; only the masked rows are written. The random numbers equal those of
-    `IdSelection`.
+    Operations compute the rows of all environments; only the rows where the mask is true are written. The random
+    numbers equal those of `IdSelection`.
 
     Args:
         mask: the selected environments. (num_envs,) bool
@@ -40,7 +40,7 @@ class MaskSelection:
 
     @property
     def count(self) -> Tensor:
-        """Number of selected environments. ()"""
+        """Number of selected environments. (scalar)"""
         return self.mask.sum()
 
     def uniform(self, low: float | Tensor, high: float | Tensor, shape: tuple[int, ...] = ()) -> Tensor:
@@ -91,11 +91,11 @@ class MaskSelection:
         self.write(field, part + values, columns)
 
     def mean(self, values: Tensor) -> Tensor:
-        """Return the mean of a (num_envs,) tensor over the masked rows; 0 for no rows. ()"""
+        """Return the mean of a (num_envs,) tensor over the masked rows; 0 for no rows. (scalar)"""
         return torch.where(self.mask, values.float(), 0.0).sum() / self.count.clamp(min=1)
 
     def where(self, mask: Tensor) -> MaskSelection:
-        """Return a selection of the rows where `mask` (num_envs,) is true too."""
+        """Return a selection of the environments of this selection where `mask` (num_envs,) is true."""
         return MaskSelection(self.mask & mask, self.seed, self.counters, self.stream_key, self.shared_streams)
 
     def env_ids(self) -> Tensor:

@@ -48,14 +48,14 @@ STATE_FIELDS: dict[str, mujoco.mjtState] = _private(mujoco.batch, "_STATE_FIELDS
 def make_batch(
     model: mujoco.MjModel, num_envs: int, threads: int, *, disable_flags: int = 0, persistent: bool = False
 ) -> Batch:
-    """Make a batch of worlds.
+    """Make a `mujoco.batch.Batch`, which steps many worlds of a model in threads.
 
     Args:
         model: the compiled model; it is copied, because other threads may step it.
         num_envs: number of worlds.
         threads: number of threads that step them.
-        disable_flags: disable flags (mjtDisableBit) to set in the batch in addition to the model's.
-        persistent: whether each world has an MjData of its own.
+        disable_flags: disable flags (mjtDisableBit) to set in addition to those of the model.
+        persistent: whether each world has its own MjData.
 
     Raises:
         DependencyError: if the installed version of MuJoCo lacks a private name that is used here.
@@ -69,12 +69,12 @@ def make_batch(
 
 
 def state_columns(batch: Batch) -> dict[str, tuple[int, int]]:
-    """Return the first column and the size of each field in the integration state."""
+    """Return field -> (first column, number of columns) in the integration state."""
     return {name: batch._component(kind) for name, kind in STATE_FIELDS.items()}
 
 
 def expanded_fields(batch: Batch) -> dict[str, NDArray[Any]]:
-    """Return the live dictionary of expanded model fields (with a value for each world), name -> (num_envs, ...)."""
+    """Return the batch's own dictionary of model fields with a value for each world: name -> (num_envs, ...)."""
     fields: dict[str, NDArray[Any]] = batch._expanded
     return fields
 
@@ -100,10 +100,10 @@ def forward_of(batch: Batch) -> Callable[[NDArray[np.int64], int], None]:
 
 
 class _WithoutProfiler:
-    """Context in which MuJoCo's profiler does not read the clock.
+    """Context in which MuJoCo's profiler does not read the clock, to save time.
 
-    It sets `mjcb_time`, a variable of MuJoCo's C library, to NULL. Python's `set_mjcb_time(None)` cannot do that: it
-    sets the clock of the bindings. The timers of threads that step MuJoCo elsewhere at the same time are wrong.
+    The context sets `mjcb_time`, a variable of MuJoCo's C library, to NULL. Python's `set_mjcb_time(None)` cannot do
+    that, because it sets the clock of the bindings. Timers of other threads that step MuJoCo meanwhile are wrong.
     """
 
     def __init__(self) -> None:

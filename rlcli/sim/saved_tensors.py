@@ -1,4 +1,4 @@
-"""State of objects as tensors, and checks of saved tensors before they are restored."""
+"""State of objects as named tensors, and checks of saved tensors before they are restored."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class TensorState:
 
 
 def mean_of(values: Tensor) -> Tensor:
-    """Return the mean of all values as a scalar tensor; if all are equal, exactly that value, without rounding. ()"""
+    """Return the mean of all values; if all values are equal, exactly this value, without rounding. (scalar)"""
     values = values.flatten().float()
     return torch.where((values == values[0]).all(), values[0], values.mean())
 
@@ -37,7 +37,7 @@ def means(values: Mapping[str, Tensor]) -> dict[str, float]:
 
 
 def substate(state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Return the part of a state whose keys begin with a prefix, without the prefix."""
+    """Return the tensors whose names begin with a prefix, by their names without the prefix."""
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
@@ -46,7 +46,7 @@ def require_matching_tensors(saved: Mapping[str, Tensor], own: Mapping[str, Tens
 
     Args:
         saved: tensors of the file.
-        own: tensors to which they are copied; names that are in only one of the two are ignored.
+        own: tensors to which the saved ones will be copied; names that only one of the two has are ignored.
         what: the part of the file, for the message.
 
     Raises:
@@ -59,10 +59,10 @@ def require_matching_tensors(saved: Mapping[str, Tensor], own: Mapping[str, Tens
 
 
 def require_in_range(value: Tensor, low: int, high: int, what: str) -> None:
-    """Check that indices are within their range.
+    """Check that saved indices are between `low` and `high`; `what` is their name in the file, for the message.
 
     Raises:
-        ValueError: with their smallest and largest value.
+        ValueError: with the smallest and largest index.
     """
     if value.numel() and not bool(((value >= low) & (value <= high)).all()):
         found = f"{int(value.min())} to {int(value.max())}"

@@ -1,4 +1,4 @@
-"""Work that MuJoCo can skip in a step without changing a bit of the state.
+"""Computations that MuJoCo can skip in a step without changing a bit of the state.
 
 MuJoCo prepares collision detection even if no two geoms may touch, it prepares constraints even if the model can have
 none, and it searches constraint islands even in a model of one kinematic tree, which is one island. Its Python bindings
@@ -17,16 +17,16 @@ _D = mujoco.mjtDisableBit
 FIELDS_OF_SKIPPED_WORK = frozenset(
     ["nisland", "nidof", "solver_niter", "solver_nnz", "solver_fwdinv", "bvh_active", "bvh_aabb_dyn"]
 )
-"""Fields of MjData that only the skipped work writes: a task that reads one turns the skipping off."""
+"""Fields of MjData that only the skipped computations write; if a task reads one of them, nothing is skipped."""
 FIELDS_OF_FRICTION = frozenset(["dof_frictionloss", "tendon_frictionloss"])
 """Fields of MjModel, other than integers, that decide whether a model can have constraints."""
 
 
 def skippable_flags(model: mujoco.MjModel) -> int:
-    """Return the disable flags (mjtDisableBit) that can be set without changing a bit of the model's states.
+    """Return the disable flags (mjtDisableBit) that can be set without changing a bit of the simulation.
 
-    The flags are valid as long as no integer field of the model changes: integers decide which geoms may touch. The
-    flag that disables constraints is valid only as long as no field in `FIELDS_OF_FRICTION` changes either.
+    The flags hold as long as no integer field of the model changes, because these fields decide which geoms may touch.
+    The flag that disables constraints holds only as long as no field in `FIELDS_OF_FRICTION` changes either.
     """
     flags = 0
     sleeps = model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP)
@@ -45,7 +45,7 @@ def skippable_flags(model: mujoco.MjModel) -> int:
 def colliding_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
     """Yield the pairs of geoms that may touch according to MuJoCo's filters.
 
-    The contype and conaffinity of the two match, and their bodies are neither welded together nor parent and child.
+    In such a pair the contype and conaffinity match, and the bodies are neither welded together nor parent and child.
     Explicit pairs of the MJCF, to which no filter applies, are not included.
     """
     weld = model.body_weldid

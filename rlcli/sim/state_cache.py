@@ -1,4 +1,4 @@
-"""Cache of the engine's state in float32: joint states are copied once per step, derived fields when they are read."""
+"""Copy of the engine's state in float32: joint states are copied once per step, derived fields when they are read."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ def is_finite(values: Tensor) -> bool:
 
 
 class SimData:
-    """Engine's joint state in float32, copied once per step, and derived fields, cast when they are read.
+    """Copy of the engine's joint state in float32, made once per step, and of derived fields, made when they are read.
 
-    `qpos` (num_envs, nq) and `qvel` (num_envs, nv) never change their storage, so views of them stay valid. If they are
-    neighbours in the engine's memory, both are copied at once; if the engine is in float32, they are its own tensors.
+    `qpos` (num_envs, nq) and `qvel` (num_envs, nv) never change their storage, so views of them stay valid. If the two
+    are neighbours in the engine's memory, they are copied together. For an engine in float32, `qpos` and `qvel` are the
+    engine's own tensors.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -40,9 +41,9 @@ class SimData:
         self.qpos = self._copies[0][:, : qpos.shape[1]]
         self.qvel = self._copies[-1][:, -qvel.shape[1] :] if qvel.shape[1] else self._copies[-1][:, :0]
         self.stamp = 0
-        """Number of updates; a cached value with an older stamp is out of date."""
+        """Number of updates of the state so far; a value that was cached at a smaller number is out of date."""
         self.command_stamp = 0
-        """Number of updates of the commands; a value of `once_per_goal` with an older stamp is out of date."""
+        """Number of updates of the commands so far. With each update, the values that `once_per_goal` caches expire."""
         self._goals: dict[tuple[object, ...], tuple[tuple[int, int, int], Tensor]] = {}
         self._saved_at, self._summed = -1, (-1, 0.0)
         self._moved: Selection | None = None
@@ -51,7 +52,7 @@ class SimData:
     def on_moved(self, selection: Selection) -> None:
         """Update the derived fields of the selected worlds after a write to their state.
 
-        An engine that can only update all worlds at once does so at the next read, once for several calls.
+        A GPU engine, which can only update all worlds at once, postpones this to the next read of a derived field.
         """
         if not self.engine.asynchronous:
             self.engine.forward(selection)
@@ -126,9 +127,9 @@ class SimData:
         return value
 
     def once_per_goal(self, key: tuple[object, ...], command: Tensor, compute: Callable[[], Tensor]) -> Tensor:
-        """Return `compute()`, cached under `key` until the state or the command changes, for all terms of a step.
+        """Return `compute()`, cached under `key` until the state or the command changes.
 
-        A goal is what a command asks for; such values are, for example, the distance or the angle to it.
+        It is for quantities that several terms need in a step, such as the distance to the goal of a pose command.
         """
         # torch counts its own writes to a tensor; commands that managers write through numpy change `command_stamp`
         writes = 0 if command.is_inference() else command._version
@@ -156,7 +157,7 @@ class SimData:
 
 
 def _joined(left: Tensor, right: Tensor) -> Tensor | None:
-    """Return two 2-d views as one if they are neighbouring columns of the same storage; else None."""
+    """Return one view of two 2-d views if they are neighbouring columns of the same memory; else None."""
     neighbours = (
         left.dtype == right.dtype
         and left.stride() == right.stride()

@@ -1,7 +1,7 @@
-"""GPU engine on MuJoCo Warp: all worlds in one launch, in float32, ready for capture in a CUDA graph.
+"""GPU engine on MuJoCo Warp: it steps all worlds together, in float32, and its steps can be part of a CUDA graph.
 
-It also runs on Warp's CPU device, slowly, for tests on machines without a GPU. Results are not bit-identical from run
-to run, because MuJoCo Warp adds with atomic operations.
+The engine also runs on Warp's CPU device, slowly, for tests on machines without a GPU. Results are not bit-identical
+from run to run, because MuJoCo Warp adds with atomic operations.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class WarpEngine(WarpWorlds):
         self._max_velocity = config.max_velocity or STATE_LIMIT
         self._force_columns = as_index(force_sensor_columns(model), self.device)
         self._ray_buffers: dict[tuple[int, int], tuple[wp.array, wp.array, wp.array]] = {}
-        """Excluded body of each ray, and buffers for the geoms and normals at the hits; by number of rays and body."""
+        """(Number of rays, excluded body) -> excluded body of each ray, buffers for geoms and normals at the hits."""
         self._checked: list[str] = []
         """Names of the values passed to `check_finite`; the index of a name is the index of its flag."""
         with self._setting_up():
@@ -104,8 +104,8 @@ class WarpEngine(WarpWorlds):
     def diverged(self, motion_is_finite: bool = False) -> Tensor:
         """Return the worlds that diverged in the last step, (num_envs,) bool.
 
-        Their state before the step has been restored, with controls and warm start set to 0. This call also restores
-        their derived fields in use, which terms read.
+        The step has already restored the state of these worlds before the step, with controls and warm start set to 0.
+        This call also restores their requested derived fields.
         """
         with self._launching():
             for name, last in self._last_derived.items():
@@ -113,9 +113,9 @@ class WarpEngine(WarpWorlds):
         return self._diverged
 
     def forward(self, selection: Selection) -> None:
-        """Compute the derived fields (xpos, ...) in use; forces and accelerations only in the selected worlds.
+        """Compute the requested derived fields (xpos, ...); forces and accelerations only in the selected worlds.
 
-        The present state of the selected worlds is saved, and restored if they diverge in the next step.
+        The present state of the selected worlds is saved. If a world diverges in the next step, it is restored.
         """
         assert isinstance(selection, MaskSelection)
         self._forward(selection)
@@ -126,7 +126,7 @@ class WarpEngine(WarpWorlds):
                 self._launch_rows(warp_kernels.save_rows, selection.mask, now, last)
 
     def reset(self, selection: Selection) -> None:
-        """Put the selected worlds into the default state, including applied forces."""
+        """Set the selected worlds to the default state, including applied forces."""
         assert isinstance(selection, MaskSelection)
         inputs = [wp.from_torch(tensor) for tensor in (selection.mask, self._default_qpos, self._default_qvel)]
         state = [self._arrays[name] for name in STATE]
@@ -157,7 +157,7 @@ class WarpEngine(WarpWorlds):
     def rays(
         self, points: Tensor, directions: Tensor, *, groups: Groups, exclude: int, selection: Selection | None
     ) -> Tensor:
-        """Return the distance to the first geom on each ray, -1 if none; see `Engine.rays`. (num_envs, rays) [m]"""
+        """Return the distance to the first geom on each ray, -1 without a hit (`Engine.rays`). (num_envs, rays) [m]"""
         self.field("geom_xpos")  # bind it, so that every step updates the geoms' positions
         shape = (self.num_envs, points.shape[1])
         distance = torch.empty(shape, device=points.device)

@@ -1,4 +1,4 @@
-"""Fields of the GPU engine's worlds: the state, and the stage of a step that computes each derived field."""
+"""Fields of MjData in the GPU engine: fields of the state, and the stages of a step that compute all other fields."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rlcli.sim.acceleration_fields import ACCELERATION_FIELDS, force_sensor_colu
 STATE = ("qpos", "qvel", "qacc_warmstart", "ctrl", "act", "time")
 """Fields of the state, which every reset restores."""
 INPUTS = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
-"""Further fields of the state, which have the model's values until a term binds them."""
+"""Further fields of the state, which keep the model's values until code requests them with `field`."""
 _KINEMATIC_FIELDS = {
     *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat", "site_xpos"),
     *("site_xmat", "cam_xpos", "cam_xmat", "light_xpos", "light_xdir", "subtree_com", "ten_length", "cinert"),
@@ -42,7 +42,7 @@ class FieldStages:
         self._sensors_need_only_motion = _MOTION_SENSORS.issuperset(other_sensors.tolist())
 
     def stages_of(self, name: str) -> set[int]:
-        """Return the stages that compute a field (KINEMATICS, VELOCITY, FORCE); none for a field of the state."""
+        """Return the stages that compute a field (KINEMATICS, VELOCITY, FORCE); the empty set for state fields."""
         if name in (*STATE, *INPUTS):
             return set()
         if name == "sensordata":

@@ -19,7 +19,7 @@ _MIX2 = wp.constant(wp.uint64(0x94D049BB133111EB))
 _TO_UNIT = wp.constant(wp.float32(2.0**-24))
 _TOO_LARGE = wp.constant(wp.float32(1e10))  # mjMAXVAL
 CAUSES = ("qpos not finite", "qpos out of bounds", "qvel not finite", "qvel out of bounds")
-"""Causes of a divergence; `check_bounds` counts each by its index."""
+"""Causes of a divergence; `check_bounds` refers to them by index."""
 
 _Rows = wp.array2d(dtype=float)
 _Counters = wp.array(dtype=wp.int64)
@@ -87,9 +87,9 @@ def check_bounds(
 ):
     """Find worlds whose state is not finite, beyond MuJoCo's limit or too fast, and restore their last good state.
 
-    `counts` has the number of divergences by index of `CAUSES`. `first` has the first world that diverged since the
-    start, counted from 1, its cause and its column. Exceeded capacities are added to `overflowed`, except those of
-    diverged worlds.
+    Results: `diverged` marks these worlds. `counts` has the number of divergences by index of `CAUSES`. `first` has
+    the first divergence since the start: 1 + index of the world, index of the cause, and column of the bad value.
+    `overflowed` gets the bits of exceeded capacities, except those of diverged worlds.
     """
     world = wp.tid()
     bad = wp.int32(0)  # 0 or index in CAUSES + 1; wp.int32, because Warp treats a plain number as a constant
@@ -138,7 +138,7 @@ def check_bounds(
 
 @wp.kernel
 def restore_diverged(diverged: wp.array(dtype=wp.bool), now: _Rows, last: _Rows):
-    """Restore the rows of diverged worlds from their last values; save the rows of the others."""
+    """Restore the rows of diverged worlds in `now` from `last`; save the rows of the other worlds to `last`."""
     world, column = wp.tid()
     if diverged[world]:
         now[world, column] = last[world, column]
@@ -166,7 +166,7 @@ def reset_worlds(
     act: _Rows,
     time: wp.array(dtype=float),
 ):
-    """Put the masked worlds into the default state."""
+    """Set the worlds where `mask` is true to the default state."""
     world = wp.tid()
     if mask[world]:
         time[world] = 0.0
@@ -183,7 +183,7 @@ def reset_worlds(
 
 @wp.kernel
 def flag_nonfinite(values: _Rows, flag: wp.array(dtype=wp.int32), index: int):
-    """Set a flag to 1 if a value is not finite."""
+    """Set `flag[index]` to 1 if a value is not finite."""
     row, column = wp.tid()
     if not wp.isfinite(values[row, column]):
         flag[index] = 1

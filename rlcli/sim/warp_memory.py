@@ -19,13 +19,13 @@ OVERFLOW_SETTINGS = {
     **dict.fromkeys((_BIT.NEFC, _BIT.NJMAX_NNZ), "constraints_per_env"),
     **dict.fromkeys((_BIT.BROADPHASE, _BIT.NARROWPHASE, _BIT.CCD, _BIT.HFIELD, _BIT.EPA_HORIZON), "contacts_per_env"),
 }
-"""Kind of overflow that MuJoCo Warp reports -> setting that raises the exceeded capacity."""
+"""Kind of overflow that MuJoCo Warp reports -> setting of `sim` that raises the exceeded capacity."""
 
 
 def put_on_device(
     model: mujoco.MjModel, num_envs: int, device: torch.device, capacity: Capacity
 ) -> tuple[mjw.Model, mjw.Data]:
-    """Put a model and its worlds on a device, which must be Warp's current device.
+    """Copy a model and its worlds to a device, which must be Warp's current device.
 
     Raises:
         ConfigError: for a model that MuJoCo Warp cannot run.
@@ -52,7 +52,7 @@ def put_on_device(
 
 
 def overflow_error(found: int, capacity: Capacity) -> DivergedError:
-    """Return the error for exceeded capacities; the bits of `found` are keys of `OVERFLOW_SETTINGS`."""
+    """Return the error for exceeded capacities: the sum of keys of `OVERFLOW_SETTINGS` in `found`."""
     settings = {setting for bit, setting in OVERFLOW_SETTINGS.items() if found & int(bit)}
     kinds = " and ".join(bit.name.lower() for bit in OVERFLOW_SETTINGS if found & int(bit) and bit.name)
     now = {"contacts_per_env": capacity.contacts, "constraints_per_env": capacity.constraints}

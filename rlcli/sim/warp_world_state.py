@@ -1,4 +1,4 @@
-"""Worlds of the GPU engine (one per environment): model fields that differ, fields of MjData, saved states."""
+"""Worlds of the GPU engine (one per environment): model fields that differ between worlds, fields of MjData, states."""
 
 from __future__ import annotations
 
@@ -56,15 +56,15 @@ class WarpWorlds:
         """CUDA graphs of `step`, by `nstep` and `derive`."""
         self._expanded: dict[str, Tensor] = {}
         self._fields: dict[str, Tensor] = {}
-        """Fields of the data that are in use (requested with `field`)."""
+        """Fields of MjData that have been requested with `field`, by name."""
         self._start_inputs: dict[str, Tensor] = {}
-        """Default values of the `INPUTS` in use, which a reset restores."""
+        """Default values of the requested `INPUTS`, which a reset restores."""
         self._last_derived: dict[str, Tensor] = {}
         """Derived fields of each world's last state that did not diverge."""
         self._derived: set[int] = set()
-        """Stages whose derived fields are in use."""
+        """Stages that compute requested derived fields."""
         self._needs_only_motion = True
-        """Whether the fields in use can be derived from the state without contacts, constraints and inertias."""
+        """Whether the requested fields can be derived from the state without contacts, constraints and inertias."""
         self._overwritten: dict[str, wp.array] = {}
         """Copies of fields that `fwd_velocity` overwrites."""
         self._substep_fields = config.derived_fields == "substep"
@@ -83,7 +83,7 @@ class WarpWorlds:
         return attribute in _batched_fields(owner) and getattr(owner, attribute, None) is not None
 
     def expand(self, name: str) -> Tensor:
-        """Give every world its own values of a model field; return them, live and writable. (num_envs, ...)"""
+        """Give every world its own values of a model field; return a writable view of the values. (num_envs, ...)"""
         if name not in self._expanded:
             owner, attribute = self._owner(name)
             if not self.can_expand(name):
@@ -116,14 +116,15 @@ class WarpWorlds:
             mjw.set_const(self._model, self._data)
 
     def field(self, name: str) -> Tensor:
-        """Return a live view of an MjData field. From now on `step` computes it, if it is a derived one (xpos, ...)."""
+        """Return a live view of an MjData field. A derived field (xpos, ...) is computed by every later `step`."""
         if name not in self._fields:
             array = getattr(self._data, name, None)
             if not isinstance(array, wp.array) or array.ndim == 0 or array.shape[0] != self.num_envs:
                 names = [f.name for f in dataclasses.fields(self._data)]
                 if name in names:
                     raise ValueError(
-                        f"field '{name}' of mujoco_warp.Data has no row for each environment; use a field that has one"
+                        f"field '{name}' of mujoco_warp.Data is shared by all environments, so it cannot be read as"
+                        " (num_envs, ...); use another field"
                     )
                 hint = did_you_mean(name, names) or "see mujoco_warp.Data"
                 raise ValueError(f"'{name}' is not a field of MuJoCo Warp's data; {hint}")
@@ -148,7 +149,7 @@ class WarpWorlds:
         return self._fields[name]
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the state, of the inputs in use and of the model fields with a value for each world."""
+        """Return copies of the state, of the requested inputs, and of the model fields with a value for each world."""
         inputs = [name for name in INPUTS if name in self._fields]
         return {
             **{name: self.field(name).clone() for name in (*STATE, *inputs)},
@@ -183,7 +184,7 @@ class WarpWorlds:
             last.copy_(self._fields[name])
 
     def world(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return the model and the data of a world after `mj_forward`; a later call for it updates the same objects."""
+        """Return (model, data) of a world after `mj_forward`; a later call for the same world updates these objects."""
         if env not in self._worlds:
             model = copy.copy(self.model)
             self._worlds[env] = (model, mujoco.MjData(model))
@@ -205,15 +206,15 @@ class WarpWorlds:
     def _update_velocities(self) -> None:
         """Compute the velocities of bodies before connect and weld constraints use them.
 
-        MuJoCo Warp 4.0 makes these constraints before it updates the velocities. They would use the velocities of the
-        step before, or of the episode before.
+        MuJoCo Warp 4.0 makes these constraints before it updates the velocities, so the constraints would use those of
+        the step before, or of the episode before.
         """
         if self._holds_bodies:
             mjw.fwd_kinematics(self._model, self._data)
             mjw.com_vel(self._model, self._data)
 
     def _derive(self) -> None:
-        """Compute the derived fields in use from the state, except those of the acceleration stage."""
+        """Compute the requested derived fields from the state, except those of the acceleration stage."""
         m, d = self._model, self._data
         if VELOCITY not in self._derived:
             if KINEMATICS in self._derived:
@@ -235,12 +236,12 @@ class WarpWorlds:
             mjw.sensor_vel(m, d)
 
     def _of_substep(self) -> list[str]:
-        """Return the fields in use that the state does not determine, such as forces: they are of the last substep."""
+        """Return the requested fields, such as forces, that no state determines: they are of the last physics step."""
         stages = {name: self._stages.stages_of(name) for name in self._fields}
         return [name for name, groups in stages.items() if FORCE in groups or (self._substep_fields and groups)]
 
     def _substep_values(self) -> dict[str, Tensor]:
-        """Return copies of the values of the last substep, which MuJoCo's mj_forward would overwrite."""
+        """Return copies of the fields of the last physics step, which MuJoCo's mj_forward would overwrite."""
         names = [*self._of_substep(), "qacc_warmstart"]
         return {name: self._fields[name].clone() for name in names if name in self._fields}
 

@@ -1,1 +1,1 @@
-"""Code that runs one training, from a configuration or a saved run to the last checkpoint."""
+"""One training, from a configuration or a saved run to the last checkpoint."""

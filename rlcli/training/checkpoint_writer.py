@@ -1,7 +1,7 @@
-"""Writer of checkpoints in the background, each completely or not at all; it also removes old checkpoints.
+"""Writer of checkpoints in a background thread, each completely or not at all; it also removes old checkpoints.
 
-A log is data of a trainer that only grows, such as a replay buffer. Its rows are written once, into files that all
-checkpoints share.
+A "log" in this module is data of a trainer that only grows, such as a replay buffer. Its rows are written once, into
+files that all checkpoints share.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ _NewRows = list[tuple[int, int, dict[str, Tensor]]]
 
 @dataclass(frozen=True, slots=True)
 class KeepRule:
-    """Rule that says which checkpoints of a run are kept; the first, the best and the newest always are."""
+    """Rule for the checkpoints of a run to keep; the first, the best and the newest one are always kept."""
 
     last: int | None = None
     """Number of newest checkpoints to keep; None: all."""
     every: int | None = None
-    """Keep also the checkpoint of every `every`-th iteration; None: no others."""
+    """Also keep the checkpoint of every `every`-th iteration; None: no further checkpoints."""
 
     @staticmethod
     def from_settings(last: int | None, every: int | None, save_interval: int | None) -> KeepRule:
@@ -58,13 +58,13 @@ class KeepRule:
 
 
 class CheckpointWriter:
-    """Writer of a run's checkpoints in a background thread. Training waits only for the copies in memory.
+    """Writer of a run's checkpoints in a background thread. Training waits only while the state is copied in memory.
 
     Args:
         checkpoints: the run's folder of checkpoints.
         keep: rule for the checkpoints to keep.
-        manifest: further JSON entries of every manifest.
-        resumed: checkpoint from which training continues; the rows of its logs are not written again.
+        manifest: entries of `manifest.json` that all checkpoints of the run share.
+        resumed: checkpoint from which training continues; rows that its files contain are not written again.
         cases: recorder of failed episodes, which are written with each checkpoint.
     """
 
@@ -81,7 +81,7 @@ class CheckpointWriter:
         self.best: int | None = None
         """Environment steps of the checkpoint with the best evaluation; None: no evaluation yet."""
         self.newest: tuple[int, int] | None = None if resumed is None else (resumed.iteration, resumed.step)
-        """Iteration and environment steps of the newest checkpoint. Its writing may not be finished."""
+        """Iteration and environment steps of the newest checkpoint, which may not be completely written yet."""
         self.written = self.newest
         """Iteration and environment steps of the newest checkpoint on the disk."""
         self._keep, self._manifest = keep, dict(manifest)
@@ -116,7 +116,7 @@ class CheckpointWriter:
             self.cases.drop(batch)
 
     def wait(self) -> None:
-        """Block until everything is on the disk.
+        """Block until the last checkpoint is on the disk.
 
         Raises:
             MachineError: if the checkpoint could not be written, or this process has lost the lock of the run.
@@ -135,7 +135,7 @@ class CheckpointWriter:
             self.wait()
 
     def _copy_new(self, name: str, rows: Rows) -> _NewRows:
-        """Return copies of a log's rows that are in no file yet: (start, stop, columns) for each new file."""
+        """Return copies of those rows of a log that no file contains yet: (start, stop, columns) for each new file."""
         start = max(rows.first, self._copied.get(name, 0))
         if start >= rows.stop:
             return []
@@ -203,9 +203,9 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
 
     Args:
         checkpoints: the run's folder of checkpoints.
-        step: environment steps.
+        step: environment steps of the training, which name the folder of the checkpoint.
         state: state of the trainer.
-        extra: further JSON entries of the manifest.
+        extra: further entries of `manifest.json`.
 
     Raises:
         MachineError: if the checkpoint cannot be written; no part of it is left.
@@ -241,9 +241,9 @@ def write_checkpoint(checkpoints: Path, step: int, state: TrainerState, extra: M
 
 
 def prune(checkpoints: Path, keep: KeepRule, best: int | None) -> None:
-    """Remove the checkpoints that need not be kept, and the rows of logs (replay buffers) that no other one needs.
+    """Remove the checkpoints that `keep` does not keep, and rows of logs (replay buffers) that only these need.
 
-    A checkpoint that cannot be removed stays whole.
+    A checkpoint that cannot be removed stays complete.
 
     Args:
         checkpoints: the run's folder of checkpoints.
@@ -265,8 +265,8 @@ def prune(checkpoints: Path, keep: KeepRule, best: int | None) -> None:
 def drop_after(checkpoints: Path, step: int) -> list[int]:
     """Remove the checkpoints after the step at which training is resumed; return their steps.
 
-    A checkpoint that cannot be read is renamed to `STEP.unreadable` instead, and the rows of logs (replay buffers) that
-    only it needs are moved into its folder.
+    A checkpoint that cannot be read is renamed to `STEP.unreadable` instead, and rows of logs (replay buffers) that
+    only this checkpoint needs are moved into its folder.
     """
     later = [saved for saved in steps(checkpoints) if saved > step]
     removed, aside = [], None
@@ -276,7 +276,7 @@ def drop_after(checkpoints: Path, step: int) -> list[int]:
             open_checkpoint(folder).verify(whole=True)
         except CheckpointError as error:
             aside = _set_aside(folder)
-            _log.warning(f"{folder} cannot be read and is kept as {aside.name}: {error.message}")
+            _log.warning(f"checkpoint {folder} cannot be read and is renamed to {aside.name}: {error.message}")
         else:
             _remove(folder)
             removed.append(saved)

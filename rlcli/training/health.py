@@ -23,17 +23,17 @@ _TIMES = 40
 _MIN_ITERATIONS = 8
 """Number of iterations before the first check."""
 _MIN_VALUES = 6
-"""Number of a metric's values from which on its change is known: the first three and the last three differ."""
+"""Smallest number of values of a metric for checks of its change: the first three and the last three are compared."""
 _SOLVED = 0.3
 """Success rate above which only defects are reported, not signs of slow learning."""
 _MIN_GAPS, _SURE, _RARE = 4, 5.0, 0.02
-"""A lower reward in states of success is reported if so many comparisons differ by so many standard errors, and the
-success rate was never higher than the third number."""
+"""A lower reward in states of success is reported only after `_MIN_GAPS` comparisons, if it is lower by `_SURE`
+standard errors, and if the success rate has always been below `_RARE`."""
 _AT = 1e-3
 """Relative distance from a bound at which a value counts as at the bound."""
 
 Found = Iterator[tuple[str, str]]
-"""Message and hint of each problem that a check finds; the hint is printed after the word "try"."""
+"""(message, hint) of each problem that a check finds; the hint is a noun phrase, printed after the word "try"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +44,9 @@ class Finding:
     iteration: int
     """Iteration in which the check first failed."""
     message: str
-    """One sentence with the figure."""
+    """One sentence with the measured value."""
     hint: str
-    """What to try."""
+    """What to try, as a noun phrase."""
 
 
 class Health:
@@ -63,7 +63,7 @@ class Health:
         self.settings: dict[str, Any] = agent.model_dump()
         self.iteration = 0
         self.findings: list[Finding] = []
-        """Problems that both the newest and the previous run of the checks found."""
+        """Problems that the checks found both the last time and the time before."""
         self._series: dict[str, list[float]] = {}
         self._suspects: dict[str, Finding] = {}
 
@@ -138,7 +138,7 @@ class Health:
         return (statistics.fmean(after) - statistics.fmean(before)) / noise
 
     def is_above_start(self) -> bool:
-        """Return whether the return is far above its first value, also if it rose within the first iterations."""
+        """Return whether the newest returns are far above the first one, also if they rose in the first iterations."""
         start, after = self.first(RETURN)[0], self.last(RETURN)
         noise = max(statistics.pstdev(after), 0.1 * abs(start), 1e-9)
         return statistics.fmean(after) - start > 5.0 * noise
@@ -148,15 +148,15 @@ class Health:
         return statistics.median(self.last(name)) if self.values(name) else None
 
     def struggles(self, after: float) -> bool:
-        """Return whether learning is slow: a share `after` (0 to 1) of the training is done, and success is still rare.
+        """Return whether at least the share `after` (0 to 1) of the training is done, and success is still rare.
 
-        A task without success conditions counts as one with rare success.
+        In a task without success conditions, success counts as rare.
         """
         return self.progress >= after and all((self.median(n) or 0.0) < _SOLVED for n in (SUCCESS, "Eval/success_rate"))
 
 
 def probe(trainer: Trainer) -> dict[str, float]:
-    """Return the metrics `Health/*`: shares of the newest observations and actions that are at a bound or constant."""
+    """Return the metrics `Health/*`: shares of the newest observations and actions that are constant or at a bound."""
     if not isinstance(trainer, BaseTrainer) or len(trainer.recent_obs) < 2:
         return {}
     found, begin, obs = {}, 0, trainer.recent_obs
@@ -211,7 +211,10 @@ def no_progress(health: Health) -> Found:
 
 
 def one_termination(health: Health) -> Found:
-    """Report a termination that ends nearly all episodes, no later than at first, or no later for half the training."""
+    """Report a termination that ends nearly all episodes, while episodes do not become longer.
+
+    Their lengths are compared with those at the start, or with those in the middle of the training.
+    """
     late = {name for name, term in health.task.terminations.items() if term is not None and term.time_out}
     for metric in health.names("Episode_Termination/"):
         name, share = metric.partition("/")[2], health.median(metric)
@@ -354,7 +357,7 @@ def blocked_success(health: Health) -> Found:
 
 
 def reward_without_success(health: Health) -> Found:
-    """Report a return that has risen while all success conditions hold in as few of the states as at the beginning."""
+    """Report a return that has risen while no success condition holds in more states than at the start."""
     shares = []
     for name, condition in health.task.success.items():
         if condition is None:
@@ -381,7 +384,7 @@ def reward_against_success(health: Health) -> Found:
 
 
 def _gaps(values: list[float], bounds: Mapping[str, Any]) -> list[float]:
-    """Return the negative distance of each value to its bounds, 0 within them; it rises as a value comes closer."""
+    """Return minus the distance of each value to the range `at_least` to `at_most`; 0 within the range."""
     low, high = bounds.get("at_least"), bounds.get("at_most")
     return [-max((low if low is not None else v) - v, v - (high if high is not None else v), 0.0) for v in values]
 
@@ -407,4 +410,4 @@ _IN_ORDER: tuple[Callable[[Health], Found], ...] = (
     *(reward_against_success, no_progress),
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in _IN_ORDER}
-"""Name -> check, in the order in which findings are listed."""
+"""Name -> check function, in the order in which findings are listed."""

@@ -43,9 +43,9 @@ class ImportedPolicy:
     weights: dict[str, Tensor]
     """Weights by their names in a saved policy."""
     critic: dict[str, Tensor]
-    """Weights of the critics by their original names."""
+    """Weights of the critics by their original names; empty: the file has none."""
     algorithm: str
-    """Algorithm of the training, as the names of the weights show it."""
+    """Algorithm of the training, derived from the names of the weights."""
 
 
 def read_sb3(
@@ -56,7 +56,7 @@ def read_sb3(
     Args:
         file: file that `model.save` has written; only its member `policy.pth` is read.
         activation: activation of the hidden layers, which the file does not contain; None: the library's default.
-        action_bound: actions of the training were within +-action_bound.
+        action_bound: bound of the actions in the training, which were within +-action_bound.
         normalizer: safetensors file with `mean` and `var` of VecNormalize.
 
     Raises:
@@ -143,7 +143,7 @@ def create_imported_run(
         resolved: configuration of the task and the agent.
         record: further entries of run.json.
         runs_dir: the folder of runs.
-        name: part of the name of the run's folder.
+        name: text to add to the name of the run's folder; None: none.
 
     Raises:
         CheckpointError: if the policy does not fit the task, with a table of the differences.
@@ -185,7 +185,10 @@ def create_imported_run(
 
 
 def _named_tensors(saved: object, where: str) -> dict[str, Tensor]:
-    """Return float32 copies of untrusted tensors; check that they are plain, finite and not larger than the file."""
+    """Return float32 copies of untrusted tensors, by name, after checks that they are dense, finite and not too large.
+
+    `where` is the file, for messages.
+    """
     if not isinstance(saved, Mapping):
         raise CheckpointError(
             f"{where} has no weights in model_state_dict or actor_state_dict; give a file model_N.pt of RSL-RL"
@@ -275,7 +278,7 @@ def _log_std(weights: Mapping[str, Tensor], names: Mapping[str, str], file: Path
 
 
 def _lstm(weights: Mapping[str, Tensor], prefix: str, file: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the entries of `policy.json` and the weights of the LSTM with a prefix; both empty if there is none."""
+    """Return (entries of `policy.json`, weights) of the LSTM whose names begin with `prefix`; empty without one."""
     lstm: dict[str, Tensor] = {}
     for name, value in below(weights, prefix).items():
         kind, _, layer = name.rpartition("_l")
@@ -305,7 +308,7 @@ def _empirical_normalizer(stats: Mapping[str, Tensor], file: Path) -> dict[str, 
 
 
 def _normalizer(mean: Tensor, var: Tensor, stats: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors of rlcli's observation normaliser; its sample count is 0 if `stats` has none."""
+    """Return the tensors of rlcli's observation normaliser; its sample count is `count` of `stats`, else 0."""
     count = stats.get("count", torch.zeros(())).double().reshape(-1)[:1].sum()
     return {"normalizer.mean": mean.double(), "normalizer.var": var.double(), "normalizer.count": count}
 

@@ -1,4 +1,4 @@
-"""Data classes for the start and the result of a training. The module imports neither torch nor MuJoCo."""
+"""Data classes for the start (`Job`) and the result of a training. The module imports neither torch nor MuJoCo."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Job:
-    """Training that is to start: its run, which this process has locked, and its settings."""
+    """A training to start: its run, which this process has locked, and its settings."""
 
     run: Run
     resolved: Resolved
@@ -30,14 +30,14 @@ class Job:
     init_from: Path | None = None
     """Folder of the checkpoint whose weights the policy starts with."""
     stages: list[int] = field(default_factory=list)
-    """Iterations after which a checkpoint is saved; training ends after the last one. If this list is not empty, the
-    agent's `max_iterations`, `max_steps`, `save_interval` and `keep_*` have no effect."""
+    """Iterations after which a checkpoint is saved; training ends after the last of these iterations. If the list is
+    not empty, the agent's `max_iterations`, `max_steps`, `save_interval` and `keep_*` have no effect."""
     config: str | None = None
     """New content of a resumed run's `config.yaml`, if its budget changes."""
     video_every: int = 0
     """Iterations between videos; 0: none."""
     writes: bool = True
-    """Whether this process writes the run."""
+    """Whether this process writes the run: True on rank 0."""
     begin: float = field(default_factory=time.monotonic)
     """Time at which the job was made, by the monotonic clock [s]."""
 
@@ -63,7 +63,8 @@ class TrainingResult:
     step: int
     """Environment steps of the whole run."""
     iteration: int | None = None
-    """Iterations of the whole run; this and the following fields are None if the run was already finished."""
+    """Iterations of the whole run. If the run was finished before, so that nothing was trained, this field and those
+    below are None."""
     elapsed_s: float | None = None
     """Duration of this training [s]."""
     seed: int | None = None

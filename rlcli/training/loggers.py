@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class LoggerKind:
-    """Entry of `LOGGERS`: where the class of a logger is, and what it needs."""
+    """Entry of `LOGGERS`: the class of a logger, and the module that it needs."""
 
     needs: str
     """Module that must be installed; the extra of rlcli that installs it has the logger's name."""
     factory: str
     """`module:name` of the class."""
     title: str
-    """Name in messages."""
+    """Name of the logger in messages."""
 
 
 LOGGERS = {
@@ -78,7 +78,7 @@ class TensorBoard:
 
     Args:
         folder: folder of the files.
-        resume_after_step: environment steps at which the run is resumed; later events are removed.
+        resume_after_step: environment steps at which the run is resumed; events of later steps are removed.
     """
 
     def __init__(self, folder: Path, *, resume_after_step: int | None = None) -> None:
@@ -140,7 +140,7 @@ def open_loggers(
     Args:
         run: the run.
         names: names of the loggers besides `metrics.jsonl`.
-        resume: iteration and environment steps at which the run is resumed.
+        resume: iteration and environment steps at which the run is resumed; None: the run is new.
         config: the resolved configuration, which trackers store.
 
     Raises:

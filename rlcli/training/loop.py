@@ -54,9 +54,9 @@ class TrainLoop:
     videos: TrainingVideos | None = None
     health: Health | None = None
     show: Callable[[Progress], None] = lambda _: None
-    """Called after each iteration."""
+    """Function that displays the progress after each iteration."""
     count_divergences: Callable[[], int] = lambda: 0
-    """Returns the number of environment steps that have diverged since the environment was built."""
+    """Function that returns the number of environment steps that have diverged since the environment was built."""
     stop: StopRequest = field(default_factory=StopRequest)
     metrics: dict[str, float] = field(init=False, default_factory=dict)
     """Metrics of the newest iteration."""
@@ -84,7 +84,8 @@ class TrainLoop:
             number = self._boundary[0] + 1
             raise self._stopped(f"stopped in iteration {number}; a resumed run repeats this iteration") from None
         except KeyboardInterrupt:
-            raise self._stopped("stopped without a new checkpoint; the work after the last one is lost") from None
+            message = "stopped without a new checkpoint; the iterations after the last checkpoint are lost"
+            raise self._stopped(message) from None
         except BaseException as error:
             with contextlib.suppress(Exception):  # the first error is the one to report
                 self.writer.wait()  # the background thread may be writing a good checkpoint
@@ -128,7 +129,7 @@ class TrainLoop:
         return self.reached or budget.spent(self.trainer)
 
     def _check_health(self, metrics: dict[str, float]) -> None:
-        """Run the health checks; log new problems, and write the present ones into run.json."""
+        """Run the health checks if they are due; log new problems, and write all present problems into run.json."""
         health = self.health
         if health is None:
             return
@@ -146,8 +147,8 @@ class TrainLoop:
         """Do one iteration and, if it is due, an evaluation.
 
         Returns:
-            The trainer's report; the metrics of the evaluation; whether it is the best evaluation (on the rank that
-            evaluates); and whether all ranks must save a checkpoint.
+            The trainer's report; the metrics of the evaluation, empty without one; whether it is the best evaluation so
+            far (on the rank that evaluates); whether all ranks must save a checkpoint.
 
         Raises:
             DivergedError: if too many environment steps diverged.
@@ -172,10 +173,10 @@ class TrainLoop:
 
     @contextlib.contextmanager
     def _interruptible(self, is_long: bool) -> Iterator[None]:
-        """Let a signal or a divergence end a long iteration, after saving the state before the iteration.
+        """Allow a signal to end a long iteration in the middle: copy the trainer's state before it, to save that state.
 
-        A short iteration is always finished: this takes less time than to copy the trainer's state before it. On a GPU
-        and with several ranks every iteration is finished.
+        A divergence in a long iteration also saves that state. A short iteration is always finished, because that takes
+        less time than copying the state. On a GPU and with several ranks every iteration is finished.
         """
         self._boundary = self.trainer.iteration, self.trainer.env_steps
         interruptible = self.stop.can_interrupt and self._ranks.world_size == 1
@@ -223,7 +224,7 @@ class TrainLoop:
 
 
 def _with_rates(report: Report, steps: int) -> dict[str, float]:
-    """Return the metrics of an iteration of `steps` environment steps, with `Perf/*` for its speed and durations."""
+    """Return the metrics of an iteration of `steps` environment steps, with its speed and durations as `Perf/*`."""
     seconds = report.seconds
     total = max(sum(seconds.values()), 1e-9)
     rates = {
@@ -239,7 +240,7 @@ def _require_stable(diverged: float, trainer: Trainer) -> None:
     """Check that at most the share `DIVERGED_SHARE` of the iteration's environment steps has diverged.
 
     Raises:
-        DivergedError: if there are more.
+        DivergedError: if more steps have diverged.
     """
     share = diverged / trainer.steps_per_iteration
     if share > DIVERGED_SHARE:

@@ -21,10 +21,10 @@ _SUCCESS, _RETURN, _LENGTH = "Eval/success_rate", "Eval/mean_reward", "Eval/mean
 class PeriodicEval:
     """Evaluation of the deterministic policy every few iterations, always in the same episodes.
 
-    It changes no random generator and no number of threads of the training.
+    An evaluation leaves the training's random generators and numbers of threads as they were.
 
     Args:
-        make_env: builds the environment; it is called at the first evaluation.
+        make_env: function that builds the environment; it is called at the first evaluation.
         episodes: number of episodes of an evaluation.
         interval: number of iterations between evaluations.
         history: metrics of the previous iterations; an iteration without an evaluation is ignored.
@@ -53,9 +53,10 @@ class PeriodicEval:
         return iteration % self._interval == 0
 
     def run(self, policy: Callable[[], Policy]) -> dict[str, float]:
-        """Evaluate the policy that `policy` returns, and restore the random generators; return the metrics `Eval/*`.
+        """Evaluate the policy that `policy()` returns; return the metrics `Eval/*`.
 
-        The policy is built after the generators are saved, because building it draws random weights.
+        The random generators are saved before `policy()` is called, because it draws initial weights, and are restored
+        at the end.
         """
         with undisturbed():
             if self._env is None:
@@ -72,12 +73,12 @@ class PeriodicEval:
         return {**metrics, _SUCCESS: summary["success"]["rate"]} if "success" in summary else metrics
 
     def improves(self, metrics: Mapping[str, float]) -> bool:
-        """Record the score of an evaluation: success rate, then return. Return whether it is better than all before."""
+        """Record an evaluation's score (success rate, then return); return whether it is the best so far."""
         better = _score(metrics) > self._best
         self._best = max(self._best, _score(metrics))
         return better
 
 
 def _score(metrics: Mapping[str, Any]) -> tuple[float, float]:
-    """Return the success rate and the mean return of an evaluation, to compare evaluations; -inf if one is missing."""
+    """Return (success rate, mean return) of an evaluation, to compare evaluations; -inf for a missing metric."""
     return metrics.get(_SUCCESS, -math.inf), metrics.get(_RETURN, -math.inf)

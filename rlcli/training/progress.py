@@ -32,7 +32,7 @@ class Progress:
 
 
 def progress_from_metrics(rows: Sequence[Mapping[str, Any]], iterations: int | None, elapsed_s: float) -> Progress:
-    """Return the progress of a run from the newest rows of its `metrics.jsonl`. The speed is the mean over the rows.
+    """Return the progress of a run from the newest rows of its `metrics.jsonl`; the speed is the mean over these rows.
 
     Args:
         rows: the rows, at least one, oldest first.

@@ -154,7 +154,7 @@ def _open_writer(job: Job, env: Environment) -> CheckpointWriter:
 
 
 def _record_begin(job: Job, trainer: Trainer, env: Environment, budget: Budget) -> None:
-    """Write the start of the training into run.json, and whether a resumed run would give the same bits."""
+    """Write the start of the training into run.json, and the state that no checkpoint can store, if there is any."""
     unsaved = env.unsaved_state()
     if unsaved:
         names = ", ".join(unsaved)
@@ -165,10 +165,10 @@ def _record_begin(job: Job, trainer: Trainer, env: Environment, budget: Budget) 
 
 
 def _provenance(job: Job, trainer: Trainer, env: Environment) -> dict[str, Any]:
-    """Return the entries of run.json that describe the compiled model.
+    """Return the entries of run.json that describe machine, versions and compiled model.
 
-    For a resumed run: the entry `resumed` with what has changed in the machine, the versions and the model; an empty
-    mapping if nothing has changed.
+    For a resumed run, return the entry `resumed` with the changes of these since the run was created; an empty mapping
+    if nothing has changed.
     """
     record, device = job.run.record, str(env.device)
     built = built_record(env.engine.model, device)
@@ -193,7 +193,7 @@ def _make_play_env(job: Job, purpose: str, flags: dict[str, Any]) -> VecEnv:
 
     Args:
         job: run and settings of the training.
-        purpose: what the environment is for (`evaluation`, `video`); its seed is derived from this text.
+        purpose: purpose of the environment (`evaluation`, `video`), from which its seed is derived.
         flags: dotted key -> value of further settings.
     """
     resolved = resolve_run(job.run, play=True, flags=flags, named=job.resolved.source)
@@ -235,7 +235,7 @@ def _health(job: Job, iterations: int) -> Health | None:
 
 
 def _report_bar(run: Run, bar: str, reached: bool) -> None:
-    """Log and record the time and the steps that the training needed to reach `bar`, the threshold of `--until`."""
+    """Log and record the time and the steps in which the training reached `bar`, the threshold of `--until`."""
     rows = read_metrics(run.metrics)
     seconds, step = sum(map(training_s, rows)), rows[-1]["step"] if rows else 0
     run.update(until={"bar": bar, "reached": reached, "seconds": seconds, "step": step})
@@ -247,7 +247,7 @@ def _report_bar(run: Run, bar: str, reached: bool) -> None:
 
 
 def _training_videos(job: Job, stop: StopRequest) -> TrainingVideos | None:
-    """Return the recorder of videos, if there is a `--video-every`; None on other ranks than 0."""
+    """Return the recorder of videos; None without `--video-every`, and on other ranks than 0."""
     if not job.video_every or not job.writes:
         return None
     # imported here: most trainings do not need OpenGL and the video modules

@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 def build_trainer(job: Job, device: str) -> tuple[Trainer, Environment]:
     """Build the trainer and its environment; load the checkpoint to resume from, if there is one.
 
-    The changed budget of a resumed run is written to its `config.yaml` last, after everything that may fail.
+    If the budget of a resumed run changes, its `config.yaml` is written last, after all operations that may fail.
 
     Raises:
         CheckpointError: if a checkpoint does not fit.
@@ -57,7 +57,7 @@ def build_trainer(job: Job, device: str) -> tuple[Trainer, Environment]:
 
 
 def make_trainer(resolved: Resolved, seed: int, device: str, torch_threads: int) -> tuple[Trainer, Environment]:
-    """Make the environment and the trainer of a configuration. Every rank has its own seeds for its environments."""
+    """Make the environment and the trainer of a configuration; each rank derives its own seeds from `seed`."""
     agent, spec = resolved.require_agent()
     ranks = distributed.current()
     seed_generators(ranks.seed(derive(seed, "task"), "task"))  # a task may draw random numbers while it is built

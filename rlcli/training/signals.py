@@ -1,4 +1,4 @@
-"""Signals (Ctrl-C, SIGTERM) that stop a training: the first one keeps what is saved, the second one ends it at once."""
+"""Signals (Ctrl-C, SIGTERM) that stop a training: the first stops it with a checkpoint, the second at once."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from rlcli.envs.observers import StepObserver
 from rlcli.errors import INTERRUPTED, STOPPED, Stopped
 
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGHUP")
-"""Names of the signals that stop a training: from Ctrl-C, from a scheduler that kills or warns, from a terminal that
-closes. Windows has only some of these signals."""
+"""Names of the signals that stop a training: from Ctrl-C, from a scheduler such as Slurm (SIGTERM, SIGUSR1), from a
+terminal that closes. Windows has only some of these signals."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -24,10 +24,10 @@ class Interrupted(KeyboardInterrupt):
 
 @dataclass(slots=True)
 class StopRequest(StepObserver):
-    """Context manager that stores the first signal and raises `Interrupted` where an iteration may be repeated.
+    """Context manager that stores the first signal, and raises `Interrupted` in iterations that may be interrupted.
 
-    A second signal always raises KeyboardInterrupt. Signals that the process ignores from its start
-    (nohup) stay ignored.
+    A second signal always raises KeyboardInterrupt. Signals that the process ignores from its start (nohup) stay
+    ignored.
     """
 
     signal: int | None = None
@@ -46,7 +46,7 @@ class StopRequest(StepObserver):
 
     @contextlib.contextmanager
     def interruptible(self, interruptible: bool = True) -> Iterator[None]:
-        """Let the first signal raise `Interrupted` at any point of the block, unless `interruptible` is False."""
+        """Raise `Interrupted` at the first signal, anywhere in the `with` block, unless `interruptible` is False."""
         self._interruptible = interruptible
         try:
             self.check()
@@ -56,7 +56,7 @@ class StopRequest(StepObserver):
 
     @contextlib.contextmanager
     def before_training(self, interruptible: bool = True) -> Iterator[None]:
-        """Let the first signal end the work before training.
+        """End the `with` block, which prepares a training, at the first signal.
 
         Raises:
             Stopped: on a signal.
@@ -73,7 +73,7 @@ class StopRequest(StepObserver):
             raise Stopped("stopped before training began", exit_code=self.exit_code) from None
 
     def before_step(self) -> None:
-        """Check for a signal before every environment step: a task may have caught the exception of the signal."""
+        """Check for a signal before every environment step, because a task's code may have caught `Interrupted`."""
         self.check()
 
     def check(self) -> None:

@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class TrainingRequest:
-    """Options of `rlcli train`: a task with all changes of its configuration, or a run to resume."""
+    """Options of `rlcli train`: a task with changes of its configuration, or a run to resume."""
 
     runs: Path
     """Folder of all runs."""
@@ -48,7 +48,7 @@ class TrainingRequest:
     config: Path | None = None
     overrides: list[str] = field(default_factory=list)
     flags: dict[str, Any] = field(default_factory=dict)
-    """Dotted key -> value of further settings."""
+    """Dotted key -> value of settings that options such as `--num-envs` set."""
     budget: dict[str, Any] = field(default_factory=dict)
     """Dotted key -> value of the budget; empty: the agent's own."""
     seed: int = 42
@@ -58,7 +58,7 @@ class TrainingRequest:
     video_every: int | None = None
     """Iterations between videos; 0: none."""
     name: str | None = None
-    """Part of the name of a new run's folder."""
+    """Text to add to the name of a new run's folder."""
 
     def resolve(self, changes: Sequence[str] = ()) -> tuple[Resolved, str]:
         """Return the configuration and the device of a new run.
@@ -139,7 +139,7 @@ def prepare_run(folder: Path, request: TrainingRequest, changes: Sequence[str] =
     if (folder / RECORD).is_file():
         recorded = open_run(folder).record.get("given")
         if recorded is not None and _overrides_in(recorded) != _overrides_in(explicit_values(resolved)):
-            message = f"{folder} is a run of a sweep with other settings"
+            message = f"the folder {folder} has a run of a sweep with other settings"
             raise UsageError(message, hint="start a new sweep with another --name")
         return device
     for file in ("config.yaml", "checkpoints"):  # left by a process that was killed while creating the run
@@ -265,7 +265,10 @@ def setup_job(
 
 
 def _job_of_other_rank(message: dict[str, Any], request: TrainingRequest, resolved: Resolved | None) -> Job:
-    """Return the job of another rank for the message of rank 0; other ranks do not write the run."""
+    """Return the job of a rank other than 0, from the message that rank 0 has broadcast (`Job.message`).
+
+    Such a rank does not write the run.
+    """
     from rlcli.runs.checkpoint_reader import open_checkpoint
     from rlcli.runs.restore import resolve_run
 
@@ -279,7 +282,11 @@ def _job_of_other_rank(message: dict[str, Any], request: TrainingRequest, resolv
 
 
 def process_device(wanted: str, gpus: int | None) -> str:
-    """Return the device of this process.
+    """Return the device of this process: with several processes, the GPU with the index of its local rank.
+
+    Args:
+        wanted: the option --device.
+        gpus: the option --gpus; None: not given.
 
     Raises:
         DeviceError: if there are fewer GPUs than processes.
@@ -303,7 +310,7 @@ def process_device(wanted: str, gpus: int | None) -> str:
 
 
 def _trainer_device(resolved: Resolved, device: str, wanted: str) -> str:
-    """Return `device`, or the CPU if the trainer cannot use a GPU and --device (`wanted`) is auto.
+    """Return `device`, but `cpu` if the trainer cannot use a GPU and the option --device (`wanted`) is auto.
 
     Raises:
         UsageError: if the trainer cannot use the device that the user gave.
@@ -394,7 +401,7 @@ def _require_larger_budget(request: TrainingRequest, run: Run, folder: Path | No
 
 
 def _overrides_in(given: object) -> Any:
-    """Return the part of run.json's entry `given` (key -> origin of its value) that overrides have set."""
+    """Return the items of run.json's entry `given` (key -> origin of its value) whose values come from overrides."""
     if not isinstance(given, dict):
         return given
     return {key: origin for key, origin in given.items() if str(origin).startswith("override")}

@@ -23,7 +23,7 @@ from rlcli.training.signals import StopRequest
 _log = logging.getLogger(__name__)
 
 STOP_WITH_PARENT = "RLCLI_LEASH"
-"""Environment variable that tells a subprocess to stop when its standard input closes: its parent has ended."""
+"""Environment variable with which a subprocess stops when its standard input closes, as it does if its parent ends."""
 LOG = "train.log"
 """File in a run with the messages of its process."""
 POLL_S = 0.1
@@ -42,7 +42,7 @@ class TrainingProcess:
     """JSON document that the process has printed; empty while it runs."""
 
     def stop(self) -> None:
-        """Request a stop at the next step, with a checkpoint. Later calls do nothing."""
+        """Send SIGTERM once: the training writes a checkpoint and ends. Later calls do nothing."""
         if not self.stop_requested:
             self.stop_requested = True
             with contextlib.suppress(OSError):

@@ -19,11 +19,11 @@ class Threshold:
     """Threshold of the option `--until KEY=X`: mean that an evaluation must reach."""
 
     key: str
-    """success, return or length."""
+    """Metric of the evaluation: success, return or length."""
     value: float
 
     def reached_by(self, row: Mapping[str, Any]) -> bool:
-        """Return whether the evaluation in a row of `metrics.jsonl` reached it; false for a row without evaluation."""
+        """Return whether the evaluation in a row of `metrics.jsonl` reached the threshold; False if there is none."""
         return bool(row.get(_METRICS[self.key], -math.inf) >= self.value)
 
     def is_certain(self, summary: Mapping[str, Any]) -> bool:
@@ -32,7 +32,7 @@ class Threshold:
         return low is not None and low >= self.value
 
     def episodes(self, least: int) -> int:
-        """Return how many evaluation episodes, at least `least`, make the interval narrow enough for the threshold."""
+        """Return a number of evaluation episodes, at least `least`, for which `is_certain` can be true."""
         if self.key != "success":
             return max(least, 2)
         from rlcli.rl.confidence import NORMAL  # it imports numpy
@@ -56,7 +56,7 @@ def read_threshold(text: str) -> Threshold:
     """Parse the value of the option `--until`, such as `success=0.95`.
 
     Raises:
-        UsageError: for a text that `parse_threshold` refuses.
+        UsageError: if the text is not KEY=X with a known metric and an allowed number.
     """
     try:
         return Threshold(*parse_threshold(text))
@@ -80,6 +80,6 @@ def time_to_threshold(rows: Iterable[Mapping[str, Any]], threshold: Threshold) -
 
 
 def median(values: Sequence[float | None]) -> float | None:
-    """Return the median of times over seeds. None, as a value or result, means that the threshold was not reached."""
+    """Return the median of times to the threshold over seeds; None, as a value or result: it was not reached."""
     found = statistics.median([math.inf if value is None else value for value in values])
     return found if math.isfinite(found) else None

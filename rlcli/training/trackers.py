@@ -1,7 +1,7 @@
 """Experiment trackers: Weights & Biases, MLflow and trackio.
 
-Without settings of the user a tracker writes only to this machine. A tracker that fails after its start does not stop a
-training, and a slow one delays only its end, by at most a minute.
+Without settings of the user a tracker writes only to this machine. A tracker that fails after its start does not stop
+the training. A slow tracker delays only the end of the training, by at most a minute.
 """
 
 from __future__ import annotations
@@ -132,9 +132,9 @@ class BackgroundTracker:
 def open_tracker(
     name: str, kind: Callable[..., Tracker], run: Run, config: Mapping[str, Any], resume: tuple[int, int] | None
 ) -> FailSafeLogger:
-    """Open a tracker of a run. A resumed run continues in the tracker, which stores no step twice.
+    """Open a tracker of a run. A resumed run continues in the tracker, and no step is recorded twice.
 
-    `run.json` stores the tracker's identifier of the run, and the last step that the tracker had when the run was
+    `run.json` stores the identifier of the run in the tracker, and the last step that the tracker had when the run was
     resumed.
 
     Args:
@@ -286,7 +286,7 @@ class Trackio(_LibraryRun):
 
 
 class _StoredTracker(FileModel):
-    """Entry of a tracker in run.json: the run's identifier in the tracker, and the last step that it has."""
+    """Entry of a tracker in run.json: identifier of the run in the tracker, and last step that the tracker has."""
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,128}$")]
     step: Annotated[int, Field(ge=0, le=2**53)]

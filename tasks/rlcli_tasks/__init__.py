@@ -1,1 +1,1 @@
-"""Built-in tasks, one folder each."""
+"""The built-in tasks of rlcli: one folder with model, configurations and shipped policies for each robot."""

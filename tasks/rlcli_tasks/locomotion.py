@@ -1,7 +1,7 @@
-"""Base of the direct locomotion tasks: a robot with a torso, joints and feet runs to a far target.
+"""Base class of the direct locomotion tasks: a robot with a torso, joints and feet runs to a far target.
 
-The hooks can also run as a CUDA graph on a GPU: they read no value back, select environments by masks instead of
-indices, write tensors that are kept between steps in place, and create few tensors.
+The methods of the class can also run as a CUDA graph on a GPU: they read no value back, select environments by masks
+instead of indices, write tensors that are kept between steps in place, and create few tensors.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from rlcli.sim.rotations import atan2
 _WRENCH = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 
 HEIGHT, UP, HEADING = 0, 10, 11
-"""Columns of the observation that rewards and terminations read, beside those of the joints."""
+"""Columns of the observation that rewards and terminations read: the torso's height [m], up and heading (cosines)."""
 _JOINTS_FROM = 12
 
 
 def observation_names(joints: tuple[str, ...], feet: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of the columns of the observation."""
+    """Return the names of the columns of the observation, for a robot with these joints and feet."""
     return (
         *("height", "vel_x", "vel_y", "vel_z", "rate_x", "rate_y", "rate_z", "yaw", "roll", "target_angle"),
         *("up", "heading"),
@@ -38,10 +38,14 @@ def observation_names(joints: tuple[str, ...], feet: tuple[str, ...]) -> tuple[s
 
 
 def observation_units(joints: int, feet: int, *, rate: str, joint_rate: str, force: str) -> tuple[str, ...]:
-    """Return the units of the observation's columns, of which some are scaled.
+    """Return the units of the observation's columns, some of which are scaled: with `4 rad/s`, 1 means 4 rad/s.
 
-    `rate` and `joint_rate` are units of the torso's and the joints' angular velocity, such as `4 rad/s`; `force` is
-    the number of N or N m that is observed as 1.
+    Args:
+        joints: number of joints.
+        feet: number of feet.
+        rate: unit of the torso's angular velocity, such as `4 rad/s`.
+        joint_rate: unit of the joints' angular velocities.
+        force: number of N or N m that is observed as 1.
     """
     return (
         *("m", "m/s", "m/s", "m/s", rate, rate, rate, "rad", "rad", "rad", "", ""),
@@ -53,7 +57,7 @@ def observation_units(joints: int, feet: int, *, rate: str, joint_rate: str, for
 
 
 class LocomotionTask(DirectTask):
-    """Base of tasks in which a robot runs towards a target.
+    """Base class of tasks in which a robot runs towards a target.
 
     A subclass defines the joints, their torques and the scales of observations. Its `Params` add
     `termination_height`, `death_reward`, `alive_weight`, `action_cost`, `energy_cost`, `limit_cost` and
@@ -61,7 +65,7 @@ class LocomotionTask(DirectTask):
     """
 
     class Params(StrictModel):
-        """Settings of all locomotion tasks."""
+        """Parameters that all locomotion tasks have, set in the section `params:` of their YAML."""
 
         target: tuple[float, float] = Field((1000.0, 0.0), description="Position of the target: x, y [m].")
         progress_weight: float = Field(1.0, description="Weight of the reward on the speed towards the target [s/m].")
@@ -94,9 +98,9 @@ class LocomotionTask(DirectTask):
         raise NotImplementedError
 
     def at_limits(self, position: Tensor) -> Tensor:
-        """Return each joint's cost near a limit, without the weight `limit_cost`. (n, joints)
+        """Return the cost of each joint near a limit, without the weight `limit_cost`. (num_envs, joints)
 
-        position: joint positions scaled so that -1 and 1 are the limits. (n, joints)
+        position: joint positions scaled so that -1 and 1 are the limits. (num_envs, joints)
         """
         raise NotImplementedError
 
@@ -105,7 +109,7 @@ class LocomotionTask(DirectTask):
         self.robots = scene.add(ArticulationView("robot"))
 
     def post_reset(self) -> None:
-        """Create constants and buffers. The hooks write the buffers in place."""
+        """Create constants, and buffers that the other methods write in place."""
         self.robot = self.env.entities["robot"]
         data, params, n, k = self.robot.data, self.params, self.num_envs, len(self.joints)
         self.joint_pos = slice(_JOINTS_FROM, _JOINTS_FROM + k)
@@ -131,7 +135,7 @@ class LocomotionTask(DirectTask):
         self.seen = torch.cat([torch.zeros(1, 3), torch.eye(3)]).to(self.device).repeat(n, 1, 1)
 
     def reset(self, selection: Selection) -> None:
-        """Set joints near their defaults and within limits, and the torso to its initial pose, at rest."""
+        """Put the torso at its initial pose, at rest, and the joints near their defaults, within their limits."""
         noise = self.params.joint_vel_noise
         shape = (self.num_actions,)
         position = selection.uniform(self.start_low, self.start_high, shape).clamp_(self.low, self.high)
@@ -142,12 +146,12 @@ class LocomotionTask(DirectTask):
         selection.write(self.actions, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Apply torques to the joints."""
+        """Apply the actions as torques of the joints."""
         self.actions.copy_(actions)
         self.robots.set_joint_efforts(self.effort * actions)
 
     def get_observations(self) -> None:
-        """Fill obs_buf."""
+        """Write the observations to `obs_buf`."""
         data = self.robot.data
         velocity, x_axis, y_axis, z_axis = self._in_torso_frame(data.root_quat_w, data.root_lin_vel_w)
         ahead_x, ahead_y, up = x_axis[:, 0], y_axis[:, 0], z_axis[:, 2]  # from the torso's x axis in the world frame
@@ -161,7 +165,7 @@ class LocomotionTask(DirectTask):
             torch.stack([ahead_y, z_axis[:, 1], across], dim=1),  # yaw, roll, target
             torch.stack([ahead_x, up, along], dim=1),
         )
-        # no physics step yet in a new episode: sensor values belong to the old state
+        # before the first physics step of an episode, sensor values belong to the state before the reset: write 0
         felt = (self.progress_buf > 0).mul(self.force_scale)
         torch.cat(
             [
@@ -181,7 +185,10 @@ class LocomotionTask(DirectTask):
         )
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the observations and actions as terms of a manager-based task, by section."""
+        """Return the observations and actions as terms of a manager-based task, by section.
+
+        rlcli uses them where it needs terms, for example to export the policy for a robot.
+        """
         target = (*self.params.target, 0.0)
         scale = dict(zip(self.joints, self.efforts(), strict=True))
         return {
@@ -202,7 +209,7 @@ class LocomotionTask(DirectTask):
         }
 
     def calculate_metrics(self) -> None:
-        """Reward progress, posture and survival, minus costs; a fall replaces the reward by its cost."""
+        """Write the rewards to `rew_buf`: progress, posture and survival, minus costs; `death_reward` for a fall."""
         params, obs, actions = self.params, self.obs_buf, self.actions
         cost = (actions * obs[:, self.joint_vel]).abs_().mul_(self.energy_cost)
         cost.addcmul_(actions, actions, value=params.action_cost)
@@ -215,11 +222,11 @@ class LocomotionTask(DirectTask):
         self.rew_buf.copy_(reward.masked_fill_(self._fallen(), params.death_reward))
 
     def is_done(self) -> None:
-        """Terminate where the torso is too low. The environment adds the time-out."""
+        """Write to `reset_buf` where the torso is too low. The environment adds time-outs."""
         self.reset_buf.copy_(self._fallen())
 
     def _measure_speed(self) -> None:
-        """Compute the speed towards the target: how much the distance decreased over the step.
+        """Compute `speed`, the speed towards the target, from the decrease of the distance in the last step.
 
         |a| - |b| = (a - b) (a + b) / (|a| + |b|), where a - b is the movement in the step. A float32 distance of 1000 m
         is exact to 0.06 mm only, which is 4 mm/s at 60 Hz.
@@ -233,7 +240,7 @@ class LocomotionTask(DirectTask):
         self.distance_before.copy_(self.distance)
 
     def _in_torso_frame(self, quat: Tensor, velocity: Tensor) -> tuple[Tensor, ...]:
-        """Return the torso's velocity and the world's axes in the torso's frame, with one rotation call. (n, 3) each"""
+        """Return the torso's velocity and the world's x, y and z axes, all in the torso's frame. (num_envs, 3) each"""
         self.seen[:, 0].copy_(velocity)
         w, axis = quat[:, None, :1], quat[:, None, 1:]
         turned = torch.linalg.cross(axis, self.seen)

@@ -1,8 +1,11 @@
 """`rlcli eval --compare`: policies in the same episodes."""
 
 import json
+import shutil
 
 import pytest
+
+from rlcli.registry import find_task
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -92,8 +95,8 @@ def test_compare_refuses_tasks_with_different_settings(cli, trained):
     one, other = trained("cartpole"), trained("changed")
     done = cli("eval", "--compare", one, other)
     assert done.code == 3
-    assert "episode_length_s: this setting is 2.0, but 5.0 in" in done.err
-    assert "rewards.alive.weight: this setting is 3.0" in done.err
+    assert "episode_length_s: the value is 2.0 here, but 5.0 in" in done.err
+    assert "rewards.alive.weight: the value is 3.0" in done.err
     assert done.err.count("error: ") == 2
     problems = json.loads(cli("eval", "--compare", one, other, "--json").out)["error"]["problems"]
     assert [problem["path"] for problem in problems] == ["episode_length_s", "rewards.alive.weight"]
@@ -112,6 +115,17 @@ def test_compare_refuses_different_tasks(cli, trained):
     assert done.code == 2
     assert "compare policies of one task" in done.err
     assert "for cartpole-direct" in done.err
+
+
+def test_compare_names_the_origin_of_different_tasks_with_the_same_name(cli, trained, tmp_path):
+    folder = tmp_path / "copy" / "cartpole"
+    shutil.copytree(find_task("cartpole").root, folder, ignore=shutil.ignore_patterns("*.py"))
+    assert cli("train", folder, *SMALL, "--max-iterations", 1, "--runs-dir", tmp_path / "runs").code == 0
+    (run,) = (tmp_path / "runs").glob("*/*")
+    done = cli("eval", "--compare", trained("cartpole"), run)
+    assert done.code == 2
+    assert f"is for cartpole ({find_task('cartpole').distribution})" in done.err
+    assert f"for cartpole ({folder})" in done.err
 
 
 def test_limits_apply_to_the_first_policy(cli, trained):

@@ -89,7 +89,7 @@ def test_regulator_balances_the_cartpoles(name):
 @pytest.mark.parametrize(
     ("overrides", "more", "output"),
     [
-        (["success.slide=null"], "", "defines no success"),
+        (["success.slide=null"], "", "defines no condition of success"),
         (["success.slide.target=1.0"], "", "does not succeed at its default state"),
         (["observations.policy.pos=null"], "", "do not determine the state: slide"),
         (["observations.policy.vel=null", "observations.policy.pos.history=1"], "", "the velocity of slide"),

@@ -163,7 +163,7 @@ def test_task_without_success_uses_the_return(cli, coin):
     assert "SUCCESS" not in done.out
     done = cli(*words[:-3], "body_mass=1:2:2", "--fail-under", "success=0.5")
     assert done.code == 2
-    assert "defines no success" in done.err
+    assert "defines no condition of success" in done.err
 
 
 def test_stress_accepts_run_checkpoint_and_task(cli, only_run):

@@ -254,7 +254,7 @@ def test_parameter_error_names_its_path(tmp_path):
         (["hip_f.", "hip_fr"], r"joint 'hip_fr' is matched twice; narrow the second pattern, 'hip_fr'"),
         (["hip_f", "hip_fl"], r"no joint matches 'hip_f'; did you mean 'hip_f"),
         (["knee.*"], r"no joint matches 'knee.\*'.*joints: hip_fl, hip_fr, hip_bl, hip_br"),
-        (["hip_("], r"'hip_\(' is neither a joint nor a regular expression"),
+        (["hip_("], r"'hip_\(' is neither the name of a joint nor a regular expression"),
         (["root"], r"no joint matches 'root'"),
     ],
 )

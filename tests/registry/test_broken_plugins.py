@@ -239,20 +239,20 @@ def test_probe_of_many_hanging_plugins_takes_little_more_than_one(plugins):
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "message"),
     [
-        "torch.set_default_dtype(torch.float64)",
-        "torch.set_default_dtype(torch.float16)",
-        "torch.set_default_device('meta')",
-        "torch.set_grad_enabled(False)",
+        ("torch.set_default_dtype(torch.float64)", "default dtype from torch.float32 to torch.float64"),
+        ("torch.set_default_dtype(torch.float16)", "default dtype from torch.float32 to torch.float16"),
+        ("torch.set_default_device('meta')", "default device from cpu to meta"),
+        ("torch.set_grad_enabled(False)", "gradient mode from True to False"),
     ],
 )
-def test_plugin_that_changes_settings_of_torch_changes_no_training(plugins, command, change):
+def test_plugin_that_changes_settings_of_torch_changes_no_training(plugins, command, change, message):
     from support.broken_plugins import FILES, SPEC
 
     plugins("sets", f"import torch\n{change}\n{SPEC}", files=FILES)
     done = command("train", "sets-task", "--num-envs", "2", "--max-iterations", "1", "--logger", "none", "--json")
-    assert "has changed torch's default type, default device or gradient mode; rlcli has restored it" in done.stderr
+    assert f"imported code has changed torch's {message}; rlcli has restored it" in done.stderr
     assert document(done)["state"] == "finished"
     assert (torch.get_default_dtype(), str(torch.get_default_device())) == (torch.float32, "cpu")
     assert torch.is_grad_enabled()

@@ -14,7 +14,7 @@ from rlcli_isaaclab.format import LIBRARIES
 
 _REASONS = {
     "pink": ("Pink inverse kinematics needs Pinocchio", "use DifferentialInverseKinematicsActionCfg"),
-    "pinocchio": ("it needs Pinocchio", "use DifferentialInverseKinematicsActionCfg"),
+    "pinocchio": ("rlcli does not use Pinocchio", "use DifferentialInverseKinematicsActionCfg"),
     "rmp": ("RMPflow is a part of Isaac Sim", "use DifferentialInverseKinematicsActionCfg"),
     "surface_gripper": ("a suction gripper has no counterpart in plain MuJoCo", "use a gripper with joints"),
     "devices": ("devices for teleoperation belong to Isaac Sim", "rlcli trains policies: remove the use of the device"),
@@ -44,7 +44,7 @@ _REASONS = {
 
 
 def reason_of(name: str) -> tuple[str, str]:
-    """Return (why rlcli does not have a name of Isaac Lab or Isaac Sim, what to do instead)."""
+    """Return the reason why rlcli does not have a name of Isaac Lab or Isaac Sim, and a hint what to do instead."""
     top = name.partition(".")[0]
     library = "trimesh" if top == "trimesh" else LIBRARIES.get(top)
     if library is not None:
@@ -52,12 +52,15 @@ def reason_of(name: str) -> tuple[str, str]:
     words = name.lower()
     return next(
         (texts for part, texts in _REASONS.items() if part in words),
-        ("plain MuJoCo and rlcli have no counterpart", "docs/guides/isaac-lab.md lists what can be used"),
+        ("plain MuJoCo and rlcli have no counterpart", "docs/guides/isaac-lab.md lists the names that can be used"),
     )
 
 
 def absence(name: str, hint: str | None = None) -> TaskError:
-    """Return the error for the use of a name that rlcli does not have; `hint` replaces the usual hint."""
+    """Return the error for using a name of Isaac Lab or Isaac Sim that rlcli does not have.
+
+    `hint` replaces the usual hint, that of `reason_of`.
+    """
     reason, usual = reason_of(name)
     return TaskError(f"{user_place()}{name} cannot be used: {reason}", hint=hint or usual)
 
@@ -85,9 +88,9 @@ def place_of(error: BaseException) -> str:
 
 
 class _AbsentMeta(type):
-    """Metaclass of the stand-ins for classes that rlcli does not have.
+    """Metaclass of the stand-ins for classes of Isaac Lab that rlcli does not have.
 
-    Attributes of a stand-in are `AbsentValue`s. Creating an object of a user's subclass raises an error.
+    The attributes of a stand-in are `AbsentValue`s. A task may subclass it, but not create objects of the subclass.
     """
 
     def __getattr__(cls, name: str) -> Any:
@@ -102,7 +105,10 @@ class _AbsentMeta(type):
 
 
 class AbsentValue:
-    """A constant or function that rlcli does not have. It can be copied, stored and passed on, but not called."""
+    """Stand-in for a constant or function of Isaac Lab that rlcli does not have.
+
+    Code may copy it, store it, pass it to functions and read its attributes; calling it raises a TaskError.
+    """
 
     absent_name: str
     imported_at: str
@@ -137,7 +143,7 @@ class AbsentValue:
     __ror__ = __add__ = __radd__ = __or__
 
     def __call__(self, *args: Any, **settings: Any) -> Any:
-        """Raise TaskError: rlcli does not have this name."""
+        """Raise TaskError: rlcli does not have the class or function that this object replaces."""
         raise absence(self.absent_name)
 
     def __repr__(self) -> str:
@@ -145,7 +151,7 @@ class AbsentValue:
 
 
 class AbsentModule(ModuleType):
-    """A module of Isaac Sim. Any name can be imported from it; its use raises an error."""
+    """Stand-in for a module of Isaac Sim. Any name can be imported from it; using the name raises an error."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -165,13 +171,13 @@ class AbsentModule(ModuleType):
         return module_of(f"{self.__name__}.{name}", "")
 
     def __call__(self, *args: Any, **settings: Any) -> Any:
-        """Raise TaskError: rlcli does not have this name."""
+        """Raise TaskError: rlcli does not have the class or function that this object replaces."""
         raise absence(self.__name__)
 
 
 @functools.cache
 def absent_module(name: str) -> AbsentModule:
-    """Return the stand-in of a module."""
+    """Return an object that replaces a module of Isaac Lab or Isaac Sim that rlcli does not have."""
     module = AbsentModule(name)
     module.__path__ = []
     return module
@@ -183,17 +189,17 @@ def absent_class(name: str) -> type:
 
 
 def absent_value(name: str) -> AbsentValue:
-    """Return the stand-in of a constant."""
+    """Return an object that replaces a constant of Isaac Lab that rlcli does not have."""
     return AbsentValue(name)
 
 
 def absent_function(name: str) -> AbsentValue:
-    """Return the stand-in of a function."""
+    """Return an object that replaces a function of Isaac Lab that rlcli does not have."""
     return AbsentValue(name)
 
 
 class _NoSettings:
-    """Settings of Isaac Sim's application: none is set."""
+    """Stand-in for the settings of Isaac Sim's application; all are unset."""
 
     def get(self, name: str) -> None:
         """Return None."""
@@ -206,7 +212,7 @@ class _NoSettings:
 
 
 class NoEffect:
-    """A USD prim, or a part of one, that only changes how a scene looks: every call does nothing."""
+    """Stand-in for a USD prim that only changes the appearance of a scene, or for a part of one: calls do nothing."""
 
     def __init__(self, name: str) -> None:
         self._name = name

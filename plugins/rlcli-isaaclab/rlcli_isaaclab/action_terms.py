@@ -1,4 +1,4 @@
-"""Action classes with Isaac Lab's interface: bases of the user's own classes, and actions that `rlcli.mdp` lacks."""
+"""Action classes with Isaac Lab's interface: base classes of user actions, and actions that `rlcli.mdp` lacks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ _OWN = "rlcli_isaaclab"
 
 
 class AffineActionTerm(ActionTerm):
-    """Base of actions clip(raw x scale + offset). Scale and offset are numbers, or mappings from regexes of names."""
+    """Base class of actions of the form clip(action x scale + offset).
+
+    scale, offset: a number, or a mapping from regular expressions of element names to numbers.
+    """
 
     def __init__(self, cfg: Any, env: Any, names: list[str]) -> None:
         super().__init__(cfg, env)
@@ -33,9 +36,9 @@ class AffineActionTerm(ActionTerm):
         self._clip = torch.stack([low, high], dim=-1)
 
     def _by_name(self, value: Any, default: float) -> Tensor:
-        """Return a number, or a mapping from regexes of names, as one value per column of the action. (num_envs, k)
+        """Return one value for each column of the action, from a number or a mapping. (num_envs, k)
 
-        `default` is the value of names that no regex matches.
+        A mapping goes from regular expressions of element names to numbers; `default` is for names that none matches.
         """
         if isinstance(value, Mapping):
             found = match_values(value, self._names, "element") if value else [None] * len(self._names)
@@ -71,7 +74,10 @@ class AffineActionTerm(ActionTerm):
 
 
 class JointAction(AffineActionTerm):
-    """Base of actions on joints, for the user's subclasses. Isaac Lab's own classes become rlcli's built-in actions."""
+    """Base class of actions on joints, for the user's subclasses.
+
+    An action class of Isaac Lab itself is replaced by rlcli's built-in action instead.
+    """
 
     def __init__(self, cfg: Any, env: Any) -> None:
         asset = env.scene[cfg.asset_name]
@@ -81,7 +87,7 @@ class JointAction(AffineActionTerm):
 
 
 class JointPositionAction(JointAction):
-    """Position targets of joints [m or rad]."""
+    """Action whose columns are position targets of joints, after scale and offset [m or rad]."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -108,7 +114,7 @@ class RelativeJointPositionAction(JointAction):
 
 
 class JointVelocityAction(JointAction):
-    """Velocity targets of joints [m/s or rad/s]."""
+    """Action whose columns are velocity targets of joints, after scale and offset [m/s or rad/s]."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -121,7 +127,7 @@ class JointVelocityAction(JointAction):
 
 
 class JointEffortAction(JointAction):
-    """Efforts of joints [N or N m]."""
+    """Action whose columns are efforts of joint motors, after scale and offset [N or N m]."""
 
     def apply_actions(self) -> None:
         """Write the efforts of the joints."""
@@ -148,11 +154,17 @@ class ThrustAction(AffineActionTerm):
 _LAB_ACTIONS: dict[str, type[ActionTerm]] = {
     kind.__name__: kind for kind in (OperationalSpaceControllerAction, RelativeJointPositionAction, ThrustAction)
 }
-"""Isaac Lab's class -> the class of this package that replaces it; rlcli's own actions run only once per step."""
+"""Name of an action class of Isaac Lab -> class of this package that replaces it, because it acts in each physics step.
+
+rlcli's built-in actions act only once per environment step.
+"""
 
 
 def find_action(class_type: Any) -> type[ActionTerm] | None:
-    """Return the class to create for an action: the user's or this package's; None: look for a built-in action."""
+    """Return the class that runs an action: the user's own or one of this package; None: a built-in action of rlcli.
+
+    `class_type` is the action's `class_type` in its configuration.
+    """
     name = class_type.rpartition(":")[2].rpartition(".")[2] if isinstance(class_type, str) else ""
     if name in _LAB_ACTIONS:
         return _LAB_ACTIONS[name]
@@ -163,7 +175,10 @@ def find_action(class_type: Any) -> type[ActionTerm] | None:
 
 
 def driven_by(action: type[ActionTerm] | None) -> str | None:
-    """Return what an action class commands to the joints: motor (it sets efforts), velocity, or None (neither)."""
+    """Return the kind of commands that an action class sends to joints, by its source code.
+
+    It is motor for efforts, velocity for velocities; None: neither.
+    """
     if action is None:
         return None
     kinds = [kind for kind in action.__mro__ if issubclass(kind, ActionTerm) and kind is not ActionTerm]

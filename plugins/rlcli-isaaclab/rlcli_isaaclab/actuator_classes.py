@@ -1,4 +1,4 @@
-"""Actuator models that compute joint efforts, as classes that a task may subclass. Names as in `isaaclab.actuators`."""
+"""Actuator models that compute joint efforts; a task may subclass them. Names as in `isaaclab.actuators`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rlcli_isaaclab.utils.types import ArticulationActions
 
 
 class ActuatorBase:
-    """An actuator model of some joints of a robot, in every environment."""
+    """Base class of actuator models, each for some joints of a robot in every environment."""
 
     is_implicit_model = False
 
@@ -26,7 +26,7 @@ class ActuatorBase:
         device: Any,
         **defaults: Any,
     ) -> None:
-        """Read the settings; `defaults` are the values of settings that the configuration leaves open."""
+        """Read the settings; `defaults` has values for settings that are None in the configuration."""
         self.cfg = cfg
         self.joint_names, self.joint_indices, self.num_joints = joint_names, joint_ids, len(joint_names)
         self._joint_names, self._joint_indices = joint_names, joint_ids
@@ -48,16 +48,22 @@ class ActuatorBase:
         """Reset the actuator's state in some environments."""
 
     def compute(self, control_action: ArticulationActions, joint_pos: Tensor, joint_vel: Tensor) -> ArticulationActions:
-        """Return the targets of the joints with the efforts for the next physics step."""
+        """Return the efforts for the next physics step, in a copy of the joints' targets (`control_action`).
+
+        `joint_pos` and `joint_vel` are the state of the actuator's joints. (num_envs, joints)
+        """
         raise NotImplementedError(f"class {type(self).__name__} has no method compute; implement it")
 
     def _parse_joint_parameter(self, cfg_value: Any, default_value: Any) -> Tensor:
-        """Return a setting of every joint: a number, a mapping from regexes, or the default. (num_envs, joints)"""
+        """Return the value of a setting for every joint. (num_envs, joints)
+
+        `cfg_value` is a number or a mapping from regular expressions of joint names; None: `default_value`.
+        """
         value = default_value if cfg_value is None else cfg_value
         if value is None:
             raise ValueError(
-                f"actuator class {type(self).__name__}: a setting such as stiffness and the default that"
-                " _parse_joint_parameter received for it are both None; give one of them a number"
+                f"actuator class {type(self).__name__}: _parse_joint_parameter received neither a value nor a default"
+                " for a setting such as stiffness; give one of them a number"
             )
         found = torch.zeros(self._num_envs, self.num_joints, device=self._device)
         if isinstance(value, dict):
@@ -126,7 +132,7 @@ class DCMotor(IdealPDActuator):
 
 
 class DelayedPDActuator(IdealPDActuator):
-    """A PD controller whose targets arrive some physics steps late, by a lag that each episode draws."""
+    """A PD controller whose targets are delayed by some physics steps; the delay is drawn for each episode."""
 
     def __init__(self, cfg: Any, *args: Any, **defaults: Any) -> None:
         super().__init__(cfg, *args, **defaults)
@@ -134,7 +140,7 @@ class DelayedPDActuator(IdealPDActuator):
         self._delayed_positions, self._delayed_velocities, self._delayed_efforts = delays
 
     def reset(self, env_ids: Any) -> None:
-        """Draw the lags of new episodes."""
+        """Draw the delays of new episodes."""
         rows = torch.arange(self._num_envs, device=self._device)[slice(None) if env_ids is None else env_ids]
         lags = torch.randint(self.cfg.min_delay, self.cfg.max_delay + 1, (len(rows),), device=self._device)
         for delay in (self._delayed_positions, self._delayed_velocities, self._delayed_efforts):

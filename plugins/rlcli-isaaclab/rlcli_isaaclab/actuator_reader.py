@@ -1,4 +1,8 @@
-"""Reader of Isaac Lab's actuators: implicit ones become joint settings, explicit ones actuator models."""
+"""Reader of Isaac Lab's actuators, which become settings of rlcli's scene.
+
+Implicit actuators, which the simulator computes, become joint settings; explicit ones, which Isaac Lab computes in
+Python, become actuator models.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,10 @@ _EXPLICIT = ("IdealPDActuator", "DCMotor", "DelayedPDActuator", "RemotizedPDActu
 _NETWORKS = ("ActuatorNetLSTM", "ActuatorNetMLP")
 
 JointSettings = list[tuple[str, dict[str, Any], list[str]]]
-"""(regex of joints, settings, regexes of all joints of the group); later entries override earlier ones."""
+"""List of (regular expression of joint names, settings, regular expressions of all joints of the actuator group).
+
+Later entries override earlier ones.
+"""
 
 
 def read_actuators(
@@ -23,11 +30,11 @@ def read_actuators(
     replaced: Mapping[str, Mapping[str, float]],
     own: dict[tuple[str, str], Mapping[str, Any]],
 ) -> tuple[JointSettings, dict[str, Any]]:
-    """Return the settings of the joints, and the explicit actuator models by group.
+    """Return (settings of the joints, name of an actuator group -> its explicit actuator model).
 
     Args:
-        actuators: groups of actuators.
-        order_joints: returns the names or regexes of a group's joints in the model's order.
+        actuators: the groups of actuators, `actuators` of an `ArticulationCfg`.
+        order_joints: function that returns the names or regular expressions of a group's joints in the model's order.
         entity: name of the entity, for messages.
         replaced: group -> gains of the PD controller that replaces its actuator network.
         own: filled with (entity, group) -> settings, for each group whose actuator class is the user's own.
@@ -47,7 +54,7 @@ def read_actuators(
             "viscous_friction": item.get("viscous_friction"),
         }
         if item.get("dynamic_friction") != item.get("friction"):
-            item.note("ignored", "dynamic_friction", "MuJoCo has one dry friction; `friction` sets it")
+            item.note("ignored", "dynamic_friction", "MuJoCo's joints have a single dry friction; `friction` sets it")
         gains = {"stiffness": item.get("stiffness"), "damping": item.get("damping")}
         if kind == "ImplicitActuator":
             settings = {**gains, **passive, **_read_implicit_limits(item)}
@@ -101,7 +108,10 @@ _NO_SPEED_LIMIT = "terms read it; MuJoCo's joints have no speed limit"
 
 
 def _read_implicit_limits(item: Node) -> dict[str, Any]:
-    """Return the limits of an implicit actuator. As in Isaac Lab, a `velocity_limit` alone has no effect."""
+    """Return `effort_limit` and `velocity_limit` of an implicit actuator.
+
+    As in Isaac Lab, only `velocity_limit_sim` sets the latter; `velocity_limit` alone has no effect.
+    """
     for key in ("effort_limit", "velocity_limit"):
         old, new = item.get(key), item.get(f"{key}_sim")
         if old is not None and new is not None and old != new:
@@ -127,7 +137,7 @@ def _speed_limit(item: Node) -> Any:
 def _read_explicit_actuator(
     item: Node, kind: str, joints: Any, gains: Mapping[str, Any], effort_limit: Any
 ) -> dict[str, Any]:
-    """Return an actuator model; rlcli computes its effort before each physics step."""
+    """Return the settings of an actuator model, whose effort rlcli computes before each physics step."""
     config = {"joints": joints, "kind": "dc_motor" if kind == "DCMotor" else "pd"}
     config |= {key: value for key, value in gains.items() if value is not None}
     of_solver = item.get("effort_limit_sim")
@@ -149,9 +159,9 @@ def _read_explicit_actuator(
 
 
 def settings_of(joint: str, settings: JointSettings) -> dict[str, Any]:
-    """Return the settings of one joint, where later entries override earlier ones.
+    """Return the settings of one joint; later entries override earlier ones.
 
-    A regex counts only for the joints of its group.
+    A regular expression matches only joints of its own actuator group.
     """
     found: dict[str, Any] = {}
     for pattern, values, group in settings:
@@ -163,12 +173,12 @@ def settings_of(joint: str, settings: JointSettings) -> dict[str, Any]:
 def merge_joint_settings(
     settings: JointSettings, model: Mapping[str, Any], driven: Mapping[str, str], name: str, report: Report
 ) -> dict[str, Any]:
-    """Return the key `joints` of one entity in rlcli's scene, without values that its MJCF already has.
+    """Return the content of the key `joints` of an entity in rlcli's scene, without values that its MJCF already has.
 
     Args:
         settings: settings of the joints, from `read_actuators`.
         model: names and values of the entity's MJCF, from `SceneReader`.
-        driven: joint -> what an action commands: effort, velocity or position.
+        driven: joint -> the quantity that an action sets: effort, motor, velocity or position.
         name: name of the entity.
         report: receives what is approximated.
     """
@@ -205,9 +215,9 @@ def _joint_config(
     """Return rlcli's settings of a joint.
 
     Args:
-        values: settings of its implicit actuator, or the passive ones (armature, friction) of an explicit one.
-        command: what an action commands: effort, motor (an effort by the task's own code), velocity, position or,
-            without an action, nothing.
+        values: settings of the joint's implicit actuator; for an explicit actuator only armature and friction.
+        command: kind of an action's commands: effort, motor (efforts from the task's own code), velocity or position;
+            empty: no action drives the joint.
         has_actuator: whether an action or an actuator of the MJCF drives the joint.
         key: key of the joint in the report.
         report: receives what is approximated.
@@ -233,7 +243,7 @@ def _joint_config(
 
 
 _LAST_KEYS = ("damping", "armature", "friction_loss", "effort_limit", "velocity_limit")
-"""Keys that follow the actuator's own keys in the file."""
+"""Keys that are written after the other keys of a joint."""
 
 
 def _rank(key: str) -> int:

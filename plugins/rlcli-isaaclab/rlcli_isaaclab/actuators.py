@@ -9,7 +9,10 @@ from rlcli_isaaclab.config_class import MISSING, config_subclass, configclass
 
 @configclass
 class ActuatorBaseCfg:
-    """Settings of all actuators. A number applies to all joints, a mapping to the joints that its regexes match."""
+    """Settings of all kinds of actuators.
+
+    A number applies to all joints; a mapping goes from regular expressions of joint names to numbers.
+    """
 
     class_type: Any = "ActuatorBase"
     joint_names_expr: Any = MISSING

@@ -1,4 +1,4 @@
-"""Reader of agents in YAML files of rl_games, skrl and Stable-Baselines3: returns settings of the trainer `ppo`."""
+"""Reader of agents in YAML files of rl_games, skrl and Stable-Baselines3, as settings of the trainer `ppo`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from rlcli_isaaclab.settings import Node, Report
 
 
 def read_agent(file: Path, library: str, notes: list[Note]) -> dict[str, Any] | None:
-    """Return the settings of an agent file; None if its library is not read. Append what is not mapped to `notes`.
+    """Return the settings of `ppo` for an agent file; None if files of `library` cannot be read.
+
+    Keys that are not translated exactly are appended to `notes`.
 
     Raises:
         ConfigError: if the file cannot be read, or rlcli has no counterpart of the agent.
@@ -47,7 +49,7 @@ def read_agent(file: Path, library: str, notes: list[Note]) -> dict[str, Any] | 
 
 
 def _line(node: yaml.Node, path: str) -> int:
-    """Return the line of a key, `a.b.c`, below a node; of a key that does not exist, the line of the key above it."""
+    """Return the line of the key `a.b.c` below a YAML node; if there is no such key, the line of its parent."""
     line = node.start_mark.line + 1
     for part in path.split("."):
         pairs = node.value if isinstance(node, yaml.MappingNode) else []
@@ -63,7 +65,7 @@ def _text(note: Note) -> tuple[Any, ...]:
 
 
 def _numbers(value: Any) -> Any:
-    """Return text such as `1e-4`, which YAML 1.1 does not read as a number, as a number."""
+    """Return data with numbers in place of strings such as `1e-4`, which PyYAML does not read as numbers."""
     if isinstance(value, dict):
         return {str(key): _numbers(item) for key, item in value.items()}
     if isinstance(value, list):
@@ -80,7 +82,7 @@ _WITHOUT_EFFECT = {*WITHOUT_EFFECT, "load_checkpoint", "load_path", "regularizer
 
 
 class _ReportSink:
-    """Receiver of what `RlGamesReader` finds: `data` has the agent's settings, `report` notes and mistakes."""
+    """Receiver of the results of `RlGamesReader`: settings of the agent in `data`, notes and mistakes in `report`."""
 
     def __init__(self, report: Report) -> None:
         self.report = report
@@ -107,18 +109,18 @@ def _read_rl_games(top: Node) -> dict[str, Any]:
     return sink.data
 
 
-_SEPARATE = "actor and critic are always separate networks"
+_SEPARATE = "rlcli cannot share layers between actor and critic: each has a network of its own"
 
 
 def _mark_false(node: Node, key: str, why: str) -> None:
-    """Report a key as approximated if its value is false: rlcli always behaves as if it were true."""
+    """Report a key as approximated if its value is false, because rlcli always behaves as if the value were true."""
     if node.data.get(key) is False:
         node.report.entries[(*node.key, key)] = ("approximated", why)
 
 
 def _no_counterpart(value: object, why: str = "") -> str:
-    """Return the message for a value of a setting that rlcli does not have, or for a missing value."""
-    return "it has no value" if value is None else f"'{value}' has no counterpart in rlcli{why}"
+    """Return the message for a setting whose value rlcli cannot represent, or which has no value."""
+    return "the key has no value" if value is None else f"'{value}' has no counterpart in rlcli{why}"
 
 
 def _cnn(layers: list[tuple[int, int, int]]) -> dict[str, Any]:
@@ -182,7 +184,7 @@ def _read_skrl(top: Node) -> dict[str, Any]:
 
 
 def _skrl_network(model: Node) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the settings of the MLP and of the CNN (empty without one) of one of skrl's models."""
+    """Return (settings of the MLP, settings of the CNN or {}) for one of skrl's models, such as `policy`."""
     hidden: list[int] = []
     convolutions: list[tuple[int, int, int]] = []
     activation = "elu"

@@ -1,4 +1,4 @@
-"""Commands of a task to a robot or object: joint targets, forces on bodies, and calls of `root_physx_view`."""
+"""Writes of a task to a robot or object: joint targets, forces on bodies, and calls of `root_physx_view`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rlcli_isaaclab.utils.math import skew_symmetric_matrix
 
 
 class JointDrive:
-    """Targets of one kind (motor, position or velocity) of the joints that have such an actuator."""
+    """Writer of targets of one kind (motor, position or velocity) to the joints that have such an actuator."""
 
     def __init__(self, env: VecEnv, entity: Entity, kind: str) -> None:
         count = len(entity.joint_names)
@@ -79,7 +79,7 @@ class BodyWrench:
         return self._local
 
     def start(self) -> None:
-        """Let the environment call `apply` before each physics step, unless the task's own code does."""
+        """Make the environment call `apply` before each physics step, unless the task's own code calls it."""
         if not self.is_applied:
             self.is_applied = True
             _WrenchSteps(self._env, f"forces on {self._entity.name}", self)
@@ -203,7 +203,7 @@ class PhysxView:
         """
         if self._env.engine.model.body_simple[self._entity.body_ids].any():
             hint = "call it in the file of an event's function: rlcli prepares the model if it finds the call there"
-            what = "root_physx_view.set_coms cannot be used here: the model has fixed centres of mass"
+            what = "root_physx_view.set_coms cannot be used here: the model was compiled for fixed centres of mass"
             raise TaskError(what, hint=hint)
         self._write_model("body_ipos", coms[..., :3], indices)
         self._write_model("body_iquat", coms[..., 3:].roll(1, dims=-1), indices)
@@ -216,32 +216,32 @@ class PhysxView:
         return [[f"{path}/{name}" for name in names] for path in start]
 
     def create_rigid_body_view(self, path: str) -> SimpleNamespace:
-        """Return the number of geoms, `max_shapes`, of the body at the end of a path. (`asset._physics_sim_view`)"""
+        """Return an object with the attribute `max_shapes`: number of geoms of the body at the end of a path."""
         names = list(self._entity.names["Bodies"])
         body = self._entity.body_ids[names.index(path.rpartition("/")[2])]
         return SimpleNamespace(max_shapes=int(self._env.engine.model.body_geomnum[int(body)]))
 
     @property
     def max_shapes(self) -> int:
-        """Number of geoms."""
+        """Number of collision shapes (geoms) of the asset."""
         return len(self._entity.ids["Geoms"])
 
     def get_material_properties(self) -> Tensor:
-        """Return static and dynamic friction, which are equal, and restitution 0 of each geom. (num_envs, geoms, 3)"""
+        """Return static friction, dynamic friction (equal) and restitution (0) of each geom. (num_envs, geoms, 3)"""
         friction = self._model_values("geom_friction", "Geoms")[..., 0]
         return torch.stack([friction, friction, torch.zeros_like(friction)], dim=-1)
 
     def set_material_properties(self, materials: Tensor, indices: Any) -> None:
         """Set the dynamic friction (column 1) of the geoms of some environments. materials (num_envs, geoms, 3)"""
         if bool(materials[..., 2].any()) or not torch.equal(materials[..., 0], materials[..., 1]):
-            report_once("root_physx_view.set_material_properties: MuJoCo has one friction, the dynamic one, and no"
-                        " restitution")  # fmt: skip
+            report_once("root_physx_view.set_material_properties: only the dynamic friction is set; MuJoCo has no"
+                        " static friction and no restitution")  # fmt: skip
         friction = self._model_values("geom_friction", "Geoms")
         friction[..., 0] = materials[..., 1].cpu()
         self._write_model("geom_friction", friction, indices, "Geoms")
 
     def get_dof_limits(self) -> Tensor:
-        """Return position limits of the joints. (num_envs, joints, 2) [m or rad]"""
+        """Return lower and upper position limits of the joints. (num_envs, joints, 2) [m or rad]"""
         limits = self._entity.data.joint_pos_limits
         return limits.expand(self._env.num_envs, *limits.shape[-2:]).clone()
 
@@ -265,7 +265,7 @@ class PhysxView:
         return torch.stack([jacobian(positions[:, i + 1]) for i, jacobian in enumerate(self._jacobians)], dim=1)
 
     def get_generalized_mass_matrices(self) -> Tensor:
-        """Return the inertia of the joints. (num_envs, joints, joints) [kg, kg m^2]"""
+        """Return the mass matrix of the asset in joint coordinates. (num_envs, joints, joints) [kg or kg m^2]"""
         inertia, motion = self._composite_inertia(), self._motion()
         forces = (inertia @ motion[..., None])[..., 0]
         matrix = torch.einsum("eid,ejd->eij", forces, motion) * self._is_below

@@ -52,7 +52,7 @@ class RigidObjectCfg(AssetBaseCfg):
 
 @configclass
 class ArticulationCfg(AssetBaseCfg):
-    """Configuration of a robot."""
+    """Configuration of a robot or another asset with joints and actuators."""
 
     @configclass
     class InitialStateCfg(RigidObjectCfg.InitialStateCfg):

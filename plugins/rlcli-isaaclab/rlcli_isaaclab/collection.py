@@ -17,7 +17,7 @@ def entity_name(collection: str, item: str) -> str:
 
 
 class CollectionData:
-    """State of a collection: `object_X` is the attribute `root_X` of each object. (num_envs, objects, ...)"""
+    """State of a collection: `object_X` has the attribute `root_X` of all its objects. (num_envs, objects, ...)"""
 
     def __init__(self, objects: list[Asset]) -> None:
         self._objects = objects
@@ -30,7 +30,7 @@ class CollectionData:
 
 
 class RigidObjectCollection:
-    """Several rigid objects under one name."""
+    """Collection of rigid objects: one asset that reads and writes several objects at once."""
 
     def __init__(self, cfg: Any, objects: dict[str, Asset]) -> None:
         self.cfg, self.object_names = cfg, list(objects)
@@ -50,7 +50,7 @@ class RigidObjectCollection:
         self.write_object_velocity_to_sim(object_state[..., 7:], env_ids, object_ids)
 
     def write_object_pose_to_sim(self, object_pose: Tensor, env_ids: Any = None, object_ids: Any = None) -> None:
-        """Set positions [m] and quaternions (w, x, y, z), world frame. (rows, objects, 7)"""
+        """Set the poses of objects: positions [m] and quaternions (w, x, y, z), world frame. (rows, objects, 7)"""
         for item, values in self._each(object_pose, object_ids):
             item.write_root_pose_to_sim(values, env_ids)
 
@@ -66,7 +66,10 @@ class RigidObjectCollection:
     )  # fmt: skip
 
     def _each(self, values: Tensor, object_ids: Any) -> list[tuple[Asset, Tensor]]:
-        """Return (object, its values) of each object; `values` may lack the dimension of environments."""
+        """Return (object, values of the object) for each object of `object_ids`; None: all objects.
+
+        `values` is (rows, objects, ...); without the first dimension, they are for all environments.
+        """
         values = values if values.dim() == 3 else values[None]
         ids = list(range(self.num_objects))
         if object_ids is not None and not isinstance(object_ids, slice):

@@ -22,7 +22,7 @@ def import_run(
         typer.Option("--model", metavar="ENTITY=FILE", help="MJCF model of a robot or object; repeatable."),
     ] = None,
 ) -> Imported:
-    """Import the settings of an Isaac Lab run. These are its env.yaml and agent.yaml.
+    """Import the task and the agent of an Isaac Lab run, from its files env.yaml and agent.yaml.
 
     Examples:
         rlcli import isaaclab env.yaml agent.yaml --model robot=robot.xml

@@ -1,6 +1,6 @@
-"""Command classes with Isaac Lab's interface, for the user's subclasses and for code that reads their attributes.
+"""Command classes with Isaac Lab's interface, for the user's subclasses and for terms that read their attributes.
 
-Elsewhere Isaac Lab's own commands become rlcli's built-in commands.
+Otherwise a command of Isaac Lab is replaced by rlcli's built-in command.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rlcli_isaaclab.utils.math import (
 
 
 class _RobotCommand(CommandTerm):
-    """Base of commands to one robot."""
+    """Base class of commands for one robot."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -53,7 +53,7 @@ class UniformVelocityCommand(_RobotCommand):
 
     @property
     def command(self) -> Tensor:
-        """Velocity. (num_envs, 3)"""
+        """Commanded velocities: forwards, to the left [m/s], and yaw rate [rad/s]. (num_envs, 3)"""
         return self.vel_command_b
 
     def _update_metrics(self) -> None:
@@ -111,7 +111,7 @@ class UniformPoseCommand(_RobotCommand):
 
     @property
     def command(self) -> Tensor:
-        """Position [m] and quaternion (w, x, y, z). (num_envs, 7)"""
+        """Commanded position [m] and quaternion (w, x, y, z), in the robot's root frame. (num_envs, 7)"""
         return self.pose_command_b
 
     def _update_metrics(self) -> None:
@@ -141,7 +141,7 @@ class UniformPose2dCommand(_RobotCommand):
 
     @property
     def command(self) -> Tensor:
-        """Position [m] and heading [rad]. (num_envs, 4)"""
+        """Vector to the commanded position [m], and angle to the heading [rad], in the root frame. (num_envs, 4)"""
         return torch.cat([self.pos_command_b, self.heading_command_b[:, None]], dim=1)
 
     def _update_metrics(self) -> None:

@@ -9,14 +9,14 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, dataclass_transform
 
 MISSING: Any = dataclasses.MISSING
-"""Marks a value that the user must set."""
+"""Value of a setting that the user must set."""
 
 T = TypeVar("T")
 
 
 @dataclass_transform()
 def configclass(cls: type[T]) -> type[T]:
-    """Turn a class into a class of settings: its members are all names except methods and nested classes."""
+    """Turn a class into a dataclass: all names except methods and nested classes become fields."""
     own = inspect.get_annotations(cls)
     assigned = [name for name, value in vars(cls).items() if name in own or _is_setting(cls, name, value)]
     if hasattr(cls, "__settings__"):  # a subclass of a class that takes any settings (sim.py)
@@ -37,11 +37,11 @@ def configclass(cls: type[T]) -> type[T]:
 
 
 def _post_init(self: Any) -> None:
-    """Do nothing: a subclass can always call `super().__post_init__()`."""
+    """Do nothing; the method exists so that a subclass can call `super().__post_init__()`."""
 
 
 def make_config_class(name: str, doc: str, bases: tuple[type, ...] = (), **members: Any) -> Any:
-    """Return a new configuration class with default values, for tables of classes that differ only in their members."""
+    """Return a new configuration class; `members` are its fields with their defaults, `doc` its docstring."""
     module = bases[0].__module__ if bases else __name__
     return configclass(type(name, bases, {"__doc__": doc, "__module__": module, "__annotations__": {}, **members}))
 
@@ -52,12 +52,12 @@ def config_subclass(class_type: str, doc: str, base: type, **members: Any) -> An
 
 
 def is_missing(value: Any) -> bool:
-    """Return whether a value has not been set. Copies of MISSING count too."""
+    """Return whether a value is MISSING or a copy of it, so that the user must set it."""
     return isinstance(value, type(MISSING))
 
 
 def fill_missing(cfg: Any, values: Mapping[tuple[str, ...], Any]) -> list[tuple[str, ...]]:
-    """Set those settings that are missing and have a value in `values`, by path; return their paths."""
+    """Set the missing settings for which `values` (path of the setting -> value) has a value; return their paths."""
     filled = []
     for path, value in values.items():
         owner: Any = {"": cfg}
@@ -75,7 +75,7 @@ def fill_missing(cfg: Any, values: Mapping[tuple[str, ...], Any]) -> list[tuple[
 
 
 def to_dict(value: Any) -> Any:
-    """Return settings as nested dicts; functions, numbers and text stay unchanged."""
+    """Return settings as nested dicts; functions, numbers and strings stay unchanged."""
     if isinstance(value, type):
         return value
     if dataclasses.is_dataclass(value) or hasattr(value, "__settings__"):

@@ -1,6 +1,6 @@
-"""Conversion of Isaac Lab's settings, as nested dicts, to a task. Keys without a counterpart are reported.
+"""Conversion of Isaac Lab's settings (nested dicts) to a task of rlcli. Keys without a counterpart are reported.
 
-Both kinds of input use it: configuration classes in Python, and the YAML files that Isaac Lab writes into runs.
+The settings come from configuration classes in Python, or from the YAML files that Isaac Lab writes into runs.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ def task(
     models: Mapping[str, Any] | None = None,
     cfg: Any = None,
 ) -> dict[str, Any]:
-    """Return the task that the settings of a `ManagerBasedRLEnvCfg` describe.
+    """Return the content of a `task.yaml` for the settings of a `ManagerBasedRLEnvCfg`.
 
     Args:
         data: settings as nested dicts.
         report: receives how each key was translated.
-        root: folder that model paths are relative to.
-        defaults: default settings, as nested dicts; keys that equal them are not reported.
+        root: folder to which paths of models are relative.
+        defaults: default settings, as nested dicts; keys with the default value are not reported.
         models: entity -> MJCF that replaces its USD file.
         cfg: the user's configuration object, which the user's terms may read.
 
@@ -79,11 +79,14 @@ def task(
 
 
 _OPTIONAL = ("events", "terminations", "curriculum", "commands")
-"""Sections that may be empty."""
+"""Sections of a manager-based configuration that may be missing."""
 
 
 def _own_members(value: Any, section: str, report: Report) -> Any:
-    """Return the settings of a section. As in Isaac Lab, an object without @configclass has only its own attributes."""
+    """Return the settings of a section such as `rewards`, from its configuration object.
+
+    As in Isaac Lab, an object without @configclass has only the attributes of the object itself, not of its class.
+    """
     if not hasattr(value, "__dict__") or isinstance(value, type) or is_missing(value):
         return value
     kind = type(value).__name__
@@ -108,7 +111,7 @@ def _check_members(value: Any, key: Key, report: Report) -> None:
 
 
 def agent(data: Mapping[str, Any], report: Report) -> dict[str, Any]:
-    """Return the `ppo` agent that the settings of a `RslRlOnPolicyRunnerCfg` describe.
+    """Return the settings of a `ppo` agent for the settings of a `RslRlOnPolicyRunnerCfg`.
 
     Args:
         data: settings as nested dicts.
@@ -208,7 +211,8 @@ def _policy(top: Node) -> Node:
             top.report.problem(model.key, f"'{model.get('class_name')}' has no counterpart in rlcli", "use MLPModel")
     distribution = actor.node("distribution_cfg")
     if distribution.get("class_name", "GaussianDistribution").rpartition(".")[2] != "GaussianDistribution":
-        top.report.problem(distribution.key, "it has no counterpart in rlcli", "use GaussianDistribution")
+        what = "this distribution of actions has no counterpart in rlcli"
+        top.report.problem(distribution.key, what, "use GaussianDistribution")
     if critic.get("activation", "elu") != actor.get("activation", "elu"):
         critic.note("approximated", "activation", "both networks have the activation of the actor")
     data = {

@@ -16,10 +16,10 @@ _SECTION = re.compile(r"^(\w+?)s?(?:_manager\.cfg)?\.")
 
 
 class modify_env_param(ManagerTermBase):  # noqa: N801  (Isaac Lab's name)
-    """Curriculum term that sets a setting to `modify_fn(env, env_ids, value, **modify_params)`."""
+    """Curriculum term that changes a setting: its new value is `modify_fn(env, env_ids, value, **modify_params)`."""
 
     NO_CHANGE: ClassVar[object] = object()
-    """Result of a function that does not change the value."""
+    """Value that `modify_fn` returns to leave the setting unchanged."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)
@@ -27,7 +27,7 @@ class modify_env_param(ManagerTermBase):  # noqa: N801  (Isaac Lab's name)
         self._value = torch.tensor(self._setting.start, dtype=torch.float64)
 
     def __call__(self, env: Any, env_ids: Any, modify_fn: Any, modify_params: Any = None, **opened: Tensor) -> None:
-        """Change the setting. `opened` has the settings of rlcli that depend on it, which are written in place."""
+        """Change the setting; `opened` has the tensors of rlcli's settings that depend on it, written in place."""
         value = _in_form_of(self._setting.start, self._value.tolist())
         new = modify_fn(env, env_ids, value, **(modify_params or {}))
         if new is self.NO_CHANGE:
@@ -50,10 +50,11 @@ class ChangedSetting:
     Args:
         data: settings of all sections, as nested dicts.
         address: Isaac Lab's address of the setting, such as `event_manager.cfg.NAME.params.KEY`.
-        read: translates a term: (section, path of the term in it, its settings) -> (path, settings) of rlcli's terms.
+        read: function that translates a term: (section, path of the term in the section, settings of the term) ->
+            (path, settings) of each term of rlcli that replaces it.
 
     Raises:
-        KeyError: if nothing has the address, or its value is neither a number nor a list of numbers.
+        KeyError: if no setting has the address, or its value is neither a number nor a list of numbers.
     """
 
     def __init__(
@@ -74,11 +75,12 @@ class ChangedSetting:
         if not _is_number(self.start):
             raise KeyError(address)
         self.is_own = False
-        """Whether the term is the user's own."""
+        """Whether the term runs the user's own code, which receives the value itself."""
         changed = set(self._numbers(_moved(self.start)).items()) - set(self._numbers(self.start).items())
         names = sorted(name for name, _ in changed)
         self.addresses = [(f"address_{index}", name) for index, name in enumerate(names)]
-        """Parameter of the curriculum term -> address of a setting of rlcli that depends on the value."""
+        """Pairs of a parameter of the curriculum term and the address of a setting of rlcli, such as
+        `rewards.alive.weight`, that depends on the value."""
 
     def translate(self, value: Any) -> list[Any]:
         """Return the values of rlcli's settings for a value of Isaac Lab's setting, in the order of `addresses`."""
@@ -86,7 +88,7 @@ class ChangedSetting:
         return [found[name] for _, name in self.addresses]
 
     def write(self, env: Any, value: Any) -> None:
-        """Set the value in the user's own term."""
+        """Write a value into the term of the environment that runs the user's own code."""
         bound = env.managed._bound.get(self.section, [])
         if self.section == "observations":
             bound = env.managed._observations[self.term[0]]
@@ -129,7 +131,10 @@ def _is_number(value: Any) -> bool:
 
 
 def _moved(value: Any) -> Any:
-    """Return a value with 1 added to every number, to find the settings of rlcli that depend on it."""
+    """Return a setting with 1 added to each of its numbers.
+
+    Settings of rlcli that differ after a translation of the changed value depend on this setting.
+    """
     if isinstance(value, list | tuple):
         return type(value)(_moved(item) for item in value)
     return value + 1.0

@@ -28,7 +28,13 @@ _KINDS = {"set_joint_effort_target": "motor", "set_joint_velocity_target": "velo
 
 
 def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]) -> PythonTask:
-    """Return the task of a configuration and its environment class. `models`: values of `--model`.
+    """Return a task of rlcli for a direct task of Isaac Lab.
+
+    Args:
+        cfg: configuration of the task.
+        env_class: its environment class.
+        root: folder of the task.
+        models: values of the option `--model`, NAME -> FILE.
 
     Raises:
         ConfigError: if the task cannot be expressed in rlcli.
@@ -95,7 +101,7 @@ def direct_task(cfg: Any, env_class: type, root: Path, models: Mapping[str, Any]
 
 
 class _Hooks:
-    """Maker of the terms of one direct task: called with the name of a hook, it returns the term."""
+    """Factory of the terms of one direct task: calling it with a hook's name returns a term that calls the hook."""
 
     def __init__(self, env_class: type, cfg: Any, reads_body_forces: bool) -> None:
         self._env_class, self._cfg, self._forces = env_class, cfg, reads_body_forces
@@ -105,7 +111,7 @@ class _Hooks:
 
 
 def _rename_spaces(cfg: Any) -> None:
-    """Set the spaces of older files, which have `num_actions` for `action_space`."""
+    """Set `action_space` and so on from the names of older versions of Isaac Lab, such as `num_actions`."""
     for space, number in (
         ("action_space", "num_actions"),
         ("observation_space", "num_observations"),

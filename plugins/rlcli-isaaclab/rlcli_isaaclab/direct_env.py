@@ -27,7 +27,7 @@ from rlcli_isaaclab.sim import SimulationCfg
 from rlcli_isaaclab.user_files import placed
 
 MANAGED: ContextVar[Any] = ContextVar("managed")
-"""The environment of rlcli for which an object of the task is created."""
+"""The environment of rlcli that is creating an object of the task's class."""
 
 
 @contextlib.contextmanager
@@ -231,7 +231,10 @@ class DirectRLEnvCfg:
     log_dir: Any = None
 
     def __rlcli_fill__(self, values: Mapping[tuple[str, ...], Any]) -> list[tuple[str, ...]]:
-        """Set missing settings and own fields; return the paths of those that were missing."""
+        """Set missing settings and the task's own fields from `values` (path -> value).
+
+        Return the paths of the settings that were missing.
+        """
         set_valid_fields(self, DirectRLEnvCfg, values)  # `_setup_scene` may read them
         return fill_missing(self, values)
 
@@ -240,7 +243,7 @@ class DirectRLEnvCfg:
         self.rlcli_class = entry
 
     def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
-        """Return this configuration as a task of rlcli. `models`: values of `--model`."""
+        """Return this configuration as a task of rlcli; `models` are the values of `--model`, NAME -> FILE."""
         from rlcli_isaaclab.direct_convert import direct_task
 
         return direct_task(self, _environment_class(self), root, models)
@@ -287,9 +290,9 @@ def _environment_class(cfg: Any) -> type[DirectRLEnv]:
 
 
 def record(env_class: type[DirectRLEnv], cfg: Any) -> tuple[Setup, Any]:
-    """Create an environment without a simulation, up to the end of `_setup_scene`: the rest needs a simulation.
+    """Run the task's `__init__` up to the end of `_setup_scene`, without a simulation.
 
-    Return what `_setup_scene` creates, and the environment. The task's `__init__` may change the configuration.
+    Return (objects that `_setup_scene` created, environment). The task's `__init__` may change `cfg`.
     """
     setup = Setup()
     with running(setup), building(_Shell(cfg)):
@@ -308,7 +311,7 @@ class _Recorded(BaseException):
 
 
 class _Shell:
-    """Values that `_setup_scene` may read before the simulation exists."""
+    """Stand-in for the environment of rlcli, with the values that `_setup_scene` may read before it exists."""
 
     def __init__(self, cfg: Any) -> None:
         self.device, self.num_envs = "cpu", cfg.scene.num_envs

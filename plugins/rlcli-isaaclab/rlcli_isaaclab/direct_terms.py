@@ -49,7 +49,7 @@ class HookTerm:
 
 
 class DirectRunner:
-    """The user's environment inside of an environment of rlcli, and the order in which its hooks are called."""
+    """Caller of the hooks of the user's `DirectRLEnv`, in the right order, for an environment of rlcli."""
 
     def __init__(self, managed: Any, term: HookTerm) -> None:
         self.managed = managed
@@ -91,7 +91,7 @@ class DirectRunner:
         self._substeps.start()
 
     def compute_dones(self) -> None:
-        """Call `_get_dones`, but not before the first reset, when managers only check the shapes of values."""
+        """Call `_get_dones`, except before the first reset, when the managers only check the shapes of values."""
         if self.phase == "build":
             return
         lab = self.lab
@@ -110,10 +110,15 @@ class DirectRunner:
         self.phase = "reset"
 
     def observe(self, group: str, shape: tuple[int, ...]) -> Tensor:
-        """Return the observations of a group. The hook runs once per step; `policy` is the first group.
+        """Return the observations of a group; `_get_observations` runs once per step, when `policy` is requested.
 
         If episodes end, the hook runs once more for their last observations; after `load_state_dict`, it runs for the
-        observations of the restored state. Afterwards the state of the task and of torch's generator is restored.
+        observations of the restored state. After these additional calls, the state of the task and of torch's random
+        generator is restored.
+
+        Args:
+            group: `policy` or `critic`.
+            shape: shape of the group's observations.
         """
         if self.phase == "build":
             return torch.zeros(self.managed.num_envs, *_channels_first(shape), device=self.managed.device)
@@ -170,7 +175,7 @@ def runner_of(managed: Any, term: HookTerm) -> DirectRunner:
 
 
 class _Hook:
-    """A hook of a direct task, bound to an environment."""
+    """Base class of terms that call a hook of a direct task."""
 
     def __init__(self, runner: DirectRunner, shape: tuple[int, ...]) -> None:
         self._runner, self._shape = runner, shape

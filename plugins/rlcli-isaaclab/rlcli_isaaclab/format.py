@@ -1,4 +1,4 @@
-"""Format of Isaac Lab's manager-based tasks: how rlcli recognizes a folder of them."""
+"""Declaration of the format `isaaclab`: how rlcli recognizes a folder with a task of Isaac Lab."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LIBRARIES = {
     **{name: name for name in ("scipy", "matplotlib", "pandas", "h5py", "tqdm", "imageio", "networkx", "shapely")},
     **{"hid": "hidapi", "sklearn": "scikit-learn", "cv2": "opencv-python", "PIL": "pillow", "warp": "warp-lang"},
 }
-"""Libraries that come with Isaac Lab -> their name for pip. A missing one raises an error when it is used."""
+"""Library that is installed with Isaac Lab -> its name for pip. If a library is missing, its use raises an error."""
 _FRAMEWORK = (
     *("isaaclab", "isaaclab_tasks", "isaaclab_assets", "isaaclab_rl", "isaaclab_contrib", "isaaclab_mimic"),
     *("isaacsim", "omni", "pxr", "carb", "usdrt"),
@@ -59,7 +59,7 @@ def find(path: Path) -> TaskSource | None:
 
 
 def agents_beside(folder: Path) -> list[Path]:
-    """Return the Python files of a folder that contain a runner configuration."""
+    """Return the Python files of a folder that contain a runner configuration of RSL-RL, the settings of an agent."""
     return sorted(file for file in folder.glob("*.py") if _RUNNER in file.read_bytes())
 
 

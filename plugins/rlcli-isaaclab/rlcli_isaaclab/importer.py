@@ -1,4 +1,4 @@
-"""Import of the YAML files that Isaac Lab writes into a run's `params/`, as a task of rlcli."""
+"""Import of the YAML files that Isaac Lab writes into the folder `params` of a run, as a task of rlcli."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ _PYTHON = "tag:yaml.org,2002:python/"
 
 
 def read(file: Path) -> dict[str, Any]:
-    """Read a YAML dump with Python's tuples and slices. Other Python objects become text; none is constructed.
+    """Read a YAML file of Isaac Lab, which may have Python's tuples and slices.
+
+    Functions and classes become text, `module:name`; other Python objects become None. No object is constructed.
 
     Raises:
         ConfigError: if the file cannot be read or is not such a dump.
@@ -54,7 +56,7 @@ def read(file: Path) -> dict[str, Any]:
 
 
 def convert(env: Path, agent_file: Path | None, folder: Path, models: Mapping[str, str]) -> Imported:
-    """Write a task folder.
+    """Write the folder of a task for the files of an Isaac Lab run.
 
     Args:
         env: env.yaml of the run.
@@ -101,7 +103,7 @@ def convert(env: Path, agent_file: Path | None, folder: Path, models: Mapping[st
 
 
 def _write(folder: Path, data: dict[str, Any], report: Report) -> list[str]:
-    """Write the files of the task, with the models that need no other files. Return the names of the files."""
+    """Write the files of the task, and copy the models that need no other files; return the names of the files."""
     files = ["task.yaml"]
     for entity in data["scene"]["entities"].values():
         model = model_file(Path.cwd(), entity["model"])
@@ -188,7 +190,7 @@ def _agent(file: Path, report: Report, data_of_task: Mapping[str, Any]) -> dict[
 
 
 def _count(value: Any) -> None:
-    """Check the number of values. YAML aliases let a small file expand to a huge structure.
+    """Check the number of values: with aliases, a small YAML file can expand to a huge structure.
 
     Raises:
         ValueError: if there are more than MAX_VALUES.

@@ -37,7 +37,7 @@ def normalize_angle(x: Tensor) -> Tensor:
 
 
 def tf_combine(q1: Tensor, t1: Tensor, q2: Tensor, t2: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the pose (q2, t2), which is given in the frame of the pose (q1, t1), in the parent frame of (q1, t1)."""
+    """Combine two poses: return the pose (q2, t2), given in the frame (q1, t1), in the parent frame of (q1, t1)."""
     return quat_mul(q1, q2), quat_apply(q1, t2) + t1
 
 
@@ -91,8 +91,8 @@ def compute_heading_and_up(
     """Return how upright a torso is, and how well it faces a target.
 
     Returns:
-        Orientation since the start (n, 4); the up vector's component `up_idx` (n,); the cosine between heading and
-        target (n,); the heading vector (n, 3); the up vector (n, 3).
+        Rotation of the torso from its start orientation, quaternion (n, 4); component `up_idx` of the up vector (n,);
+        cosine between heading and target (n,); heading vector (n, 3); up vector (n, 3).
     """
     rotation = quat_mul(torso_rotation, inv_start_rot)
     up, heading = quat_apply(rotation, vec1), quat_apply(rotation, vec0)

@@ -1,4 +1,4 @@
-"""Terms of Isaac Lab that are written here in its form, because no built-in term of rlcli has their parameters."""
+"""Terms of Isaac Lab, written again in its form, because no built-in term of rlcli has their parameters."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from rlcli_isaaclab.utils.math import quat_apply_inverse, sample_uniform
 
 @dataclass(frozen=True, slots=True)
 class LabTerm:
-    """A term of Isaac Lab that is run by a function of this module."""
+    """Term of Isaac Lab that a function or class of this module replaces."""
 
     function: Any
     needed: Callable[[Mapping[str, Any]], bool]
-    """Whether these parameters need the function; otherwise the built-in term of the same name is used."""
+    """Function from the term's parameters to whether they need `function`, not the built-in term of the same name."""
 
 
 def last_action_of_term(env: Any, action_name: str) -> Tensor:
-    """Last raw action of one action term. (num_envs, k)"""
+    """Last action of the policy for one action term, before scaling. (num_envs, k)"""
     return env.action_manager.get_term(action_name).raw_actions
 
 
@@ -109,4 +109,4 @@ LAB_TERMS: dict[str, LabTerm] = {
     "action_l2_clamped": LabTerm(action_l2_clamped, _always),
     "action_rate_l2_clamped": LabTerm(action_rate_l2_clamped, _always),
 }
-"""Isaac Lab's name -> term."""
+"""Isaac Lab's name of a term -> its copy in this module, and the condition under which the copy is used."""

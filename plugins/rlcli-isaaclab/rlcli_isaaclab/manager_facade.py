@@ -1,4 +1,7 @@
-"""rlcli's managers with Isaac Lab's interface, for the user's terms: `env.command_manager.get_command("pose")`."""
+"""Adapters that give rlcli's managers Isaac Lab's interface, for terms of the user.
+
+For example, a term may call `env.command_manager.get_command("pose")`.
+"""
 
 from __future__ import annotations
 
@@ -128,7 +131,7 @@ class CommandManagerFacade(ManagerFacade):
 
 
 class BuiltinCommand:
-    """A command of rlcli, whose attributes differ from those of Isaac Lab's class."""
+    """Built-in command of rlcli, as code written for Isaac Lab's class reads it: other attributes raise an error."""
 
     def __init__(self, term: Any) -> None:
         self._term = term

@@ -12,7 +12,10 @@ from rlcli_isaaclab.config_class import MISSING, configclass
 
 @configclass
 class SceneEntityCfg:
-    """Selected elements of one entity. Binding the term resolves the names to `joint_ids` and `body_ids`."""
+    """Selection of elements of one entity, as a parameter of a term.
+
+    When the environment is built, the names are resolved to `joint_ids` and `body_ids`.
+    """
 
     name: str = MISSING
     joint_names: Any = None
@@ -24,9 +27,9 @@ class SceneEntityCfg:
     object_collection_names: Any = None
     object_collection_ids: Any = slice(None)
     site_names: Any = None
-    """Sites of the MJCF, for terms that Isaac Lab gives a frame transformer."""
+    """Names of sites of the MJCF, for terms that read a frame transformer in Isaac Lab."""
     sensor_names: Any = None
-    """Sensors of the MJCF, for terms that Isaac Lab gives an IMU."""
+    """Names of sensors of the MJCF, for terms that read an IMU in Isaac Lab."""
     preserve_order: bool = False
 
     def resolve(self, scene: Any) -> None:
@@ -121,7 +124,7 @@ class CommandTermCfg:
 
 
 class ManagerTermBase:
-    """A term with a state: constructed with its configuration, then called with the environment and its parameters."""
+    """Base class of terms with a state, made as `Name(cfg, env)` and called as `term(env, **parameters)`."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         self.cfg = cfg
@@ -215,7 +218,7 @@ class CommandTerm(ManagerTermBase):
         return False
 
     def _resample(self, env_ids: Any) -> None:
-        """Sample new commands now; `_update_command` may call it before their time is up."""
+        """Sample new commands now; `_update_command` may call this method before the resampling time is over."""
         self._resample_command(env_ids)
         self.command_counter[env_ids] += 1
 

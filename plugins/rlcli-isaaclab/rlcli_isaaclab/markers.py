@@ -1,4 +1,4 @@
-"""Markers of a task's own. rlcli does not draw them. Names as in `isaaclab.markers`."""
+"""Stand-in for markers that a task creates, which rlcli does not draw. Names as in `isaaclab.markers`."""
 
 from __future__ import annotations
 

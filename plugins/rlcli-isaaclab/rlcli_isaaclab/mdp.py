@@ -25,7 +25,7 @@ from rlcli_isaaclab.utils.math import sample_gaussian, sample_log_uniform, sampl
 
 
 class MdpFunction:
-    """A built-in term under its name in Isaac Lab."""
+    """Built-in term of rlcli under its name in Isaac Lab, which can be configured or called."""
 
     def __init__(self, name: str) -> None:
         self.__name__ = self.__qualname__ = name
@@ -42,7 +42,8 @@ class MdpFunction:
         signature = builtin_terms(section)[builtin_name]
         if signature.is_class or section == "events":
             name = f"mdp.{self.__name__}"
-            raise TypeError(f"{name} has a state or changes the simulation: use it only in the configuration")
+            what = f"{name} has a state or changes the simulation, so it cannot be called"
+            raise TypeError(f"{what}; use it as `func` in the configuration")
         module = importlib.import_module(signature.module)
         entry = TERMS.get(section, {}).get(self.__name__, Entry())
         by_name = {p.name: p for p in signature.parameters}
@@ -69,7 +70,7 @@ class MdpFunction:
 
 
 def _default(env: Any, parameter: Parameter) -> Any:
-    """Return the default of a parameter as a bound term receives it: an entity, or a slice for "all elements"."""
+    """Return the default of a parameter in the form that a term receives: an entity, or a slice of all elements."""
     if parameter.alias == "Entity":
         return env.entities[parameter.default]
     return slice(None) if parameter.alias in ("Joints", "Bodies", "Sites", "Actuators") else parameter.default
@@ -105,7 +106,7 @@ class SensorPart:
 
 
 def find_term(name: str) -> tuple[str, str]:
-    """Return the section and rlcli's name of one of Isaac Lab's terms.
+    """Return (section, name) of the term of rlcli that replaces a term of Isaac Lab.
 
     Raises:
         KeyError: if rlcli has no counterpart.
@@ -121,7 +122,7 @@ def find_term(name: str) -> tuple[str, str]:
 def _randomize_prop_by_op(
     data: Tensor, distribution_parameters: Any, dim_0_ids: Any, dim_1_ids: Any, operation: str, distribution: str
 ) -> Tensor:
-    """Sample new values for some rows and columns of `data`, in place. Events of the user's own call this function."""
+    """Sample new values for some rows and columns of `data`, in place; the user's own events call this function."""
     samplers: dict[str, Any] = {
         "uniform": sample_uniform,
         "log_uniform": sample_log_uniform,
@@ -171,7 +172,7 @@ def __getattr__(name: str) -> Any:
 
 
 class _UnknownTermError(AttributeError):
-    """Error for a name that this module lacks. It searches for similar names, a slow step, only for its message."""
+    """Error for a name that this module lacks; similar names are searched, which is slow, only if it is printed."""
 
     def __str__(self) -> str:
         near = did_you_mean(self.args[0], _names()) or "docs/reference/isaac-lab-terms.md lists the terms"
@@ -180,7 +181,10 @@ class _UnknownTermError(AttributeError):
 
 @configclass
 class JointActionCfg(ActionTermCfg):
-    """Settings of all joint actions. A number applies to all joints, a mapping to the joints that its regexes match."""
+    """Settings of all joint actions.
+
+    A number applies to all joints; a mapping goes from regular expressions of joint names to numbers.
+    """
 
     joint_names: Any = MISSING
     scale: Any = 1.0
@@ -242,7 +246,7 @@ BinaryJointVelocityActionCfg = config_subclass(
 
 @configclass
 class DifferentialInverseKinematicsActionCfg(ActionTermCfg):
-    """Joint positions that move a body to a pose."""
+    """Joint position targets that move a body to a pose, by differential inverse kinematics."""
 
     @configclass
     class OffsetCfg:

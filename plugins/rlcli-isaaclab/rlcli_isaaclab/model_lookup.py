@@ -16,7 +16,7 @@ from rlcli.machine.plain_files import read_plain
 from rlcli.registry.models import MODELS
 
 MODEL_MAP = "models.yaml"
-"""File that maps entities, or ends of USD paths, to MJCF files beside it."""
+"""Name of the file that maps entities, or ends of USD paths, to MJCF files in the same folder."""
 
 USD_TO_MJCF: dict[str, str] = {
     "Robots/Classic/Cartpole/cartpole.usd": "cartpole:cartpole.xml",
@@ -28,7 +28,7 @@ USD_TO_MJCF: dict[str, str] = {
 
 
 def map_usd(usd: str, mjcf: str) -> None:
-    """Replace a USD file by an MJCF; the end of the USD's path is enough. Call it before creating the configuration."""
+    """Set the MJCF that replaces the USD files whose path ends in `usd`. Call this before making the configuration."""
     USD_TO_MJCF[usd] = mjcf
 
 
@@ -43,10 +43,10 @@ class GivenModels:
 
 
 def given_models(root: Path, asked: Mapping[str, Any]) -> GivenModels:
-    """Return the models from `--model` (`asked`) and from every file `models.yaml`.
+    """Return the models that the user gives with the option `--model` (`asked`) and in files `models.yaml`.
 
-    These files are searched for in the task's folder, in the folders above it that belong to its package, and in the
-    folders of RLCLI_MODELS. For each name, `--model` wins, then the first file.
+    Files `models.yaml` are searched for in the task's folder, in the folders above it that belong to its package, and
+    in the folders of RLCLI_MODELS. For each name, `--model` takes precedence, then the first file.
 
     Raises:
         TaskError: if a file is not YAML, is not a mapping from names to a model's file or to a mapping with `model`
@@ -77,7 +77,10 @@ def given_models(root: Path, asked: Mapping[str, Any]) -> GivenModels:
 
 
 def _add(found: GivenModels, name: str, value: Any, prefix: str) -> None:
-    """Add the model of a name, and the gains that are given with the model, unless the name is known."""
+    """Add the model, and the gains, that a line of `models.yaml` gives for a name, unless the name has a model already.
+
+    `prefix` is put before the path of the model.
+    """
     model = value["model"] if isinstance(value, Mapping) else value
     if isinstance(value, Mapping):
         found.gains.setdefault(name, value.get("gains") or {})
@@ -99,7 +102,7 @@ def mjcf_of(usd: str, root: Path, given: Mapping[str, str], entity: str) -> str:
         entity: the entity's name.
 
     Raises:
-        TaskError: if no MJCF is known for it.
+        TaskError: if no MJCF is known for the entity.
     """
     path = usd.replace("\\", "/")
     for end, mjcf in [(entity, given[entity])] if entity in given else given.items():

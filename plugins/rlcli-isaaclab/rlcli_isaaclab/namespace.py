@@ -1,8 +1,8 @@
-"""Import of `isaaclab` and `isaacsim` in task files: the modules of this package that replace theirs.
+"""Replacement of the modules `isaaclab` and `isaacsim` that task files import.
 
 The table `names.json` lists the public names of each module of Isaac Lab; `tools/names.py` writes it. A name that this
-package defines is imported from this package. Any other name of the table is a stand-in, which raises an error when the
-task uses it.
+package defines is imported from this package. For any other name of the table a task gets a stand-in, which raises an
+error when the task uses it.
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ _LIBRARY_NAMES = {
     **{"math_utils": "isaaclab.utils.math", "string_utils": "isaaclab.utils.string", "sim_utils": "isaaclab.sim"},
     **{"math": "math", "re": "re", "torch": "torch", "Literal": "typing", "Sequence": "collections.abc"},
 }
-"""Name in `_STAR_NAMES` -> the module that it is, or that defines it."""
+"""Name in `_STAR_NAMES` -> the module with this name, or the module that defines the name."""
 _SOURCE_PACKAGES = ("isaaclab_tasks", "isaaclab_assets")
-"""Packages whose original files are imported if they are found: they only use other modules of Isaac Lab."""
+"""Packages of which Isaac Lab's original files are imported, if found: their code only uses other modules."""
 _TORCH = "isaacsim.core.utils.torch"
 _SIM = {
     **dict.fromkeys((_TORCH, *(f"{_TORCH}.{n}" for n in ("rotations", "maths", "transformations"))), "isaacsim_torch"),
@@ -86,7 +86,7 @@ _SIM = {
 
 
 class LabModule(ModuleType):
-    """A module of Isaac Lab: its names are found when they are first used."""
+    """Replacement of a module of Isaac Lab; each of its names is looked up at its first use."""
 
     def __getattr__(self, name: str) -> Any:
         if name == "__all__":
@@ -195,7 +195,7 @@ def _member(module: str, name: str) -> Any:
 
 
 class _UnknownNameError(AttributeError):
-    """Error for a name that Isaac Lab lacks. It searches for similar names, a slow step, only for its message."""
+    """Error for a name that Isaac Lab lacks; similar names are searched, which is slow, only if it is printed."""
 
     def __str__(self) -> str:
         name, module = self.args
@@ -222,7 +222,10 @@ def lab_name(name: str) -> Any:
 
 
 def _settings_class(name: str, kind: Mapping[str, Any], full: str, qualified: str | None = None) -> Any:
-    """Return the configuration class that `names.json` describes. Readers report the settings that rlcli cannot use."""
+    """Return a configuration class of Isaac Lab that rlcli does not define, from its entry in `names.json`.
+
+    The code that reads the configuration reports settings that rlcli cannot use.
+    """
     bases = tuple(base for base in map(_base, kind["bases"]) if isinstance(base, type)) or (object,)
     members: dict[str, Any] = {"__doc__": f"Settings of Isaac Lab's `{full}`.", "__module__": f"{_OWN}.namespace"}
     qualified = full.rpartition(".")[2] if qualified is None else qualified

@@ -1,4 +1,4 @@
-"""Reader of Isaac Lab's actions, and of classes `Name(cfg, env)`: actions and commands of the user's own."""
+"""Reader of Isaac Lab's actions, and of the user's own actions and commands, which are classes `Name(cfg, env)`."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class ObjectReader:
         self.driven_joints = scene.driven_joints
 
     def record_driven_joints(self, actions: Node) -> None:
-        """Record the kind of command that each joint gets.
+        """Record, for each joint, the kind of command that an action sends to it.
 
-        It is position, velocity or effort for an action of Isaac Lab; motor for efforts that the user's own action
-        class sets.
+        The kind is position, velocity or effort for an action of Isaac Lab, and motor for efforts that the user's own
+        action class sets.
         """
         for _, item in actions.nodes():
             wanted = item.data.get("joint_names")
@@ -56,7 +56,8 @@ class ObjectReader:
         if action is not None and self.context.cfg is not None:
             return self._read_user_object(action, node)
         if kind in ONCE_PER_STEP:
-            node.note("approximated", "class_type", "targets are computed once per step, not in each physics step")
+            what = "targets are computed once per environment step, not in each physics step"
+            node.note("approximated", "class_type", what)
         signature = builtin_terms("actions").get(name or "")
         if name is None or signature is None:
             reason, hint = reason_of(kind)
@@ -121,7 +122,7 @@ class ObjectReader:
         settings = {key: node.get(key) for key in node.data if key not in OBJECT_KEYS}
         plain = {key: value for key, value in settings.items() if is_plain(value)}
         for key in settings.keys() - plain.keys() if self.context.cfg is None else ():
-            node.note("ignored", key, "only numbers, text, lists and mappings can be written to a file")
+            node.note("ignored", key, "only numbers, strings, lists and mappings can be written to a file")
         term = UserObject(class_type, section, name, tuple(plain), self.context)
         return {"func": term, **{key_of(key): to_plain(value) for key, value in plain.items()}}
 

@@ -12,10 +12,10 @@ from rlcli_isaaclab.settings import kind_of
 
 
 class NoNoise:
-    """No noise, and base of the noise models."""
+    """Noise model without noise, and base class of the other noise models."""
 
     def __call__(self, data: Tensor) -> Tensor:
-        """Return the data unchanged; a noise model returns the data with noise."""
+        """Return the observation `data` unchanged; subclasses return it with noise. (num_envs, d)"""
         return data
 
     def reset(self, env_ids: Any) -> None:
@@ -29,7 +29,7 @@ class NoiseModel(NoNoise):
         self._cfg = cfg
 
     def __call__(self, data: Tensor) -> Tensor:
-        """Return the data with noise."""
+        """Return the observation `data` with noise. (num_envs, d)"""
         return _with_noise(self._cfg.noise_cfg, data)
 
 
@@ -42,7 +42,7 @@ class NoiseModelWithAdditiveBias(NoiseModel):
         self._per_component = bool(getattr(cfg, "sample_bias_per_component", True))
 
     def __call__(self, data: Tensor) -> Tensor:
-        """Return the data with noise."""
+        """Return the observation `data` with noise. (num_envs, d)"""
         if self._per_component and self._bias.shape[1] != data.shape[1]:
             self._bias = self._bias.repeat(1, data.shape[1])
             self.reset(slice(None))
@@ -54,7 +54,7 @@ class NoiseModelWithAdditiveBias(NoiseModel):
 
 
 def noise_model(cfg: Any, managed: Any) -> NoNoise:
-    """Return the noise that a configuration describes; None: no noise."""
+    """Return the noise model for a configuration; `cfg` None: `NoNoise`."""
     if cfg is None:
         return NoNoise()
     kind = kind_of(cfg.class_type)
@@ -70,7 +70,7 @@ def noise_model(cfg: Any, managed: Any) -> NoNoise:
 
 
 def _with_noise(cfg: Any, data: Tensor) -> Tensor:
-    """Return data with uniform, gaussian or constant noise, which is added, multiplied or replaces the data."""
+    """Return data with uniform, gaussian or constant noise: data + noise, data x noise, or the noise itself."""
     if hasattr(cfg, "n_min"):
         noise = torch.rand_like(data) * (cfg.n_max - cfg.n_min) + cfg.n_min
     elif hasattr(cfg, "std"):

@@ -1,4 +1,4 @@
-"""Reader of the processing of an observation: modifiers, noise, clip, scale and history."""
+"""Reader of the operations on an observation term's value: modifiers, noise, clip, scale and history."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rlcli_isaaclab.settings import Node, as_float, kind_of, to_plain
 
 
 def read_processing(node: Node) -> dict[str, Any]:
-    """Return the processing of an observation: modifiers, noise, clip, scale and history."""
+    """Return rlcli's keys for the operations on an observation: modifiers, noise, clip, scale and history."""
     config: dict[str, Any] = {}
     modifiers = node.get("modifiers")
     if modifiers:

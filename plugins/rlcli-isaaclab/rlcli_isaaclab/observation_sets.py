@@ -15,9 +15,10 @@ _RANDOM = ("noise", "bias", "delay")
 def fit_groups(
     sets: Mapping[str, Any], agent: dict[str, Any], observations: Mapping[str, Any], notes: list[Note]
 ) -> None:
-    """Set `critic_obs` of an agent, and the changes of the task that it needs to read the groups of `obs_groups`.
+    """Set `critic_obs` of an agent, and the agent's changes of the task, so that it reads the groups of `obs_groups`.
 
-    An actor of rlcli reads the group `policy`. If the actor reads other groups of the file, too, their terms are added.
+    rlcli's actor reads only the group `policy`. If `obs_groups` gives the actor other groups as well, their terms are
+    added to `policy`.
 
     Args:
         sets: `obs_groups`: `policy` (or `actor`) and `critic` -> names of groups.
@@ -43,7 +44,7 @@ def fit_groups(
 
 
 def _names(sets: Mapping[str, Any], observations: Mapping[str, Any], *keys: str) -> list[str]:
-    """Return the groups of a set, by the first of its names that `sets` has; empty without such a set."""
+    """Return the names of the groups in the set with the first of the `keys` that `sets` has; empty without one."""
     key = next((key for key in keys if sets.get(key)), None)
     found = list(sets[key]) if key is not None else []
     # the group `actor` of a file is the group `policy` of rlcli
@@ -58,7 +59,7 @@ def _names(sets: Mapping[str, Any], observations: Mapping[str, Any], *keys: str)
 
 
 def _merged(groups: list[str], observations: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the group `policy` with the terms of several groups, each with the settings of its own group."""
+    """Return one observation group with the terms of several groups; each term keeps the settings of its group."""
     merged: dict[str, Any] = {"enable_corruption": True, "history": None}
     if "policy" not in groups:
         merged |= dict.fromkeys(_terms(observations["policy"]))

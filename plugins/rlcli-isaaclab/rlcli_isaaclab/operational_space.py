@@ -22,7 +22,7 @@ from rlcli_isaaclab.utils.math import (
 _TARGETS = {"pose_abs": 7, "pose_rel": 6, "wrench_abs": 6}
 """Kind of target -> number of columns."""
 _GAINS = {"fixed": 0, "variable_kp": 6, "variable": 12}
-"""Impedance mode -> number of columns of gains."""
+"""Impedance mode -> number of the command's columns that are gains."""
 
 
 class OperationalSpaceController:
@@ -54,7 +54,7 @@ class OperationalSpaceController:
         self.desired_ee_wrench_b: Tensor | None = None
 
     def _row(self, value: Any) -> Tensor:
-        """Return a number, or six numbers, as one row for each environment. (num_envs, 6)"""
+        """Return one number, or six (one for each axis), as a row for each environment. (num_envs, 6)"""
         row = torch.as_tensor(value, dtype=torch.float32, device=self._device).expand(6)
         return row.expand(self.num_envs, 6).clone()
 
@@ -64,7 +64,7 @@ class OperationalSpaceController:
         return self.target_dim + _GAINS[self.cfg.impedance_mode]
 
     def reset(self) -> None:
-        """Forget the targets."""
+        """Remove the targets of the last command."""
         self.desired_ee_pose_b = self.desired_ee_wrench_b = None
 
     def set_command(
@@ -117,7 +117,10 @@ class OperationalSpaceController:
         current_joint_vel: Tensor | None = None,
         nullspace_joint_pos_target: Tensor | None = None,
     ) -> Tensor:
-        """Return the efforts of the joints. jacobian_b (num_envs, 6, k) -> (num_envs, k) [N or N m]"""
+        """Return the efforts of the k joints, from the Jacobian of the controlled frame and the present state.
+
+        Everything is in the root's frame. jacobian_b (num_envs, 6, k) -> (num_envs, k) [N or N m]
+        """
         efforts = torch.zeros(self.num_envs, jacobian_b.shape[2], device=self._device)
         inverse = inertia = None
         if self.cfg.inertial_dynamics_decoupling:
@@ -189,7 +192,7 @@ class OperationalSpaceController:
 
 
 class OperationalSpaceControllerAction(ActionTerm):
-    """Targets of an operational space controller, which computes the efforts of joints in every physics step."""
+    """Action that sets targets of an `OperationalSpaceController`, which computes efforts in every physics step."""
 
     def __init__(self, cfg: Any, env: Any) -> None:
         super().__init__(cfg, env)

@@ -18,9 +18,9 @@ Numeric = int | Number
 
 
 def own_fields(cfg: Any, base: type) -> tuple[dict[str, Any], type[BaseModel]]:
-    """Return the values of the plain fields that a configuration adds to those of `base`, and their pydantic model.
+    """Return (values, pydantic model) of the fields that a configuration adds to those of its base class `base`.
 
-    Plain are numbers, text, lists of these, and objects of the task's own configuration classes.
+    Only fields with numbers, strings, lists of these, or objects of the task's own configuration classes are included.
     """
     known = {field.name for field in dataclasses.fields(base)}
     values: dict[str, Any] = {}
@@ -69,7 +69,10 @@ class _Nothing:
 
 
 def _type_of(value: Any, annotation: Any) -> Any:
-    """Return the type of a field; None for a value that is not plain. `annotation`: type or text in the source."""
+    """Return the type of a field for the pydantic model; None for a value of a type that `own_fields` leaves out.
+
+    `annotation` is the field's type in the source, an object or text.
+    """
     if isinstance(value, bool):
         return bool
     if isinstance(value, int) and annotation in (int, "int"):

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 TermConfig = dict[str, Any]
 EventConfigs = dict[str, TermConfig]
-"""Events that replace one event: suffix of its name -> parameters of the term."""
+"""Events of rlcli that replace one event of Isaac Lab: suffix of the event's name -> settings of the term."""
 _OPERATIONS = {"abs": "set"}
 _DISTRIBUTIONS = {"log_uniform": "loguniform"}
 
@@ -83,7 +83,10 @@ class EventParameters:
         return {} if names is None else {parameter: names}
 
     def sampling(self, operation: str, distribution: str = "uniform") -> TermConfig:
-        """Return `operation` and `distribution` of rlcli's term. The arguments are Isaac Lab's defaults."""
+        """Return the keys `operation` and `distribution` for rlcli's term, from Isaac Lab's parameters.
+
+        The arguments are the values that Isaac Lab uses if the parameters are not set.
+        """
         operation = self.params.get("operation", operation)
         distribution = self.params.get("distribution", distribution)
         return {
@@ -132,7 +135,7 @@ def _material(event: EventParameters) -> EventConfigs:
     if friction is None and static is None:
         raise ParameterError("missing 'dynamic_friction_range'; give [low, high]")
     if static != friction:
-        event.approximate("static_friction_range", "MuJoCo has one friction, the dynamic one")
+        event.approximate("static_friction_range", "MuJoCo has no static friction, only dynamic friction")
     event.ignore("restitution_range", "in MuJoCo, solref of a geom sets how contacts bounce")
     event.params.skip("num_buckets", "make_consistent")
     return {"": {**config, "range": friction if friction is not None else static, "operation": "set"}}

@@ -12,7 +12,7 @@ from rlcli_isaaclab.observation_sets import fit_groups
 
 @configclass
 class RslRlPpoActorCriticCfg:
-    """Actor and critic networks."""
+    """Settings of the actor and critic MLPs, as RSL-RL before version 5 has them."""
 
     class_name: str = "ActorCritic"
     init_noise_std: float = MISSING
@@ -27,7 +27,7 @@ class RslRlPpoActorCriticCfg:
 
 @configclass
 class RslRlPpoActorCriticRecurrentCfg(RslRlPpoActorCriticCfg):
-    """Recurrent actor and critic networks."""
+    """Settings of actor and critic networks with a recurrent layer (GRU or LSTM) in front of the MLP."""
 
     class_name: str = "ActorCriticRecurrent"
     rnn_type: str = MISSING
@@ -37,11 +37,11 @@ class RslRlPpoActorCriticRecurrentCfg(RslRlPpoActorCriticCfg):
 
 @configclass
 class RslRlMLPModelCfg:
-    """One network, the actor or the critic, of RSL-RL 5."""
+    """Settings of one network, the actor or the critic, as RSL-RL 5 has them."""
 
     @configclass
     class GaussianDistributionCfg:
-        """Distribution of the actions."""
+        """Settings of the normal distribution from which the actor samples actions."""
 
         class_name: str = "GaussianDistribution"
         init_std: float = 1.0
@@ -56,7 +56,7 @@ class RslRlMLPModelCfg:
 
 @configclass
 class RslRlSymmetryCfg:
-    """Symmetry of the robot in the PPO update."""
+    """Settings of the robot's symmetry in the PPO update: mirrored samples, or a loss for unequal mirrored actions."""
 
     use_data_augmentation: bool = False
     use_mirror_loss: bool = False
@@ -89,7 +89,7 @@ class RslRlPpoAlgorithmCfg:
 
 @configclass
 class RslRlBaseRunnerCfg:
-    """Settings of all runners."""
+    """Settings that every runner of RSL-RL has. A runner trains one policy."""
 
     seed: int = 42
     device: str = "cuda:0"
@@ -111,7 +111,7 @@ class RslRlBaseRunnerCfg:
 
 @configclass
 class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
-    """Settings of a training."""
+    """Settings of a training with PPO: the networks, the algorithm, the length of rollouts."""
 
     __rlcli_library__ = "rsl-rl"
 
@@ -122,7 +122,7 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
     algorithm: Any = MISSING
 
     def __rlcli_agent__(self, notes: list[Note] | None = None) -> dict[str, Any]:
-        """Return the settings of the agent; append the translation notes to `notes`."""
+        """Return the keys of `agent:` for the trainer; append to `notes` how each setting was translated."""
         from rlcli_isaaclab.convert import agent
         from rlcli_isaaclab.settings import Report
 
@@ -133,6 +133,6 @@ class RslRlOnPolicyRunnerCfg(RslRlBaseRunnerCfg):
         return data
 
     def __rlcli_fit__(self, agent: dict[str, Any], observations: Mapping[str, Any], notes: list[Note]) -> None:
-        """Adapt the settings of the agent to the observation groups of the task."""
+        """Assign the task's observation groups to actor and critic in `agent`, as `obs_groups` says."""
         if isinstance(self.obs_groups, Mapping):
             fit_groups(self.obs_groups, agent, observations, notes)

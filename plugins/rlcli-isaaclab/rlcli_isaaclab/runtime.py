@@ -35,7 +35,7 @@ from rlcli_isaaclab.settings import kind_of
 
 
 class ManagerBasedRLEnv(gymnasium.Env):
-    """A manager-based environment with Isaac Lab's attributes; `managed` is the environment of rlcli."""
+    """Manager-based environment with Isaac Lab's attributes; `managed` is rlcli's environment, which does the work."""
 
     metadata = {"render_modes": [None]}  # noqa: RUF012  (gymnasium's)
 
@@ -63,7 +63,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
     managed: Any
     cfg: Any
     _own: Any
-    """Object of the task's own environment class; it is created when a term first uses a member of the class."""
+    """Object of the environment class that the task defines, created when a term first uses a member of the class."""
     extras: dict[str, Any]
     selection: Any = None
     """The environments for which a term is called; None outside of such a call."""
@@ -94,29 +94,29 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
     @property
     def scene(self) -> Scene:
-        """Assets and sensors by name."""
+        """Robots, objects, sensors and terrain of the scene, by name."""
         if self._scene is None:
             self._scene = Scene(self.managed)
         return self._scene
 
     @property
     def action_manager(self) -> Any:
-        """Action manager."""
+        """Action manager under Isaac Lab's names."""
         return self._manager("action_manager", ActionManagerFacade)
 
     @property
     def termination_manager(self) -> Any:
-        """Termination manager."""
+        """Termination manager under Isaac Lab's names."""
         return self._manager("termination_manager", TerminationManagerFacade)
 
     @property
     def command_manager(self) -> Any:
-        """Command manager."""
+        """Command manager under Isaac Lab's names."""
         return self._manager("command_manager", CommandManagerFacade)
 
     @property
     def reward_manager(self) -> Any:
-        """Reward manager. In `__init__` of a curriculum term it has the terms only."""
+        """Reward manager under Isaac Lab's names. In `__init__` of a curriculum term it only has the reward terms."""
         bound = getattr(self.managed, "_bound", {})
         if not hasattr(self.managed, "reward_manager") and "rewards" in bound:
             return RewardManagerFacade(SimpleNamespace(terms=bound["rewards"]), self.managed._binder.tunable)
@@ -126,12 +126,12 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
     @property
     def curriculum_manager(self) -> Any:
-        """Curriculum manager."""
+        """Curriculum manager under Isaac Lab's names."""
         return self._manager("curriculum_manager", ManagerFacade)
 
     @property
     def event_manager(self) -> Any:
-        """Event manager."""
+        """Event manager under Isaac Lab's names."""
         return self._manager("event_manager", ManagerFacade)
 
     @property
@@ -146,17 +146,17 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
     @property
     def reset_terminated(self) -> Tensor:
-        """Terminated in this step. (num_envs,) bool"""
+        """Whether the episode of each environment was terminated in this step. (num_envs,) bool"""
         return self.managed.termination_manager.terminated
 
     @property
     def reset_buf(self) -> Tensor:
-        """Terminated or timed out in this step. (num_envs,) bool"""
+        """Whether the episode of each environment ended in this step, by termination or time-out. (num_envs,) bool"""
         return self.reset_terminated | self.reset_time_outs
 
     @property
     def reset_time_outs(self) -> Tensor:
-        """Timed out in this step. (num_envs,) bool"""
+        """Whether the episode of each environment reached its time limit in this step. (num_envs,) bool"""
         return self.managed.termination_manager.time_outs
 
     @property
@@ -184,11 +184,11 @@ class ManagerBasedRLEnv(gymnasium.Env):
         return gymnasium.vector.utils.batch_space(self.single_observation_space, self.managed.num_envs)
 
     def reset(self, *, seed: int | None = None, options: Any = None, env_ids: Any = None) -> Any:
-        """Reset all environments. Return the observations by group, and extras."""
+        """Reset all environments. Return the observations by group, and `extras`, a dict of values to log."""
         return self.managed.reset(seed), self.extras
 
     def step(self, action: Tensor) -> Any:
-        """Step all environments. Return observations by group, reward, terminated, truncated and extras."""
+        """Step all environments. Return observations by group, reward, terminated, truncated and `extras`."""
         result = self.managed.step(action.to(self.managed.device))
         self.extras["log"] = {}
         if result.episodes is not None:
@@ -208,7 +208,7 @@ class ManagerBasedRLEnv(gymnasium.Env):
         self.managed.close()
 
     def use(self, context: Any) -> None:
-        """Take over the parts of the user's configuration that terms read: `cfg`, frame transformers and lights."""
+        """Give terms access to the user's configuration: as `cfg`, and its frame transformers and lights in `scene`."""
         self.scene.add_frames(context.frames)
         if context.cfg is not None and self._context is not context:
             self._context, self.cfg = context, copy.deepcopy(context.cfg)
@@ -227,12 +227,12 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
     @property
     def unwrapped(self) -> Any:
-        """The environment itself."""
+        """The environment itself, which has no wrappers."""
         return self
 
     @property
     def observation_manager(self) -> Any:
-        """Observation manager."""
+        """Observation manager under Isaac Lab's names."""
         return self._manager("observation_manager", ObservationManagerFacade)
 
     @property
@@ -241,7 +241,10 @@ class ManagerBasedRLEnv(gymnasium.Env):
         return self.managed._last_obs
 
     def run_own_reset_events(self) -> None:
-        """Run the user's reset events once, before the first episode: they create attributes that terms read."""
+        """Run reset events that are the user's functions, once, before the first episode.
+
+        Such events may create attributes of the environment that observation terms read.
+        """
         if self._has_run_reset_events:
             return
         self._has_run_reset_events = True
@@ -264,7 +267,11 @@ class ManagerBasedRLEnv(gymnasium.Env):
 
 @functools.cache
 def _own_class(entry: Any) -> type | None:
-    """Return the task's own environment class, by the class or its name; None if it is not ours or not known."""
+    """Return the environment class that a task defines, a subclass of `ManagerBasedRLEnv`.
+
+    `entry` is the class, or its reference `module:Class`. Return None for any other class and for classes of the
+    frameworks themselves.
+    """
     found = load_object(entry) if isinstance(entry, str) and entry != OWN_CLASS else entry
     own = isinstance(found, type) and issubclass(found, ManagerBasedRLEnv) and not is_framework(found.__module__)
     return found if own else None

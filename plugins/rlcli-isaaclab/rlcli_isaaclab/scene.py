@@ -7,7 +7,7 @@ from rlcli_isaaclab.config_class import MISSING, configclass
 
 @configclass
 class InteractiveSceneCfg:
-    """Scene of each environment; its other members are assets, sensors and lights."""
+    """Settings of the scene of each environment; a task adds members for assets, sensors and lights."""
 
     num_envs: int = MISSING
     env_spacing: float = MISSING

@@ -30,7 +30,7 @@ class Asset:
 
     @classmethod
     def of(cls, env: VecEnv, entity: Entity) -> Asset:
-        """Create the asset of an entity of the simulation."""
+        """Return the asset that reads and writes an entity of the simulation."""
         asset = cls.__new__(cls)
         asset.cfg = entity.config
         asset.bind(env, entity)
@@ -39,7 +39,7 @@ class Asset:
     cfg: Any
 
     def bind(self, env: VecEnv, entity: Entity) -> None:
-        """Connect the asset with an entity of the simulation."""
+        """Let the asset read and write an entity of the simulation."""
         self._env, self._entity = env, entity
         self._drives: dict[str, JointDrive] = {}
         self._wrench = BodyWrench(env, entity)
@@ -53,14 +53,14 @@ class Asset:
 
     @property
     def permanent_wrench_composer(self) -> BodyWrench:
-        """Writer of forces on bodies, which act until they change."""
+        """Writer of forces and torques on bodies. They act in every physics step until they are changed."""
         return self._wrench
 
     instantaneous_wrench_composer = permanent_wrench_composer
 
     @property
     def _external_force_b(self) -> Tensor:
-        """Forces on the bodies. (num_envs, bodies, 3) [N]"""
+        """Forces that the task applies to the bodies, in the frame of each body. (num_envs, bodies, 3) [N]"""
         return self._wrench.local[..., :3]
 
     @_external_force_b.setter
@@ -69,7 +69,7 @@ class Asset:
 
     @property
     def _external_torque_b(self) -> Tensor:
-        """Torques on the bodies. (num_envs, bodies, 3) [N m]"""
+        """Torques that the task applies to the bodies, in the frame of each body. (num_envs, bodies, 3) [N m]"""
         return self._wrench.local[..., 3:]
 
     @_external_torque_b.setter
@@ -83,7 +83,10 @@ class Asset:
         self._wrench.set_forces_and_torques(forces, torques, body_ids=body_ids, env_ids=env_ids, **frame)
 
     def start_wrenches(self, by_task: bool = False) -> None:
-        """Apply forces on bodies before each physics step; `by_task`: the task's own code calls `apply_wrenches`."""
+        """Begin to apply forces on bodies before each physics step.
+
+        With `by_task` the task's own code calls `apply_wrenches` before each physics step.
+        """
         self._wrench.is_applied |= by_task
         self._wrench.start()
 
@@ -92,11 +95,11 @@ class Asset:
         self._wrench.apply()
 
     def reset(self, env_ids: Any = None) -> None:
-        """Remove forces on bodies."""
+        """Remove the forces and torques on bodies in the environments `env_ids`; None: in all."""
         self._wrench.reset(env_ids)
 
     def set_joint_effort_target(self, target: Tensor, joint_ids: Any = None, env_ids: Any = None) -> None:
-        """Set efforts of joints. (rows, joints) [N or N m]"""
+        """Set the efforts that motors apply to joints. (rows, joints) [N or N m]"""
         self._drive("motor").set(target, joint_ids, env_ids)
 
     def set_joint_position_target(self, target: Tensor, joint_ids: Any = None, env_ids: Any = None) -> None:
@@ -108,14 +111,14 @@ class Asset:
         self._drive("velocity").set(target, joint_ids, env_ids)
 
     def write_data_to_sim(self) -> None:
-        """Do nothing: targets are written when they are set."""
+        """Do nothing: the methods that set targets write them into the simulation at once."""
 
     def state(self) -> dict[str, Tensor]:
-        """Return the tensors that a checkpoint contains; the simulation has the others."""
+        """Return the tensors, by name, that a checkpoint must contain besides the state of the simulation."""
         return {}
 
     def update(self, dt: float) -> None:
-        """Do nothing: data are computed when they are read."""
+        """Do nothing: the members of `data` are computed when they are read."""
 
     def _drive(self, kind: str) -> JointDrive:
         if kind not in self._drives:
@@ -134,11 +137,11 @@ class Asset:
         raise AttributeError(f"an asset has no '{name}'; {hint}")
 
     def find_joints(self, name_keys: Any, joint_subset: Any = None, preserve_order: bool = False) -> Any:
-        """Return ids and names of the joints that names or regexes match."""
+        """Return (indices, names) of the joints whose names match `name_keys`, names or regexes."""
         return find_elements(name_keys, joint_subset or self.joint_names, self.joint_names, "joint", preserve_order)
 
     def find_bodies(self, name_keys: Any, preserve_order: bool = False) -> Any:
-        """Return ids and names of the bodies that names or regexes match."""
+        """Return (indices, names) of the bodies whose names match `name_keys`, names or regexes."""
         return find_elements(name_keys, self.body_names, self.body_names, "body", preserve_order)
 
     def write_joint_state_to_sim(
@@ -225,7 +228,7 @@ class Asset:
         self.write_root_velocity_to_sim(root_state[:, 7:], env_ids)
 
     def _require_same_base(self, root_pose: Tensor, env_ids: Any) -> None:
-        """Check that the pose of a fixed base does not change."""
+        """Raise a TaskError if the pose of a base that is fixed in the MJCF is set to another pose."""
         rows = slice(None) if env_ids is None else env_ids
         now = self.data.root_pos_w[rows]
         if not torch.allclose(root_pose[:, :3], now, atol=1e-4):
@@ -243,7 +246,7 @@ class Asset:
 
 
 class Scene(Mapping[str, Any]):
-    """Assets and sensors by name."""
+    """Mapping from names to the assets and sensors of the scene, as `env.scene` in Isaac Lab."""
 
     def __init__(self, env: VecEnv) -> None:
         self._env = env
@@ -257,7 +260,10 @@ class Scene(Mapping[str, Any]):
         """Lights and other assets that only change how a scene looks."""
 
     def add_frames(self, frames: Mapping[str, Any]) -> None:
-        """Add frame transformers by their settings (`sensor_reader.py`), and lights, which have none."""
+        """Add frame transformers and lights by name.
+
+        The settings of a frame transformer come from `sensor_reader.py`; a light has None.
+        """
         for name, settings in frames.items():
             if settings is None:
                 self.looks[name] = SimpleNamespace(
@@ -267,7 +273,7 @@ class Scene(Mapping[str, Any]):
             self._frames.setdefault(name, FrameTransformer(self.articulations, settings))
 
     def add_collections(self, cfg: Any) -> None:
-        """Add the collections of rigid objects of the user's configuration of the scene."""
+        """Add the collections of rigid objects that `cfg`, the user's configuration of the scene, has."""
         from rlcli_isaaclab.collection import RigidObjectCollection, entity_name
 
         for name, settings in vars(cfg).items():
@@ -278,7 +284,7 @@ class Scene(Mapping[str, Any]):
 
     @property
     def sensors(self) -> Mapping[str, Any]:
-        """Sensors by name."""
+        """Sensors of the simulation and frame transformers, by name."""
         sensors = getattr(self._env, "sensors", {}).items()
         found = {name: camera_or_sensor(name, dict(sensors)) for name, _ in sensors} | self._frames
         for name, made in found.items():
@@ -304,7 +310,7 @@ class Scene(Mapping[str, Any]):
 
     @property
     def cfg(self) -> Any:
-        """Settings of the scene: the user's object, or rlcli's without one."""
+        """Settings of the scene: the user's configuration object; without such an object, rlcli's settings."""
         return self._env.config.scene if self.user_cfg is None else self.user_cfg
 
     @property
@@ -320,7 +326,7 @@ class Scene(Mapping[str, Any]):
 
     @property
     def terrain(self) -> Any:
-        """Terrain; without one None, or the origins only if the settings have a plane."""
+        """Terrain. None for a scene without one; for a plane an object that only has `cfg` and `env_origins`."""
         terrain, cfg = getattr(self._env, "terrain", None), getattr(self.user_cfg, "terrain", None)
         if terrain is None and cfg is None:
             return None
@@ -350,7 +356,7 @@ class Scene(Mapping[str, Any]):
         return len(list(iter(self)))
 
     def resolve(self, cfg: Any) -> None:
-        """Resolve the names of a `SceneEntityCfg` to ids.
+        """Write into a `SceneEntityCfg` the indices of the joints and bodies that its names select.
 
         Raises:
             NameProblem: if a name matches nothing.
@@ -365,7 +371,7 @@ class Scene(Mapping[str, Any]):
                 continue
             names = getattr(element, f"{kind}_names")
             ids, matched = find_elements(wanted, names, names, kind, cfg.preserve_order)
-            # as in Isaac Lab, a regex that matches all gives their ids, and only a list of all names gives a slice
+            # as in Isaac Lab, a regex that matches all names gives a list of ids, and a list of all names a slice
             is_slice = not isinstance(wanted, str) and list(wanted) == list(names)
             setattr(cfg, f"{kind}_names", matched)
             setattr(cfg, f"{kind}_ids", slice(None) if is_slice else torch.tensor(ids, device=self._env.device).long())

@@ -1,4 +1,4 @@
-"""Reader of Isaac Lab's scene settings: returns the `scene:` of a task."""
+"""Reader of Isaac Lab's settings of a scene. It returns the section `scene:` of a task of rlcli."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terra
 
 
 class SceneReader:
-    """Reader of assets, lights, ground and sensors. It compiles the models to find the names of their elements."""
+    """Reader of assets, lights, ground and sensors. It compiles the MJCF models to find names."""
 
     def __init__(self, node: Node, root: Path, models: Mapping[str, Any] | None = None) -> None:
         self.node, self.root, self.report = node, root, node.report
@@ -30,17 +30,17 @@ class SceneReader:
         """Entity -> the last part of its prim path."""
         self.sensors: dict[str, dict[str, Any]] = {}
         self.user_actuators: dict[tuple[str, str], Mapping[str, Any]] = {}
-        """(entity, group) -> settings of the actuators with a class of the user's."""
+        """(entity, actuator group) -> settings of the groups whose actuator class is defined by the user."""
         self.has_terrain = False
         self.frames: dict[str, dict[str, Any] | None] = {}
-        """Frame transformers, and lights (None), which only the user's terms read."""
+        """Name -> settings of a frame transformer, or None for a light. Only the user's terms read them."""
         self._models: dict[str, Any] = {}
         self._joint_settings: dict[str, JointSettings] = {}
         self.driven_joints: dict[str, dict[str, str]] = {}
-        """Entity -> joint -> what an action commands: effort, motor, velocity or position."""
+        """Entity -> joint -> the quantity that an action sets for the joint: effort, motor, velocity or position."""
 
     def read(self) -> dict[str, Any]:
-        """Return the task's `scene`.
+        """Return the section `scene:` of the task.
 
         Raises:
             ConfigError: if the settings of an entity are missing.
@@ -107,10 +107,11 @@ class SceneReader:
         return config
 
     def _require_assets(self) -> None:
-        """Refuse entities whose settings are names of `isaaclab_assets`, of which no folder was found.
+        """Refuse entities whose settings are imported from `isaaclab_assets` if no folder has this package.
 
         Raises:
-            ConfigError: with these mistakes only: without the entities, what refers to them would be reported, too.
+            ConfigError: with these mistakes only. Other settings refer to the missing entities, and would be reported
+                as further mistakes.
         """
         missing = Report()
         for name, value in self.node.data.items():
@@ -125,10 +126,10 @@ class SceneReader:
     def add_joint_settings(self, driven: Mapping[str, Mapping[str, str]]) -> None:
         """Write `joints` of each entity, without the settings that its MJCF has already.
 
-        Call this after the actions are read: what a stiffness becomes depends on the action that drives the joint.
+        Call this after the actions are read: the action that drives a joint decides how its stiffness is translated.
 
         Args:
-            driven: entity -> joint -> what an action commands: effort, velocity or position.
+            driven: entity -> joint -> the quantity that an action sets: effort, motor, velocity or position.
         """
         for name, entity in self.entities.items():
             model = self._models.get(name) or {"joint": []}
@@ -138,24 +139,31 @@ class SceneReader:
                 entity["joints"] = joints
 
     def integrator(self) -> dict[str, str]:
-        """Return the setting `integrator` that a model with drives needs; empty without drives.
+        """Return {"integrator": "implicitfast"} if a joint has a damping gain `kv`, otherwise {}.
 
-        PhysX integrates the damping of drives implicitly. MuJoCo's Euler method would diverge with a large damping.
+        PhysX integrates the damping of joint drives implicitly. MuJoCo's Euler method would diverge with a large one.
         """
         joints = [settings for entity in self.entities.values() for settings in entity.get("joints", {}).values()]
         return {"integrator": "implicitfast"} if any(settings.get("kv") for settings in joints) else {}
 
     def names(self, entity: str, kind: str) -> list[str] | None:
-        """Return the names of an entity's joints or bodies (`kind`) in the model's order; None without a model."""
+        """Return the names of an entity's joints or bodies, in the model's order; None if it has no model.
+
+        `kind` is "joint" or "body".
+        """
         model = self._models.get(entity)
         return None if model is None else model[kind]
 
     def is_fixed(self, entity: str) -> bool:
-        """Return whether the model of an entity has a fixed base; False without a model."""
+        """Return whether the model of an entity has a fixed base; False if the entity has no model."""
         return bool(self._models.get(entity, {}).get("fixed"))
 
     def order_names(self, entity: str, kind: str, wanted: Any, preserve: bool, key: Key) -> Any:
-        """Return names or regexes as Isaac Lab orders them: in the model's order, or as written if `preserve`."""
+        """Return the names that `wanted` selects in the order that Isaac Lab gives them.
+
+        This is the model's order, or the written order if `preserve`. `wanted` is returned unchanged if its order does
+        not matter, or if a name matches nothing.
+        """
         if wanted is None or isinstance(wanted, str):
             return wanted
         wanted = list(wanted)
@@ -171,7 +179,7 @@ class SceneReader:
             return wanted
 
     def geoms_of_bodies(self, entity: str, bodies: list[str], key: Key) -> list[str]:
-        """Return the names of the geoms of bodies, which are given by names or regexes."""
+        """Return the names of all geoms of the bodies whose names match `bodies`, names or regexes."""
         from rlcli.scene.names import NameProblem, match
 
         model = self._models.get(entity)
@@ -185,10 +193,13 @@ class SceneReader:
         return [geom for geom, body in model["geoms"] if body in chosen]
 
     def gains_of_joints(self, entity: str, joints: list[str] | None) -> dict[str, Any]:
-        """Return the names of the elements that have the gains of the joints (None: all), by kind.
+        """Return the elements of the model in which the stiffness and damping of joints are stored. None: all joints.
 
-        `kp` and `kv` are MuJoCo's actuators with that gain, `damping` the joints whose damping is their own, and
-        `explicit` the joints with an explicit actuator model.
+        Returns:
+            kp: names of MuJoCo's actuators with a stiffness.
+            kv: names of MuJoCo's actuators with a damping.
+            damping: names of joints whose damping is a property of the joint, not of an actuator.
+            explicit: names of joints whose efforts an actuator model of rlcli computes.
         """
         from rlcli.scene.names import NameProblem, match
 
@@ -215,18 +226,21 @@ class SceneReader:
         }
 
     def damped_joints(self, entity: str, driven: Mapping[str, str]) -> list[str]:
-        """Return the joints whose implicit actuator becomes a damping of the joint, as its stiffness is zero.
+        """Return the joints for which an implicit actuator without stiffness is translated to joint damping.
 
         Args:
             entity: name of the entity.
-            driven: joint -> what an action commands: effort, velocity or position.
+            driven: joint -> the quantity that an action sets: effort, motor, velocity or position.
         """
         found = {n: settings_of(n, self._joint_settings.get(entity, [])) for n in self.names(entity, "joint") or []}
         passive = [n for n, values in found.items() if values.get("damping") and not values.get("stiffness")]
         return [n for n in passive if driven.get(n) != "velocity"]
 
     def sensor_of_bodies(self, name: str, bodies: Any, preserve: bool, key: Key) -> str:
-        """Return the name of a contact sensor with only these bodies of the sensor `name`; add one if there is none."""
+        """Return the name of a contact sensor that only has the bodies `bodies` of the sensor `name`.
+
+        If `bodies` are all bodies of the sensor, return `name`; otherwise add a sensor if there is none with them.
+        """
         sensor = self.sensors.get(name)
         if sensor is None or sensor["kind"] != "contact" or bodies is None:
             return name  # a missing sensor is reported when the environment is built
@@ -272,12 +286,12 @@ class SceneReader:
         if several and spawn and isinstance(path, str):
             item.report.entries[(*spawn.key, "assets_cfg")] = ("approximated", "one model in all environments")
         elif several:
-            what = "has assets that differ by environment, and MuJoCo has one model for all environments"
+            what = "the assets differ between environments, but MuJoCo has one model for all environments"
             self.report.problem(item.key, what, model_hint(name))
             return
         if not isinstance(path, str):
-            source = kind_of(spawn.data.get("func")) if spawn else "nothing"
-            message = f"has no model, but {source}; write spawn=UsdFileCfg(usd_path='{name}.xml')"
+            found = f"`spawn` calls {kind_of(spawn.data.get('func'))}" if spawn else "`spawn` is not set"
+            message = f"no model: {found}; write spawn=UsdFileCfg(usd_path='{name}.xml')"
             self.report.problem(item.key, message)
             return
         spawn = spawn or item.node("spawn")
@@ -316,7 +330,10 @@ class SceneReader:
         self.entities[name] = entity
 
     def _read_shape(self, item: Node, spawn: Node, shape: str) -> dict[str, Any]:
-        """Return an entity of one geom: free to move as a rigid object, a mocap body if kinematic, fixed otherwise."""
+        """Return the settings of an entity with one geom.
+
+        A rigid object moves freely, a kinematic one is a mocap body; any other shape is fixed in the world.
+        """
         size = spawn.get("size") or [spawn.get(key) for key in ("radius", "height") if spawn.get(key) is not None]
         config: dict[str, Any] = {"shape": shape, "size": [as_float(v) for v in size]}
         rigid, mass = spawn.data.get("rigid_props") or {}, spawn.node("mass_props")
@@ -341,7 +358,7 @@ class SceneReader:
         return config
 
     def _read_model(self, name: str, model: str) -> None:
-        """Compile an entity's MJCF and store the names and values that other settings refer to."""
+        """Compile an entity's MJCF, and store the names and values that other settings refer to in `_models`."""
         import mujoco
 
         from rlcli.registry import model_file
@@ -379,7 +396,7 @@ class SceneReader:
         }
 
     def _read_joint_state(self, name: str, entity: dict[str, Any], init: Node) -> None:
-        """Write the joints' initial positions and velocities that differ from the MJCF's."""
+        """Write into `entity` the initial positions and velocities of joints that differ from those in the MJCF."""
         config: dict[str, Any] = {}
         model = self._models.get(name)
         for key in ("joint_pos", "joint_vel"):
@@ -401,7 +418,7 @@ class SceneReader:
                 entity.setdefault("init", {})[key] = value
 
     def _has_value(self, entity: str, pattern: str, value: float, known: Mapping[str, float]) -> bool:
-        """Return whether every joint that a pattern matches has this value in the model (0 if not in `known`)."""
+        """Return whether a pattern matches joints, and all of them have the value in `known`, by joint name (or 0)."""
         matched = [n for n in self.names(entity, "joint") or [] if re.fullmatch(pattern, n)]
         return bool(matched) and all(known.get(n, 0.0) == value for n in matched)
 

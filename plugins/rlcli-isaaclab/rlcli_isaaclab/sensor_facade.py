@@ -20,7 +20,10 @@ from rlcli_isaaclab.setup_scene import current_setup
 
 
 class FrameTransformer:
-    """Poses of frames that are fixed to bodies, under Isaac Lab's names; `data` is the object itself."""
+    """Sensor of the poses of frames that are fixed to bodies: a source frame and target frames.
+
+    The names are Isaac Lab's; `data` is the object itself.
+    """
 
     def __init__(self, assets: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
         self.data = self
@@ -84,7 +87,7 @@ class FrameTransformer:
 
 
 class CameraView:
-    """A camera under Isaac Lab's names; `data` is the object itself."""
+    """Camera with the attributes of Isaac Lab's cameras; `data` is the object itself."""
 
     def __init__(self, cfg: Any) -> None:
         current_setup().add(self, cfg)
@@ -92,7 +95,7 @@ class CameraView:
     cfg: Any
 
     def bind(self, *sensors: Any) -> None:
-        """Connect the camera with its sensors in the simulation, one for each kind of data."""
+        """Connect the camera with its sensors in the simulation: one for each kind of image (rgb, depth, distance)."""
         self._sensor, self.data = sensors[0], self
         self._images = _Images({name: sensor for sensor in sensors for name in _IMAGE_NAMES[sensor.config.data]})
         self.body_names: list[str] = []
@@ -100,7 +103,7 @@ class CameraView:
 
     @property
     def output(self) -> Mapping[str, Tensor]:
-        """Images by type of data, channels last. (num_envs, h, w, c)"""
+        """Images by Isaac Lab's type of image, such as `rgb`. (num_envs, height, width, channels) each"""
         return self._images
 
     @property
@@ -110,11 +113,14 @@ class CameraView:
 
 
 _IMAGE_NAMES = {"rgb": ("rgb",), "depth": ("depth", "distance_to_image_plane"), "distance": ("distance_to_camera",)}
-"""Data of rlcli's camera -> Isaac Lab's types of images."""
+"""The setting `data` of a camera in rlcli -> Isaac Lab's types of images with this content."""
 
 
 class _Images(Mapping[str, Tensor]):
-    """Images by type of data, such as `rgb`, rendered when they are read; another type raises an error."""
+    """Images of a camera by Isaac Lab's type, such as `rgb`, rendered when they are read.
+
+    Reading a type that the camera does not have raises an error with the types that it has.
+    """
 
     def __init__(self, sensors: Mapping[str, Any]) -> None:
         self._sensors = sensors
@@ -137,13 +143,13 @@ class _Images(Mapping[str, Tensor]):
 
 
 class TerrainImporter:
-    """The terrain under Isaac Lab's names."""
+    """Terrain with the attributes of Isaac Lab's `TerrainImporter`."""
 
     def __init__(self, cfg: Any) -> None:
         current_setup().add(self, cfg)
 
     def bind(self, env: VecEnv, terrain: Any) -> None:
-        """Connect the object with the terrain of the simulation; None: a plane."""
+        """Connect the object with the terrain of the environment; None: the ground is a plane."""
         self._env, self._terrain = env, terrain
 
     def __getattr__(self, name: str) -> Any:
@@ -153,7 +159,7 @@ class TerrainImporter:
 
     @functools.cached_property
     def cfg(self) -> Any:
-        """Configuration of the terrain in Isaac Lab's form, as far as terms read it."""
+        """Configuration of the terrain in Isaac Lab's form, with the members that terms of its tasks read."""
         config: Any = self._env.config.scene.terrain
         return SimpleNamespace(terrain_type="generator", terrain_generator=SimpleNamespace(
             size=tuple(config.patch), num_rows=self._terrain.rows, num_cols=self._terrain.origins.shape[1],
@@ -172,16 +178,22 @@ class TerrainImporter:
 
     @property
     def terrain_origins(self) -> Tensor:
-        """Start positions by level and column. (rows, columns, 3) [m]"""
+        """Start positions on the sub-terrains, by level (row) and column, world frame. (rows, columns, 3) [m]"""
         return self._terrain.origins
 
     @property
     def env_origins(self) -> Tensor:
-        """Start position of each environment. (num_envs, 3) [m]"""
+        """Start position of each environment, world frame. (num_envs, 3) [m]"""
         return self._env.origins
 
     def update_env_origins(self, env_ids: Any, move_up: Tensor, move_down: Tensor) -> None:
-        """Move environments a level up or down. env_ids: the environments of the running curriculum term."""
+        """Move environments a level up or down the terrain.
+
+        Args:
+            env_ids: not used: the environments are those for which the curriculum term is called.
+            move_up: whether to move each of them to the next level. (rows,)
+            move_down: whether to move each of them to the previous level. (rows,)
+        """
         from rlcli_isaaclab.runtime import facade_of
 
         selection = facade_of(self._env).selection
@@ -189,13 +201,16 @@ class TerrainImporter:
 
 
 def camera_or_sensor(name: str, sensors: Mapping[str, Any]) -> Any:
-    """Return a `CameraView` of a camera, or a `Sensor` of another sensor."""
+    """Return a sensor of the simulation with Isaac Lab's attributes: a `CameraView`, or for another kind a `Sensor`."""
     is_camera = _kind(sensors[name]) == "camera"
     return bound(CameraView if is_camera else Sensor, *bound_parts(name, sensors))
 
 
 def bound_parts(name: str, sensors: Mapping[str, Any]) -> list[Any]:
-    """Return a sensor of the simulation; after a camera, those for its further data."""
+    """Return the sensors of the simulation that belong to one sensor of Isaac Lab.
+
+    A camera has one for each kind of image; any other sensor has one.
+    """
     more = [image_name(name, kind) for kind in _IMAGE_NAMES] if _kind(sensors[name]) == "camera" else []
     return [sensors[key] for key in (name, *more) if key in sensors]
 
@@ -205,14 +220,14 @@ def _kind(sensor: Any) -> str:
 
 
 def bound(kind: Any, *parts: Any) -> Any:
-    """Create an object of a class without `__init__`, and connect it by `bind` with parts of the simulation."""
+    """Create an object of the class `kind` without calling `__init__`, and pass `parts` to its method `bind`."""
     made = kind.__new__(kind)
     made.bind(*parts)
     return made
 
 
 class Sensor:
-    """A contact or ray sensor under Isaac Lab's names."""
+    """Contact or ray sensor with the attributes of Isaac Lab's sensors; `data` is the object itself."""
 
     _NAMES = {  # noqa: RUF012  (constant)
         "net_forces_w": "force",
@@ -227,7 +242,7 @@ class Sensor:
 
     cfg: Any
     filters: list[Sensor]
-    """Sensors of the contacts with each filtered body."""
+    """One sensor for each entry of `filter_prim_paths_expr`: contacts with only these bodies."""
 
     @property
     def force_matrix_w(self) -> Tensor | None:
@@ -273,22 +288,33 @@ class Sensor:
         return self._sensor._directions.expand(len(self._sensor._position), -1, -1)
 
     def find_bodies(self, name_keys: Any, preserve_order: bool = False) -> Any:
-        """Return indices and names of the sensor's bodies that names or regexes match."""
+        """Return (indices, names) of the sensor's bodies whose names match `name_keys`, names or regexes."""
         return find_elements(name_keys, self.body_names, self.body_names, "body", preserve_order)
 
     def compute_first_contact(self, dt: float, abs_tol: float = 1e-8) -> Tensor:
-        """Return where contact began in this step. (num_envs, bodies) bool"""
+        """Return for each body whether a contact began in this step. (num_envs, bodies) bool"""
         return self._sensor.first_contact
 
     def compute_first_air(self, dt: float, abs_tol: float = 1e-8) -> Tensor:
-        """Return where contact ended in this step. (num_envs, bodies) bool"""
+        """Return for each body whether its contact ended in this step. (num_envs, bodies) bool"""
         return self._sensor.first_air
 
 
 def find_elements(
     wanted: Any, candidates: Any, names: list[str], kind: str, preserve_order: bool
 ) -> tuple[list[int], list[str]]:
-    """Return indices into `names`, and the names, of the candidates that names or regexes match."""
+    """Return the candidates that names or regexes in `wanted` match.
+
+    Args:
+        wanted: a name or regex, or a list of them.
+        candidates: the names that may be selected, a part of `names`.
+        names: all names.
+        kind: the kind of element, such as "joint", for the message of the error.
+        preserve_order: whether the order of `wanted` is kept; otherwise the order of `names`.
+
+    Returns:
+        Indices into `names`, and the selected names.
+    """
     try:
         indices = [names.index(candidates[i]) for i in match(wanted, list(candidates), kind)]
     except NameProblem as problem:

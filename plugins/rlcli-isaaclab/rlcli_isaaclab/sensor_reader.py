@@ -14,7 +14,7 @@ from rlcli_isaaclab.settings import Node, as_float, kind_of, to_plain
 
 
 def read_sensor(kind: str, item: Node, prims: Mapping[str, str], frames: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the settings of one sensor; None if it has no counterpart.
+    """Return the settings of one sensor for `scene.sensors`; None if it has no counterpart there.
 
     Args:
         kind: Isaac Lab's class of the sensor.
@@ -29,7 +29,7 @@ def read_sensor(kind: str, item: Node, prims: Mapping[str, str], frames: dict[st
     if kind in ("Camera", "TiledCamera"):
         return read_camera(item, entity, parts[parts.index(prims[entity]) + 1 : -1] if entity else [])
     if entity is None:
-        hint = f"prims: {listing(prims)}"
+        hint = f"prims of robots and objects: {listing(prims.values())}"
         item.report.problem((*item.key, "prim_path"), f"'{prim}' is not a prim of a robot or object", hint)
         return None
     inside = parts[parts.index(prims[entity]) + 1 :]
@@ -50,7 +50,7 @@ def read_sensor(kind: str, item: Node, prims: Mapping[str, str], frames: dict[st
 
 
 def _read_frames(item: Node, entity: str, body: str | None, prims: Mapping[str, str]) -> dict[str, Any]:
-    """Return the settings of a frame transformer: the source frame, and a list of target frames."""
+    """Return the settings of a frame transformer: `source`, a frame, and `targets`, a list of frames (see `_frame`)."""
     targets = []
     for target in item.get("target_frames") or ():
         frame = Node(target, (*item.key, "target_frames"), item.report)
@@ -75,13 +75,13 @@ CAMERA_DATA = {
     "distance_to_image_plane": "depth",
     "distance_to_camera": "distance",
 }
-"""Isaac Lab's type of images -> data of rlcli's camera."""
+"""Isaac Lab's type of image -> the setting `data` of a camera in rlcli."""
 _FORWARD = {
     "world": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     "ros": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
     "opengl": ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
 }
-"""Convention -> the camera's viewing direction and its upward direction in the frame of `rot`."""
+"""Isaac Lab's `convention` -> viewing direction and upward direction of the camera, before `rot` rotates them."""
 
 
 def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, Any] | None:
@@ -90,7 +90,7 @@ def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, 
     Args:
         item: Isaac Lab's settings of the camera.
         entity: entity to whose body the camera is fixed; None: it is fixed in the environment.
-        inside: parts of the camera's prim path below the entity.
+        inside: parts of the camera's prim path between the entity and the camera, such as names of bodies.
     """
     wanted = list(item.get("data_types", ["rgb"]))
     kinds = camera_kinds(wanted)
@@ -153,17 +153,23 @@ def read_camera(item: Node, entity: str | None, inside: list[str]) -> dict[str, 
 
 
 def camera_kinds(wanted: Iterable[str]) -> list[str]:
-    """Return the data of rlcli's cameras for a camera's `data_types`, without those that have no counterpart."""
+    """Return the values of rlcli's setting `data` for Isaac Lab's `data_types`, without types that rlcli lacks."""
     return list(dict.fromkeys(CAMERA_DATA[name] for name in wanted if name in CAMERA_DATA))
 
 
 def image_name(camera: str, kind: str) -> str:
-    """Return the name of the sensor for further data of a camera: `CAMERA__depth`."""
+    """Return the name of the sensor for a second kind of image of a camera, such as `front__depth`."""
     return f"{camera}__{kind}"
 
 
 def choose_image(params: Node, config: dict[str, Any], sensors: dict[str, Any]) -> None:
-    """Set the sensor of the term `image`: the camera's one for `data_type`. Report a type that the camera lacks."""
+    """Set `sensor` of the observation term `image` to the sensor of the camera that has the images `data_type`.
+
+    Args:
+        params: Isaac Lab's parameters of the term. A `data_type` that the camera lacks is reported as a mistake.
+        config: settings of rlcli's term, changed in place.
+        sensors: settings of all sensors by name. A sensor of depths is added if the term converts distances to depths.
+    """
     camera, wanted = config.get("sensor", "tiled_camera"), str(params.data.get("data_type", "rgb"))
     base = sensors.get(camera)
     if base is None or base["kind"] != "camera":
@@ -204,7 +210,10 @@ def _read_contact_sensor(item: Node, entity: str, body: str | None) -> dict[str,
 
 
 def read_filters(item: Node, sensor: Mapping[str, Any], prims: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return a contact sensor for each entry of `filter_prim_paths_expr`; `force_matrix_w` has their forces."""
+    """Return the settings of one more contact sensor for each entry of `filter_prim_paths_expr`.
+
+    Such a sensor measures the contacts with one body; `Sensor.force_matrix_w` stacks their forces.
+    """
     found = []
     for path in item.get("filter_prim_paths_expr") or ():
         parts = [part for part in str(path).split("/") if part]
@@ -225,7 +234,7 @@ def filter_name(sensor: str, index: int) -> str:
 
 
 def _read_pattern(pattern: Node) -> Any:
-    """Return the rays of a ray sensor: a grid, or a list of directions."""
+    """Return the setting `pattern` of a ray sensor: a grid as a dict, or a list of directions of rays."""
     function = pattern.get("func")
     if kind_of(function) == "grid_pattern":
         pattern.skip("ordering")
@@ -246,7 +255,7 @@ def _read_pattern(pattern: Node) -> Any:
     cfg = SimpleNamespace(**{key: pattern.get(key) for key in pattern.data})
     starts, directions = function(cfg, "cpu")
     if bool(starts.any()):
-        what = "rays that start in several points have no counterpart in rlcli"
+        what = "rays that start in different points, and not on a grid, have no counterpart in rlcli"
         pattern.report.problem(pattern.key, what, "use GridPatternCfg, or rays from one point")
     return [[round(value, 9) for value in ray] for ray in directions.tolist()]
 
@@ -264,7 +273,7 @@ def _read_ray_sensor(item: Node, entity: str, body: str | None) -> dict[str, Any
         config["pattern"] = [_rotated(rot, ray) for ray in config["pattern"]]
         offset.skip("rot")
     elif rot != [1, 0, 0, 0]:
-        offset.note("ignored", "rot", "set the pattern's direction instead")
+        offset.note("ignored", "rot", "rays of a grid do not turn with the offset: set `direction` of the pattern")
     else:
         offset.skip("rot")
     # Older versions of Isaac Lab have attach_yaw_only, newer ones ray_alignment.

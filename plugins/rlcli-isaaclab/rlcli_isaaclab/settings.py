@@ -1,4 +1,7 @@
-"""Reader of Isaac Lab's settings, which are nested dicts. Keys that are never read are reported as ignored."""
+"""Reading of Isaac Lab's settings, which are nested dicts, with a report of how each key was translated.
+
+A key that no reader has read is reported as ignored.
+"""
 
 from __future__ import annotations
 
@@ -16,25 +19,28 @@ Key = tuple[str, ...]
 
 @dataclass(slots=True)
 class Report:
-    """Record of how each key was translated, and of the mistakes found."""
+    """Record of how each key of a configuration was translated, and of the mistakes in the configuration."""
 
     entries: dict[Key, tuple[Status, str]] = field(default_factory=dict)
-    """Key -> (mapped, approximated, ignored, default or to do; the reason)."""
+    """Key -> (status, reason). The status is `mapped`, `approximated`, `ignored`, `default` or `to do`."""
     problems: list[Problem] = field(default_factory=list)
     stubs: dict[str, tuple[str, dict[str, Any]]] = field(default_factory=dict)
-    """Functions whose code is not in the imported files: name -> (section, parameters)."""
+    """Functions of which the imported YAML only has the name: name -> (section of the term, its parameters).
+
+    The user must write their code; `rlcli import` writes an empty function for each.
+    """
 
     def notes(self, prefix: str = "", where: str = "") -> list[Note]:
-        """Return how each key was translated, as notes."""
+        """Return one note for each key: its path behind `prefix`, its status and the reason. `where` is the file."""
         start = f"{prefix}." if prefix else ""
         return [Note(where, start + ".".join(key), *entry) for key, entry in self.entries.items()]
 
     def user_notes(self, prefix: str = "") -> list[Note]:
-        """Return the notes that matter to the user: those of keys that are neither mapped nor defaults."""
+        """Return the notes of keys that were approximated or ignored, or for which something is to do."""
         return [note for note in self.notes(prefix) if note.status not in ("mapped", "default")]
 
     def problem(self, key: Key, message: str, hint: str | None = None) -> None:
-        """Add a mistake."""
+        """Record a mistake at a key; `finish` raises an error with all of them."""
         self.problems.append(Problem("configuration", ".".join(key), message, hint))
 
     def finish(self, data: Any, defaults: Any = None) -> None:
@@ -60,7 +66,13 @@ class Report:
 
 
 class Node:
-    """Mapping of settings. Reading a key marks it as mapped in the report."""
+    """Dict of settings at one place of the configuration. Reading one of its keys marks the key in the report.
+
+    Args:
+        data: the settings.
+        key: the place, as the path of keys from the top.
+        report: receives how the keys were translated.
+    """
 
     def __init__(self, data: Mapping[str, Any], key: Key, report: Report) -> None:
         self.data, self.key, self.report = data, key, report
@@ -70,21 +82,21 @@ class Node:
         return value is not None and not is_missing(value)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Return a value, or the default if it is null or missing."""
+        """Return the value of a key and mark the key as mapped; return `default` if the value is None or missing."""
         if name in self.data:
             self.report.entries.setdefault((*self.key, name), ("mapped", ""))
         value = self.data.get(name)
         return default if value is None or is_missing(value) else value
 
     def require(self, name: str) -> Any:
-        """Return a value; report a mistake if it is null or missing."""
+        """Return the value of a key; if it is None or missing, report a mistake and return None."""
         value = self.get(name)
         if value is None:
             self.report.problem(self.key, f"missing '{name}'; give it a value")
         return value
 
     def node(self, name: str) -> Node:
-        """Return the settings under a name; empty if there are none."""
+        """Return the dict of settings under a key as a `Node`; an empty one if the key has no value."""
         value = self.data.get(name)
         if value is None or is_missing(value):
             self.get(name)
@@ -92,30 +104,30 @@ class Node:
         if not isinstance(value, Mapping):
             kind = type(value).__name__
             hint = None if type(value).__module__ == "builtins" else f"write @configclass above the class {kind}"
-            self.report.problem((*self.key, name), f"expected settings, found a {kind}", hint)
+            self.report.problem((*self.key, name), f"expected a configuration object, found a {kind}", hint)
             value = {}
         return Node(value, (*self.key, name), self.report)
 
     def nodes(self) -> Iterator[tuple[str, Node]]:
-        """Yield (name, settings) of every member that is a mapping."""
+        """Yield (key, settings) for every key whose value is a dict."""
         for name, value in self.data.items():
             if isinstance(value, Mapping):
                 yield name, Node(value, (*self.key, name), self.report)
 
     def note(self, status: Status, name: str, why: str = "") -> None:
-        """Record how a member was translated, unless its value is empty."""
+        """Record how a key was translated, with the reason `why`, unless its value is empty."""
         if name in self and not is_empty(self.data[name]):
             self.report.entries[(*self.key, name)] = (status, why)
 
     def skip(self, *names: str) -> None:
-        """Mark members as mapped that have no effect outside Isaac Sim."""
+        """Mark keys as mapped without reading them, because their values have no effect in rlcli."""
         for name in names:
             if name in self.data:
                 self.report.entries[(*self.key, name)] = ("mapped", "")
 
 
 def kind_of(value: Any) -> str:
-    """Return the last part of the name of a class or function, which may be written as `module:Name`."""
+    """Return the name, without module, of a class, a function, an object's class or a reference `module:Name`."""
     if value is None or is_missing(value):
         return ""
     name = value if isinstance(value, str) else getattr(value, "__name__", type(value).__name__)
@@ -123,7 +135,7 @@ def kind_of(value: Any) -> str:
 
 
 def to_plain(value: Any) -> Any:
-    """Return tuples as lists, and infinities as +-1e9, because a YAML task has neither."""
+    """Return a setting as a YAML task can hold it: tuples become lists, and infinities become +-1e9."""
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -139,7 +151,7 @@ def as_float(value: Any) -> Any:
 
 
 def is_empty(value: Any) -> bool:
-    """Return whether a setting and all settings below it have no value."""
+    """Return whether a setting is None, missing, False, "" or an empty list, or a dict that has only such values."""
     if isinstance(value, Mapping):
         return all(is_empty(item) for item in value.values())
     return (

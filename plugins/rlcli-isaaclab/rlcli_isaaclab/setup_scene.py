@@ -1,6 +1,7 @@
-"""Assets and sensors that a direct task creates in `_setup_scene`.
+"""Record of the assets and sensors that a direct task creates in its method `_setup_scene`.
 
-They are recorded to build the scene, and then bound to its entities.
+The method is called twice: first to record what the scene must contain, and again after the simulation is built, to
+connect the new objects with its entities and sensors.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ class Setup:
         self.created: list[tuple[Any, Any]] = []
         """Object and configuration of each asset, sensor and terrain."""
         self.spawned: list[tuple[str, Any, dict[str, Any]]] = []
-        """Path, configuration and pose of what is spawned without an object."""
+        """Prim path, configuration and pose of prims that the task spawns with a function, without an asset object."""
 
     def add(self, created: Any, cfg: Any) -> None:
         """Store an object; if the simulation exists, bind the object to its entity, sensor or terrain."""
@@ -61,7 +62,7 @@ def running(setup: Setup) -> Iterator[None]:
 
 
 class Spawn:
-    """A function of Isaac Lab that spawns something by its configuration."""
+    """Replacement of a function of Isaac Lab that spawns a prim, such as a light, by its configuration."""
 
     def __init__(self, name: str) -> None:
         self.__name__ = self.__qualname__ = name
@@ -75,13 +76,16 @@ class Spawn:
     def __call__(
         self, prim_path: str, cfg: Any, translation: Any = None, orientation: Any = None, **other: Any
     ) -> None:
-        """Store what is spawned."""
+        """Record the prim in the running `Setup`; the arguments are those of Isaac Lab's function."""
         pose = {"pos": translation or (0.0, 0.0, 0.0), "rot": orientation or (1.0, 0.0, 0.0, 0.0)}
         current_setup().spawned.append((prim_path, cfg, pose))
 
 
 def clone(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function itself: it decorates spawners, whose objects every environment of rlcli has."""
+    """Return the function itself. Isaac Lab's decorator copies a spawned prim to all environments.
+
+    In rlcli all environments have the same model.
+    """
     return function
 
 

@@ -1,6 +1,7 @@
-"""Configuration classes of the simulation and of what is spawned. Names as in `isaaclab.sim`, often `sim_utils`.
+"""Configuration classes of the simulation and of models, shapes, lights and materials. Names as in `isaaclab.sim`.
 
-Settings of Isaac Sim without a counterpart are accepted and reported; docs/guides/isaac-lab.md lists the others.
+Settings of Isaac Sim without a counterpart are accepted and reported as ignored; docs/guides/isaac-lab.md lists the
+settings that have an effect.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from rlcli_isaaclab.setup_scene import Spawn
 
 
 class _OpenSettings:
-    """Settings with any names. `scene_reader.py` reports which of them have no effect."""
+    """Configuration class that accepts settings of any name. `scene_reader.py` reports those that have no effect."""
 
     __settings__ = True
     _fixed: dict[str, Any]
@@ -25,7 +26,7 @@ class _OpenSettings:
             self.__post_init__()
 
     def replace(self, **changes: Any) -> Any:
-        """Return a copy with some members changed."""
+        """Return a copy in which the given settings have other values."""
         copied = copy.deepcopy(self)
         vars(copied).update(changes)
         return copied
@@ -45,13 +46,15 @@ JointDrivePropertiesCfg = _settings_class("JointDrivePropertiesCfg", "PhysX sett
 FixedTendonPropertiesCfg = _settings_class("FixedTendonPropertiesCfg", "PhysX settings of tendons.")
 DeformableBodyPropertiesCfg = _settings_class("DeformableBodyPropertiesCfg", "PhysX settings of soft bodies.")
 RigidBodyMaterialCfg = _settings_class(
-    "RigidBodyMaterialCfg", "Friction and restitution.", func=Spawn("spawn_rigid_body_material"), static_friction=0.5,
-    dynamic_friction=0.5, restitution=0.0,
+    "RigidBodyMaterialCfg", "Friction and restitution of contacts.", func=Spawn("spawn_rigid_body_material"),
+    static_friction=0.5, dynamic_friction=0.5, restitution=0.0,
 )  # fmt: skip
-PreviewSurfaceCfg = _settings_class("PreviewSurfaceCfg", "A colour.", func=Spawn("spawn_preview_surface"))
-MdlFileCfg = _settings_class("MdlFileCfg", "A material of Isaac Sim.", func=Spawn("spawn_from_mdl_file"))
-PhysxCfg = _settings_class("PhysxCfg", "The PhysX solver.")
-RenderCfg = _settings_class("RenderCfg", "The renderer.")
+PreviewSurfaceCfg = _settings_class("PreviewSurfaceCfg", "Colour of a shape.", func=Spawn("spawn_preview_surface"))
+MdlFileCfg = _settings_class(
+    "MdlFileCfg", "Material of Isaac Sim, from an MDL file.", func=Spawn("spawn_from_mdl_file")
+)
+PhysxCfg = _settings_class("PhysxCfg", "Settings of the solver PhysX.")
+RenderCfg = _settings_class("RenderCfg", "Settings of the renderer.")
 
 GroundPlaneCfg = _settings_class(
     "GroundPlaneCfg", "A ground plane.", func=Spawn("spawn_ground_plane"), size=(100.0, 100.0)
@@ -70,10 +73,14 @@ CylinderLightCfg = _settings_class(
     "CylinderLightCfg", "A cylindrical light.", func=Spawn("spawn_light"), prim_type="CylinderLight"
 )
 UsdFileCfg = _settings_class(
-    "UsdFileCfg", "A model by its USD path, which `model_lookup` maps to an MJCF.", func=Spawn("spawn_from_usd")
+    "UsdFileCfg",
+    "Model, given by the path of a USD file; `model_lookup.py` finds the MJCF for it.",
+    func=Spawn("spawn_from_usd"),
 )
 UrdfFileCfg = _settings_class(
-    "UrdfFileCfg", "A model by its URDF path, which `model_lookup` maps to an MJCF.", func=Spawn("spawn_from_urdf")
+    "UrdfFileCfg",
+    "Model, given by the path of a URDF file; `model_lookup.py` finds the MJCF for it.",
+    func=Spawn("spawn_from_urdf"),
 )
 CuboidCfg = _settings_class("CuboidCfg", "A box; `size` are its edges [m].", func=Spawn("spawn_cuboid"))
 SphereCfg = _settings_class("SphereCfg", "A sphere.", func=Spawn("spawn_sphere"))

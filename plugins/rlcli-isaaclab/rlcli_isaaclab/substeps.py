@@ -1,4 +1,7 @@
-"""Code of a task that runs before each physics step, with the state of that physics step."""
+"""Execution of a task's own code before each physics step, such as the method `apply_actions` of an action.
+
+An environment step has several physics steps.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +17,13 @@ _STALE = "_isaaclab_stale_state"
 
 
 class StepCode(Protocol):
-    """Code that runs before each physics step, and its state."""
+    """Protocol of an object with code that runs before each physics step, and with tensors for checkpoints."""
 
     def apply(self) -> None:
         """Write targets and forces for the next physics step."""
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the tensors that a checkpoint contains."""
+        """Return copies of the object's tensors, by name, for a checkpoint."""
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore the tensors returned by `state_dict`."""
@@ -29,8 +32,13 @@ class StepCode(Protocol):
 class Substeps:
     """Caller of a task's code before each physics step of an environment.
 
-    Between the physics steps of one environment step rlcli does not update the values that it caches. If the code reads
-    a state there, the state is updated first, once per physics step.
+    rlcli caches values such as poses of bodies once per environment step. If the code reads such a value after the
+    first physics step of an environment step, the cached values are updated first, once per physics step.
+
+    Args:
+        managed: the environment.
+        name: name of this object among the actuator models of the environment.
+        code: the task's code.
     """
 
     def __init__(self, managed: VecEnv, name: str, code: StepCode) -> None:
@@ -43,11 +51,11 @@ class Substeps:
         actuators.update(models)
 
     def start(self) -> None:
-        """Begin an environment step."""
+        """Mark the start of an environment step, in which the cached values are up to date."""
         self._is_first = True
 
     def compute(self) -> None:
-        """Run the code before a physics step."""
+        """Run the task's code; the environment calls this before each physics step."""
         if not self._is_first:
             vars(self._managed)[_STALE] = lambda: self._managed.sim.on_moved(self._managed._select_all())
         self._is_first = False
@@ -55,7 +63,7 @@ class Substeps:
         vars(self._managed).pop(_STALE, None)
 
     def reset(self, selection: Selection) -> None:
-        """Do nothing: the code resets itself."""
+        """Do nothing: the task's code is reset by the term that it belongs to."""
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of the code's tensors."""
@@ -67,7 +75,7 @@ class Substeps:
 
 
 def update_state(managed: VecEnv) -> None:
-    """Update the cached state, if a physics step has run since it was computed."""
+    """Update the values that an environment caches, if a physics step has run since they were computed."""
     update: Callable[[], None] | None = vars(managed).pop(_STALE, None)
     if update is not None:
         update()

@@ -1,4 +1,7 @@
-"""Table of Isaac Lab's terms and rlcli's counterparts. A term without a row has the same name in both."""
+"""Tables of Isaac Lab's terms and their counterparts in rlcli.
+
+A term that is in no table has the same name and parameters in both.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +15,14 @@ Translate = Callable[[Any], dict[str, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Counterpart of a term: its name in rlcli, and parameters with another name or another form."""
+    """Counterpart in rlcli of one of Isaac Lab's terms, which has another name, other parameters or another result."""
 
     name: str | None = None
     params: Mapping[str, str | Translate] = field(default_factory=dict)
     note: str | None = None
-    """How the counterpart differs."""
+    """Note for the user on how the value of the counterpart differs from Isaac Lab's; None: it does not differ."""
     fixed: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters that Isaac Lab's term has as constants in its code; `entity`: its default asset."""
+    """Parameters of the counterpart whose values are constants, or the default of `asset_cfg`, in Isaac Lab's code."""
 
 
 def _pose(value: Mapping[str, Any]) -> dict[str, Any]:
@@ -40,7 +43,7 @@ def _xyz(value: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _bounds(value: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the range of each axis; as in Isaac Lab, an axis that is not given has the range 0 to 0."""
+    """Return the range (low, high) of each of the axes x, y and z; as in Isaac Lab, a missing one is (0, 0)."""
     return {axis: value.get(axis, (0.0, 0.0)) for axis in ("x", "y", "z")}
 
 
@@ -62,12 +65,12 @@ _ROOT: dict[str, str | Translate] = {"pose_range": _pose, "velocity_range": _vel
 _TARGET: dict[str, str | Translate] = {"target_pos": "target"}
 
 _ACCELERATION = "MuJoCo's acceleration, not the change of velocity in the last physics step divided by its time"
-_PRESENT = "MuJoCo's own actuators: from the present state, not from that before the last physics step"
+_PRESENT = "efforts of MuJoCo's own actuators are those of the present state, not of the last physics step"
 
 TERMS: dict[str, dict[str, Entry]] = {
     "observations": {
-        "height_scan": Entry(note="a ray without a hit has its full length, not infinity"),
-        "body_incoming_wrench": Entry(note="about the body's origin, in its frame; PhysX: in the frame of the joint"),
+        "height_scan": Entry(note="a ray without a hit has the sensor's maximum distance, not infinity"),
+        "body_incoming_wrench": Entry(note="about the body's origin, in its frame; in PhysX: the joint's frame"),
         "imu_lin_acc": Entry(note=_ACCELERATION),
         "image": Entry(params=dict.fromkeys(("data_type", "convert_perspective_to_orthogonal", "permute"), _nothing)),
         "base_heading_proj": Entry(params=_TARGET),
@@ -85,15 +88,18 @@ TERMS: dict[str, dict[str, Entry]] = {
     "rewards": {
         "is_terminated_term": Entry(params={"term_keys": _names}),
         "move_to_target_bonus": Entry(params=_TARGET),
-        "progress_reward": Entry(params=_TARGET, note="the first step of an episode has no difference in height"),
+        "progress_reward": Entry(
+            params=_TARGET,
+            note="the first step of an episode excludes the difference in height, which Isaac Lab counts",
+        ),
         "body_lin_acc_l2": Entry(note=_ACCELERATION),
         "joint_acc_l2": Entry(note=_ACCELERATION),
         "joint_acceleration_penalty": Entry(note=_ACCELERATION),
         "applied_torque_limits": Entry(note=_PRESENT),
-        "open_drawer_bonus": Entry(note="not doubled during a grasp"),
-        "multi_stage_open_drawer": Entry(note="later stages need no grasp"),
+        "open_drawer_bonus": Entry(note="not doubled while the handle is grasped, as it is in Isaac Lab"),
+        "multi_stage_open_drawer": Entry(note="the later stages do not require a grasp, as they do in Isaac Lab"),
         "orientation_command_error_tanh": Entry(
-            note="the angle of a body of the robot, not of an object, and without the condition on contacts"
+            note="the orientation of a body of the robot, not of an object, whether or not it is touched"
         ),
         "GaitReward": Entry("gait_reward"),
         "action_l2_clamped": Entry("action_l2", note="not clamped to 1000"),
@@ -103,7 +109,7 @@ TERMS: dict[str, dict[str, Entry]] = {
         "joint_effort_out_of_limit": Entry(note=_PRESENT),
         "out_of_bound": Entry(params={"in_bound_range": _bounds}, fixed={"entity": "object"}),
         "terrain_out_of_bounds": Entry(
-            "out_of_bound", {"distance_buffer": lambda value: {}}, "without bounds: set x and y of out_of_bound"
+            "out_of_bound", {"distance_buffer": lambda value: {}}, "set the terrain's bounds: x and y of out_of_bound"
         ),
     },
     "events": {
@@ -116,7 +122,7 @@ TERMS: dict[str, dict[str, Entry]] = {
         "push_by_setting_velocity": Entry(params={"velocity_range": _velocity}),
         "apply_external_force_torque": Entry(
             params={"force_range": "force", "torque_range": "torque"},
-            note="force and torque keep their direction in the world, not in the body's frame",
+            note="force and torque keep their direction in the world frame, not in the body's frame",
         ),
         "reset_scene_to_default": Entry(params={"reset_joint_targets": lambda value: {}}),
         "randomize_rigid_body_scale": Entry("randomize_geom_size"),
@@ -135,7 +141,7 @@ TERMS: dict[str, dict[str, Entry]] = {
         "terrain_levels_vel": Entry("terrain_levels", fixed={"command": "base_velocity"}),
     },
 }
-"""Section -> Isaac Lab's name -> counterpart. `randomization.py` translates the parameters of randomization events."""
+"""Section -> Isaac Lab's name of a term -> counterpart. `randomization.py` translates randomization events."""
 
 HEIGHT_TERMS = {
     "base_pos_z",
@@ -145,7 +151,7 @@ HEIGHT_TERMS = {
     "object_goal_distance",
     "foot_clearance_reward",
 }
-"""Terms that measure heights above the environment's origin; Isaac Lab measures them above z = 0."""
+"""Terms whose heights are relative to the environment's origin; in Isaac Lab they are relative to z = 0."""
 
 EFFORT_TERMS = {
     "joint_effort",
@@ -171,7 +177,7 @@ ACTIONS: dict[str, str] = {
 """Isaac Lab's class -> action term."""
 
 ONCE_PER_STEP = {"RelativeJointPositionAction", "DifferentialInverseKinematicsAction"}
-"""Actions whose targets Isaac Lab computes again in each physics step."""
+"""Actions whose targets Isaac Lab computes again in each physics step; rlcli does so once per environment step."""
 
 COMMANDS: dict[str, Entry] = {
     "NullCommand": Entry("null_command"),
@@ -190,9 +196,9 @@ COMMANDS: dict[str, Entry] = {
 """Isaac Lab's class -> command term. Its `ranges` become parameters of the term."""
 
 NEVER = 1.0e9
-"""A time that no episode reaches [s]; replaces infinity, which a YAML task cannot hold."""
+"""Time that no episode reaches [s]. It replaces infinity, which a YAML task cannot hold."""
 
 
 def finite_times(value: Any) -> Any:
-    """Return a range of times [s] with infinite ends replaced by NEVER."""
+    """Return a range (low, high) of times [s], in which NEVER replaces infinity."""
     return [NEVER if math.isinf(end) else end for end in value]

@@ -10,9 +10,9 @@ from rlcli.registry.failed_imports import failed_import
 
 
 def import_packages(package_name: str, blacklist_pkgs: list[str] | None = None) -> None:
-    """Import a package and all packages below it, except those whose name contains a word of the blacklist.
+    """Import a package and all its subpackages, except those whose name contains a word of the blacklist.
 
-    A package below it whose import fails is left out, with a warning.
+    A subpackage whose import fails is left out, with a warning.
     """
     package = importlib.import_module(package_name)
     for found in pkgutil.iter_modules(getattr(package, "__path__", []), f"{package_name}."):
@@ -24,7 +24,12 @@ def import_packages(package_name: str, blacklist_pkgs: list[str] | None = None) 
 
 
 def load_cfg_from_registry(task_name: str, entry_point_key: str) -> Any:
-    """Return the configuration that a registered task names under a key such as `env_cfg_entry_point`."""
+    """Return a configuration object of a task that is registered with Gymnasium.
+
+    Args:
+        task_name: id of the task, such as `Isaac-Cartpole-v0`.
+        entry_point_key: key of the registration that names the configuration, such as `env_cfg_entry_point`.
+    """
     from rlcli.registry.task_imports import load_object, registrations
 
     entry = registrations[task_name][entry_point_key]

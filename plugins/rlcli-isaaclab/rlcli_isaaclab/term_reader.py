@@ -1,4 +1,4 @@
-"""Reader of Isaac Lab's term settings: returns the terms of a task, section by section."""
+"""Reader of Isaac Lab's settings of terms. It returns the terms of a task of rlcli, section by section."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from rlcli_isaaclab.term_values import builtin_name, is_entity, is_plain, order_
 
 _READS_COMMAND = "command_manager.get_term("
 _ISAAC_LAB_MODULES = ("isaaclab", "omni.isaac.lab", "mdp.")
-"""Prefixes of the modules whose functions are in `table.py`."""
+"""Prefixes of modules of Isaac Lab, whose functions are translated by `table.py`, not run."""
 
 
 def _functions(data: Any) -> Iterator[Any]:
-    """Yield the user's functions and classes in the settings of all terms."""
+    """Yield all functions and classes in nested dicts of settings."""
     for value in data.values() if isinstance(data, Mapping) else ():
         if inspect.isfunction(value) or inspect.isclass(value):
             yield value
@@ -47,7 +47,7 @@ def _functions(data: Any) -> Iterator[Any]:
 
 
 class TermReader(ObjectReader):
-    """Reader of the terms of all sections."""
+    """Reader of the terms of all sections: observations, rewards, terminations, events, commands and curriculum."""
 
     def __init__(self, scene: SceneReader, report: Report, cfg: Any = None, data: Mapping[str, Any] = {}) -> None:
         from rlcli_isaaclab.terms import TermContext
@@ -59,12 +59,12 @@ class TermReader(ObjectReader):
         self.reads_commands = any(
             function is command_resample or _READS_COMMAND in file_text(function) for function in _functions(data)
         )
-        """Whether the user's code reads or changes the object of a command, which must then be Isaac Lab's class."""
+        """Whether the user's code reads or changes the object of a command, which then needs Isaac Lab's attributes."""
         self.stubs: dict[str, tuple[str, dict[str, Any]]] = {}
-        """Functions whose code is not in the imported files: name -> (section, parameters)."""
+        """Functions of which the imported YAML only has the name: name -> (section of the term, its parameters)."""
 
     def read_command(self, node: Node) -> dict[str, Any]:
-        """Return the settings of a command term of rlcli."""
+        """Return the settings of rlcli's command term for Isaac Lab's settings of a command."""
         class_type = node.get("class_type")
         kind = kind_of(class_type)
         entry = COMMANDS.get(kind)
@@ -100,7 +100,10 @@ class TermReader(ObjectReader):
         return config
 
     def _read_user_command(self, kind: str, node: Node) -> dict[str, Any]:
-        """Return a command term for the user's class. A YAML file has only its name: then record a stub to fill in."""
+        """Return the settings of a command term that runs the user's class `kind`.
+
+        If the settings come from a YAML file, the class is only a name: record a stub that the user fills in.
+        """
         config: dict[str, Any] = {"resampling_time_s": finite_times(node.require("resampling_time_range"))}
         class_type = node.data.get("class_type")
         node.skip("debug_vis")
@@ -118,7 +121,7 @@ class TermReader(ObjectReader):
         return config | self._read_user_object(class_type, node)
 
     def read_group(self, node: Node) -> dict[str, Any]:
-        """Return the settings of an observation group."""
+        """Return the settings of an observation group in rlcli: its terms, and settings such as `history`."""
         config: dict[str, Any] = {}
         noisy = any("noise" in item for _, item in node.nodes())
         corrupt = node.get("enable_corruption", False)
@@ -135,7 +138,10 @@ class TermReader(ObjectReader):
         return config
 
     def read_terms(self, section: str, name: str, node: Node) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield the rlcli terms that replace one term of Isaac Lab, usually one; names of several get a suffix."""
+        """Yield (name, settings) of the terms of rlcli that replace the term `name` of Isaac Lab.
+
+        Usually this is one term with the same name. The names of several terms get a suffix.
+        """
         function = builtin_name(node.data.get("func"))
         if section == "events" and function in _LOOKS:
             self.report.entries[node.key] = ("ignored", "rlcli does not randomize colours and textures")
@@ -153,7 +159,7 @@ class TermReader(ObjectReader):
             yield name if len(parts) == 1 else f"{name}_{suffix}", {"func": config["func"], **common, **config}
 
     def _moves_nothing(self, node: Node) -> bool:
-        """Return whether an event that resets the root changes nothing: a fixed base, and only ranges of zero."""
+        """Return whether a `reset_root_state_uniform` event does nothing: a fixed base, and all ranges zero."""
         params = node.data.get("params") or {}
         asset = params.get("asset_cfg") or {"name": "robot"}
         name = asset["name"] if isinstance(asset, Mapping) else asset.name
@@ -169,7 +175,7 @@ class TermReader(ObjectReader):
             return {"func": "missing"}
         if not callable(function) and not isinstance(function, str):
             if function is not None:
-                hint = "another member of the same name replaces the function"
+                hint = "rename the member of the class that has the same name as the function"
                 kind = type(function).__name__
                 self.report.problem((*node.key, "func"), f"expected a function, found a {kind}", hint)
             return {"func": "missing"}
@@ -196,18 +202,21 @@ class TermReader(ObjectReader):
             if entry.note:
                 self.report.entries[(*node.key, "func")] = ("approximated", entry.note)
             if name in HEIGHT_TERMS and self.scene.has_terrain:
-                why = "heights above the environment's origin, not above z = 0"
+                why = "heights are relative to the environment's origin, not to z = 0"
                 self.report.entries[(*node.key, "func")] = ("approximated", why)
             entity = config.get("entity", "robot")
             if name in EFFORT_TERMS and self.scene.damped_joints(entity, self.driven_joints.get(entity, {})):
-                why = "without the damping of implicit actuators with zero stiffness, which becomes joint damping"
+                why = "efforts lack the damping of implicit actuators with zero stiffness, which is joint damping here"
                 self.report.entries[(*node.key, "func")] = ("approximated", why)
         else:
             config = self._read_user_term(section, function, name, node, params)
         return config
 
     def _read_changed_setting(self, function: type, node: Node, params: Node) -> dict[str, Any]:
-        """Return a curriculum term that changes a setting by a function of the user's."""
+        """Return a curriculum term that changes a setting during training with the user's function.
+
+        `function` is Isaac Lab's class `modify_env_param`, or a subclass.
+        """
         from rlcli_isaaclab.terms import SettingTerm
 
         address = str(params.require("address"))
@@ -225,7 +234,16 @@ class TermReader(ObjectReader):
     def _read_again(
         self, section: str, term: list[str], settings: Mapping[str, Any]
     ) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Translate one term of Isaac Lab with changed settings; yield (address, settings) of each term of rlcli."""
+        """Translate one term of Isaac Lab again, with changed settings.
+
+        Args:
+            section: section of the term.
+            term: name of the term; for an observation, names of the group and the term.
+            settings: the changed settings.
+
+        Yields:
+            Address (such as `rewards.alive`) and settings of each term of rlcli that replaces the term.
+        """
         reader = copy.copy(self)
         reader.report, reader.stubs = Report(), {}
         node = Node(settings, (section, *term), reader.report)
@@ -239,7 +257,10 @@ class TermReader(ObjectReader):
                 yield f"{section}.{name}", config
 
     def _find_builtin(self, section: str, name: str | None) -> tuple[str | None, Entry]:
-        """Return rlcli's name of one of Isaac Lab's terms (None if there is none), and its entry in `table.py`."""
+        """Return rlcli's name of one of Isaac Lab's terms, and its entry in `table.py`.
+
+        The name is None if rlcli has no such term; a term without entry has an empty one.
+        """
         if name is None:
             return None, Entry()
         entry = TERMS.get(section, {}).get(name, Entry())
@@ -252,7 +273,7 @@ class TermReader(ObjectReader):
         return {"func": "stages", "address": f"rewards.{reward}.weight", "steps": [steps], "values": [as_float(weight)]}
 
     def _read_common(self, section: str, node: Node) -> dict[str, Any]:
-        """Return the settings that all terms of a section have."""
+        """Return the settings that every term of a section may have, such as `weight` of a reward."""
         config: dict[str, Any] = {}
         if section == "rewards":
             config["weight"] = as_float(node.require("weight"))
@@ -277,7 +298,13 @@ class TermReader(ObjectReader):
         return config
 
     def _read_params(self, signature: Signature, entry: Entry, params: Node) -> dict[str, Any]:
-        """Return the parameters of a built-in term under rlcli's names."""
+        """Return the parameters of a built-in term of rlcli, translated from Isaac Lab's `params`.
+
+        Args:
+            signature: the built-in term.
+            entry: names and forms of parameters that differ from Isaac Lab's.
+            params: Isaac Lab's parameters.
+        """
         config = {key: value for key, value in entry.fixed.items() if key != "entity" or "asset_cfg" not in params}
         by_alias: dict[str, Any] = {}
         for parameter in signature.parameters:
@@ -302,7 +329,10 @@ class TermReader(ObjectReader):
         return config
 
     def _read_gear_ratios(self, params: Node, ratios: Mapping[str, float]) -> Any:
-        """Return the gear ratio of each joint, divided by the largest one. A joint without a ratio has the ratio 1."""
+        """Return the gear ratio of each joint of the robot, divided by the largest one.
+
+        `ratios` maps names or regexes of joints to gear ratios; a joint that none matches has the ratio 1.
+        """
         from rlcli.scene.names import NameProblem, match_values
 
         names = self.scene.names("robot", "joint")
@@ -319,7 +349,15 @@ class TermReader(ObjectReader):
     def _read_selection(
         self, key: str, value: Any, by_alias: Mapping[str, Any], known: Mapping[str, Any], at: Key
     ) -> dict[str, Any]:
-        """Return the parameters of a built-in term for the joints, bodies, ... that a `SceneEntityCfg` selects."""
+        """Return the parameters of a built-in term for the entity, joints and bodies that a `SceneEntityCfg` selects.
+
+        Args:
+            key: name of Isaac Lab's parameter, such as `asset_cfg`.
+            value: the `SceneEntityCfg`, or a dict of its members.
+            by_alias: kind of selection, such as Joints -> the parameter of rlcli's term.
+            known: the term's parameters by name.
+            at: place of the parameter in the configuration, for the report.
+        """
         settings = value if isinstance(value, Mapping) else vars(value)
         stem = key.removesuffix("_cfg")
         config: dict[str, Any] = {}
@@ -354,7 +392,10 @@ class TermReader(ObjectReader):
     def _read_user_term(
         self, section: str, function: Any, name: str | None, node: Node, params: Node
     ) -> dict[str, Any]:
-        """Return a term for the user's function. A YAML file has only its name: then record a stub to fill in."""
+        """Return the settings of a term that runs the user's function.
+
+        If the settings come from a YAML file, the function is only a name: record a stub that the user fills in.
+        """
         from rlcli_isaaclab.terms import entity_data, key_of
 
         common = self._read_common(section, node)
@@ -393,7 +434,10 @@ class TermReader(ObjectReader):
     def _user_term(
         self, function: Any, section: str, entities: frozenset[str], names: tuple[str, ...], objects: dict[str, Any]
     ) -> Any:
-        """Return the `UserTerm` of a function; the same object for the same arguments."""
+        """Return the `UserTerm` that runs a function; without `objects`, equal arguments give the same object.
+
+        The arguments are those of `UserTerm`.
+        """
         from rlcli_isaaclab.terms import UserTerm
 
         key = (function, section, entities, names)
@@ -404,7 +448,10 @@ class TermReader(ObjectReader):
         return self._user_terms[key]
 
     def _write_stub(self, section: str, function: str, values: Mapping[str, Any], node: Node) -> str:
-        """Record a function whose code is not available, with its parameters under rlcli's names. Return its name."""
+        """Record a stub for a function of which only the name is known. Return the name without its module.
+
+        The stub has the parameters `values` in rlcli's form: `entity`, `joints` and `bodies` for a `SceneEntityCfg`.
+        """
         config: dict[str, Any] = {}
         for key, value in values.items():
             if not is_entity(value):
@@ -425,7 +472,7 @@ class TermReader(ObjectReader):
 
 
 _LOOKS = ("randomize_visual_color", "randomize_visual_texture_material")
-"""Events that only change how a scene looks."""
+"""Isaac Lab's events that only change colours and textures."""
 
 
 def _find_signature(terms: Mapping[str, Signature], name: str) -> Signature:

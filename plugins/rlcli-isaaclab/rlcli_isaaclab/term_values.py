@@ -14,7 +14,7 @@ from rlcli_isaaclab.settings import Node, as_float
 
 
 def is_plain(value: Any) -> bool:
-    """Return whether a setting can be written to a YAML file."""
+    """Return whether a setting only has dicts, lists, strings, numbers and None, which a YAML file can hold."""
     if isinstance(value, Mapping):
         return all(map(is_plain, value.values()))
     if isinstance(value, list | tuple):
@@ -23,14 +23,14 @@ def is_plain(value: Any) -> bool:
 
 
 def is_entity(value: Any) -> bool:
-    """Return whether a parameter is a `SceneEntityCfg`, or the dict of one."""
+    """Return whether a parameter is a `SceneEntityCfg`, or a dict with its members."""
     if isinstance(value, SceneEntityCfg):
         return True
     return isinstance(value, Mapping) and "name" in value and ("joint_names" in value or "body_names" in value)
 
 
 def resolved(value: Any, scene: Any) -> Any:
-    """Return a parameter with every `SceneEntityCfg` in it resolved."""
+    """Return a parameter in which every `SceneEntityCfg` has the indices of its joints and bodies in `scene`."""
     if isinstance(value, list | tuple):
         return type(value)(resolved(item, scene) for item in value)
     if isinstance(value, Mapping) and {"name", "joint_names", "body_names"} <= set(value):
@@ -44,7 +44,7 @@ def resolved(value: Any, scene: Any) -> Any:
 
 
 def builtin_name(function: Any) -> str | None:
-    """Return the name of one of Isaac Lab's functions; None for the user's own function."""
+    """Return the name of a function that is Isaac Lab's or only known by name; None for the user's own function."""
     if isinstance(function, MdpFunction):
         return function.__name__
     if isinstance(function, str):
@@ -53,7 +53,10 @@ def builtin_name(function: Any) -> str | None:
 
 
 def order_ranges(signature: Signature, config: dict[str, Any]) -> None:
-    """Swap the ends of ranges that are written from high to low: Isaac Lab draws from them as well."""
+    """Swap the ends of ranges in `config` that are written as (high, low), which Isaac Lab accepts.
+
+    The types of the term's parameters in `signature` tell which of them are ranges.
+    """
     for parameter in signature.parameters:
         if parameter.name in config and _has_range(parameter.type):
             config[parameter.name] = _in_order(config[parameter.name])
@@ -70,10 +73,10 @@ def _in_order(value: Any) -> Any:
 
 
 def triple(ranges: Node, name: str) -> list[float]:
-    """Return a setting of three numbers; zeros if it is not set."""
+    """Return the setting `name` of `ranges` as three floats; zeros if it is not set."""
     return [as_float(v) for v in ranges.get(name, (0.0, 0.0, 0.0))]
 
 
 def has_no_effect(key: str, value: Any) -> bool:
-    """Return whether a setting without a counterpart has a value that changes nothing."""
+    """Return whether a setting that rlcli lacks has a value without effect, such as `scale` = 1."""
     return {"scale": 1.0, "offset": 0.0}.get(key) == value or value is False or value == "" or key == "use_zero_offset"

@@ -39,14 +39,14 @@ from rlcli_isaaclab.utils.buffers import set_tensors, tensors_of
 
 _RESERVED = {name for model in SECTIONS.values() for name in model.model_fields} | {"params"}
 _PLAIN: dict[Any, Any] = {float: Number, int: int | Number, bool: bool, str: str}
-"""Type in a function's signature -> type of the key. Isaac Lab checks no types: `int` also takes 0.5."""
+"""Annotation of a parameter -> type by which rlcli checks its value. As Isaac Lab checks none, `int` also takes 0.5."""
 
 
 _Nothing = Annotated[list[str], Field(max_length=0)]
 
 
 class EntityModel(StrictModel):
-    """`SceneEntityCfg` in the form that a YAML file has."""
+    """Schema of a `SceneEntityCfg` in a YAML task: a parameter of the user's term that selects joints and bodies."""
 
     name: str
     """Name of an entity or sensor."""
@@ -60,23 +60,24 @@ class EntityModel(StrictModel):
 
 @dataclass(slots=True)
 class TermContext:
-    """Parts of a configuration that only the user's terms read."""
+    """Parts of Isaac Lab's configuration that rlcli does not use, but which the user's terms may read."""
 
     cfg: Any = None
-    """The user's configuration object; None: rlcli's configuration."""
+    """The user's configuration object, which terms read as `env.cfg`; None: they read rlcli's configuration."""
     frames: dict[str, Any] = field(default_factory=dict)
-    """Settings of the frame transformers, by name."""
+    """Name -> settings of a frame transformer, or None for a light."""
 
 
 class UserTerm:
-    """The user's function or class as a term of one section.
+    """Term of rlcli that runs a function or class of the user, written for Isaac Lab.
 
     Args:
         function: the user's function or class.
-        section: section of the configuration.
+        section: section of the configuration, such as `rewards`.
         entities: names of the parameters that are a `SceneEntityCfg`.
-        extra: names of all parameters that the configuration sets; those not declared go to `**kwargs`.
-        objects: parameters that no file can hold, such as functions.
+        extra: names of all parameters that the configuration sets. Those that the function does not declare are passed
+            to its `**kwargs`.
+        objects: values of parameters that a YAML file cannot hold, such as functions.
         context: parts of the configuration that the function may read from the environment.
     """
 
@@ -122,7 +123,7 @@ class UserTerm:
         return self
 
     def __call__(self, *args: Any, **params: Any) -> Any:
-        """Call the function."""
+        """Call the user's function, or create an object of the user's class."""
         return self.function(*args, **params)
 
     def __rlcli_term__(self, name: str) -> Signature:
@@ -146,14 +147,14 @@ class UserTerm:
 
 
 class UserObject:
-    """The user's class `Name(cfg, env)` of an action or a command, as one term.
+    """Term of rlcli that runs a class of the user for an action or a command, created as `Name(cfg, env)`.
 
     Args:
         function: the user's class.
         section: `actions` or `commands`.
         name: name of the term.
-        settings: names of the settings that a file can hold; they are the parameters of the term.
-        context: the user's configuration, which has the settings that no file can hold.
+        settings: names of the settings that a YAML file can hold; they are the parameters of the term.
+        context: the user's configuration, which has the other settings.
     """
 
     def __init__(self, function: Any, section: str, name: str, settings: tuple[str, ...], context: TermContext) -> None:
@@ -177,7 +178,7 @@ class UserObject:
         return Signature(name, self.__name__, True, file, 1, summary, parameters, target=self.target)
 
     def settings(self, params: Mapping[str, Any]) -> Any:
-        """Return the configuration object of the term, with the values of its parameters."""
+        """Return the object `cfg` for the user's class: the user's configuration with the values in `params`."""
         values = {self.original[key]: value for key, value in params.items()}
         cfg = copy.deepcopy(getattr(getattr(self.context.cfg, self.section, None), self.name, None))
         if cfg is None:
@@ -187,12 +188,12 @@ class UserObject:
 
 
 class SettingTerm:
-    """Curriculum term that changes a setting by a function of the user's.
+    """Curriculum term that changes a setting during training with a function of the user.
 
     Args:
         function: class of the term, `modify_env_param` or a subclass.
-        setting: the setting, a `ChangedSetting`.
-        params: parameters of the term that no file can hold.
+        setting: the setting that changes, a `ChangedSetting`.
+        params: parameters of the term, such as the user's function; a YAML file cannot hold them.
         context: the user's configuration.
     """
 
@@ -216,12 +217,12 @@ class SettingTerm:
 
 
 def key_of(name: str) -> str:
-    """Return the YAML key of a parameter: its name, with `_` appended if a section has a setting of that name."""
+    """Return the YAML key of a parameter: its name, and a `_` if terms have a setting of that name, as `weight`."""
     return f"{name}_" if name in _RESERVED else name
 
 
 def entity_data(settings: Any) -> dict[str, Any]:
-    """Return the settings of a `SceneEntityCfg` that are not at their default.
+    """Return the members of a `SceneEntityCfg` that differ from their defaults, for a YAML task.
 
     Raises:
         ValueError: if it selects fixed tendons or objects of a collection.
@@ -242,13 +243,13 @@ def entity_data(settings: Any) -> dict[str, Any]:
 
 
 _CHECKS_FOR_LIST = re.compile(r"isinstance\([\w.]+\.(joint|body)_ids, list\)")
-"""Code that checks for a list of ids, Isaac Lab's form. rlcli has tensors of ids, which a GPU need not copy."""
+"""Code of terms that need the ids of joints or bodies as a list. Other terms get tensors, which are faster on a GPU."""
 _AFTER_RESET = {"rewards": ("reward_manager", torch.float32), "terminations": ("termination_manager", torch.bool)}
-"""Sections whose terms Isaac Lab first calls in the first step: their manager, and the type of their values."""
+"""Sections whose terms Isaac Lab first calls in the first step -> (their manager, the type of their values)."""
 
 
 class _Bound:
-    """The user's function, bound to an environment and parameters."""
+    """Term in one environment that calls the user's function with Isaac Lab's `env` and the configured parameters."""
 
     def __init__(self, function: Any, section: str, env: Any, params: dict[str, Any]) -> None:
         self.term, self._section, self._env, self.params = function, section, env, params
@@ -260,7 +261,7 @@ class _Bound:
             value = self.term(self._env, selection.env_ids(), **self.params)
             # a curriculum term may return several values to log; rlcli logs one
             return next(iter(value.values()), None) if isinstance(value, dict) else value
-        if self._reads_reset:  # the reset events create attributes on which the shape of the value depends
+        if self._reads_reset:  # reset events create attributes that decide the shape of the value
             self._reads_reset = False
             self._env.run_own_reset_events()
         manager, dtype = _AFTER_RESET.get(self._section, ("num_envs", None))
@@ -269,27 +270,27 @@ class _Bound:
         except Exception:
             if hasattr(self._env.managed, manager):
                 raise
-            # the check of shapes calls the term before the first reset, which creates what the function needs
+            # rlcli calls the term before the first reset to find its shape; the reset creates attributes that it reads
             return torch.zeros(self._env.num_envs, device=self._env.device, dtype=dtype)
         if self._section == "observations" and value.dim() == 1:
-            return value.unsqueeze(1).float()  # a group that is not concatenated may have such terms
+            return value.unsqueeze(1).float()  # Isaac Lab allows (num_envs,) in groups that are not concatenated
         if self._section == "observations" and value.dim() == 3:
             return value.flatten(1)  # as Isaac Lab does for a term with a history
         return value.bool() if self._section == "terminations" and value.dtype != torch.bool else value
 
 
 class _BoundObject:
-    """The user's object, bound to an environment. Its tensors are saved with a checkpoint."""
+    """Base class of terms in one environment that have an object of the user's class, and save its tensors."""
 
     term: Any
 
     def reset(self, selection: Selection) -> None:
-        """Reset the object at the start of episodes."""
+        """Reset the user's object in the environments whose episode starts."""
         if hasattr(self.term, "reset"):
             self.term.reset(selection.env_ids())
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the object's tensors."""
+        """Return copies of the tensors of the user's object, by the path of the attribute."""
         return {name: value.clone() for name, value in tensors_of(self.term).items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
@@ -298,11 +299,11 @@ class _BoundObject:
 
 
 class _BoundClass(_Bound, _BoundObject):
-    """The user's term with a state, bound to an environment and parameters."""
+    """Term in one environment that calls an object of the user's class: a term with a state."""
 
 
 class _BoundCommand(_BoundObject):
-    """The user's command, bound to an environment."""
+    """Command term in one environment that runs an object of the user's class, a `CommandTerm`."""
 
     def __init__(self, term: Any) -> None:
         self.term = term
@@ -310,18 +311,18 @@ class _BoundCommand(_BoundObject):
         self._has_command = False
 
     def resample(self, selection: Selection) -> None:
-        """Sample new commands."""
+        """Sample new commands in the selected environments."""
         self.term._resample(selection.env_ids())
         self.command.copy_(self.term.command)
         self._has_command = True
 
     def update(self) -> None:
-        """Update the commands, once per step."""
+        """Update the commands of all environments; the command manager calls this once per environment step."""
         self.term._update_command()
         self.command.copy_(self.term.command)
 
     def metrics(self) -> dict[str, Tensor]:
-        """Return the command's own metrics. (num_envs,) each"""
+        """Return the metrics that the user's class computes, by name. (num_envs,) each"""
         if self._has_command:  # metrics of a command that was never sampled have no meaning
             self.term._update_metrics()
         return dict(self.term.metrics)
@@ -333,7 +334,7 @@ class _BoundCommand(_BoundObject):
 
 
 class _BoundAction(_BoundObject):
-    """The user's action, bound to an environment."""
+    """Action term in one environment that runs an object of the user's class, an `ActionTerm`."""
 
     unit = ""
 
@@ -346,12 +347,12 @@ class _BoundAction(_BoundObject):
         self._substeps = Substeps(managed, f"action {name}", self)
 
     def process(self, action: Tensor) -> None:
-        """Call `process_actions`."""
+        """Pass the policy's action to `process_actions` of the user's class. (num_envs, action_dim)"""
         self.term.process_actions(action)
         self._substeps.start()
 
     def apply(self) -> None:
-        """Call `apply_actions` before a physics step."""
+        """Call `apply_actions` of the user's class, before each physics step."""
         self.term.apply_actions()
         self.term._asset.write_data_to_sim()
         self.term._asset.apply_wrenches()
@@ -397,7 +398,7 @@ def _bind_setting(term: SettingTerm, env: Any, **opened: Tensor) -> _BoundClass:
 
 
 def _set_members(target: Any, values: Mapping[str, Any]) -> None:
-    """Set the members of a configuration object that differ from `values`; a list equals a tuple of equal items."""
+    """Set the members of a configuration object to `values`. A member with an equal value keeps its type and object."""
     for name, value in values.items():
         now = getattr(target, name, None)
         if isinstance(value, Mapping) and hasattr(now, "__dataclass_fields__"):
@@ -407,7 +408,10 @@ def _set_members(target: Any, values: Mapping[str, Any]) -> None:
 
 
 def _to_namespace(value: Any) -> Any:
-    """Return nested mappings as objects with attributes, where all keys are identifiers; other values unchanged."""
+    """Return a dict as an object whose attributes are the keys; nested dicts too.
+
+    Return other values, and dicts with a key that is not an identifier, unchanged.
+    """
     if isinstance(value, dict) and all(str(key).isidentifier() for key in value):
         return SimpleNamespace(**{key: _to_namespace(item) for key, item in value.items()})
     return value
@@ -419,7 +423,7 @@ def _bind_term(term: UserTerm, env: Any, **params: Any) -> _Bound:
     facade = facade_of(env)
     facade.use(term.context)
     if term.section == "curriculum":
-        facade.open_weights()  # before the reward manager is created, which fixes the weights otherwise
+        facade.open_weights()  # first, because the reward manager copies weights that are not marked as changeable
     if any(word in file_text(term.function) for word in ("external_force", "wrench_composer")):
         for asset in facade.scene.articulations.values():
             asset.start_wrenches()

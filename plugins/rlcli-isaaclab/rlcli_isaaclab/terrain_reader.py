@@ -1,4 +1,4 @@
-"""Reader of Isaac Lab's ground, terrain and contact materials."""
+"""Reader of Isaac Lab's settings of the ground, the terrain and contact materials."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _HEIGHT_RANGES = {
     "grid": ("grid_height_range", "height"),
     "noise": ("noise_range", "height"),
 }
-"""Kind of sub-terrain -> the range that the difficulty scales: Isaac Lab's key, rlcli's key."""
+"""Kind of sub-terrain -> (Isaac Lab's key, rlcli's key) of the range from which the difficulty chooses a value."""
 
 _OTHER_KEYS = {
     "noise": {"downsampled_scale": "spacing"},
@@ -41,11 +41,11 @@ _OTHER_KEYS = {
     "stairs": {"step_width": "step_width"},
     "grid": {"grid_width": "cell"},
 }
-"""Kind of sub-terrain -> Isaac Lab's key -> rlcli's key."""
+"""Kind of sub-terrain -> Isaac Lab's key -> rlcli's key, for the settings that do not depend on the difficulty."""
 
 
 def read_ground(item: Node, spawn: Node) -> dict[str, Any]:
-    """Return `scene.ground` for a ground plane."""
+    """Return the section `scene.ground` for a ground plane: size, height and friction."""
     item.skip("prim_path", "collision_group", "debug_vis", "class_type")
     init = item.node("init_state")
     x, y, height = (as_float(value) for value in init.get("pos", (0.0, 0.0, 0.0)))
@@ -59,13 +59,16 @@ def read_ground(item: Node, spawn: Node) -> dict[str, Any]:
 
 
 def read_friction(material: Node) -> dict[str, float]:
-    """Return `friction`, the sliding friction; empty for Isaac Lab's default of 0.5, which becomes rlcli's default."""
+    """Return {"friction": sliding friction} of a contact material; {} for Isaac Lab's default of 0.5.
+
+    Without the key, rlcli's own default applies.
+    """
     material.skip("func", "restitution_combine_mode", "friction_combine_mode", "improve_patch_friction")
     material.skip("compliant_contact_stiffness", "compliant_contact_damping")
     static = material.get("static_friction", 0.5)
     dynamic = material.get("dynamic_friction", 0.5)
     if static != dynamic:
-        material.note("approximated", "static_friction", "MuJoCo has one friction; dynamic_friction sets it")
+        material.note("approximated", "static_friction", "MuJoCo has one coefficient: dynamic_friction is used")
     if material.data.get("restitution"):
         material.note("ignored", "restitution", "in MuJoCo, solref of a geom sets how contacts bounce")
     else:
@@ -74,7 +77,7 @@ def read_friction(material: Node) -> dict[str, float]:
 
 
 def read_terrain(item: Node, scene: dict[str, Any]) -> dict[str, Any] | None:
-    """Return `scene.ground` for a plane, or write `scene.terrain` for a generator and return None."""
+    """Return the section `scene.ground` for a plane; for a generator write `terrain` into `scene`, and return None."""
     item.skip("class_type", "prim_path", "collision_group", "debug_vis", "num_envs", "env_spacing", "usd_path")
     item.skip("visual_material", "use_terrain_origins")
     kind = item.get("terrain_type", "generator")
@@ -85,7 +88,7 @@ def read_terrain(item: Node, scene: dict[str, Any]) -> dict[str, Any] | None:
         return plane
     generator = item.node("terrain_generator")
     if kind != "generator" or not generator.data:
-        item.note("approximated", "terrain_type", "replaced by a plane")
+        item.note("approximated", "terrain_type", "replaced by a plane: rlcli has planes and generated terrains")
         return plane
     scene["terrain"] = _read_generator(generator) | friction
     start_level = item.get("max_init_terrain_level")
@@ -95,7 +98,7 @@ def read_terrain(item: Node, scene: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _read_generator(node: Node) -> dict[str, Any]:
-    """Return the settings of a terrain generator; rlcli builds every sub-terrain as a height field."""
+    """Return the section `scene.terrain` for a terrain generator. rlcli builds every sub-terrain as a height field."""
     config: dict[str, Any] = {
         "kind": "generator",
         "rows": node.get("num_rows", 1),
@@ -117,9 +120,9 @@ def _read_generator(node: Node) -> dict[str, Any]:
 
 
 def _read_sub_terrain(node: Node, resolution: float) -> dict[str, Any]:
-    """Return the settings of one sub-terrain. The name of its function decides its kind.
+    """Return the settings of one sub-terrain; the name of Isaac Lab's terrain function decides its `kind`.
 
-    `resolution` is the distance between two heights of the terrain [m].
+    `resolution` is the distance between two points of the height field [m].
     """
     function = kind_of(node.get("function"))
     proportion = as_float(node.get("proportion", 1.0))
@@ -146,11 +149,11 @@ def _read_sub_terrain(node: Node, resolution: float) -> dict[str, Any]:
             config[ours] = to_plain(value)
     if kind == "noise":
         config.setdefault("spacing", resolution)
-        if "height" in config:  # the same at every difficulty
+        if "height" in config:  # rlcli has a range, Isaac Lab one height for every difficulty
             low, high = config["height"]
             config["height"] = [(high - low) / 2.0] * 2
             node.note("approximated", "noise_range", "heights are relative to the middle of the range")
-        node.note("ignored", "noise_step", "heights are not rounded")
+        node.note("ignored", "noise_step", "heights are not rounded to multiples of a step")
     if kind in ("slope", "stairs") and inverted:
         config["inverted"] = True
     return config

@@ -11,7 +11,7 @@ from rlcli_isaaclab.sim import RigidBodyMaterialCfg
 
 @configclass
 class TerrainGeneratorCfg:
-    """A grid of sub-terrains; the difficulty rises from row to row."""
+    """Settings of a terrain that is a grid of sub-terrains; the difficulty rises from row to row."""
 
     class_type: Any = "TerrainGenerator"
     seed: Any = None
@@ -33,7 +33,7 @@ class TerrainGeneratorCfg:
 
 @configclass
 class TerrainImporterCfg:
-    """A plane, or the terrain of a generator."""
+    """Settings of the ground: a plane, or the terrain of a generator."""
 
     class_type: Any = TerrainImporter
     collision_group: int = -1
@@ -51,7 +51,10 @@ class TerrainImporterCfg:
 
 
 def _sub_terrain(name: str, function: str, **settings: Any) -> Any:
-    """Return the class of a sub-terrain. Its settings keep Isaac Lab's names."""
+    """Create the configuration class `name` of a sub-terrain.
+
+    `function` is the name of Isaac Lab's terrain function; `settings` are Isaac Lab's names and defaults.
+    """
     common: dict[str, Any] = {"function": function, "proportion": 1.0, "size": None, "flat_patch_sampling": None}
     if name.startswith("Hf"):
         common |= {"border_width": 0.0, "horizontal_scale": 0.1, "vertical_scale": 0.005, "slope_threshold": None}
@@ -104,7 +107,10 @@ MeshRepeatedBoxesTerrainCfg.ObjectCfg = make_config_class(
 
 
 def height_field_to_mesh(function: Any) -> Any:
-    """Return a terrain function of the task's own. rlcli does not call it: flat ground replaces the sub-terrain."""
+    """Return `function`, a terrain function that the task defines, unchanged.
+
+    Isaac Lab decorates such functions. rlcli does not call them: flat ground replaces the sub-terrain.
+    """
     return function
 
 
@@ -134,4 +140,4 @@ ROUGH_TERRAINS_CFG = TerrainGeneratorCfg(
         ),
     },
 )
-"""Stairs, boxes, rough ground and slopes."""
+"""Terrain generator with stairs, boxes, rough ground and slopes; named as in `isaaclab.terrains.config.rough`."""

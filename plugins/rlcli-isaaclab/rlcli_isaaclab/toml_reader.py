@@ -1,4 +1,4 @@
-"""The function `load` of the package `toml`, with which packages of Isaac Lab read their version."""
+"""Replacement of the library `toml`, with which packages of Isaac Lab tasks read their version."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def load(file: Any) -> dict[str, Any]:
-    """Read a TOML file."""
+    """Return the content of a TOML file, given by its path."""
     return tomllib.loads(Path(file).read_text(encoding="utf-8"))
 
 

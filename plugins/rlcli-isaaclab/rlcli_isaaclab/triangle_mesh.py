@@ -1,4 +1,4 @@
-"""Replacement of the library trimesh, if it is not installed, for tasks that sample points on surfaces."""
+"""Replacement of the library `trimesh` if it is not installed, for tasks that sample points on surfaces."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rlcli_isaaclab.absent import absence
 
 
 class Trimesh:
-    """Triangle mesh: vertices (n, 3) [m] and faces (m, 3)."""
+    """Triangle mesh: vertices (n, 3) [m], and faces (m, 3), each with the indices of its three vertices."""
 
     def __init__(self, vertices: Any, faces: Any, process: bool = False) -> None:
         self.vertices, self.faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
@@ -33,7 +33,10 @@ class Trimesh:
 
 
 def sample_surface(mesh: Any, count: int, face_weight: Any = None, seed: Any = None) -> tuple[Any, Any]:
-    """Return random points on a surface, uniform by area (or by `face_weight`), and the face of each point."""
+    """Return random points on the surface of a mesh (count, 3) [m], and the index of each point's face (count,).
+
+    The probability of a face is proportional to its area, or to `face_weight`.
+    """
     draws = np.random.default_rng(seed if seed is not None else np.random.randint(2**31))
     weight = mesh.area_faces if face_weight is None else np.asarray(face_weight)
     faces = draws.choice(len(weight), size=count, p=weight / weight.sum())

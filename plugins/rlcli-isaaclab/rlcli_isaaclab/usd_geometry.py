@@ -1,4 +1,7 @@
-"""Shapes of the simulation as USD prims: every collision geom of an entity is a triangle mesh."""
+"""Replacement of USD geometry, for tasks that read the shapes of objects.
+
+Every collision geom of an entity is a prim with a triangle mesh.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +12,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rlcli.errors import TaskError
+from rlcli.errors import TaskError, listing
 from rlcli_isaaclab.direct_env import MANAGED
 from rlcli_isaaclab.usd_stage import Prim
 from rlcli_isaaclab.usd_stage import UsdGeom as _Poses
 
 _SEGMENTS = 16
-"""Segments of a circle."""
+"""Number of segments by which a circle is approximated in triangle meshes."""
 
 
 class Matrix:
-    """Pose as a matrix in the convention of USD: a point is a row vector p, and is moved to p M."""
+    """Pose as a 4 x 4 matrix M in the convention of USD: a point is a row vector p = (x, y, z, 1) and moves to p M."""
 
     def __init__(self, values: NDArray[np.float64]) -> None:
         self._values = values
@@ -38,21 +41,28 @@ class Matrix:
 
 
 class GeomPrim(Prim):
-    """A geom as a prim of the type Mesh, or the root of an entity (geom -1)."""
+    """Prim of a geom, or of the root of an entity (`geom` = -1).
+
+    Args:
+        path: prim path.
+        model: the model.
+        body: index of the entity's root body.
+        geom: index of the geom, or -1.
+    """
 
     def __init__(self, path: str, model: mujoco.MjModel, body: int, geom: int) -> None:
         super().__init__(path)
         self.model, self.body, self.geom = model, body, geom
 
     def GetTypeName(self) -> str:  # noqa: N802
-        """Return the text "Mesh"."""
+        """Return "Mesh" for a geom, "Xform" for the root of an entity."""
         return "Mesh" if self.geom >= 0 else "Xform"
 
     def GetAttribute(self, name: str) -> None:  # noqa: N802
-        """Return None: a geom has no USD attributes, such as a scale."""
+        """Return None, as USD does for an attribute that a prim lacks: a geom has no attributes such as a scale."""
 
     def in_root(self) -> NDArray[np.float64]:
-        """Return the geom's pose in the root's frame, as a matrix that multiplies columns."""
+        """Return the pose of the geom in the frame of the entity's root. (4, 4), for column vectors"""
         pose = np.eye(4)
         if self.geom < 0:
             return pose
@@ -73,7 +83,7 @@ def _pose(position: Any, quat: Any) -> NDArray[np.float64]:
 
 
 def prims_below(path: str) -> list[GeomPrim]:
-    """Return the root of the entity with a prim path, and the collision geoms below it.
+    """Return the prim of the entity with a prim path, followed by the prims of its collision geoms.
 
     Raises:
         TaskError: if no entity has the path.
@@ -82,7 +92,8 @@ def prims_below(path: str) -> list[GeomPrim]:
     name = path.rstrip("/").rsplit("/", 1)[-1].lower()
     entity = managed.entities.get(name)
     if entity is None:
-        raise TaskError(f"no entity '{name}' for the prim {path}", hint="name the entity like its prim")
+        hint = f"the last part of the path must be the name of an entity: {listing(managed.entities)}"
+        raise TaskError(f"the prim {path} does not exist: the scene has no entity '{name}'", hint=hint)
     model = managed.engine.model
     bodies = [int(body) for body in entity.body_ids]
     shapes = [
@@ -93,31 +104,31 @@ def prims_below(path: str) -> list[GeomPrim]:
 
 
 def get_all_matching_child_prims(prim_path: Any, predicate: Any = lambda prim: True, **options: Any) -> list[GeomPrim]:
-    """Return the prims below a path that match a condition."""
+    """Return the prims below a prim path for which `predicate` returns True."""
     return [prim for prim in prims_below(str(prim_path)) if predicate(prim)]
 
 
 class _Mesh:
-    """Triangles of a geom."""
+    """Triangle mesh of a geom with the methods of `pxr.UsdGeom.Mesh`."""
 
     def __init__(self, prim: GeomPrim) -> None:
         self._points, self._faces = _triangles(prim.model, prim.geom)
 
     def GetPointsAttr(self) -> Any:  # noqa: N802
-        """Return the vertices. (n, 3) [m]"""
+        """Return an object whose `Get()` returns the vertices in the geom's frame. (n, 3) [m]"""
         return SimpleNamespace(Get=lambda: self._points)
 
     def GetFaceVertexCountsAttr(self) -> Any:  # noqa: N802
-        """Return the number of corners of each face."""
+        """Return an object whose `Get()` returns the number of corners of each face, which is 3."""
         return SimpleNamespace(Get=lambda: [3] * len(self._faces))
 
     def GetFaceVertexIndicesAttr(self) -> Any:  # noqa: N802
-        """Return the corners of all faces."""
+        """Return an object whose `Get()` returns the indices of the corners of all faces, as one list."""
         return SimpleNamespace(Get=lambda: self._faces.reshape(-1).tolist())
 
 
 def _triangles(model: mujoco.MjModel, geom: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return vertices and faces of a geom in its own frame."""
+    """Return the vertices of a geom in its own frame (n, 3) [m], and its faces (m, 3), indices of vertices."""
     kind, size = int(model.geom_type[geom]), model.geom_size[geom]
     types = mujoco.mjtGeom
     if kind == types.mjGEOM_MESH:
@@ -131,11 +142,16 @@ def _triangles(model: mujoco.MjModel, geom: int) -> tuple[NDArray[np.float32], N
         return corners.astype(np.float32), np.array([(a, b, c) for s in sides for a, b, c in (s[:3], (s[0], *s[2:]))])
     if kind in (types.mjGEOM_SPHERE, types.mjGEOM_ELLIPSOID, types.mjGEOM_CAPSULE, types.mjGEOM_CYLINDER):
         return _revolved(*_profile(kind, size))
-    raise TaskError(f"a geom of type {types(kind).name} has no triangles", hint="use a box, a sphere, ... or a mesh")
+    hint = "use a box, a sphere, an ellipsoid, a capsule, a cylinder or a mesh"
+    raise TaskError(f"a geom of type {types(kind).name} cannot be converted to triangles", hint=hint)
 
 
 def _profile(kind: int, size: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the outline (radius, height) of a shape of revolution, from bottom to top, and the scale of its axes."""
+    """Return the outline of a shape of revolution, and the scale of its axes.
+
+    Returns:
+        Points (radius, height) from bottom to top, (n, 2) [m], and factors for x, y and z, (3,).
+    """
     types = mujoco.mjtGeom
     if kind == types.mjGEOM_CYLINDER:
         return np.array([(0, -size[1]), (size[0], -size[1]), (size[0], size[1]), (0, size[1])]), np.ones(3)

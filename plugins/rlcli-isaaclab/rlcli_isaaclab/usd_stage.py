@@ -1,4 +1,4 @@
-"""Poses of prims, which tasks read from the USD stage while they start."""
+"""Replacement of the USD stage, for tasks that read the poses of prims when they start."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rlcli_isaaclab.direct_env import MANAGED
 
 
 class Prim:
-    """A body of the first environment, named by the last part of a path."""
+    """Prim of a body or entity in the first environment; the last part of its path is the name."""
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -22,7 +22,7 @@ class Prim:
         raise absence(f"pxr.Usd.Prim.{name}")
 
     def pose(self) -> tuple[Any, Any]:
-        """Return position [m] and quaternion (w, x, y, z) in the world frame."""
+        """Return position (3,) [m] and quaternion (w, x, y, z) of the body in the world frame."""
         name = self.path.rstrip("/").rsplit("/", 1)[-1]
         for entity in MANAGED.get().entities.values():
             bodies = list(entity.names["Bodies"])
@@ -31,14 +31,15 @@ class Prim:
                 return entity.data.body_pos_w[0, index], entity.data.body_quat_w[0, index]
             if name.lower() == entity.name:
                 return entity.data.root_pos_w[0], entity.data.root_quat_w[0]
-        raise TaskError(f"no body '{name}' for the prim {self.path}", hint="name a body of the MJCF like the prim")
+        hint = "rename a body of the MJCF: its name must be the last part of the prim path"
+        raise TaskError(f"the prim {self.path} does not exist: no entity has a body '{name}'", hint=hint)
 
 
 class Stage:
     """Replacement of the USD stage: its prims are the bodies of the first environment."""
 
     def GetPrimAtPath(self, path: Any) -> Any:  # noqa: N802
-        """Return the prim of a path: the root of an entity, or else a body."""
+        """Return the prim of a path, whose last part is the name of an entity or of a body."""
         from rlcli_isaaclab.usd_geometry import prims_below
 
         name = str(path).rstrip("/").rsplit("/", 1)[-1].lower()
@@ -50,7 +51,7 @@ class _Xformable:
         self._prim = prim
 
     def ComputeLocalToWorldTransform(self, time: Any = None) -> Any:  # noqa: N802
-        """Return the pose of the body."""
+        """Return the pose of the prim in the world frame, with the methods of a USD matrix that read it."""
         position, quat = self._prim.pose()
         w, x, y, z = quat.tolist()
         turn = SimpleNamespace(real=w, imaginary=(x, y, z), GetReal=lambda: w, GetImaginary=lambda: (x, y, z))

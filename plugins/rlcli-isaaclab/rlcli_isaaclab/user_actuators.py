@@ -1,4 +1,4 @@
-"""Actuator classes of the user's own: subclasses of `ActuatorBase`, which replace a PD controller of rlcli."""
+"""Actuator models that the user defines: subclasses of `ActuatorBase`, which compute efforts in place of rlcli's."""
 
 from __future__ import annotations
 
@@ -20,13 +20,16 @@ from rlcli_isaaclab.utils.types import ArticulationActions
 
 
 def is_user_actuator(class_type: Any) -> bool:
-    """Return whether an actuator is a class of the user's."""
+    """Return whether the class of an actuator is defined by the user, and not by this package."""
     own = isinstance(class_type, type) and issubclass(class_type, ActuatorBase)
     return own and not class_type.__module__.startswith("rlcli_isaaclab")
 
 
 def actuator_events(found: Mapping[tuple[str, str], Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the startup events that install the user's actuators: (entity, group) -> settings of the group."""
+    """Return the startup events, by name, that install the user's actuators in an environment.
+
+    `found` maps (entity, actuator group) to the settings of the group.
+    """
     return {
         f"actuator_{entity}_{group}": {"func": ActuatorTerm(entity, group, settings), "mode": "startup"}
         for (entity, group), settings in found.items()
@@ -34,7 +37,7 @@ def actuator_events(found: Mapping[tuple[str, str], Mapping[str, Any]]) -> dict[
 
 
 class ActuatorTerm:
-    """A startup event that lets the user's class compute the efforts of a group of joints."""
+    """Startup event after which an object of the user's class computes the efforts of a group of joints."""
 
     def __init__(self, entity: str, group: str, settings: Mapping[str, Any]) -> None:
         self.actuator = f"{entity}.{group}"
@@ -47,7 +50,7 @@ class ActuatorTerm:
         return self
 
     def __call__(self, *args: Any) -> Any:
-        """Raise an error: only the bound term can be called."""
+        """Raise a TypeError: only a term that is bound to an environment can be called."""
         raise TypeError("an actuator's term cannot be called before it is bound to an environment")
 
     def __rlcli_term__(self, name: str) -> Signature:
@@ -58,7 +61,7 @@ class ActuatorTerm:
 
 
 class _BoundActuator:
-    """The user's actuator in an environment."""
+    """Object of the user's actuator class in one environment, in place of one of rlcli's actuator models."""
 
     def __init__(self, term: ActuatorTerm, env: Any) -> None:
         model = env.actuators[term.actuator]
@@ -83,17 +86,26 @@ class _BoundActuator:
         """Do nothing: the actuator is installed when the term is bound."""
 
     def compute_efforts(self, targets: Tensor, position: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (efforts of the user's actuator before its limits, efforts after them)."""
+        """Return the efforts of the user's actuator before and after its limits are applied.
+
+        Args:
+            targets: position, velocity and effort targets. (num_envs, 3, joints)
+            position: joint positions. (num_envs, joints) [m or rad]
+            velocity: joint velocities. (num_envs, joints) [m/s or rad/s]
+
+        Returns:
+            Efforts before, and after the limits. (num_envs, joints) each [N or N m]
+        """
         wanted = ArticulationActions(*(row.clone() for row in targets.unbind(1)))
         self._actuator.compute(wanted, position, velocity)
         return self._actuator.computed_effort, self._actuator.applied_effort
 
     def reset(self, selection: Selection) -> None:
-        """Reset the actuator at the start of episodes."""
+        """Reset the actuator in the environments whose episode starts."""
         self._actuator.reset(selection.env_ids())
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return copies of the actuator's tensors."""
+        """Return copies of the tensors of the user's actuator, by name."""
         return self._state.state_dict()
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:

@@ -1,4 +1,4 @@
-"""Adaptation of the user's functions: what they read from the model, found in their source, and where they run."""
+"""Inspection of the source of the user's functions, and adaptation of functions that are written for a GPU."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from rlcli.sim.device_names import on_cpu
 
 
 def code_of(function: Any) -> Any:
-    """Return the function or class that has the code of a term, which may be a partial function or an object."""
+    """Return the function or class that has the code of `function`, which may be a partial or a callable object."""
     while isinstance(function, functools.partial):
         function = function.func
     return function if inspect.isfunction(function) or inspect.isclass(function) else type(function)
 
 
 def place_of_code(function: Any) -> tuple[Path, int]:
-    """Return the file and the first line of the code of a term; `?` if it has no file."""
+    """Return the file and the line where the code of a callable begins; (`?`, 1) if its file is not known."""
     try:
         return Path(inspect.getsourcefile(code_of(function)) or "?"), inspect.getsourcelines(code_of(function))[1]
     except (OSError, TypeError):
@@ -43,12 +43,15 @@ def _text(file: str) -> str:
 
 
 def reads_body_forces(text: str) -> bool:
-    """Return whether code reads accelerations or joint forces of bodies, which MuJoCo computes only on demand."""
+    """Return whether source code names accelerations or joint forces of bodies.
+
+    MuJoCo only computes them on request (`mj_rnePostConstraint`).
+    """
     return any(word in text for word in _BODY_FORCES)
 
 
 def term_reads_body_forces(function: Any) -> bool:
-    """Return whether a user's function or class, or one that it names, passes `reads_body_forces`."""
+    """Return whether the code of a user's function or class, or of a function that it calls, `reads_body_forces`."""
     found: dict[Any, str] = {}
     waiting = [function]
     while waiting:
@@ -72,9 +75,10 @@ _BODY_FORCES = (
 
 
 def placed(target: Any, device: Any) -> Any:
-    """Return a function or class of the user's, changed if that is needed to run on a device.
+    """Return a function or class of the user in a form that runs on `device`.
 
-    If the device is the CPU and the file names the device `cuda`, the code runs with the CPU in place of `cuda`.
+    If the device is the CPU and the user's file contains `cuda`, the code is run with the CPU in place of `cuda`.
+    Otherwise return the function or class unchanged.
     """
     kinds = [kind for kind in reversed(getattr(target, "__mro__", (target,))) if not is_framework(kind.__module__)]
     if str(device) != "cpu" or not any("cuda" in file_text(kind) for kind in kinds):
@@ -96,6 +100,9 @@ def source_text(function: Any) -> str:
 
 
 def unset_simple(spec: mujoco.MjSpec, params: Mapping[str, Any]) -> None:
-    """Clear the `simple` flag of all bodies, with which MuJoCo assumes the centre of mass at the frame's origin."""
+    """Clear the flag `simple` of all bodies before the model is compiled.
+
+    With the flag MuJoCo assumes that the centre of mass stays at the origin of the frame; a user's event may move it.
+    """
     for body in spec.bodies:
         body.simple = 0

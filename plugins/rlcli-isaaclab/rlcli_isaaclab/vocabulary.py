@@ -1,5 +1,8 @@
 # ruff: noqa: F401
-"""All names of this package that task files import, in one module. `rlcli_isaaclab` reads its names from here."""
+"""All names that task files can import from Isaac Lab's modules, collected from the modules of this package.
+
+`rlcli_isaaclab` exports the names of this module.
+"""
 
 from rlcli_isaaclab import actuators, assets, envs, managers, mdp, rsl_rl, scene, sensors, sim, terrains, utils
 from rlcli_isaaclab import sim as sim_utils

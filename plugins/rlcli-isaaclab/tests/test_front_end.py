@@ -437,7 +437,7 @@ def test_error_in_user_command_lists_valid_names(cfg, change, message):
         (('{"steps": 5}', "{}"), "missing key 'steps'"),
         (
             ("    too_late = DoneTerm(func=late", "    late = DoneTerm(func=late)\n    two = DoneTerm(func=late"),
-            "member of the same name",
+            "rename the member of the class that has the same name as the function",
         ),
         (('{"steps": 5}', '{"steps": "x"}'), "expected a whole number"),
         (("self.sim.dt = 0.01", "self.decimation = None"), "missing 'decimation'"),

@@ -463,7 +463,7 @@ def test_rl_games_settings_without_counterpart_are_reported(direct):
 
 
 @pytest.mark.parametrize(
-    ("new", "message"), [("class: AMP", "'AMP' has no counterpart in rlcli"), ("class: null", "it has no value")]
+    ("new", "message"), [("class: AMP", "'AMP' has no counterpart in rlcli"), ("class: null", "the key has no value")]
 )
 def test_agent_of_another_algorithm_is_refused_with_its_line(direct, new, message):
     registered(direct.parent, ["skrl"])

@@ -1,4 +1,6 @@
-"""Write `rlcli_isaaclab/names.json`: the names of each module of Isaac Lab, read from its files without import.
+"""Write `rlcli_isaaclab/names.json`: the functions and classes that each module of Isaac Lab defines.
+
+The files are parsed, not imported.
 
 Usage: python names.py FOLDER, where FOLDER is Isaac Lab's `source`.
 """
@@ -16,7 +18,7 @@ KINDS = {ast.ClassDef: "class", ast.FunctionDef: "function"}
 
 
 def main(source: Path) -> None:
-    """Write the table."""
+    """Write the names of all modules below the folder `source` to `names.json`."""
     table: dict[str, dict[str, Any]] = {}
     for package in PACKAGES:
         root = source / package / package
@@ -33,7 +35,10 @@ def main(source: Path) -> None:
 
 
 def names_of(tree: ast.Module) -> dict[str, Any]:
-    """Return name -> function, class or value for what a module defines itself; settings of a configuration class."""
+    """Return the names that a module defines.
+
+    The value of a name is "function", "class" or "value"; for a configuration class it is its `settings`.
+    """
     found: dict[str, Any] = {}
     for node in tree.body:
         for kind, word in KINDS.items():
@@ -50,7 +55,10 @@ def names_of(tree: ast.Module) -> dict[str, Any]:
 
 
 def settings(node: ast.ClassDef) -> dict[str, Any]:
-    """Return bases, fields and nested classes of a configuration class. A default that is no literal is null."""
+    """Return bases, fields (name -> default) and nested classes of a configuration class.
+
+    A default that is not a literal is None.
+    """
     fields: dict[str, Any] = {}
     nested: dict[str, Any] = {}
     for item in node.body:
@@ -64,7 +72,7 @@ def settings(node: ast.ClassDef) -> dict[str, Any]:
 
 
 def literal(node: ast.expr | None) -> Any:
-    """Return the value of a literal that JSON has, else null."""
+    """Return the value of a literal if JSON can hold it, otherwise None."""
     try:
         value = ast.literal_eval(node) if node is not None else None
         json.dumps(value, allow_nan=False)

@@ -114,9 +114,10 @@ def _copy_models(models: dict[str, Any], source: Path, folder: Path) -> list[Pat
     for entry in models.values():
         file, target = source / entry["model"], folder / entry["model"]
         if not target.resolve().is_relative_to(folder.resolve()):
-            raise TaskError(f"'{entry['model']}' in mjcf: is outside of the task's folder; move it inside")
+            what = f"the key `mjcf` names the model '{entry['model']}', which is outside of the task's folder {source}"
+            raise TaskError(what, hint="move the model into the folder, and correct its path in the key")
         if not file.is_file():
-            raise TaskError(f"no file '{file}', which mjcf: names; correct the name")
+            raise TaskError(f"the key `mjcf` names the file '{file}', which does not exist; correct the path")
         if file.resolve() != target.resolve():
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, target)

@@ -26,9 +26,15 @@ SPACE = TRAIN[TRAIN.index("    space: {") : TRAIN.index("    mlp: {")]
     ("old", "new", "key", "message", "hint"),
     [
         ("params:\n", "parms:\n", "parms", "unknown key 'parms'", "keys: params"),
-        ("  config:\n", "  conf:\n", "params", "an rl_games YAML has params:", None),
+        ("  config:\n", "  conf:\n", "params", "a configuration of rl_games needs the mapping params:", None),
         ("name: a2c_continuous", "name: sac", "params.algo", "'sac' has no counterpart", "expected 'a2c_continuous'"),
-        ("name: a2c_continuous", "nam: a2c_continuous", "params.algo", "it has no value", "expected 'a2c_continuous'"),
+        (
+            "name: a2c_continuous",
+            "nam: a2c_continuous",
+            "params.algo",
+            "the key has no value",
+            "expected 'a2c_continuous'",
+        ),
         ("{name: a2c_continuous}", "a2c_discrete", "params.algo", "'a2c_discrete' has no counterpart", None),
         ("name: continuous_a2c_logstd", "name: [x]", "params.model", "has no counterpart", "'continuous_a2c_logstd'"),
         ("  load_path:", "  load_pth:", "params.load_pth", "unknown key 'load_pth'", "did you mean 'load_path'"),

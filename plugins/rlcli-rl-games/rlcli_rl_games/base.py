@@ -1,4 +1,4 @@
-"""Base of the trainers that run rl_games' PPO and SAC."""
+"""Base class of the trainers that run rl_games' PPO and SAC."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from rlcli_rl_games.library import AlgoObserver, DefaultRewardsShaper, NullWrite
 from rlcli_rl_games.vec_env import RlGamesVecEnv
 
 ACTIVATIONS = {"swish": "silu"}
-"""rl_games' names of activations that differ from those of a saved policy."""
+"""Name of an activation in rl_games -> its name in a saved policy, where they differ."""
 OBSERVATION_CLIP = 5.0
 """rl_games clips normalized observations to +-this value."""
 _EPSILON = 1e-5
@@ -35,7 +35,7 @@ _LEARNER_HINT = "lower the learning rate or grad_norm in params.config; the last
 
 
 class RlGamesTrainer(BaseTrainer):
-    """Base of the trainers for PPO and SAC.
+    """Base class of the trainers that run rl_games' PPO and SAC.
 
     Args:
         env: the environment.
@@ -88,7 +88,7 @@ class RlGamesTrainer(BaseTrainer):
 
     @abstractmethod
     def _epoch(self) -> tuple[float, dict[str, float]]:
-        """Run one iteration; return the seconds of the update, and the metrics."""
+        """Run one iteration; return (duration of the update [s], metrics by name)."""
 
     @abstractmethod
     def _modules(self) -> dict[str, torch.nn.Module]:
@@ -100,7 +100,7 @@ class RlGamesTrainer(BaseTrainer):
 
     @abstractmethod
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normalizer; the critics keep their own."""
+        """Load a policy's weights, with its normalizer; the weights of the critics do not change."""
 
     def start(self) -> None:
         """Reset the environment to its first episodes."""
@@ -169,7 +169,13 @@ class RlGamesTrainer(BaseTrainer):
         return config.params.config.model_dump(exclude_none=True)
 
     def _parameters(self, settings: dict[str, Any], device: str, folder: str) -> dict[str, Any]:
-        """Return all of `params`, as rl_games' runner passes them to an agent; `folder` is for its files."""
+        """Return the whole mapping `params`, in the form in which rl_games' runner passes it to an agent.
+
+        Args:
+            settings: `params.config`, from `_settings`.
+            device: device of the networks.
+            folder: folder to which rl_games may write files.
+        """
         config: Any = self.config
         shaper = DefaultRewardsShaper(**settings["reward_shaper"])
         if self.config.max_iterations is not None:
@@ -225,7 +231,7 @@ def mean_of(values: list[Any]) -> float:
 
 
 def _with_none_activations(value: Any) -> Any:
-    """Return a copy in which null activations are the text "None", which rl_games expects."""
+    """Return a copy of settings with the string "None", which rl_games expects, in place of null activations."""
     if isinstance(value, dict):
         return {
             key: "None" if item is None and "activation" in key else _with_none_activations(item)

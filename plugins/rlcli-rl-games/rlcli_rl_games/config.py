@@ -1,4 +1,4 @@
-"""rl_games' settings in the form of a train YAML, under `params`.
+"""Settings of the rl_games trainer: the mapping `params` of rl_games' own YAML files.
 
 The module imports neither torch nor rl_games, so that a YAML is checked fast.
 """
@@ -15,7 +15,7 @@ from rlcli.trainers import TrainerSpec
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Activation = Literal["elu", "relu", "tanh", "swish"]
-"""Activations that a saved policy supports too; swish is SiLU."""
+"""Activations of rl_games that a saved policy supports as well; swish is SiLU."""
 Initializer = dict[str, str | int | float]
 """`{name: default}`, or another initializer of rl_games with its parameters."""
 Nothing = Literal["None"] | None
@@ -33,9 +33,9 @@ IGNORED: Mapping[str, str] = {
     "num_actors": "use scene.num_envs",
     "score_to_win": "training runs until its limit of iterations or steps",
     "save_best_after": "use save_interval",
-    "print_stats": "",
+    "print_stats": "rlcli prints its own statistics",
     "player": "use rlcli play",
-    "games_to_track": "",
+    "games_to_track": "rlcli averages over at least 100 episodes",
     "max_frames": "use --max-steps",
     "seq_length": "sequences of recurrent networks are whole rollouts",
     "num_seed_steps": "rl_games itself does not read it",
@@ -56,48 +56,48 @@ class Named(StrictModel):
     """Reference to an algorithm or a model of rl_games by its name."""
 
     name: str
-    """Name in rl_games."""
+    """Name of the algorithm or model in rl_games."""
 
 
 class MlpConfig(StrictModel):
-    """A multilayer perceptron."""
+    """Settings of a multilayer perceptron."""
 
     units: Annotated[list[Count], Field(min_length=1)]
     """Widths of the hidden layers."""
     activation: Activation
-    """Activation between layers."""
+    """Activation after each hidden layer."""
     initializer: Initializer = _DEFAULT
-    """Initial weights."""
+    """How the weights are initialized: `{name: default}`, or another initializer of rl_games with its parameters."""
     regularizer: dict[str, Any] | None = None
     """Ignored, as in rl_games."""
     d2rl: Literal[False] = False
-    """Only the first layer receives the input."""
+    """Whether every hidden layer also receives the input (a D2RL network): not supported."""
 
 
 class ContinuousConfig(StrictModel):
-    """The distribution of continuous actions."""
+    """Settings of the normal distribution from which continuous actions are sampled."""
 
     mu_activation: Nothing = None
-    """No activation for the mean."""
+    """Activation on the mean: only null."""
     sigma_activation: Nothing = None
-    """No activation for the logarithm of the standard deviation."""
+    """Activation on the logarithm of the standard deviation: only null."""
     mu_init: Initializer = _DEFAULT
-    """Initial weights of the layer that gives the mean."""
+    """Initializer of the layer that computes the mean."""
     sigma_init: Initializer = _ZERO
-    """Initial logarithm of the standard deviation."""
+    """Initializer of the logarithm of the standard deviation, such as `{name: const_initializer, val: 0}`."""
     fixed_sigma: Literal[True] = True
-    """The standard deviation is trained and does not depend on the state."""
+    """Whether the standard deviation is trained but does not depend on the observation: only true."""
 
 
 class SpaceConfig(StrictModel):
-    """The action space."""
+    """Settings of the action space."""
 
     continuous: ContinuousConfig | None = ContinuousConfig()
-    """Continuous actions."""
+    """Settings of continuous actions, the only kind that rlcli has."""
 
 
 class NetworkConfig(StrictModel):
-    """Actor and critic of PPO."""
+    """Settings of the networks of PPO's actor and critic."""
 
     name: Literal["actor_critic"] = "actor_critic"
     """Name of the network in rl_games."""
@@ -106,86 +106,86 @@ class NetworkConfig(StrictModel):
     space: SpaceConfig = SpaceConfig()
     """The action space."""
     mlp: MlpConfig
-    """The network."""
+    """The hidden layers of actor and critic."""
 
 
 class SacNetworkConfig(StrictModel):
-    """Actor and critics of SAC."""
+    """Settings of the networks of SAC's actor and its two critics."""
 
     name: Literal["soft_actor_critic"] = "soft_actor_critic"
     """Name of the network in rl_games."""
     separate: Literal[True] = True
-    """Actor and critics are separate networks."""
+    """Whether actor and critics have separate networks: only true."""
     space: dict[str, Any] | None = None
     """Ignored, as in rl_games."""
     mlp: MlpConfig
-    """The networks."""
+    """The hidden layers of each network."""
     log_std_bounds: tuple[float, float] = (-5.0, 2.0)
-    """Bounds of the logarithm of the standard deviation."""
+    """[low, high]: bounds of the logarithm of the actions' standard deviation."""
 
 
 class RewardShaper(StrictModel):
     """Reward used in training: (reward + shift_value) * scale_value, clipped."""
 
     scale_value: float = 1.0
-    """Factor of the reward."""
+    """Factor on the reward."""
     shift_value: float = 0.0
-    """Added to the reward before scaling."""
+    """Number that is added to the reward before scaling."""
     min_val: float | None = None
-    """Lower limit; null: none."""
+    """Lower limit of the scaled reward; null: none."""
     max_val: float | None = None
-    """Upper limit; null: none."""
+    """Upper limit of the scaled reward; null: none."""
 
 
 class CentralValueConfig(_Settings):
-    """A separate critic, which observes the group `critic`."""
+    """Settings of a critic with its own network and optimizer, which observes the group `critic`."""
 
     network: CentralNetworkConfig
     """Network of the critic."""
     learning_rate: Positive
-    """Learning rate."""
+    """Learning rate of Adam for this critic."""
     lr_schedule: Literal["linear", "constant", "None"] | None = None
-    """Schedule of the learning rate."""
+    """Schedule of the learning rate: linear falls to 0 over the training."""
     mini_epochs: Count
     """Epochs per iteration."""
     minibatch_size: Count
     """Samples per minibatch."""
     clip_value: bool
-    """Clip the change of the value."""
+    """Whether the loss is the larger error of the value and of the value clipped to its old prediction +- e_clip."""
     normalize_input: bool
-    """Normalize the observations of this critic."""
+    """Whether this critic's observations are normalized by running mean and standard deviation."""
     truncate_grads: bool = False
-    """Clip the gradient's norm to grad_norm."""
+    """Whether the norm of the gradient is clipped to grad_norm."""
     grad_norm: Positive = 1.0
-    """Maximum norm of the gradient."""
+    """Maximum norm of the gradient, with truncate_grads."""
     e_clip: Positive = 0.2
-    """Clipping of the value's change."""
+    """Largest change of the value from its old prediction, with clip_value."""
     kl_threshold: Positive | None = None
     """Ignored, as in rl_games."""
     weight_decay: NotNegative = 0.0
-    """Weight decay."""
+    """Weight decay of Adam for this critic."""
 
 
 class CentralNetworkConfig(StrictModel):
-    """The network of a separate critic (`central_value_config`)."""
+    """Settings of the network of a separate critic (`central_value_config`)."""
 
     name: Literal["actor_critic"] = "actor_critic"
     """Name of the network in rl_games."""
     central_value: Literal[True] = True
-    """Only a value output, no actions."""
+    """Whether the network only has a value output, no actions: only true."""
     mlp: MlpConfig
-    """The network."""
+    """The hidden layers of the critic."""
 
 
 class PpoSettings(_Settings):
-    """`params.config` of PPO."""
+    """Settings of PPO: the mapping `params.config`."""
 
     normalize_input: bool
     """Normalize observations by running mean and standard deviation."""
     normalize_value: bool = False
-    """Train the critic on returns normalized by running mean and standard deviation."""
+    """Whether the critic is trained on returns that are normalized by running mean and standard deviation."""
     normalize_advantage: bool
-    """Normalize advantages over the rollout."""
+    """Whether advantages are normalized over the rollout."""
     value_bootstrap: bool = True
     """Whether a time-out is bootstrapped; `bootstrap` sets how."""
     reward_shaper: RewardShaper = RewardShaper()
@@ -211,9 +211,9 @@ class PpoSettings(_Settings):
     entropy_coef: NotNegative
     """Weight of the entropy bonus."""
     e_clip: Positive
-    """Clipping of the probability ratio and of the value's change."""
+    """Largest deviation of the probability ratio from 1, and with clip_value of the value from its old prediction."""
     clip_value: bool
-    """Use the larger error of the value and of the value clipped around its old prediction."""
+    """Whether the value loss is the larger error of the value and of the value clipped to the old one +- e_clip."""
     clip_actions: bool = True
     """Whether actions are clipped to +-1."""
     horizon_length: Count
@@ -221,7 +221,7 @@ class PpoSettings(_Settings):
     minibatch_size: Count | None = None
     """Samples per minibatch; the rollout must be divisible by it."""
     minibatch_size_per_env: Count | None = None
-    """Samples per minibatch and environment."""
+    """Samples of each environment in a minibatch; an alternative to minibatch_size."""
     mini_epochs: Count
     """Epochs per iteration."""
     critic_coef: NotNegative
@@ -229,23 +229,24 @@ class PpoSettings(_Settings):
     bounds_loss_coef: NotNegative | None = None
     """Weight of the bounds loss; null: none."""
     bound_loss_type: Literal["bound", "regularisation"] = "bound"
-    """bound: square of the excess of the mean action over 1.1; otherwise square of the mean action."""
+    """bound: square of the amount by which the mean action exceeds +-1.1. regularisation: square of the mean action."""
     use_smooth_clamp: bool = False
-    """Clip the probability ratio smoothly."""
+    """Whether the probability ratio is clipped by a smooth function."""
     weight_decay: NotNegative = 0.0
     """Weight decay of Adam."""
     central_value_config: CentralValueConfig | None = None
-    """A separate critic; null: none."""
+    """Settings of a separate critic; null: the critic is part of `network`."""
 
     @model_validator(mode="after")
     def _minibatch(self) -> PpoSettings:
         if (self.minibatch_size is None) == (self.minibatch_size_per_env is None):
-            raise ValueError("no minibatch size: give minibatch_size or minibatch_size_per_env")
+            found = "neither" if self.minibatch_size is None else "both"
+            raise ValueError(f"give one of minibatch_size and minibatch_size_per_env; found {found}")
         return self
 
 
 class SacSettings(_Settings):
-    """`params.config` of SAC."""
+    """Settings of SAC: the mapping `params.config`."""
 
     normalize_input: bool = False
     """Normalize observations by running mean and standard deviation."""
@@ -299,14 +300,14 @@ class _Params(StrictModel):
 
 
 class PpoParams(_Params):
-    """`params` of PPO."""
+    """The mapping `params` of a configuration with PPO."""
 
     algo: Named = Named(name="a2c_continuous")
     """Algorithm of rl_games; its name must be a2c_continuous."""
     model: Named = Named(name="continuous_a2c_logstd")
     """Model of rl_games; its name must be continuous_a2c_logstd."""
     network: NetworkConfig
-    """Networks."""
+    """Settings of the networks."""
     config: PpoSettings
     """All other settings."""
 
@@ -318,14 +319,14 @@ class PpoParams(_Params):
 
 
 class SacParams(_Params):
-    """`params` of SAC."""
+    """The mapping `params` of a configuration with SAC."""
 
     algo: Named = Named(name="sac")
     """Algorithm of rl_games; its name must be sac."""
     model: Named = Named(name="soft_actor_critic")
     """Model of rl_games; its name must be soft_actor_critic."""
     network: SacNetworkConfig
-    """Networks."""
+    """Settings of the networks."""
     config: SacSettings
     """All other settings."""
 

@@ -30,9 +30,10 @@ class PpoTrainer(RlGamesTrainer):
         sizes = {"minibatch_size": size, **({"central_value_config": central.minibatch_size} if central else {})}
         for key, wanted in sizes.items():
             if self.steps_per_iteration % wanted:
-                message = f"minibatches of {wanted} samples do not divide a rollout of horizon_length x num_envs ="
-                message += f" {config.horizon_length} x {self.env.num_envs} = {self.steps_per_iteration}"
-                raise self._error(key, message, f"give {self.steps_per_iteration}, or a divisor of it")
+                rollout = f"horizon_length x num_envs = {config.horizon_length} x {self.env.num_envs}"
+                message = f"a rollout of {rollout} = {self.steps_per_iteration} samples cannot be split into"
+                message += f" minibatches of {wanted} samples each"
+                raise self._error(key, message, f"give a minibatch size that divides {self.steps_per_iteration}")
         parameters["config"] = {**_DEFAULTS, **parameters["config"]}
         agent = A2CAgent("rlcli", parameters)
         if agent.has_central_value:
@@ -42,7 +43,10 @@ class PpoTrainer(RlGamesTrainer):
         return agent
 
     def _bootstrapping(self, agent: Any, shaper: Any) -> Any:
-        """Return rl_games' reward shaper, extended: a time-out adds gamma times the value of its last observation."""
+        """Return a reward shaper that calls rl_games' shaper and bootstraps time-outs.
+
+        At a time-out it adds gamma times the critic's value of the episode's last observation.
+        """
 
         def shape(reward: Tensor) -> Tensor:
             shaped, step = shaper(reward), self.vec.result
@@ -101,7 +105,10 @@ class PpoTrainer(RlGamesTrainer):
             self.agent.central_value_net.update_lr(self.agent.central_value_net.lr)
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normalizer; a critic that shares the network keeps its own output layer."""
+        """Load a policy's weights, with its normalizer; the critic's weights do not change.
+
+        If actor and critic share a network, only the critic's output layer does not change.
+        """
         network = self.agent.model.a2c_network
         weights = network.state_dict()
         weights |= {theirs: policy[ours].clone() for theirs, ours in self._names().items()}

@@ -20,11 +20,11 @@ _COLUMNS = ("obses", "actions", "rewards", "next_obses", "dones")
 
 
 class ReplayBuffer(VectorizedReplayBuffer):
-    """rl_games' replay buffer, in which a time-out has the episode's last observation and is not done.
+    """rl_games' replay buffer with correct time-outs: not done, with the episode's last observation as the next one.
 
     Args:
         vec: the environment.
-        plain: the buffer that this one replaces.
+        plain: rl_games' buffer, whose storage this buffer takes over.
     """
 
     def __init__(self, vec: RlGamesVecEnv, plain: VectorizedReplayBuffer) -> None:
@@ -32,7 +32,7 @@ class ReplayBuffer(VectorizedReplayBuffer):
         self.vec = vec
 
     def add(self, obs: Tensor, action: Tensor, reward: Tensor, next_obs: Tensor, done: Tensor) -> None:
-        """Store a step of every environment."""
+        """Store one transition of every environment: a step from `obs` to `next_obs`."""
         step = self.vec.result
         assert step is not None
         if step.final_obs is not None:
@@ -49,7 +49,7 @@ class SacTrainer(RlGamesTrainer):
         config = self.config.params.config
         if config.replay_buffer_size < self.env.num_envs:
             message = (
-                f"the buffer of {config.replay_buffer_size} does not hold a step of {self.env.num_envs} environments"
+                f"{config.replay_buffer_size} transitions are fewer than one step of {self.env.num_envs} environments"
             )
             raise self._error("replay_buffer_size", message, f"give at least {self.env.num_envs}")
         agent = SACAgent("rlcli", parameters)
@@ -105,7 +105,7 @@ class SacTrainer(RlGamesTrainer):
         super().load(state)
 
     def load_weights(self, policy: Mapping[str, Tensor]) -> None:
-        """Load a policy's weights, with its normalizer; the critics keep their own."""
+        """Load a policy's weights, with its normalizer; the weights of the critics do not change."""
         actor, last = self.agent.model.sac_network.actor, 2 * len(self.spec.hidden)
         weights = {}
         for name in actor.state_dict():

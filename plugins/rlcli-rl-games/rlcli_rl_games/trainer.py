@@ -1,4 +1,4 @@
-"""Choice of the trainer, PPO or SAC, for an agent of rl_games."""
+"""`make_trainer`, which makes the PPO or SAC trainer for an agent's settings."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ from rlcli_rl_games.sac import SacTrainer
 def make_trainer(
     env: Environment, config: RlGamesConfig, *, seed: int, device: str, torch_threads: int
 ) -> RlGamesTrainer:
-    """Return the trainer for an agent's algorithm."""
+    """Return a `PpoTrainer` or `SacTrainer`, by the type of the agent's settings."""
     trainer = SacTrainer if isinstance(config, SacConfig) else PpoTrainer
     return trainer(env, config, seed=seed, device=device, torch_threads=torch_threads)

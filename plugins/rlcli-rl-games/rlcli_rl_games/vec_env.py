@@ -1,4 +1,4 @@
-"""Environment with rl_games' interface."""
+"""Adapter that gives an rlcli environment the interface of rl_games."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class RlGamesVecEnv(IVecEnv):
         self.result: StepResult | None = None
 
     def step(self, actions: Tensor) -> tuple[dict[str, Tensor], Tensor, Tensor, dict[str, Tensor]]:
-        """Step every environment."""
+        """Step every environment; return (observations, reward, done, infos) in rl_games' form."""
         torch.set_num_threads(1)
         self.result = step = self.env.step(actions)
         torch.set_num_threads(self.threads)
@@ -43,11 +43,11 @@ class RlGamesVecEnv(IVecEnv):
         return self.observe(step.obs), step.reward, (step.terminated | step.truncated).to(torch.uint8), infos
 
     def reset(self) -> dict[str, Tensor]:
-        """Return the first observations."""
+        """Reset the environment, and return its first observations in rl_games' form."""
         return self.observe(self.env.reset(seed=self.env.seed))
 
     def observe(self, groups: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return observation groups in rl_games' form."""
+        """Return observations, given by group, in rl_games' form: `obs`, and `states` for a separate critic."""
         return {"obs": groups["policy"], **({"states": groups["critic"]} if self.central else {})}
 
     @property

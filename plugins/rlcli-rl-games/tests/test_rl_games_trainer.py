@@ -330,7 +330,7 @@ def test_load_weights_gives_same_policy(sac_task):
         (["agent.algorithm=a2c_discrete"], "algorithm", "discrete actions"),
         (["agent.algorithm=a2c_continuous"], "algorithm", "this algorithm ppo"),
         (["agent.action_bound=2.0"], "agents.rl-games", "clip_actions"),
-        (["agent.params.config.minibatch_size_per_env=4"], "params.config", "no minibatch size"),
+        (["agent.params.config.minibatch_size_per_env=4"], "params.config", "found both"),
     ],
 )
 def test_invalid_settings_are_refused_without_heavy_imports(overrides, place, words):

@@ -89,7 +89,8 @@ class JointConfig(StrictModel):
 
 
 ByJoint = NotNegative | dict[str, NotNegative]
-"""One number for all joints; or joint name or regex -> number, where every joint must match exactly once."""
+"""One number for all joints, or a mapping from names or regexes of joints to numbers, in which every joint must match
+exactly one key."""
 
 
 class ActuatorConfig(StrictModel):
@@ -100,11 +101,12 @@ class ActuatorConfig(StrictModel):
     kind: Literal["pd", "dc_motor"] = "pd"
     """pd: a PD controller with an effort limit; dc_motor: a PD controller of a motor with a torque-speed curve."""
     stiffness: ByJoint = 0.0
-    """Gain on the position error [N/m or N m/rad]."""
+    """Gain on the position error [N/m or N m/rad]: one number for all joints, or a mapping from names or regexes of
+    joints to numbers, in which every joint must match exactly one key."""
     damping: ByJoint = 0.0
-    """Gain on the velocity error [N s/m or N m s/rad]."""
+    """Gain on the velocity error [N s/m or N m s/rad]: one number, or a mapping as in `stiffness`."""
     effort_limit: ByJoint | None = None
-    """Largest force or torque [N or N m]; null: no limit."""
+    """Largest force or torque [N or N m]: one number, or a mapping as in `stiffness`; null: no limit."""
     saturation_effort: Positive | None = None
     """Stall force or torque of a dc_motor [N or N m]."""
     velocity_limit: Positive | dict[str, Positive] | None = None

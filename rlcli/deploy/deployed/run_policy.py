@@ -40,7 +40,7 @@ class Controller:
         self.action = np.zeros(self.metadata["outputs"]["action"]["shape"][1], np.float32)
         self.memory = {part["input"]: np.zeros(part["single"], np.float32) for part in self.metadata["memory"]}
 
-    def value(self, f, data, given):  # of a formula f: constants, fields of data, inputs, or an operation on formulas
+    def value(self, f, data, given):  # value of a formula f: constants, fields of data, inputs, or an operation
         if "op" not in f:
             row = np.ravel(getattr(data, f["field"]) if "field" in f else given[f["given"]] if "given" in f else f)
             return np.float32(row[f["at"]] if "at" in f else row)

@@ -1,4 +1,4 @@
-"""Tensors in memory that processes share."""
+"""Tensors in shared memory, through which the main process and the workers exchange actions and results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,14 @@ class ArraySpec:
 
 
 def map_tensors(descriptor: int, specs: Mapping[str, ArraySpec]) -> dict[str, Tensor]:
-    """Return tensors in the memory of a shared file. The same specs give the same tensors in every process."""
+    """Return name -> tensor in the memory of a shared file, one after the other in the order of `specs`.
+
+    Processes that pass the same `specs` get tensors in the same memory.
+
+    Args:
+        descriptor: file descriptor of the shared file.
+        specs: shapes and types, by name.
+    """
     size = max(sum(spec.size for spec in specs.values()), _ALIGNMENT)
     if os.fstat(descriptor).st_size < size:
         os.ftruncate(descriptor, size)

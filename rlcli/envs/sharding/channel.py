@@ -51,7 +51,9 @@ class Channel:
             raise ChannelClosedError from error
 
     def receive(self, wait: Callable[[], None] = lambda: None) -> tuple[bytes, Any]:
-        """Wait for a message; return its kind and content. `wait` is called before this process sleeps.
+        """Wait for a message; return its kind and content.
+
+        If no message comes while this process polls, it calls `wait` and then sleeps until a message comes.
 
         Raises:
             ChannelClosedError: if the other process has ended.
@@ -60,7 +62,7 @@ class Channel:
         return kind.rstrip(b"\0"), pickle.loads(self._read(size)) if size else None
 
     def is_silent(self, seconds: float) -> bool:
-        """Wait for a message or the end of the other process; return whether neither came within `seconds`."""
+        """Return True if within `seconds` no message comes and the other process does not end."""
         return not select.select([self._socket], [], [], seconds)[0]
 
     def wait_until_closed(self) -> None:

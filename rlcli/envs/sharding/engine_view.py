@@ -1,4 +1,4 @@
-"""View of the engines of all shards as one engine, for observers, recordings and reports."""
+"""One engine object for environments in several processes, for observers, recordings and reports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ N = TypeVar("N", int, float)
 
 
 class Shards(Protocol):
-    """Interface for calls of functions in the processes of the shards."""
+    """Interface of an environment in several processes: call a function in each process, or in one of them."""
 
     @property
     def local(self) -> VecEnv:
@@ -30,11 +30,14 @@ class Shards(Protocol):
         """Return the results of `function(vec_env, *arguments)`, called in every shard, in order."""
 
     def call_one(self, env: int, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return `function(vec_env, row, *arguments)`, called in the shard of `env`; `row` is its index there."""
+        """Return `function(vec_env, row, *arguments)`, called in the shard of environment `env`.
+
+        `row` is the index of the environment in that shard.
+        """
 
 
 class ShardedEngine:
-    """View of the worlds of all shards, one for each environment. Each call copies their state from the processes.
+    """Engine with the simulations (worlds) of all shards. Each call copies data from the worker processes.
 
     Args:
         shards: the shards.
@@ -72,7 +75,7 @@ class ShardedEngine:
 
     @property
     def own_constants(self) -> bool:
-        """Whether `set_constants` has been called."""
+        """Whether each world has its own values of MuJoCo's derived constants (`Engine.set_constants`)."""
         return self._local.own_constants
 
     @property
@@ -118,7 +121,7 @@ class ShardedEngine:
 
 
 def sums(counts: Sequence[Mapping[str, N]]) -> dict[str, N]:
-    """Return the sum of the counts of all shards, by name."""
+    """Return name -> sum of the counts of all shards."""
     names = dict.fromkeys(name for count in counts for name in count)
     return {name: sum(count.get(name, 0) for count in counts) for name in names}
 

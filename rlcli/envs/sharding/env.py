@@ -93,7 +93,7 @@ class ShardedEnv(Environment):
         self._slot = 0
         self._episodes: Episodes | None = None
         self._waiting: dict[Worker, tuple[Stage, Any]] = {}
-        """Workers that wait for the others: the stage of the step that they have reached, and what they sent."""
+        """Workers that wait for other shards -> the stage that they have reached, and the data that they sent."""
         self._stage: Stage | None = None
         """Stage whose observers are running; None: no observers are running."""
         self._is_broken = False
@@ -188,7 +188,7 @@ class ShardedEnv(Environment):
         )
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Restore a state returned by `state_dict()`, also with another number of processes."""
+        """Restore a state returned by `state_dict()`, also of an environment with another number of processes."""
         shapes = self.call_all(_state_shapes)
         present = {name: [part[name] for part in shapes] for name in shapes[0]}
         own, *others = split_state(state, present, self._shards)
@@ -235,7 +235,10 @@ class ShardedEnv(Environment):
     # --- calls of functions in the processes of the shards ---
 
     def share(self, specs: Mapping[str, ArraySpec]) -> dict[str, Tensor]:
-        """Return new tensors, zeros, that all processes share; in each process they are in `VecEnv.shard.shared`."""
+        """Make tensors of zeros in shared memory, and return them by name.
+
+        In each process they are in `VecEnv.shard.shared`.
+        """
         self._require_usable()
         self._specs = {**self._specs, **specs}
         self._workers.request(worker.SHARE, (self._specs, list(specs)))
@@ -263,7 +266,10 @@ class ShardedEnv(Environment):
         return [own, *(value for (value,) in values)]
 
     def call_one(self, env: int, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return `function(vec_env, row, *arguments)`, called in the shard where environment `env` is a `row`."""
+        """Return `function(vec_env, row, *arguments)`, called in the shard of environment `env`.
+
+        `row` is the index of the environment in that shard.
+        """
         self._require_usable()
         number = next(n for n, shard in enumerate(self._shards) if env < shard.first + shard.count)
         row = env - self._shards[number].first
@@ -325,7 +331,10 @@ class ShardedEnv(Environment):
                 return
 
     def _observe(self, stage: Stage, contents: Sequence[Any]) -> None:
-        """Run the observers of a stage. `contents`: what each shard sent; None for a shard at another stage."""
+        """Run the observers of a stage.
+
+        `contents` has the data that each shard sent for the observers; None for a shard at another stage.
+        """
         if stage in (Stage.ON_STEP, Stage.DONE):
             for number, columns in enumerate(contents):
                 self._columns[number] = columns or self._columns[number]
@@ -355,7 +364,10 @@ class ShardedEnv(Environment):
         return {name: self._joined_metric([part[name] for part in parts]) for name in parts[0]}
 
     def _joined_metric(self, parts: Sequence[Tensor]) -> Tensor:
-        """Return a metric's values of all environments; if each shard has a single value, the mean of these."""
+        """Return a metric's values of all environments; if each shard has a single value, their weighted mean.
+
+        The weights are the numbers of environments.
+        """
         if parts[0].dim():
             return join(parts)
         counts = torch.tensor([shard.count for shard in self._shards], dtype=torch.float64)
@@ -379,7 +391,7 @@ def _resolved_parts(resolved: Resolved, shards: Sequence[Shard]) -> list[Resolve
 
 
 def _pickled(resolved: Resolved) -> bytes:
-    """Return a configuration in the form in which a worker receives it.
+    """Return a configuration as bytes of pickle, to send it to a worker.
 
     Raises:
         ConfigError: if the configuration has functions or classes that no module defines.

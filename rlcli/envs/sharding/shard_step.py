@@ -26,7 +26,7 @@ from rlcli.sim.divergence_report import Divergence
 SLOTS = 3
 """Number of shared buffers for results: the result of a step stays valid until the step after the next one."""
 _FIXED_COLUMNS = 4
-"""Columns of a finished episode before its named ones: environment, return, length, truncated."""
+"""Number of columns of every finished episode: environment, return, length, truncated. `Columns` names the others."""
 _MAX_COLUMNS = 256
 """Largest number of columns of a finished episode, besides its reward terms."""
 
@@ -55,7 +55,7 @@ class Needs(enum.Flag):
 
     @staticmethod
     def of_observers(observers: Observers) -> Needs:
-        """Return the kinds of observers that are registered."""
+        """Return the kinds of methods that at least one registered observer overrides."""
         needs = Needs(0)
         needs |= Needs.AFTER_PHYSICS if observers.after_physics else needs
         needs |= Needs.ON_DIVERGENCE if observers.on_divergence else needs
@@ -74,7 +74,7 @@ class Columns:
 
     @staticmethod
     def of_episodes(episodes: Episodes) -> Columns:
-        """Return the names of the values that these episodes have."""
+        """Return the columns for the values of these episodes."""
         named = (episodes.reward_terms, episodes.causes, episodes.metrics)
         return Columns(*(tuple(part) for part in (*named, episodes.conditions, episodes.condition_values)))
 
@@ -86,7 +86,10 @@ class Columns:
 
 
 def counter_specs(total: int) -> dict[str, ArraySpec]:
-    """Return shape and type of the episode counters, the shared tensor that is needed while environments are built."""
+    """Return the shape and type of the episode counters of all environments: lengths and indices, (2, total).
+
+    They are separate from `array_specs`, because they are needed before the environments are built.
+    """
     return {"counters": ArraySpec((2, total), torch.int64)}
 
 
@@ -119,9 +122,9 @@ class ShardRunner:
         env: the environments of the shard.
         number: index of the shard.
         arrays: the shared tensors.
-        stop: called with a stage, and the data for its observers, at each stage that an observer of the main process
-            needs, and at the end. It returns when the shard may continue.
-        check: called before the end of each step and reset; it may raise an error.
+        stop: called as `stop(stage, data)` at each stage that an observer of the main process needs, and at the end;
+            `data` is for these observers. It returns when the shard may continue.
+        check: called before the end of each step and reset, to raise an error that makes the results invalid.
     """
 
     def __init__(
@@ -183,7 +186,10 @@ class ShardRunner:
         self._end(self.env.load_state_dict(state))
 
     def publish_record(self, record: StepRecord) -> Columns | None:
-        """Write what observers read to shared memory. Return the columns of finished episodes if they have changed."""
+        """Write reward, reward terms and finished episodes to shared memory, for the observers of the main process.
+
+        Return the columns of finished episodes if they have changed, else None.
+        """
         self._reward[self._slot].copy_(record.reward)
         self._reward_terms.copy_(record.reward_terms)
         self._publish_episodes(record.episodes)
@@ -197,7 +203,7 @@ class ShardRunner:
         self.stop(Stage.DONE, self._pop_new_columns())
 
     def _observe(self, needs: Needs) -> None:
-        """Stop at the stages that the observers of the main process need from now on."""
+        """Choose the stages at which `stop` is called from now on: those that observers of the main process need."""
         for need in needs ^ self._needs:
             change = self.env.observers.add if need in needs else self.env.observers.remove
             change(self._stops[need])
@@ -291,7 +297,15 @@ def read_episodes(
 
 
 def _with_causes(part: NDArray[np.float64], names: Columns, widest: Columns) -> NDArray[np.float64]:
-    """Return a shard's values of episodes, with zeros for each cause (such as a divergence) that it does not have."""
+    """Return a shard's columns of episodes with the causes of `widest`: zeros for a cause that the shard lacks.
+
+    A cause such as a divergence is a column only in shards in which it has occurred.
+
+    Args:
+        part: values of the shard's finished episodes, one row for each column.
+        names: columns of this shard.
+        widest: columns with the causes of all shards.
+    """
     begin = _FIXED_COLUMNS + len(names.terms)
     own = dict(zip(names.causes, part[begin:], strict=False))
     none = np.zeros_like(part[0])

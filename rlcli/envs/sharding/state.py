@@ -12,22 +12,25 @@ from rlcli.errors import TaskError
 
 
 def environment_dim(shapes: Sequence[torch.Size]) -> int | None:
-    """Return the environment dimension of a tensor, from its shapes in the shards; None if no dimension differs.
+    """Return the dimension of a tensor that counts environments, from the tensor's shapes in the shards.
 
     `rlcli.envs.shard_range.split` gives the first and the last shard different sizes. The environment dimension is
-    therefore the only one in which the shapes differ.
+    therefore the only one in which the shapes differ. None: the tensor has no such dimension.
     """
     return next((dim for dim, sizes in enumerate(zip(*shapes, strict=True)) if len(set(sizes)) > 1), None)
 
 
 def join(parts: Sequence[Tensor]) -> Tensor:
-    """Join the tensors of all shards, in order; without an environment dimension, return the first shard's tensor."""
+    """Concatenate the tensors of all shards along the environment dimension.
+
+    If they have no such dimension, return the first shard's tensor.
+    """
     dim = environment_dim([part.shape for part in parts])
     return parts[0] if dim is None else torch.cat(list(parts), dim=dim)
 
 
 def join_states(states: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-    """Join the states of all shards, in order.
+    """Join the states (`VecEnv.state_dict`) of all shards into the state of one environment with all rows.
 
     Raises:
         TaskError: if a value that all environments share differs between the shards.
@@ -53,7 +56,7 @@ def _all_equal(value: Tensor, parts: Sequence[Tensor | None]) -> bool:
 def split_state(
     state: Mapping[str, Tensor], present: Mapping[str, Sequence[torch.Size]], shards: Sequence[Shard]
 ) -> list[dict[str, Tensor]]:
-    """Split a joined state into one state for each shard.
+    """Split the state of all environments, as `join_states` returns it, into one state for each shard.
 
     Args:
         state: the joined state.
@@ -69,5 +72,5 @@ def split_state(
 
 
 def _first_dim(value: Tensor, total: int) -> int | None:
-    """Return the environment dimension of a tensor that the current state does not contain."""
+    """Return 0 if a tensor has `total` rows, else None: the guess for a tensor that the current state does not have."""
     return 0 if value.shape[:1] == (total,) else None

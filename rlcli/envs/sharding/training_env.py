@@ -9,7 +9,7 @@ from rlcli.envs.sharding.worker_count import number_of_workers
 
 
 def make_training_env(resolved: Resolved, *, seed: int, device: str) -> Environment:
-    """Return the environment of a training, in as many processes as `scene.workers` says.
+    """Return the environment of a training, stepped by the number of processes that `scene.workers` sets.
 
     Raises:
         ConfigError: if the task cannot run in several processes.

@@ -50,7 +50,7 @@ class Job:
     files: list[tuple[Path, str]]
     """Task files that the main process has imported; `resolved` may contain their functions and classes."""
     has_own_code: bool
-    """Whether the task has code that is not tested with several workers."""
+    """Whether the task has code that is not tested with several workers (`has_untested_code`)."""
     generator_state: Tensor
     """State of torch's global generator at the start: a task may use it while it is built."""
 
@@ -192,7 +192,7 @@ class _Worker:
 
 
 class _GlobalGenerators:
-    """Detector of a task's use of the global random generators, of which each process has its own."""
+    """Detector of draws from global random generators; each process has its own, so results would depend on workers."""
 
     def __init__(self) -> None:
         self._states = self._read_states()
@@ -235,7 +235,10 @@ class _PortableError:
 
     @staticmethod
     def from_exception(error: BaseException) -> _PortableError:
-        """Return the portable form of an exception; one that a task has raised becomes a TaskError with its line."""
+        """Return an exception in a form that can be pickled.
+
+        An exception in the task's code becomes a TaskError that names the line of code.
+        """
         trace = "".join(traceback.format_exception(error))
         if not isinstance(error, RlcliError):
             error = memory_error(error) or error_of_task(error) or error
@@ -246,7 +249,7 @@ class _PortableError:
         return _PortableError(RuntimeError, (f"{type(error).__name__}: {error}",), {}, trace)
 
     def rebuild(self) -> BaseException:
-        """Return the exception again, with the worker's traceback as a note."""
+        """Return the exception, with the worker's traceback as a note."""
         error = self.kind.__new__(self.kind)
         error.args = self.arguments
         error.__dict__.update(self.attributes)

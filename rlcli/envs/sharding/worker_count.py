@@ -18,7 +18,7 @@ FEWEST_WORKERS = 4
 FREE_MEMORY_PER_WORKER = 1 << 30
 """Free memory for each process that `auto` starts [bytes]; a process takes about a quarter of it."""
 ONE_WORKER = "RLCLI_ONE_WORKER"
-"""Environment variable of trainings that run beside others: `auto` then uses one process."""
+"""Environment variable that is set for trainings that run at the same time: `scene.workers: auto` is then 1."""
 FEWEST_CORES = 4
 """Fewest cores with which `auto` uses several processes: on fewer, physics already takes most of a step."""
 _TESTED = ("rlcli", "rlcli-gymnasium", "rlcli-menagerie")

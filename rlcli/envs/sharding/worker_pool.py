@@ -96,7 +96,7 @@ class Worker:
         return self._process.pid
 
     def has_ended(self) -> bool:
-        """Return whether the process has ended."""
+        """Return whether the worker process has ended."""
         return self._process.poll() is not None
 
     def disconnect(self) -> None:
@@ -114,7 +114,7 @@ class Worker:
             self._process.wait()
 
     def _warn_if_silent(self) -> None:
-        """Wait for a message; log a warning, once, if there is none for a long time."""
+        """Wait for a message; if the worker sends none for `_SILENT_S` seconds, log a warning, once."""
         if not self._was_named and self._channel.is_silent(_SILENT_S):
             self._was_named = True
             _log.warning(
@@ -183,8 +183,8 @@ class Workers:
 
         Raises:
             MachineError: if a process has ended.
-            BaseException: the first error of a worker, after all have replied; a KeyboardInterrupt at once, and the
-                workers cannot be used any more.
+            BaseException: the first error that a worker sent, after all have replied.
+            KeyboardInterrupt: at once; the workers cannot be used any more.
         """
         contents, first_error = [], None
         for process in self._workers:
@@ -242,5 +242,5 @@ def _close(workers: list[Worker], arrays: int) -> None:
 
 
 def _search_path() -> str:
-    """Return the folders from which this process imports, without the current folder."""
+    """Return `sys.path` without the current folder, as JSON for the command line of a worker."""
     return json.dumps([entry for entry in sys.path if entry])

@@ -41,7 +41,7 @@ class RandomizeActuatorGains(DrawKeys, ActuatorTerm):
 
     def __post_init__(self) -> None:
         if self.kp is None and self.kv is None:
-            raise NameProblem("no gain is given, so the term changes nothing", "give kp, kv or both")
+            raise NameProblem("no gain is given (kp or kv), so the term changes nothing", "give kp, kv or both")
         model = self.env.engine.model
         kinds = [model_actuator_kind(model, number) for number in self.entity.actuator_ids.tolist()]
         has_kp = [kind == "position" for kind in kinds]
@@ -91,7 +91,8 @@ class RandomizePdGains(DrawKeys, JointTerm):
     def __post_init__(self) -> None:
         pairs = {"stiffness": self.stiffness, "damping": self.damping, "effort_limit": self.effort_limit}
         if not any(pair is not None for pair in pairs.values()):
-            raise NameProblem("no range is given, so nothing changes", "give stiffness, damping or effort_limit")
+            missing = "neither stiffness, damping nor effort_limit is given, so the term changes nothing"
+            raise NameProblem(missing, "give a range for one or more of them")
         driven = {
             joint: (model, column) for model in self.entity.actuators for column, joint in enumerate(model.joints)
         }
@@ -183,7 +184,10 @@ class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
         events = getattr(self.env, "config").events.items()  # noqa: B009 (events exist in managed environments only)
         others = [name for name, event in events if event is not None and _changes_actuators(event)]
         if others:
-            raise NameProblem(f"events.{others[0]} changes the same fields", "remove one of the two events")
+            raise NameProblem(
+                f"events.{others[0]} changes the same fields of the model, so each event overwrites the other's values",
+                "remove one of the two events",
+            )
         fields = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
         self._fields = [ModelField(self.entity, name, self.actuators, _AXES.get(name)) for name in fields]
         self._draw = Draw(self, self.range, (self._fields[0].shape[0], 1), lowest=0.0)
@@ -197,7 +201,7 @@ class RandomizeActuatorStrength(ActuatorTerm, DrawingTerm):
 
 
 _AXES = {"actuator_gainprm": [0, 1, 2], "actuator_biasprm": [0, 1, 2]}
-"""Field -> its columns for a linear force (constant, length, velocity); further columns belong to muscles."""
+"""Field of MjModel -> its columns for actuators with a linear force; the further columns belong to muscles."""
 
 
 def _changes_actuators(event: Any) -> bool:
@@ -231,6 +235,6 @@ class RandomizeModelField(DrawKeys, FieldRandomization):
 
     @staticmethod
     def prepare(spec: mujoco.MjSpec, params: dict[str, Any]) -> None:
-        """Clear the `simple` flag of bodies whose inertial frame changes: with it, MuJoCo uses the body's frame."""
+        """Clear the `simple` flag of bodies whose inertial frame changes: with it, MuJoCo ignores this frame."""
         if params["field"] in ("body_ipos", "body_iquat"):
             unset_simple(spec, params, "names")

@@ -34,7 +34,7 @@ class RandomizeBodyMass(Randomization, BodyTerm):
         super().__post_init__()
         if self.with_inertia:
             has_mass = (self.entity.engine.model.body_mass[self.entity.body_ids] > 0).tolist()
-            hint = "choose others, or set with_inertia: false"
+            hint = "choose bodies with mass, or set with_inertia: false"
             require_supported(self.entity, "Bodies", self.bodies, has_mass, "without mass", hint)
         self._inertia = ModelField(self.entity, "body_inertia", self.bodies) if self.with_inertia else None
 
@@ -54,7 +54,7 @@ class RandomizeBodyCom(AxisRandomization, BodyTerm):
 
     @staticmethod
     def prepare(spec: mujoco.MjSpec, params: dict[str, Any]) -> None:
-        """Clear the bodies' `simple` flag, with which MuJoCo assumes the centre of mass at the frame's origin."""
+        """Clear the bodies' `simple` flag: with it, MuJoCo assumes that the centre of mass is the frame's origin."""
         unset_simple(spec, params, "bodies")
 
 

@@ -1,4 +1,4 @@
-"""Reward terms, without sign and weight: `weight` in the YAML gives both. (num_envs,) each."""
+"""Reward terms, (num_envs,) each. The sign and size of a reward come from the term's `weight` in the YAML."""
 
 from rlcli.mdp.rewards.base_motion import *
 from rlcli.mdp.rewards.feet import *

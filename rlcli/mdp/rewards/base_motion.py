@@ -137,9 +137,9 @@ def move_to_target_bonus(
 class ProgressReward(EntityTerm, TensorState):
     """Speed at which the horizontal distance from the root to `target` decreases [m/s]. (num_envs,)
 
-    target: a point from the environment's origin [m]. The speed is computed from the way since the last step. The
-    difference of two distances would be inexact: 32-bit floats resolve a distance of 1 km to 0.06 mm, which is 4 mm/s
-    at 60 Hz.
+    target: a point from the environment's origin [m]. The speed is computed from the root's displacement in the step.
+    The difference of two distances would be inexact: 32-bit floats resolve a distance of 1 km to 0.06 mm, which is
+    4 mm/s at 60 Hz.
     """
 
     target: tuple[float, float, float]
@@ -152,7 +152,7 @@ class ProgressReward(EntityTerm, TensorState):
         """Return the value of the reward term. (num_envs,)"""
         position = self.entity.data.root_pos_w[:, :2]
         ahead, ahead_before = self._target_from(position), self._target_from(self._position)
-        # |b| - |a| = (b - a) (b + a) / (|b| + |a|), with b - a computed from the short way of one step
+        # |b| - |a| = (b - a) (b + a) / (|b| + |a|), with b - a computed from the short displacement of one step
         gained = _dot_xy(position - self._position, ahead + ahead_before)
         progress = gained / ((_norm_xy(ahead) + _norm_xy(ahead_before)).clamp_(min=1e-9) * self.env.step_dt)
         self._position.copy_(position)

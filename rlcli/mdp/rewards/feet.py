@@ -17,14 +17,14 @@ from rlcli.task import Bodies, Sites
 
 
 def undesired_contacts(env: ManagedEnv, *, sensor: ContactSensor, threshold: float = 1.0) -> Tensor:
-    """Count of the sensor's bodies with a force above `threshold` [N] within its history. (num_envs,)"""
+    """Count of the sensor's bodies with a contact force above `threshold` [N] within its history. (num_envs,)"""
     return (strongest_force(sensor) > threshold).sum(dim=1).float()
 
 
 def desired_contacts(env: ManagedEnv, *, sensor: ContactSensor, threshold: float = 1.0) -> Tensor:
-    """1 where no body of the sensor has a force above `threshold` [N] within its history. (num_envs,)
+    """1 where no body of the sensor has a contact force above `threshold` [N] within its history. (num_envs,)
 
-    Use it as a penalty, with a negative weight.
+    The term marks missing contacts: use it as a penalty, with a negative weight.
     """
     return all_columns(strongest_force(sensor) <= threshold)
 
@@ -54,7 +54,7 @@ def feet_air_time(env: ManagedEnv, *, sensor: ContactSensor, command: Command, t
 def feet_air_time_positive_biped(
     env: ManagedEnv, *, sensor: ContactSensor, command: Command, threshold: float
 ) -> Tensor:
-    """Time since which exactly one of two feet has been in contact, clipped to `threshold` [s]. (num_envs,)
+    """Duration for which exactly one of two feet has been in contact, clipped to `threshold` [s]. (num_envs,)
 
     0 where both or no feet are in contact, or the commanded speed is at most 0.1 m/s.
     """
@@ -185,7 +185,9 @@ def air_time_reward(
     mode_time: float,
     velocity_threshold: float,
 ) -> Tensor:
-    """Reward for steps of up to `mode_time` while moving and for contact while standing, over feet [s]. (num_envs,)
+    """Reward for steps of up to `mode_time` while moving and for contact while standing, summed over feet [s].
+
+    (num_envs,)
 
     Moving: each foot gives the time since it last touched down or lifted off, and 0 if that is above `mode_time`.
     Standing: each foot gives its time in contact minus its time in the air, clipped to +-`mode_time`. A robot is moving

@@ -51,9 +51,11 @@ def joint_pos_limits(env: ManagedEnv, *, entity: Entity = "robot", joints: Joint
 
 @dataclass(kw_only=True, eq=False)
 class JointPosLimitsPenaltyRatio(JointTerm):
-    """Sum of (|x| - threshold) / (1 - threshold) x gear_ratio over joints with |x| > threshold. (num_envs,)
+    """Sum over joints of a value that rises from 0 at `threshold` to the gear ratio at the soft limit. (num_envs,)
 
-    x: joint position, scaled to -1 at the lower and 1 at the upper soft limit; joints without limits do not count.
+    A joint position is scaled to x: -1 at the lower and 1 at the upper soft limit. The value of a joint is
+    (|x| - threshold) / (1 - threshold) x gear_ratio if |x| > threshold, otherwise 0; 0 also for a joint without limits.
+
     gear_ratio: one for all joints, or one for each in the order of `joints`.
     """
 
@@ -76,9 +78,9 @@ class JointPosLimitsPenaltyRatio(JointTerm):
 def joints_at_limit(
     env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", threshold: float = 0.99
 ) -> Tensor:
-    """Count of the joints with |x| > threshold. (num_envs,)
+    """Count the joints beyond +-`threshold`, in positions that are scaled to +-1 at the soft limits. (num_envs,)
 
-    x: joint position, scaled to -1 at the lower and 1 at the upper soft limit; joints without limits do not count.
+    Joints without limits do not count.
     """
     low, high = entity.data.joint_limits_of(joints, soft=True)
     scaled = (2.0 * entity.data.joint_pos_of(joints) - low - high) / (high - low)
@@ -87,9 +89,9 @@ def joints_at_limit(
 
 @dataclass(kw_only=True, eq=False)
 class PowerConsumption(JointTerm):
-    """Sum of |raw action x joint velocity x gear ratio| over joints [rad/s]. (num_envs,)
+    """Sum of |policy's action x joint velocity x gear ratio| over joints [rad/s]. (num_envs,)
 
-    joints: the driven ones, in the order of the action. gear_ratio: one for all joints, or one for each.
+    joints: the joints that the action drives, in its order. gear_ratio: one for all joints, or one for each.
     """
 
     gear_ratio: float | list[float] = 1.0
@@ -176,7 +178,7 @@ def stand_still_joint_deviation_l1(
 def joint_vel_limits(
     env: ManagedEnv, *, entity: Entity = "robot", joints: Joints = ".*", soft_ratio: float = 1.0
 ) -> Tensor:
-    """Sum of joint speeds' excess over `soft_ratio` x `velocity_limit`, each at most 1 [m/s or rad/s]. (num_envs,)"""
+    """Sum of max(speed - `soft_ratio` x `velocity_limit`, 0) over joints, each at most 1 [m/s or rad/s]. (num_envs,)"""
     excess = entity.data.joint_vel_of(joints).abs() - entity.data.joint_vel_limits[joints] * soft_ratio
     return excess.clamp_(0.0, 1.0).sum(dim=1)
 

@@ -84,7 +84,7 @@ class Collector:
         self.initial_hidden_state = {name: state.clone() for name, state in self.hidden_state.items()}
         """Hidden states at the beginning of the rollout."""
         self.explained_variance = torch.zeros((), device=device)
-        """Share of the variance of the returns that the critic predicts: 1 - Var(target - value) / Var(target). ()"""
+        """Explained variance of the critic: 1 - Var(target - value) / Var(target). (scalar)"""
 
     # --- the rollout ---
 
@@ -209,7 +209,7 @@ class Collector:
         return value, last_value, self._value_where(rollout.time_out, rollout.final_obs)
 
     def _recurrent_values(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the values of `_values` for a critic with an LSTM, and advance the LSTM's hidden state."""
+        """Return the same as `_values` for a critic with an LSTM, and advance the LSTM's hidden state."""
         lstm, state, rollout = self.networks.critic_memory, self.hidden_state["critic"], self.rollout
         assert lstm is not None
         features, states = unroll(lstm, rollout.samples.critic_obs, rollout.samples.episode_start, state)
@@ -237,7 +237,7 @@ class Collector:
 
     @torch.no_grad()
     def complete_images(self) -> None:
-        """Compute action, mean, value, ... of the samples' mirror images, after the advantages of the samples.
+        """Compute the samples' mirror images (observation, action, value, ...), after the samples' advantages.
 
         As in Mittal et al. 2024, a mirrored action gets the probability of the original action, because both are
         equally probable for a symmetric policy.

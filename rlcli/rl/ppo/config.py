@@ -27,7 +27,7 @@ class NetworkConfig(StrictModel):
 
 
 class RnnConfig(StrictModel):
-    """RNN before each network. A minibatch then holds all steps of its environments."""
+    """Recurrent network before the MLPs of actor and critic. A minibatch then holds all steps of its environments."""
 
     type: Literal["lstm"] = "lstm"
     """Kind of the RNN: lstm."""
@@ -95,8 +95,8 @@ class PpoConfig(AgentConfig):
     lam: Fraction = 0.95
     """Lambda of generalised advantage estimation."""
     bootstrap: Literal["final_obs", "pre_step"] = "final_obs"
-    """Bootstrap of a time-out: the reward gets gamma times the value of the last observation of the episode
-    (final_obs), or of the observation before the step (pre_step, as in RSL-RL and rl_games)."""
+    """Bootstrap of a time-out: gamma times the critic's value of an observation is added to the reward. final_obs: the
+    last observation of the episode. pre_step: the observation before the step, as in RSL-RL and rl_games."""
     reward_scale: Positive = 1.0
     """Factor on rewards in training; reported returns do not include it."""
 
@@ -112,8 +112,8 @@ class PpoConfig(AgentConfig):
     clip_range: Positive = 0.2
     """Clipping range of the probability ratio: 1 +- clip_range."""
     clip_value: Literal["larger", "clipped"] | None = "larger"
-    """Value loss with the value clipped to old value +- clip_value_range: the clipped error alone, or the larger of the
-    clipped and the plain error; null: the plain error."""
+    """Squared error in the value loss. clipped: the error of the value, clipped to old value +- clip_value_range.
+    larger: the larger one of the clipped and the plain error. null: the plain error."""
     clip_value_range: Positive | None = None
     """Clipping range of the change of the value; null: clip_range."""
     value_coef: NotNegative = 1.0
@@ -206,14 +206,15 @@ class PpoConfig(AgentConfig):
     @model_validator(mode="after")
     def _relations(self) -> PpoConfig:
         if self.schedule.startswith("adaptive") != (self.desired_kl is not None):
-            raise ValueError("desired_kl and an adaptive schedule need each other: set both or neither")
+            raise ValueError("desired_kl and an adaptive schedule are only used together: set both or neither")
         if self.kl_from == "last_pass" and self.shuffle == "epoch":
-            message = "kl_from last_pass needs the same minibatches in every epoch: set shuffle to update or none"
+            message = "kl_from: last_pass needs the same minibatches in every epoch: set shuffle to update or none"
             raise ValueError(message)
         if self.cnn is not None and self.rnn is not None:
-            raise ValueError("cnn and rnn cannot be combined; give the image a history to show motion")
+            message = "cnn and rnn cannot be combined: set rnn: null, and give the image a history to show motion"
+            raise ValueError(message)
         if self.symmetry is not None and (self.cnn is not None or self.rnn is not None):
-            raise ValueError("symmetry needs networks without cnn and rnn: a hidden state has no mirror image")
+            raise ValueError("symmetry needs networks without cnn and rnn: set both to null, or set symmetry: null")
         low, high = self.learning_rate_range
         if low > high:
             raise ValueError(f"learning_rate_range: {low:g} is above {high:g}; write [low, high]")

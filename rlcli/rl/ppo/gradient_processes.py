@@ -1,4 +1,4 @@
-"""Gradients of the layers, computed by the processes that step the environment: between two rollouts they are idle.
+"""Gradients of MLPs, computed by the worker processes of the environment, which are idle between two rollouts.
 
 Python runs one thread at a time, so that more than about eight threads of one process slow each other down. A
 minibatch is split and summed as in `rlcli.rl.mlp_gradients.MlpGradients`, so the results are bit-identical.
@@ -71,12 +71,12 @@ def distributed_gradients(
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """Message that each process receives once, before the first update: networks, settings and sizes."""
+    """Networks, settings and sizes that each process receives once, before the first update."""
 
     actor: Mlp
     critic: Mlp
     slices: dict[str, tuple[int, torch.Size]]
-    """Where each parameter is in the vector of all parameters."""
+    """Name of a parameter -> (its first index in the vector of all parameters, its shape)."""
     config: PpoConfig
     columns: tuple[int, int, int]
     """Columns of actor observation, critic observation and action (`RolloutBuffer.columns`)."""

@@ -142,7 +142,7 @@ class Learner:
             self._kl_sum += self._minibatch_kl
 
     def compute_gradient(self, minibatch_gradient: MinibatchGradient, batch: Samples, number: int) -> LossResult:
-        """Return the loss of a minibatch; its gradient and its KL divergence are then in `gradient_and_kl`."""
+        """Return the loss of a minibatch, and write its gradient and its KL divergence to `gradient_and_kl`."""
         config, old_std = self.config, self.collector.rollout.old_std[number]
         obs, critic_obs = self.network_inputs(batch, number)
         advantage = batch.advantage
@@ -240,7 +240,10 @@ class Learner:
         return finite_values(metrics)
 
     def _gradient_in_causal_order(self, result: LossResult) -> list[tuple[str, Tensor]]:
-        """Return the named tensors of a minibatch: losses, then gradients in the order of the backward pass."""
+        """Return (name, tensor) of losses, then of gradients in the order of the backward pass.
+
+        The first of them that is not finite is the cause of a divergence.
+        """
         losses = [(f"the loss ({name})", result.metrics[i]) for i, name in enumerate(METRICS) if i != KL]
         names, parameters = zip(*self._networks.named_parameters(), strict=True)
         parts = self.gradient.split_with_sizes([parameter.numel() for parameter in parameters])

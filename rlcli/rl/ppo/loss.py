@@ -27,7 +27,7 @@ class LossResult(NamedTuple):
     """Loss of a minibatch, its metrics and the new policy's distribution."""
 
     loss: Tensor
-    """Scalar that the optimiser minimises. ()"""
+    """Scalar that the optimiser minimises. (scalar)"""
     metrics: Tensor
     """`METRICS`, detached. (7,)"""
     mean: Tensor
@@ -143,7 +143,7 @@ def log_prob(noise: Tensor, std: Tensor) -> Tensor:
 
 
 def entropy(std: Tensor) -> Tensor:
-    """Return the entropy of a diagonal Gaussian: sum of log std + log(2 pi e) / 2. (a,) -> ()"""
+    """Return the entropy of a diagonal Gaussian: sum of log std + log(2 pi e) / 2. (a,) -> scalar"""
     return (std.log() + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
 
 

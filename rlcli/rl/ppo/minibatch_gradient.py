@@ -46,7 +46,7 @@ class LayerGradients(Protocol):
 
 
 MakeLayerGradients = Callable[[Sequence[Tensor]], LayerGradients]
-"""Function of tensors for the gradients of the parameters; it returns the function that writes to them."""
+"""Function from the tensors for the gradients of all parameters to the function that writes these gradients."""
 
 
 def threaded_gradients(networks: ActorCritic, rows: int, threads: int) -> MakeLayerGradients:

@@ -154,11 +154,11 @@ class ValueNormalizer(Normalizer):
         self.count.fill_(1.0)
 
     def forward(self, value: Tensor) -> Tensor:
-        """Return normalised returns, clipped."""
+        """Return `value`, discounted returns, normalised by their running mean and std, and clipped."""
         return ((value - self.mean.float()) / self._std).clamp(-_VALUE_CLIP, _VALUE_CLIP)
 
     def inverse(self, value: Tensor) -> Tensor:
-        """Return the returns for normalised values."""
+        """Return the discounted returns for normalised values, which are clipped first: the inverse of `forward`."""
         return value.clamp(-_VALUE_CLIP, _VALUE_CLIP) * self._std + self.mean.float()
 
     @property

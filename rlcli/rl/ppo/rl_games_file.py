@@ -1,6 +1,7 @@
-"""Reader of rl_games' `params`, as train files of other frameworks have them, for the trainer `ppo`.
+"""Reader of an rl_games configuration (its mapping `params`), which becomes settings of the trainer `ppo`.
 
-`dialect: rl_games` gives the settings their meaning in rl_games. The module imports no torch.
+Isaac Lab and OmniIsaacGymEnvs have such configurations. The setting `dialect: rl_games` gives settings that the file
+lacks the defaults of rl_games. The module imports no torch.
 """
 
 from __future__ import annotations
@@ -16,7 +17,10 @@ from rlcli.formats import Status
 
 
 class Sink(Protocol):
-    """Receiver of settings, notes and mistakes. `source` and `path` are places in the file: ("params", "config")."""
+    """Receiver of the settings, notes and mistakes of a reader.
+
+    `source` and `path` are places in the file, as keys: ("params", "config", "gamma"). `target` is a key of `ppo`.
+    """
 
     def put(self, target: Path, value: Any, source: Path, /) -> None:
         """Set a setting of `ppo`."""
@@ -49,7 +53,7 @@ _MAX_ABS_LOG_STD = 20
 
 
 class RlGamesReader:
-    """Reader of `params`.
+    """Reader of the mapping `params` of an rl_games configuration.
 
     Args:
         sink: receives the settings, notes and mistakes.
@@ -61,9 +65,10 @@ class RlGamesReader:
         self._is_strict = is_strict
 
     def read(self, params: Any) -> None:
-        """Read the mapping `params`."""
+        """Translate the mapping `params` into settings of `ppo`, notes and mistakes, which the sink receives."""
         if not isinstance(params, Mapping) or not isinstance(params.get("config"), Mapping):
-            self.problem(("params",), "an rl_games YAML has params: {algo, model, network, config}; add them")
+            message = "a configuration of rl_games needs the mapping params: {algo, model, network, config}"
+            self.problem(("params",), message, "add the missing keys")
             return
         for key, value in {"trainer": "ppo", "algorithm": "ppo", "dialect": "rl_games"}.items():
             self.put((key,), value, ("params",))
@@ -80,7 +85,7 @@ class RlGamesReader:
             self.note(at, "ignored", "rlcli has no such setting")
 
     def _env(self, env: Any, config: Mapping[str, Any]) -> None:
-        """Read the settings of Isaac Lab's wrapper of the environment."""
+        """Read the mapping `env`: settings of the wrapper through which Isaac Lab gives an environment to rl_games."""
         at = ("params", "env")
         bound = env.get("clip_actions") if isinstance(env, Mapping) else None
         bound = float(bound) if isinstance(bound, int | float) and math.isfinite(bound) else None
@@ -122,12 +127,13 @@ class RlGamesReader:
             return
         for key, value in network.items():
             if key == "name":
-                self.note((*at, key), "mapped", "actor and critic")
+                self.note((*at, key), "mapped", "an actor and a critic, the only kind of network in rlcli")
             elif key == "separate":
                 if value:
-                    self.note((*at, key), "mapped", "actor and critic are separate networks")
+                    self.note((*at, key), "mapped", "actor and critic have separate networks, as always in rlcli")
                 else:
-                    self.note((*at, key), "approximated", "actor and critic are always separate networks")
+                    text = "rlcli cannot share layers between actor and critic: each has a network of its own"
+                    self.note((*at, key), "approximated", text)
             elif key == "mlp":
                 self._mlp((*at, key), value)
             elif key == "space":
@@ -158,9 +164,9 @@ class RlGamesReader:
             elif key == "initializer":
                 self.note((*at, key), "mapped", "init")
             elif key == "d2rl":
-                self.note((*at, key), "ignored", "it is false: the networks are plain MLPs, as in rlcli")
+                self.note((*at, key), "ignored", "d2rl is off, and rlcli has no d2rl networks")
             elif key == "regularizer":
-                self.note((*at, key), "ignored", "rlcli has no regularizer of weights")
+                self.note((*at, key), "ignored", "rlcli has no weight regularizer")
             else:
                 self._report_unknown_key((*at, key))
         for network in ("actor", "critic"):
@@ -180,7 +186,7 @@ class RlGamesReader:
                     self.problem(inner, f"val: expected a number between -{_MAX_ABS_LOG_STD} and {_MAX_ABS_LOG_STD}")
                     continue
                 self.put(("init_std",), math.exp(log_std), inner)
-                self.note(inner, "mapped", "init_std")
+                self.note(inner, "mapped", "the key `init_std` of ppo")
             elif key == "fixed_sigma" and value is not True:
                 self.note(inner, "approximated", "the standard deviation never depends on the state")
             else:
@@ -200,7 +206,7 @@ class RlGamesReader:
         convs = cnn.get("convs") if isinstance(cnn, Mapping) else None
         if not isinstance(convs, list) or not convs or not all(isinstance(layer, Mapping) for layer in convs):
             hint = "write {type: conv2d, convs: [{filters: 32, kernel_size: 8, strides: 4, padding: 0}, ...]}"
-            self.problem(at, "expected layers of convolutions", hint)
+            self.problem(at, "expected the type conv2d and a list `convs` with its layers", hint)
             return
         if cnn.get("type") != "conv2d":
             self.problem((*at, "type"), _no_counterpart(cnn.get("type")), "expected 'conv2d'")
@@ -263,7 +269,7 @@ class RlGamesReader:
         if "clip_actions" in config:
             mapped("clip_actions", "action_bound", 1.0 if config["clip_actions"] else None)
         if "central_value_config" in config:
-            text = "the critic observes the states; it uses the policy's network and schedule"
+            text = "the critic observes the group `critic`; its network and learning rate are those of the actor"
             self.note((*at, "central_value_config"), "approximated", text)
 
     def _schedule(self, at: Path, config: Mapping[str, Any]) -> None:
@@ -289,8 +295,8 @@ class RlGamesReader:
 
 
 def _no_counterpart(value: object) -> str:
-    """Return the message for a value of a setting that rlcli does not have, or for a missing value."""
-    return "it has no value" if value is None else f"'{value}' has no counterpart"
+    """Return the note for a setting whose value rlcli cannot represent, or which has no value."""
+    return "the key has no value" if value is None else f"'{value}' has no counterpart in rlcli"
 
 
 def _number(value: Any, default: float) -> float:

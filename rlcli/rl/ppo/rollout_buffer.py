@@ -33,9 +33,13 @@ class Samples:
 
     @classmethod
     def views(cls, packed: Tensor, obs: int, critic_obs: int, action: int) -> Samples:
-        """Return views of the columns of `packed`, given the number of columns of each part.
+        """Return samples whose tensors are views of the columns of `packed`.
 
-        If `critic_obs` is 0, the critic reads the actor's observation.
+        Args:
+            packed: memory of the samples. (..., columns)
+            obs: number of columns of the actor's observation.
+            critic_obs: number of columns of the critic's observation; 0: the critic reads the actor's observation.
+            action: number of columns of the action.
         """
         parts = packed.split_with_sizes([obs, critic_obs, action, action, 1, 1, 1, 1, 1], dim=-1)
         scalars = [part.squeeze(-1) for part in parts[4:]]
@@ -110,7 +114,10 @@ class RolloutBuffer:
         return is_finite(self._packed)
 
     def in_causal_order(self) -> list[tuple[str, Tensor]]:
-        """Return all tensors with their names, each after the tensors that it depends on. (num_steps, num_envs, ...)"""
+        """Return (name, tensor) of all samples, each after the tensors from which it is computed, for `require_finite`.
+
+        (num_steps, num_envs, ...) each
+        """
         samples = self.samples
         final_obs = torch.where(self.time_out[..., None], self.final_obs, 0.0)
         return [
@@ -127,14 +134,17 @@ class RolloutBuffer:
         ]
 
     def order_by_environment(self, environments: Tensor) -> Tensor:
-        """Assign environments to the minibatches; return the order of the samples, step by step in each minibatch."""
+        """Assign environments to minibatches in the order of `environments`; return the indices of the samples.
+
+        Within a minibatch the samples are ordered by step. The indices are as in `fill_minibatches`.
+        """
         parts = environments.split_with_sizes([len(own) for own in self.environments])
         for own, part in zip(self.environments, parts, strict=True):
             own.copy_(part)
         return torch.cat([self._indices.index_select(1, part).flatten() for part in parts])
 
     def fill_minibatches(self, order: Tensor) -> None:
-        """Copy the samples into the minibatches; sample (t, env) has index t * num_envs + env."""
+        """Copy the samples into the minibatches in the given order; sample (t, env) has index t * num_envs + env."""
         if self.images is not None:
             parts = order.split_with_sizes(self._samples_of_minibatches)
             order = torch.cat([torch.cat((part, part + len(order))) for part in parts])

@@ -1,4 +1,4 @@
-"""Sizes and structure of the PPO trainer for a configuration and an environment."""
+"""Structure of the PPO trainer for a configuration and an environment: policy, CNN, critic groups, minibatch sizes."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def minibatch_sizes(env: Environment, config: PpoConfig, total: int) -> list[int
         split = parts.tensor_split(config.num_minibatches)
     sizes = [len(part) * whole for part in split]
     if min(sizes) == 0:
-        message = f"{config.num_minibatches} minibatches cannot be made: {rollout}"
+        message = f"{config.num_minibatches} minibatches are too many: {rollout}"
     elif (config.normalize_advantage == "minibatch" and min(sizes) == 1) or (config.normalize_advantage and total == 1):
         message = f"advantages cannot be normalised over one sample: {rollout}"
     else:

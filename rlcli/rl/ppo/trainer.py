@@ -106,7 +106,7 @@ class PpoTrainer(BaseTrainer):
         return self.make_report(losses, seconds)
 
     def _timestamp(self) -> Any:
-        """Return the time [s]; on a GPU a CUDA event in its stream of work, which forces no host sync."""
+        """Return the time [s]; on a GPU a CUDA event in the current stream, which forces no host sync."""
         if self.device.type != "cuda":
             return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]  # torch has no type here
@@ -206,7 +206,7 @@ def _copies(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _module_tensors(name: str, module: nn.Module | None) -> dict[str, Tensor]:
-    """Return the tensors of a module, not copied, with the prefix `name.`; none for None."""
+    """Return the tensors of a module, not copied, by `name.TENSOR`; an empty dict without a module."""
     return {} if module is None else {f"{name}.{key}": value for key, value in module.state_dict().items()}
 
 

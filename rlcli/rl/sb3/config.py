@@ -88,7 +88,7 @@ class PpoConfig(OnPolicyConfig):
     @model_validator(mode="after")
     def _schedule(self) -> PpoConfig:
         if (self.schedule == "adaptive") != (self.desired_kl is not None):
-            raise ValueError("desired_kl and schedule adaptive need each other: set both or neither")
+            raise ValueError("desired_kl and schedule: adaptive are only used together: set both or neither")
         return self
 
 

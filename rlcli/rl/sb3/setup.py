@@ -1,4 +1,4 @@
-"""SB3's algorithm and the policy's structure for a configuration and an environment."""
+"""SB3's algorithm object and the structure of the policy, for a configuration and an environment."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _require_batch(env: Environment, config: OnPolicyConfig) -> None:
     rollout = f"a rollout holds n_steps x num_envs = {config.n_steps} x {env.num_envs} = {total} samples"
     minibatches = config.num_minibatches if isinstance(config, PpoConfig) else 1
     if total < minibatches:
-        key, message = "num_minibatches", f"{minibatches} minibatches cannot be made: {rollout}"
+        key, message = "num_minibatches", f"{minibatches} minibatches are too many: {rollout}"
     elif total == 1 and config.normalize_advantage:
         key, message = "n_steps", f"advantages cannot be normalised: {rollout}"
     else:

@@ -193,8 +193,8 @@ class Sb3Trainer(BaseTrainer):
 
         Args:
             policy: the tensors of a saved policy.
-            rest: tensors of a checkpoint with all other weights. None: the critics do not change, and the target actor
-                becomes a copy of the loaded actor.
+            rest: all other weights, from a checkpoint. None: the critics do not change, and the target actor becomes a
+                copy of the loaded actor.
         """
         weights = self.model.policy.state_dict()
         if rest is not None:

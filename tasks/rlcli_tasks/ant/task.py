@@ -23,7 +23,7 @@ class AntTask(LocomotionTask):
     action_names = JOINTS
 
     class Params(LocomotionTask.Params):
-        """Settings of the task."""
+        """Parameters of the task, set in the section `params:` of its YAML."""
 
         effort: float = Field(7.5, gt=0, description="Torque of each joint at action 1 [N m].")
         termination_height: float = Field(0.31, description="An episode fails if the torso is lower than this [m].")
@@ -55,5 +55,8 @@ class AntTask(LocomotionTask):
         return (self.params.effort,) * len(JOINTS)
 
     def at_limits(self, position: Tensor) -> Tensor:
-        """Return whether each joint is at a limit; positions are in half ranges, from -1 to 1. (n, joints) bool"""
+        """Return whether each joint is within 1 % of half its range of a limit. (num_envs, joints) bool
+
+        position: joint positions scaled so that -1 and 1 are the limits. (num_envs, joints)
+        """
         return position.abs() > 0.99

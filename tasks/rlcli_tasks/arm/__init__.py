@@ -1,1 +1,4 @@
-"""The arm of several tasks: seven joints and a gripper with two fingers. Numbers: docs/reference/zoo/reach.md."""
+"""Model of the arm that several tasks use: seven joints and a gripper with two fingers.
+
+Parameters and their sources: docs/reference/zoo/reach.md.
+"""

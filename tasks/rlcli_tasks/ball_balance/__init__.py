@@ -1,4 +1,7 @@
-"""Table on three legs: catch a ball and hold it in the middle. Numbers: docs/reference/zoo/ball-balance.md."""
+"""Table on three legs: catch a ball and hold it in the middle.
+
+Parameters and their sources: docs/reference/zoo/ball-balance.md.
+"""
 
 from rlcli.task import TaskSpec
 

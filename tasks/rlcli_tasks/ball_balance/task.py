@@ -1,7 +1,7 @@
-"""A table on three legs catches a ball and holds it in the middle.
+"""Ball balance in the direct workflow: a table on three legs catches a ball and holds it in the middle.
 
-The hooks can also run as a CUDA graph on a GPU: they read no value back, select environments by masks instead of
-indices, and write tensors that are kept between steps in place.
+The methods of the class can also run as a CUDA graph on a GPU: they read no value back, select environments by masks
+instead of indices, and write tensors that are kept between steps in place.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ KNEES = tuple(f"knee{leg}" for leg in LEGS)
 JOINTS = tuple(f"{joint}{leg}" for leg in LEGS for joint in ("hip", "knee"))
 
 BALL_POS, BALL_VEL = slice(6, 9), slice(9, 12)
-"""Columns of the observation that rewards and terminations read."""
+"""Columns of the ball's position [m] and velocity [m/s] in the observation; rewards and terminations read them."""
 
 
 class BallBalanceTask(DirectTask):
@@ -49,7 +49,7 @@ class BallBalanceTask(DirectTask):
     action_names = KNEES
 
     class Params(StrictModel):
-        """Settings of the task."""
+        """Parameters of the task, set in the section `params:` of its YAML."""
 
         speed: float = Field(20.0, gt=0, description="Speed of the target angle of a knee at action 1 [rad/s].")
         target_height: float = Field(0.7, description="Height of the point where the ball should rest [m].")
@@ -78,7 +78,7 @@ class BallBalanceTask(DirectTask):
         self.tables = scene.add(ArticulationView("robot", name="table_view"))
 
     def post_reset(self) -> None:
-        """Create constants and buffers. The hooks write the buffers in place."""
+        """Create constants, and buffers that the other methods write in place."""
         self.robot, self.ball = self.env.entities["robot"], self.env.entities["ball"]
         assert tuple(self.robot.joint_names) == JOINTS
         params, device = self.params, self.device
@@ -86,14 +86,17 @@ class BallBalanceTask(DirectTask):
         self.lowest, self.highest = low[1::2].contiguous(), high[1::2].contiguous()
         self.targets = torch.zeros(self.num_envs, len(JOINTS), device=device)  # knees [rad]; hips have no motor
         self.goal = torch.tensor([0.0, 0.0, params.target_height], device=device)
-        # distance, direction, height, and inward speed as a fraction of the highest
+        # ranges of the initial state: distance, direction, height, and inward speed as a fraction of the highest
         ranges = [params.start_distance, (-math.pi, math.pi), params.start_height, (0.0, 1.0)]
         self.start_low, self.start_high = torch.tensor(ranges, device=device).unbind(dim=1)
         self.distance = torch.zeros(self.num_envs, device=device)
         self.extras["distance"] = self.distance  # distance of the ball from its goal [m]
 
     def reset(self, selection: Selection) -> None:
-        """Set the table to rest. The ball falls, and moves towards the middle faster the farther away it starts."""
+        """Put the table at rest, and the ball above it: falling, and moving towards the middle.
+
+        The farther the ball is from the middle, the faster it may move.
+        """
         params = self.params
         distance, direction, height, share = selection.uniform(self.start_low, self.start_high, (4,)).unbind(dim=1)
         nearest, furthest = params.start_distance
@@ -106,16 +109,16 @@ class BallBalanceTask(DirectTask):
         selection.write(self.targets, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Move the targets of the knees, within their limits."""
+        """Move the position targets of the knees by the actions, which are speeds, within the joint limits."""
         knees = self.targets[:, 1::2]
         knees.add_(actions, alpha=self.params.speed * self.step_dt)
         knees.copy_(torch.minimum(torch.maximum(knees, self.lowest), self.highest))
         self.tables.set_joint_position_targets(self.targets)
 
     def get_observations(self) -> None:
-        """Fill obs_buf."""
+        """Write the observations to `obs_buf`."""
         robot, ball = self.robot.data, self.ball.data
-        # no physics step yet in a new episode: sensor values belong to the old state
+        # before the first physics step of an episode, sensor values belong to the state before the reset: write 0
         scale = (self.progress_buf > 0).mul(1.0 / 20.0)
         readings = robot.sensordata.unflatten(1, (len(LEGS), 6)).transpose(1, 2) * scale[:, None, None]
         torch.cat(
@@ -132,11 +135,11 @@ class BallBalanceTask(DirectTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Reward a ball that is slow and near the middle."""
+        """Write the rewards to `rew_buf`: 1 for a ball at rest in the middle, less with distance and speed."""
         speed = torch.linalg.vector_norm(self.obs_buf[:, BALL_VEL], dim=1)
         torch.linalg.vector_norm(self.obs_buf[:, BALL_POS] - self.goal, dim=1, out=self.distance)
         self.rew_buf.copy_(((1.0 + self.distance) * (1.0 + speed)).reciprocal_())
 
     def is_done(self) -> None:
-        """Terminate where the ball has fallen off. The environment adds the time-out."""
+        """Write to `reset_buf` where the ball has fallen off the table. The environment adds time-outs."""
         self.reset_buf.copy_(self.obs_buf[:, BALL_POS][:, 2] < self.params.fall_height)

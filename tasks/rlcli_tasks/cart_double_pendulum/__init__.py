@@ -1,4 +1,4 @@
-"""Cart with two links: balance both. Numbers and their sources: docs/reference/zoo/cart-double-pendulum.md."""
+"""Cart with two links: balance both. Parameters and their sources: docs/reference/zoo/cart-double-pendulum.md."""
 
 from rlcli.task import TaskSpec
 

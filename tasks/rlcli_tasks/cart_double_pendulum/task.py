@@ -1,4 +1,4 @@
-"""Cart with two links: a force on the cart and a torque between the links balance both.
+"""Cart with two links in the direct workflow: a force on the cart and a torque between the links balance both.
 
 The original is a task for two agents, the cart and the pendulum. Here one policy controls both: it has the observations
 and actions of both, and its reward is the sum of theirs.
@@ -35,7 +35,7 @@ class CartDoublePendulumTask(DirectTask):
     action_names = (CART, PENDULUM)
 
     class Params(StrictModel):
-        """Settings of the task."""
+        """Parameters of the task, set in the section `params:` of its YAML."""
 
         cart_effort: float = Field(100.0, gt=0, description="Force on the cart at action 1 [N].")
         pendulum_effort: float = Field(
@@ -75,7 +75,7 @@ class CartDoublePendulumTask(DirectTask):
         self.scale = torch.tensor([params.cart_effort, params.pendulum_effort], device=self.device)
 
     def reset(self, selection: Selection) -> None:
-        """Set the cart to the middle and the links to random angles, all at rest."""
+        """Put the cart in the middle and the links at random angles, all at rest."""
         self.robot.write_joint_positions(selection, selection.uniform(-self.start, self.start, (len(JOINTS),)))
 
     def pre_physics_step(self, actions: Tensor) -> None:
@@ -84,7 +84,7 @@ class CartDoublePendulumTask(DirectTask):
         self.carts.set_joint_efforts(self.efforts)
 
     def get_observations(self) -> None:
-        """Fill obs_buf: first the observations of the cart, then those of the pendulum."""
+        """Write the observations to `obs_buf`: first the observations of the cart, then those of the pendulum."""
         position, velocity = self.robot.data.joint_pos, self.robot.data.joint_vel
         pole, between = position[:, 1], wrap_to_pi(position[:, 2])
         torch.stack(
@@ -97,7 +97,10 @@ class CartDoublePendulumTask(DirectTask):
         )
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the observations and actions as terms of a manager-based task, by section."""
+        """Return the observations and actions as terms of a manager-based task, by section.
+
+        rlcli uses them where it needs terms, for example to export the policy for a robot.
+        """
         params = self.params
         return {
             "observations": [
@@ -113,7 +116,7 @@ class CartDoublePendulumTask(DirectTask):
         }
 
     def calculate_metrics(self) -> None:
-        """Reward upright links and slow joints; a failure has a cost."""
+        """Write the rewards to `rew_buf`: for survival, minus penalties on tilt and speed; a failure has a cost."""
         params = self.params
         _, cart_vel, pole, pole_vel, tilt, _, pendulum_vel = self.obs_buf.unbind(dim=1)
         self.rew_buf.fill_(params.alive_weight).masked_fill_(self._failed(), params.failure_reward)
@@ -121,7 +124,7 @@ class CartDoublePendulumTask(DirectTask):
         self.rew_buf.sub_(cart_vel.abs() + pole_vel.abs() + pendulum_vel.abs(), alpha=params.speed_weight)
 
     def is_done(self) -> None:
-        """Terminate where the cart left the rail or the pole fell. The environment adds the time-out."""
+        """Write to `reset_buf` where the cart left the rail or the pole fell. The environment adds time-outs."""
         self.reset_buf.copy_(self._failed())
 
     def _failed(self) -> Tensor:

@@ -1,4 +1,7 @@
-"""Cartpole: balance a pole on a cart, in both workflows and from images. Numbers: docs/reference/zoo/cartpole.md."""
+"""Cartpole: balance a pole on a cart, in both workflows and from images.
+
+Parameters and their sources: docs/reference/zoo/cartpole.md.
+"""
 
 from rlcli.task import TaskSpec
 
@@ -6,7 +9,7 @@ MANAGED = TaskSpec(package=__name__, summary="Balance a pole on a cart (manager-
 CAMERA = TaskSpec(
     package=__name__,
     config="camera.yaml",
-    summary="Balance a pole on a cart from depth pictures alone (manager-based, after Isaac Lab's).",
+    summary="Balance a pole on a cart from depth images alone (manager-based, based on Isaac Lab's task).",
 )
 DIRECT = TaskSpec(
     package=__name__,

@@ -1,4 +1,4 @@
-"""Cartpole in the direct workflow: one class with OmniIsaacGymEnvs' hooks."""
+"""Cartpole in the direct workflow: one class with the methods of a task of OmniIsaacGymEnvs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class CartpoleTask(DirectTask):
     action_names = ("slider_to_cart",)
 
     class Params(StrictModel):
-        """Settings of the task."""
+        """Parameters of the task, set in the section `params:` of its YAML."""
 
         reset_dist: float = Field(
             3.0, gt=0, description="An episode fails if the cart is farther than this from the middle of the rail [m]."
@@ -44,7 +44,7 @@ class CartpoleTask(DirectTask):
         self.cartpoles = scene.add(ArticulationView("robot", name="cartpole_view"))
 
     def post_reset(self) -> None:
-        """Look up the joints."""
+        """Find the indices of the joints, and create the ranges of initial states."""
         self.cart = self.cartpoles.get_dof_index("slider_to_cart")
         self.pole = self.cartpoles.get_dof_index("cart_to_pole")
         self.position_span, self.velocity_span = torch.empty(2, self.cartpoles.num_dof, device=self.device)
@@ -52,7 +52,7 @@ class CartpoleTask(DirectTask):
         self.velocity_span[self.cart], self.velocity_span[self.pole] = 0.5, 0.25 * math.pi
 
     def reset_idx(self, env_ids: Tensor) -> None:
-        """Sample the cart in +-1 m and +-0.5 m/s, the pole in +-pi/8 rad and +-pi/4 rad/s."""
+        """Sample initial states: the cart in +-1 m and +-0.5 m/s, the pole in +-pi/8 rad and +-pi/4 rad/s."""
         draws = self.draws(env_ids)
         position = self.position_span * draws.uniform(-1.0, 1.0, (self.cartpoles.num_dof,))
         velocity = self.velocity_span * draws.uniform(-1.0, 1.0, (self.cartpoles.num_dof,))
@@ -60,13 +60,13 @@ class CartpoleTask(DirectTask):
         self.cartpoles.set_joint_velocities(velocity, indices=env_ids)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Push the cart."""
+        """Apply the action as a force on the cart."""
         efforts = torch.zeros(self.num_envs, self.cartpoles.num_dof, device=self.device)
         efforts[:, self.cart] = self.params.max_effort * actions[:, 0]
         self.cartpoles.set_joint_efforts(efforts)
 
     def get_observations(self) -> dict[str, dict[str, Tensor]]:
-        """Fill obs_buf."""
+        """Write the observations to `obs_buf`; return them as {view's name: {"obs_buf": observations}}."""
         position = self.cartpoles.get_joint_positions(clone=False)
         velocity = self.cartpoles.get_joint_velocities(clone=False)
         self.obs_buf[:, 0] = position[:, self.cart]
@@ -76,7 +76,10 @@ class CartpoleTask(DirectTask):
         return {self.cartpoles.name: {"obs_buf": self.obs_buf}}
 
     def in_terms(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the observations and actions as terms of a manager-based task, by section."""
+        """Return the observations and actions as terms of a manager-based task, by section.
+
+        rlcli uses them where it needs terms, for example to export the policy for a robot.
+        """
         cart, pole = ["slider_to_cart"], ["cart_to_pole"]
         observed = [{"func": func, "joints": joints} for joints in (cart, pole) for func in ("joint_pos", "joint_vel")]
         return {
@@ -85,7 +88,7 @@ class CartpoleTask(DirectTask):
         }
 
     def calculate_metrics(self) -> None:
-        """Reward an upright pole and slow joints; a failure costs 2."""
+        """Write the rewards to `rew_buf`: 1, minus penalties on the pole's angle and on speeds; -2 for a failure."""
         _, cart_vel, pole_pos, pole_vel = self.obs_buf.unbind(dim=1)
         reward = 1.0 - pole_pos.square()
         reward -= self.params.cart_vel_weight * cart_vel.abs()
@@ -93,7 +96,7 @@ class CartpoleTask(DirectTask):
         self.rew_buf[:] = torch.where(self._failed(), -2.0, reward)
 
     def is_done(self) -> None:
-        """Terminate where the cart left the rail or the pole fell. The environment adds the time-out."""
+        """Write to `reset_buf` where the cart left the rail or the pole fell. The environment adds time-outs."""
         self.reset_buf[:] = self._failed()
 
     def _failed(self) -> Tensor:

@@ -1,6 +1,6 @@
 """Crazyflie: rise to a point with four slow motors and hover.
 
-Numbers and their sources: docs/reference/zoo/crazyflie.md.
+Parameters and their sources: docs/reference/zoo/crazyflie.md.
 """
 
 from rlcli.task import TaskSpec

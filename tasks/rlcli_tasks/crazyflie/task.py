@@ -28,7 +28,7 @@ class CrazyflieTask(FlightTask):
     motors = False
 
     class Params(FlightTask.Params):
-        """Settings of the task."""
+        """Parameters of the task, set in the section `params:` of its YAML."""
 
         thrust_to_weight: float = Field(
             1.9, gt=1, description="Thrust of all four motors at full speed, divided by the weight."
@@ -53,7 +53,7 @@ class CrazyflieTask(FlightTask):
     params: Params
 
     def post_reset(self) -> None:
-        """Create constants and buffers. The hooks write the buffers in place."""
+        """Create constants, and buffers that the other methods write in place."""
         super().post_reset()
         params, n, model = self.params, self.num_envs, self.env.engine.model
         weight = float(model.body_mass[self.robot.body_ids].sum()) * -float(model.opt.gravity[2])
@@ -64,18 +64,21 @@ class CrazyflieTask(FlightTask):
         self.everywhere = torch.ones(n, dtype=torch.bool, device=self.device)
         self.actions = torch.zeros(n, len(MOTORS), device=self.device)
         self.up = torch.zeros(n, device=self.device)
-        """Height of the tip of the robot's z axis, since the last `get_observations`. (n,)"""
+        """z component of the robot's z axis in the world frame (1: upright), set by `get_observations`. (num_envs,)"""
         self.speeds = torch.zeros(n, len(MOTORS), device=self.device)
-        """Motor speeds, divided by the highest speed. (n, 4)"""
+        """Motor speeds, divided by the highest speed. (num_envs, 4)"""
 
     def reset(self, selection: Selection) -> None:
-        """Set the drone level and at rest below the target, with motors off."""
+        """Put the drone below the target, level and at rest, with motors off."""
         super().reset(selection)
         selection.write(self.actions, 0.0)
         selection.write(self.speeds, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Set the commanded thrusts. Motor speeds follow with a lag; the thrust is the square of the speed."""
+        """Apply the thrusts that the actions command.
+
+        The speed of a motor follows its command with a lag, and the thrust is proportional to the square of the speed.
+        """
         self.move_target()
         self.actions.copy_(actions)
         command = (actions + 1.0).mul_(0.5).clamp_(0.0, 1.0)
@@ -87,7 +90,7 @@ class CrazyflieTask(FlightTask):
         self.env.engine.field("ctrl").copy_(thrusts.mul_(self.max_thrust))
 
     def get_observations(self) -> None:
-        """Fill obs_buf."""
+        """Write the observations to `obs_buf`."""
         data = self.robot.data
         torch.sub(self.target, data.root_pos_w, out=self.to_target)
         robot_axes = axes(data.root_quat_w)
@@ -99,7 +102,11 @@ class CrazyflieTask(FlightTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Reward nearness, and near the target an upright pose without spin; small actions cost a little."""
+        """Write the rewards to `rew_buf`.
+
+        They are for nearness to the target, and near the target for an upright pose without spin. The penalty on
+        actions is largest at action 0.
+        """
         self.distance.copy_(length(self.to_target))
         near = (1.0 + self.distance).reciprocal_()
         up = self.up.clamp(0.0, 1.0)
@@ -109,7 +116,7 @@ class CrazyflieTask(FlightTask):
         self.rew_buf.copy_(reward.sub_(low_effort, alpha=self.params.effort_cost))
 
     def is_done(self) -> None:
-        """Terminate where the drone is too far, too low, too high or upside down. The environment adds the time-out."""
+        """Write to `reset_buf` where the drone is too far, too low, too high or upside down, without time-outs."""
         low, high = self.params.height_range
         height = self.robot.data.root_pos_w[:, 2]
         outside = (height < low) | (height > high)

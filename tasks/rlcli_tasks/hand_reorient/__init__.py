@@ -1,4 +1,4 @@
-"""Hand: fingers turn a cube. Numbers and their sources: docs/reference/zoo/hand-reorient.md."""
+"""Hand: fingers turn a cube. Parameters and their sources: docs/reference/zoo/hand-reorient.md."""
 
 from rlcli.task import TaskSpec
 

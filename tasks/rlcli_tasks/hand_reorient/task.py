@@ -1,7 +1,7 @@
 """Hand in the direct workflow: fingers turn a cube to one orientation after another.
 
-The hooks can also run as a CUDA graph on a GPU: they read no value back, select environments by masks instead of
-indices, and write tensors that are kept between steps in place.
+The methods of the class can also run as a CUDA graph on a GPU: they read no value back, select environments by masks
+instead of indices, and write tensors that are kept between steps in place.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ FINGERS = ("index", "middle", "ring", "thumb")
 JOINTS = tuple(f"{finger}_{joint}" for finger in FINGERS for joint in range(4))
 _QUAT, _XYZ = ("w", "x", "y", "z"), ("x", "y", "z")
 GOAL = slice(45, 53)
-"""Columns of the observation that a new goal changes."""
+"""Columns of the observation that change with the goal: its orientation, and the rotation from it to the cube."""
 
 
 class HandTask(DirectTask):
     """Turn the cube to one goal after another. Observations: docs/reference/zoo/hand-reorient.md lists the 69 columns.
 
-    The critic observes 145 columns: these 69, then positions, velocities and loads of the fingertips.
+    The critic observes 145 columns: these 69, then poses, velocities, forces and torques of the fingertips.
     """
 
     num_observations = 69
@@ -56,7 +56,7 @@ class HandTask(DirectTask):
     motors = False
 
     class Params(StrictModel):
-        """Settings of the task."""
+        """Parameters of the task, set in the section `params:` of its YAML."""
 
         goal_pos: tuple[float, float, float] = Field(
             (-0.01, 0.0, 0.55), description="Position where the cube should stay: x, y, z [m]."
@@ -114,7 +114,7 @@ class HandTask(DirectTask):
         self.hands = scene.add(ArticulationView("robot", name="hand_view"))
 
     def post_reset(self) -> None:
-        """Create constants and buffers. The hooks write the buffers in place."""
+        """Create constants, and buffers that the other methods write in place."""
         self.robot, self.cube, self.shown = (self.env.entities[name] for name in ("robot", "object", "goal"))
         data, params, n, device = self.robot.data, self.params, self.num_envs, self.device
         self.low, self.high = (ends.clone() for ends in data.joint_pos_limits.to(device).unbind(dim=1))
@@ -136,7 +136,7 @@ class HandTask(DirectTask):
         self.extras["angle"] = self.angle  # angle to the goal [rad]
 
     def reset(self, selection: Selection) -> None:
-        """Set the fingers near their default pose and the cube above the palm, randomly oriented; sample a goal."""
+        """Put the fingers near their default pose and the cube above the palm, randomly oriented; sample a goal."""
         joints = selection.uniform(self.start_low, self.start_high, (self.num_actions,))
         self.robot.write_joint_positions(selection, joints)
         noise = self.params.position_noise
@@ -149,7 +149,7 @@ class HandTask(DirectTask):
         selection.write(self.successes, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Set smoothed position targets."""
+        """Set the position targets of the joints: a weighted mean of the actions and the previous targets."""
         self.actions.copy_(actions)
         wanted = torch.addcmul(self.middle, self.half, actions)
         self.targets.lerp_(wanted, self.params.smoothing)
@@ -157,7 +157,7 @@ class HandTask(DirectTask):
         self.hands.set_joint_position_targets(self.targets)
 
     def get_observations(self) -> None:
-        """Fill obs_buf."""
+        """Write the observations to `obs_buf`."""
         hand, cube = self.robot.data, self.cube.data
         torch.cat(
             [
@@ -175,9 +175,9 @@ class HandTask(DirectTask):
         )
 
     def get_states(self) -> None:
-        """Fill states_buf: the observations, then position, orientation, velocity and load of the fingertips."""
+        """Write `states_buf`: the observations, then pose, velocity, and force and torque of each fingertip."""
         position, quat, linear, angular = self.robot.data.body_states_of(self.ends)
-        # no physics step yet in a new episode: sensor values belong to the old state
+        # before the first physics step of an episode, sensor values belong to the state before the reset: write 0
         felt = (self.progress_buf > 0).mul(0.1)
         torch.cat(
             [
@@ -193,7 +193,11 @@ class HandTask(DirectTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Reward a cube near its position and goal, minus effort. A reached goal earns a bonus and is replaced."""
+        """Write the rewards to `rew_buf`, and sample a new goal where the goal is reached.
+
+        The reward is for a cube near its position and goal orientation, minus a penalty on actions, plus a bonus for a
+        reached goal.
+        """
         params, cube = self.params, self.cube.data
         self.distance.copy_(length(cube.root_pos_w - self.goal_pos))
         self.angle.copy_(turn_between(self.goal_quat, cube.root_quat_w))
@@ -213,11 +217,11 @@ class HandTask(DirectTask):
                 self.states_buf[:, GOAL] = self.obs_buf[:, GOAL]
 
     def is_done(self) -> None:
-        """Terminate where the cube has fallen. The environment adds the time-out."""
+        """Write to `reset_buf` where the cube has fallen. The environment adds time-outs."""
         self.reset_buf.copy_(self.distance >= self.params.fall_distance)
 
     def _draw_goal(self, selection: Selection) -> None:
-        """Sample a goal orientation, and show it in the viewer."""
+        """Sample a goal orientation in the selected environments, and show it in the viewer."""
         quat = _random_rotation(selection)
         selection.write(self.goal_quat, quat)
         self.shown.write_root_pose(selection, selection.read(self.shown_pos), quat)

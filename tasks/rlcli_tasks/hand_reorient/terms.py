@@ -1,4 +1,4 @@
-"""Term for the condition of success of `hand-reorient`."""
+"""Term with which the task `hand-reorient` defines the success of an episode."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from rlcli.envs.direct import DirectEnv
 
 
 def goals_reached(env: DirectEnv) -> Tensor:
-    """Return how many goals the current episode of `hand-reorient` has reached. (num_envs,)"""
+    """Return the number of goal orientations that the cube has reached in the current episode. (num_envs,)"""
     return env.task.successes  # type: ignore[attr-defined]

@@ -30,7 +30,7 @@ class HumanoidTask(LocomotionTask):
     action_names = JOINTS
 
     class Params(LocomotionTask.Params):
-        """Settings of the task."""
+        """Parameters of the task, set in the section `params:` of its YAML."""
 
         power: float = Field(1.0, gt=0, description="Factor on the torques of all motors.")
         termination_height: float = Field(0.8, description="An episode fails if the torso is lower than this [m].")
@@ -67,7 +67,10 @@ class HumanoidTask(LocomotionTask):
     params: Params
 
     def post_reset(self) -> None:
-        """Sample initial hip angles only outwards: inwards, the legs would overlap in a fifth of all initial states."""
+        """Create buffers as the base class does, and let the hips start outwards only.
+
+        With hips turned inwards, the legs would overlap in a fifth of all initial states.
+        """
         super().post_reset()
         self.start_high[[JOINTS.index("hip_roll_l"), JOINTS.index("hip_roll_r")]] = 0.0
 
@@ -76,5 +79,10 @@ class HumanoidTask(LocomotionTask):
         return tuple(self.params.power * effort for effort in EFFORTS.values())
 
     def at_limits(self, position: Tensor) -> Tensor:
-        """Return costs that rise from 0 at 98 % of the half range to the motor's weight at the limit. (n, joints)"""
+        """Return the cost of each joint near a limit. (num_envs, joints)
+
+        It rises from 0 at 98 % of half the joint's range to (torque of the joint's motor / 135 N m) at the limit.
+
+        position: joint positions scaled so that -1 and 1 are the limits. (num_envs, joints)
+        """
         return (position.abs() - 0.98).clamp_(min=0.0).mul_(self.share / 0.02)

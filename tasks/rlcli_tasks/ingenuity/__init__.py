@@ -1,6 +1,6 @@
 """Ingenuity: fly from point to point on Mars with two coaxial rotors.
 
-Numbers and their sources: docs/reference/zoo/ingenuity.md.
+Parameters and their sources: docs/reference/zoo/ingenuity.md.
 """
 
 from rlcli.task import TaskSpec

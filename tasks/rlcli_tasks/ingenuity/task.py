@@ -15,7 +15,7 @@ ROTORS = ("lower", "upper")
 
 
 class IngenuityTask(FlightTask):
-    """Hover at the target, which changes. Observations: docs/reference/zoo/ingenuity.md lists the 13 columns."""
+    """Fly from target to target. Observations: docs/reference/zoo/ingenuity.md lists the 13 columns."""
 
     num_observations = 13
     num_actions = 6
@@ -28,7 +28,7 @@ class IngenuityTask(FlightTask):
     motors = False
 
     class Params(FlightTask.Params):
-        """Settings of the task."""
+        """Parameters of the task, set in the section `params:` of its YAML."""
 
         max_thrust: float = Field(20.0, gt=0, description="Largest thrust of a rotor, upwards or downwards [N].")
         lateral: float = Field(
@@ -59,15 +59,15 @@ class IngenuityTask(FlightTask):
     params: Params
 
     def post_reset(self) -> None:
-        """Create constants and buffers. The hooks write the buffers in place."""
+        """Create constants, and buffers that the other methods write in place."""
         super().post_reset()
         self.forces = torch.zeros(self.num_envs, len(ROTORS), 3, device=self.device)
-        """Force of each rotor, in the rotor's frame. (n, 2, 3) [N]"""
+        """Force of each rotor, in the rotor's frame. (num_envs, 2, 3) [N]"""
         self.units = torch.tensor([3.0] * 3 + [1.0] * 4 + [2.0] * 3 + [math.pi] * 3, device=self.device)
-        """Values that are observed as 1. (13,)"""
+        """Divisors of the observation's columns: a column is 1 if its quantity has this value. (13,)"""
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Set each rotor's thrust, and two sideways fractions of it."""
+        """Apply the force of each rotor: a thrust, and along x and y a fraction of the thrust."""
         self.move_target()
         command = actions.view(-1, len(ROTORS), 3).clamp(-1.0, 1.0)
         thrust = command[..., 2:] * self.params.max_thrust
@@ -76,7 +76,7 @@ class IngenuityTask(FlightTask):
         self.env.engine.field("ctrl").copy_(self.forces.view(-1, 6))
 
     def get_observations(self) -> None:
-        """Fill obs_buf."""
+        """Write the observations to `obs_buf`."""
         data = self.robot.data
         torch.sub(self.target, data.root_pos_w, out=self.to_target)
         torch.cat(
@@ -86,7 +86,11 @@ class IngenuityTask(FlightTask):
         ).div_(self.units)
 
     def calculate_metrics(self) -> None:
-        """Reward nearness, and near the target an upright pose, no spin, and (`steadiness`) a low speed."""
+        """Write the rewards to `rew_buf`.
+
+        They are for nearness to the target, and near the target for an upright pose, no spin and, with the parameter
+        `steadiness`, a low speed.
+        """
         data = self.robot.data
         self.distance.copy_(length(self.to_target))
         _, x, y, _ = data.root_quat_w.unbind(dim=1)
@@ -100,6 +104,6 @@ class IngenuityTask(FlightTask):
             self.rew_buf.addcmul_(near, rest, value=self.params.steadiness)
 
     def is_done(self) -> None:
-        """Terminate where the robot is too far or too low. The environment adds the time-out."""
+        """Write to `reset_buf` where the robot is too far or too low. The environment adds time-outs."""
         low = self.robot.data.root_pos_w[:, 2] < self.params.min_height
         self.reset_buf.copy_((self.distance > self.params.max_distance) | low)

@@ -1,6 +1,6 @@
 """Lift: an arm grasps a cube and holds it at a commanded position.
 
-Numbers and their sources: docs/reference/zoo/lift-cube.md.
+Parameters and their sources: docs/reference/zoo/lift-cube.md.
 """
 
 from rlcli.task import TaskSpec

@@ -1,6 +1,6 @@
 """Open drawer: an arm pulls a drawer open by its handle.
 
-Numbers and their sources: docs/reference/zoo/open-drawer.md.
+Parameters and their sources: docs/reference/zoo/open-drawer.md.
 """
 
 from rlcli.task import TaskSpec

@@ -1,7 +1,7 @@
 """Open drawer in the direct workflow: an arm grasps the handle of a drawer and pulls.
 
-The hooks can also run as a CUDA graph on a GPU: they read no value back, select environments by masks instead of
-indices, write tensors that are kept between steps in place, and create few tensors.
+The methods of the class can also run as a CUDA graph on a GPU: they read no value back, select environments by masks
+instead of indices, write tensors that are kept between steps in place, and create few tensors.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class DrawerTask(DirectTask):
     motors = False  # the drawer has no motor
 
     class Params(StrictModel):
-        """Settings of the task."""
+        """Parameters of the task, set in the section `params:` of its YAML."""
 
         action_scale: float = Field(2.5, gt=0, description="Speed of the target of an arm joint at action 1 [rad/s].")
         finger_speed: float = Field(
@@ -108,7 +108,7 @@ class DrawerTask(DirectTask):
         self.arms = scene.add(ArticulationView("robot", name="arm_view"))
 
     def post_reset(self) -> None:
-        """Create constants and buffers. The hooks write the buffers in place."""
+        """Create constants, and buffers that the other methods write in place."""
         self.robot, self.cabinet = self.env.entities["robot"], self.env.entities["cabinet"]
         data, params, n = self.robot.data, self.params, self.num_envs
         self.low, self.high = data.joint_pos_limits.to(self.device).unbind(dim=1)
@@ -120,7 +120,7 @@ class DrawerTask(DirectTask):
         share = torch.ones(self.num_actions)
         share[FINGERS] = params.finger_speed
         self.stride = (params.action_scale * self.step_dt * share).to(self.device)
-        """Change of each target in one step at action 1. (9,)"""
+        """Change of each position target in one environment step at action 1. (9,)"""
         self.targets = data.default_joint_pos.clone()
         self.actions = torch.zeros(n, self.num_actions, device=self.device)
         self.opening = torch.zeros(n, device=self.device)
@@ -132,7 +132,7 @@ class DrawerTask(DirectTask):
         self.handle = self.cabinet.names["Sites"].index("handle")
 
     def reset(self, selection: Selection) -> None:
-        """Set the arm near its default pose and the drawer nearly shut, all at rest."""
+        """Put the arm near its default pose and the drawer nearly shut, all at rest."""
         position = selection.uniform(self.start_low, self.start_high, (self.num_actions,))
         self.robot.write_joint_positions(selection, position)
         self.cabinet.write_joint_positions(selection, selection.uniform(0.0, self.params.start_opening, (1,)))
@@ -140,14 +140,14 @@ class DrawerTask(DirectTask):
         selection.write(self.actions, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Move the targets of the joints, within their limits."""
+        """Move the position targets of the joints by the actions, which are speeds, within the joint limits."""
         self.actions.copy_(actions)
         self.targets.addcmul_(self.stride, actions)
         torch.minimum(torch.maximum(self.targets, self.low, out=self.targets), self.high, out=self.targets)
         self.arms.set_joint_position_targets(self.targets)
 
     def get_observations(self) -> None:
-        """Fill obs_buf."""
+        """Write the observations to `obs_buf`."""
         arm, drawer = self.robot.data, self.cabinet.data
         torch.cat(
             [
@@ -162,7 +162,7 @@ class DrawerTask(DirectTask):
         )
 
     def calculate_metrics(self) -> None:
-        """Reward nearness, orientation, grasp and opening, minus the size of the actions."""
+        """Write the rewards to `rew_buf`: for nearness, orientation, grasp and opening, minus a penalty on actions."""
         params, arm = self.params, self.robot.data
         self.opening.copy_(self.obs_buf[:, OPENING])
         opening, distance = self.opening, length(self.obs_buf[:, WAY])
@@ -191,5 +191,5 @@ class DrawerTask(DirectTask):
         self.rew_buf.copy_(reward)
 
     def is_done(self) -> None:
-        """Never terminate: an open drawer must be held open until the time-out."""
+        """Write False to `reset_buf`: episodes only end by time-out, because the drawer must be held open."""
         self.reset_buf.zero_()

@@ -1,6 +1,6 @@
 """Quadcopter: fly to a point and hover, with tilting rotors.
 
-Numbers and their sources: docs/reference/zoo/quadcopter.md.
+Parameters and their sources: docs/reference/zoo/quadcopter.md.
 """
 
 from rlcli.task import TaskSpec

@@ -1,7 +1,7 @@
 """Quadcopter in the direct workflow: fly to a point and stay there, with four thrusts and eight rotor tilts.
 
-The hooks can also run as a CUDA graph on a GPU: they read no value back, select environments by masks instead of
-indices, and write tensors that are kept between steps in place.
+The methods of the class can also run as a CUDA graph on a GPU: they read no value back, select environments by masks
+instead of indices, and write tensors that are kept between steps in place.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class QuadcopterTask(DirectTask):
     motors = False
 
     class Params(StrictModel):
-        """Settings of the task."""
+        """Parameters of the task, set in the section `params:` of its YAML."""
 
         tilt_speed: float = Field(
             25.132741, gt=0, description="Speed of the target of a rotor's tilt angle at action 1: 8 pi [rad/s]."
@@ -61,7 +61,7 @@ class QuadcopterTask(DirectTask):
     params: Params
 
     def post_reset(self) -> None:
-        """Create constants and buffers. The hooks write the buffers in place."""
+        """Create constants, and buffers that the other methods write in place."""
         params, n = self.params, self.num_envs
         self.robot, self.goal = self.env.entities["robot"], self.env.entities["target"]
         low, high = self.robot.data.joint_pos_limits.to(self.device).unbind(dim=1)
@@ -71,21 +71,21 @@ class QuadcopterTask(DirectTask):
         self.start_high = torch.tensor(params.start_high, device=self.device)
         rates = [params.tilt_speed] * len(JOINTS) + [params.thrust_speed] * len(THRUSTS)
         self.steps = torch.tensor([self.step_dt * rate for rate in rates], device=self.device)
-        """Change of each control in a step at action 1. (12,)"""
+        """Change of each element of `controls` in one environment step at action 1. (12,)"""
         thrusts = torch.full((len(THRUSTS),), params.max_thrust, device=self.device)
         self.lowest, self.highest = torch.cat([low, -thrusts]), torch.cat([high, thrusts])
         self.controls = torch.zeros(n, self.num_actions, device=self.device)
-        """Target angles of the servos [rad], then thrusts [N]. (n, 12)"""
+        """Target angles of the servos that tilt the rotors [rad], then thrusts [N]. (num_envs, 12)"""
         self.tilts, self.thrusts = self.controls.split([len(JOINTS), len(THRUSTS)], dim=1)
         self.units = torch.tensor([3.0] * 3 + [1.0] * 4 + [2.0] * 3 + [math.pi] * 3 + [1.0] * 8, device=self.device)
-        """Values that are observed as 1. (21,)"""
+        """Divisors of the observation's columns: a column is 1 if its quantity has this value. (21,)"""
         self.to_target = torch.zeros(n, 3, device=self.device)
-        """From the robot to the target, since the last `get_observations`. (n, 3) [m]"""
+        """Vector from the robot to the target in the world frame, set by `get_observations`. (num_envs, 3) [m]"""
         self.distance = torch.zeros(n, device=self.device)
         self.extras["distance"] = self.distance  # distance to the target [m]
 
     def reset(self, selection: Selection) -> None:
-        """Set the robot near the target, level and at rest, with tilted rotors and no thrust."""
+        """Put the robot near the target, level and at rest, with tilted rotors and no thrust."""
         default = selection.read_view(self.robot.data.default_root_state)
         position = default[:, :3] + selection.uniform(self.start_low, self.start_high, (3,))
         tilts = selection.uniform(self.tilt_low, self.tilt_high, (len(JOINTS),))
@@ -95,13 +95,13 @@ class QuadcopterTask(DirectTask):
         selection.write(self.thrusts, 0.0)
 
     def pre_physics_step(self, actions: Tensor) -> None:
-        """Change the target tilts and the thrusts: the actions are rates."""
+        """Change the target tilts and the thrusts by the actions, which are rates of change, within their limits."""
         self.controls.addcmul_(actions, self.steps)
         torch.clamp(self.controls, self.lowest, self.highest, out=self.controls)
         self.env.engine.field("ctrl").copy_(self.controls)
 
     def get_observations(self) -> None:
-        """Fill obs_buf."""
+        """Write the observations to `obs_buf`."""
         data = self.robot.data
         torch.sub(self.goal.data.root_pos_w, data.root_pos_w, out=self.to_target)
         torch.cat(
@@ -111,7 +111,7 @@ class QuadcopterTask(DirectTask):
         ).div_(self.units)
 
     def calculate_metrics(self) -> None:
-        """Reward nearness, and near the target an upright pose without spin."""
+        """Write the rewards to `rew_buf`: for nearness, and near the target for an upright pose without spin."""
         data = self.robot.data
         self.distance.copy_(length(self.to_target))
         _, x, y, _ = data.root_quat_w.unbind(dim=1)
@@ -122,6 +122,6 @@ class QuadcopterTask(DirectTask):
         torch.clamp(near + near * posture, min=0.0, out=self.rew_buf)
 
     def is_done(self) -> None:
-        """Terminate where the robot is too far or too low. The environment adds the time-out."""
+        """Write to `reset_buf` where the robot is too far or too low. The environment adds time-outs."""
         low = self.robot.data.root_pos_w[:, 2] < self.params.min_height
         self.reset_buf.copy_((self.distance > self.params.max_distance) | low)

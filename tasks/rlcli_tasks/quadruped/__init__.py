@@ -1,6 +1,6 @@
 """Quadruped: a four-legged robot follows velocity commands.
 
-Numbers and their sources: docs/reference/zoo/quadruped-flat.md.
+Parameters and their sources: docs/reference/zoo/quadruped-flat.md.
 """
 
 from rlcli.task import TaskSpec

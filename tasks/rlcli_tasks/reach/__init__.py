@@ -1,14 +1,14 @@
-"""Reach: an arm brings its hand to poses. Numbers and their sources: docs/reference/zoo/reach.md."""
+"""Reach: an arm brings its hand to poses. Parameters and their sources: docs/reference/zoo/reach.md."""
 
 from rlcli.task import TaskSpec
 
 JOINT = TaskSpec(
     package=__name__,
     config="joint.yaml",
-    summary="Bring an arm's hand to poses by joint positions (manager-based, Isaac Lab's parameters).",
+    summary="Move an arm's hand to commanded poses with joint positions (manager-based, Isaac Lab's parameters).",
 )
 IK = TaskSpec(
     package=__name__,
     config="ik.yaml",
-    summary="Bring an arm's hand to poses by inverse kinematics (manager-based, Isaac Lab's parameters).",
+    summary="Move an arm's hand to commanded poses with inverse kinematics (manager-based, Isaac Lab's parameters).",
 )

@@ -168,7 +168,7 @@ def test_success_limit_without_success_is_usage_error(cli, coin):
     assert "success" not in cli("eval", coin, *arguments, "--json").json
     done = cli("eval", coin, *arguments, "--fail-under", "success=0.5")
     assert done.code == 2
-    assert "defines no success" in done.err
+    assert "defines no condition of success" in done.err
     assert cli("eval", coin, *arguments, "--fail-under", "return=0.5").code == 0
 
 

@@ -250,7 +250,7 @@ def test_train_with_any_number_of_environments(cli, task, envs):
 def test_too_small_rollout_is_config_error(cli):
     done = cli("train", "cartpole", "scene.num_envs=1", "agent.n_steps=2", "-q")
     assert done.code == 3
-    assert "4 minibatches cannot be made: a rollout holds n_steps x num_envs = 2 x 1 = 2 samples" in done.err
+    assert "4 minibatches are too many: a rollout holds n_steps x num_envs = 2 x 1 = 2 samples" in done.err
 
 
 def test_diverged_learner_keeps_last_good_checkpoint(cli, only_run):

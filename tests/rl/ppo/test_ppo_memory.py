@@ -148,7 +148,7 @@ def test_deployed_recurrent_policy_matches_learner(recurrent_task):
 
 
 def test_fewer_environments_than_minibatches_is_a_config_error(recurrent_task):
-    with pytest.raises(ConfigError, match="5 minibatches cannot be made"):
+    with pytest.raises(ConfigError, match="5 minibatches are too many"):
         make_trainer(recurrent_task, "agent.num_minibatches=5")
 
 

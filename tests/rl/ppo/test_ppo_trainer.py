@@ -247,7 +247,7 @@ def test_shuffle_setting_gives_number_of_orders(ppo_task, monkeypatch):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("scene.num_envs=1", "agent.num_steps=2", "agent.num_minibatches=3"), "3 minibatches cannot be made"),
+        (("scene.num_envs=1", "agent.num_steps=2", "agent.num_minibatches=3"), "3 minibatches are too many"),
         (("scene.num_envs=1", "agent.num_steps=1", "agent.num_minibatches=1"), "cannot be normalised over one sample"),
         (("agent.normalize_advantage=minibatch", "agent.minibatch_size=1"), "cannot be normalised over one sample"),
         (("agent.critic_obs=[critic]",), "no observation group 'critic'"),

@@ -217,7 +217,7 @@ def test_nan_in_learner_is_a_divergence(make, scheduled, rate):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("scene.num_envs=1", "agent.n_steps=2", "agent.num_minibatches=3"), "3 minibatches cannot be made"),
+        (("scene.num_envs=1", "agent.n_steps=2", "agent.num_minibatches=3"), "3 minibatches are too many"),
         (("scene.num_envs=1", "agent.n_steps=1", "agent.num_minibatches=1"), "advantages cannot be normalised"),
     ],
 )

@@ -55,7 +55,7 @@ class ManagerBasedEnvCfg:
         self._rlcli_class = entry
 
     def __rlcli_task__(self, root: Path, models: Mapping[str, Any]) -> Any:
-        """Return this configuration as a task of rlcli. `models`: values of `--model`."""
+        """Return this configuration as a task of rlcli; `models` are the values of `--model`, NAME -> FILE."""
         from rlcli.config.python_task import PythonTask
         from rlcli_isaaclab.convert import task
         from rlcli_isaaclab.settings import Report

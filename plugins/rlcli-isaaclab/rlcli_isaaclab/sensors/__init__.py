@@ -12,7 +12,7 @@ from rlcli_isaaclab.sensors import patterns
 
 @configclass
 class SensorBaseCfg:
-    """Settings of all sensors."""
+    """Settings that every sensor has."""
 
     class_type: Any = "SensorBase"
     prim_path: str = MISSING
@@ -23,7 +23,7 @@ class SensorBaseCfg:
 
 @configclass
 class ContactSensorCfg(SensorBaseCfg):
-    """Contact forces on bodies."""
+    """Settings of a sensor of the contact forces on bodies."""
 
     class_type: Any = "ContactSensor"
     track_pose: bool = False
@@ -38,7 +38,7 @@ class ContactSensorCfg(SensorBaseCfg):
 
 @configclass
 class RayCasterCfg(SensorBaseCfg):
-    """Distances along rays."""
+    """Settings of a sensor of distances along rays, such as a height scan or a lidar."""
 
     @configclass
     class OffsetCfg:
@@ -61,7 +61,7 @@ class RayCasterCfg(SensorBaseCfg):
 
 @configclass
 class ImuCfg(SensorBaseCfg):
-    """Orientation, angular velocity and acceleration of a body. An MJCF has its own sensors for them."""
+    """Settings of an IMU. rlcli ignores them: an MJCF has sensors of its own for angular velocity and acceleration."""
 
     class_type: Any = "Imu"
     offset: Any = None

@@ -1,4 +1,4 @@
-"""Start points and directions of rays. Names as in `isaaclab.sensors.patterns`."""
+"""Patterns of rays for ray sensors: start points and directions. Names as in `isaaclab.sensors.patterns`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rlcli_isaaclab.config_class import MISSING, configclass
 
 
 def grid_pattern(cfg: Any, device: Any) -> tuple[Tensor, Tensor]:
-    """Return start points and directions of parallel rays that start on a grid. (rays, 3) each"""
+    """Return start points [m] and directions of parallel rays that start on a grid, sensor frame. (rays, 3) each"""
     x, y = (torch.arange(-size / 2, size / 2 + 1e-9, cfg.resolution, device=device) for size in cfg.size)
     across, along = torch.meshgrid(x, y, indexing=cfg.ordering if cfg.ordering == "xy" else "ij")
     starts = torch.stack([across.flatten(), along.flatten(), torch.zeros_like(across).flatten()], dim=1)
@@ -20,7 +20,7 @@ def grid_pattern(cfg: Any, device: Any) -> tuple[Tensor, Tensor]:
 
 
 def lidar_pattern(cfg: Any, device: Any) -> tuple[Tensor, Tensor]:
-    """Return start points (zero) and directions of a lidar's rays, channel by channel. (rays, 3) each"""
+    """Return start points (all zero) and directions of a lidar's rays, channel by channel. (rays, 3) each"""
     low, high = cfg.horizontal_fov_range
     count = math.ceil((high - low) / cfg.horizontal_res) + 1
     heading = torch.linspace(low, high, count)
@@ -32,7 +32,7 @@ def lidar_pattern(cfg: Any, device: Any) -> tuple[Tensor, Tensor]:
 
 
 def bpearl_pattern(cfg: Any, device: Any) -> tuple[Tensor, Tensor]:
-    """Return start points (zero) and directions of the rays of an RS-Bpearl, heading by heading. (rays, 3) each"""
+    """Return start points (all zero) and directions of the rays of the lidar RS-Bpearl, by heading. (rays, 3) each"""
     heading = torch.arange(-cfg.horizontal_fov / 2, cfg.horizontal_fov / 2, cfg.horizontal_res, device=device)
     up = torch.tensor(list(cfg.vertical_ray_angles), device=device)
     turn, up = torch.meshgrid(heading.deg2rad(), up.deg2rad(), indexing="ij")
@@ -42,7 +42,7 @@ def bpearl_pattern(cfg: Any, device: Any) -> tuple[Tensor, Tensor]:
 
 @configclass
 class GridPatternCfg:
-    """Parallel rays that start on a grid."""
+    """Settings of parallel rays that start on a grid."""
 
     func: Any = grid_pattern
     resolution: float = MISSING
@@ -53,7 +53,7 @@ class GridPatternCfg:
 
 @configclass
 class LidarPatternCfg:
-    """Rays of a lidar, which start in one point."""
+    """Settings of the rays of a lidar, which start in one point."""
 
     func: Any = lidar_pattern
     channels: int = MISSING
@@ -64,7 +64,7 @@ class LidarPatternCfg:
 
 @configclass
 class BpearlPatternCfg:
-    """Rays of the lidar RS-Bpearl, which start in one point."""
+    """Settings of the rays of the lidar RS-Bpearl, which start in one point."""
 
     func: Any = bpearl_pattern
     horizontal_fov: float = 360.0

@@ -1,4 +1,4 @@
-"""Folders of Isaac Lab's models. Only the ends of such paths matter: `model_lookup.py` maps them."""
+"""Folders of Isaac Lab's models. They do not exist here: `model_lookup.py` finds an MJCF by the end of such a path."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ ISAACLAB_NUCLEUS_DIR = f"{ISAAC_NUCLEUS_DIR}/IsaacLab"
 
 
 def retrieve_file_path(path: str, download_dir: str | None = None, force_download: bool = True) -> str:
-    """Return the path; with `download_dir`, that of the file of the same name in this folder: nothing is downloaded.
+    """Return `path`, or with `download_dir` the path of the file with the same name in this folder.
+
+    Nothing is downloaded.
 
     Raises:
         TaskError: if the folder does not have the file.
@@ -29,5 +31,5 @@ def retrieve_file_path(path: str, download_dir: str | None = None, force_downloa
 
 
 def check_file_path(path: str) -> int:
-    """Return 2, as for a file on a server: whether the file exists is checked where a model replaces it."""
+    """Return 2, which in Isaac Lab means that the file is on a server. rlcli checks models when it reads the scene."""
     return 2

@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 class CircularBuffer:
-    """The last values of every environment. The first value of an episode fills the whole history."""
+    """Buffer of the last `max_len` values of every environment. After a reset the first value fills it."""
 
     def __init__(self, max_len: int, batch_size: int, device: Any) -> None:
         if max_len < 1:
@@ -27,7 +27,7 @@ class CircularBuffer:
         return self._stored().clone()
 
     def reset(self, batch_ids: Any = None) -> None:
-        """Forget the values of some environments."""
+        """Remove the values of the environments `batch_ids`; None: of all."""
         rows = slice(None) if batch_ids is None else batch_ids
         self.current_length[rows] = 0
         if self._values is not None:
@@ -63,7 +63,7 @@ class CircularBuffer:
 
 
 class DelayBuffer:
-    """A buffer that returns values some steps late; each environment has its own lag."""
+    """Buffer that returns each value some steps later; every environment has its own delay, called lag."""
 
     def __init__(self, history_length: int, batch_size: int, device: Any) -> None:
         self.history_length, self.batch_size, self.device = max(0, history_length), batch_size, device
@@ -81,18 +81,18 @@ class DelayBuffer:
         return int(self.time_lags.max())
 
     def set_time_lag(self, time_lag: Any, batch_ids: Any = None) -> None:
-        """Set the lags of some environments [steps]."""
+        """Set the delays of the environments `batch_ids` [steps]; None: of all."""
         lags = torch.as_tensor(time_lag, device=self.device).long()
         if int(lags.min()) < 0 or int(lags.max()) > self.history_length:
             raise ValueError(f"a lag must be between 0 and {self.history_length}, found {time_lag}")
         self.time_lags[slice(None) if batch_ids is None else batch_ids] = lags
 
     def reset(self, batch_ids: Any = None) -> None:
-        """Forget the values of some environments."""
+        """Remove the values of the environments `batch_ids`; None: of all."""
         self._history.reset(batch_ids)
 
     def compute(self, data: Tensor) -> Tensor:
-        """Add a value for every environment, and return the delayed ones. (batch, ...)"""
+        """Add a value for every environment, and return the value of `time_lags` steps ago. (batch, ...) each"""
         self._history.append(data)
         return self._history[self.time_lags].clone()
 
@@ -106,7 +106,10 @@ class TimestampedBuffer:
 
 
 def tensors_of(holder: object) -> dict[str, Tensor]:
-    """Return the tensors in the attributes of an object and of its buffers, by their path."""
+    """Return the tensors in the attributes of an object, and of buffers in its attributes, by name.
+
+    The names are paths of attributes, such as `history._values`.
+    """
     found: dict[str, Tensor] = {}
     for name, value in vars(holder).items():
         if isinstance(value, Tensor):

@@ -63,7 +63,7 @@ def quat_inv(q: Tensor, eps: float = 1e-9) -> Tensor:
 
 
 def yaw_quat(quat: Tensor) -> Tensor:
-    """Return only the rotation around z. (..., 4)"""
+    """Return the yaw of a rotation as a rotation around z. (..., 4)"""
     w, x, y, z = quat.unbind(-1)
     yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     zero = torch.zeros_like(yaw)
@@ -71,7 +71,7 @@ def yaw_quat(quat: Tensor) -> Tensor:
 
 
 def quat_apply_yaw(quat: Tensor, vec: Tensor) -> Tensor:
-    """Rotate a vector only around z. (..., 4), (..., 3) -> (..., 3)"""
+    """Rotate a vector by the yaw of a rotation. (..., 4), (..., 3) -> (..., 3)"""
     return quat_apply(yaw_quat(quat), vec)
 
 
@@ -99,7 +99,10 @@ def quat_error_magnitude(q1: Tensor, q2: Tensor) -> Tensor:
 def subtract_frame_transforms(
     t01: Tensor, q01: Tensor, t02: Tensor | None = None, q02: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return the pose of frame 2 in frame 1. Both poses are given in frame 0."""
+    """Return the pose of frame 2 relative to frame 1, from the poses of both relative to frame 0.
+
+    A position t (n, 3) [m] and a quaternion q (n, 4) each; None: zero, or no rotation.
+    """
     back = quat_conjugate(q01)
     quat = back if q02 is None else multiply(back, q02)
     return quat_apply(back, -t01 if t02 is None else t02 - t01), quat
@@ -108,7 +111,10 @@ def subtract_frame_transforms(
 def combine_frame_transforms(
     t01: Tensor, q01: Tensor, t12: Tensor | None = None, q12: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return the pose of frame 2 in frame 0, from frame 1 in frame 0 and frame 2 in frame 1."""
+    """Return the pose of frame 2 relative to frame 0, from frame 1 relative to 0 and frame 2 relative to 1.
+
+    A position t (n, 3) [m] and a quaternion q (n, 4) each; None: zero, or no rotation.
+    """
     quat = q01 if q12 is None else multiply(q01, q12)
     return t01 if t12 is None else t01 + quat_apply(q01, t12), quat
 
@@ -119,12 +125,12 @@ def normalize(x: Tensor, eps: float = 1e-9) -> Tensor:
 
 
 def scale_transform(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Map [lower, upper] to [-1, 1]."""
+    """Map values linearly from [lower, upper] to [-1, 1]."""
     return 2.0 * (x - 0.5 * (lower + upper)) / (upper - lower)
 
 
 def unscale_transform(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Map [-1, 1] to [lower, upper]."""
+    """Map values linearly from [-1, 1] to [lower, upper]."""
     return 0.5 * (x * (upper - lower) + upper + lower)
 
 
@@ -134,7 +140,7 @@ def saturate(x: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
 
 
 def copysign(mag: float, other: Tensor) -> Tensor:
-    """Return a tensor of one magnitude with the signs of another tensor."""
+    """Return a tensor with the magnitude `mag` everywhere and the signs of `other`."""
     return torch.full_like(other, abs(mag)).copysign(other)
 
 
@@ -146,7 +152,10 @@ def quat_from_angle_axis(angle: Tensor, axis: Tensor) -> Tensor:
 
 
 def axis_angle_from_quat(quat: Tensor, eps: float = 1.0e-6) -> Tensor:
-    """Return axis x angle [rad], times the quaternion's length. (..., 4) -> (..., 3)"""
+    """Return a rotation as its axis times its angle [rad]. (..., 4) -> (..., 3)
+
+    The quaternions must have length 1; any other length is a factor of the result, as in Isaac Lab.
+    """
     quat = torch.where(quat[..., :1] < 0.0, -quat, quat)
     half = torch.atan2(quat[..., 1:].norm(p=2, dim=-1, keepdim=True), quat[..., :1])
     small = half.abs() < 0.5 * eps
@@ -189,31 +198,40 @@ def convert_quat(quat: Any, to: str = "xyzw") -> Any:
 
 
 def quat_box_minus(q1: Tensor, q2: Tensor) -> Tensor:
-    """Return the rotation from q2 to q1 as axis x angle [rad]. (n, 4) each -> (n, 3)"""
+    """Return the rotation from q2 to q1 as its axis times its angle [rad]. (n, 4) each -> (n, 3)"""
     return axis_angle_from_quat(multiply(q1, quat_conjugate(q2)))
 
 
 def quat_box_plus(q: Tensor, delta: Tensor, eps: float = 1.0e-6) -> Tensor:
-    """Return the rotation `delta` (axis x angle) after q, w >= 0. (n, 4), (n, 3) -> (n, 4)"""
+    """Return the rotation q followed by `delta` (axis times angle [rad]), with w >= 0. (n, 4), (n, 3) -> (n, 4)"""
     return quat_unique(multiply(quat_from_angle_axis(delta.norm(p=2, dim=-1), delta), q))
 
 
 def compute_pose_error(
     t01: Tensor, q01: Tensor, t02: Tensor, q02: Tensor, rot_error_type: str = "axis_angle"
 ) -> tuple[Tensor, Tensor]:
-    """Return the error of position and rotation from pose 1 to pose 2. (n, 3), (n, 3 or 4)"""
+    """Return the difference in position [m] and the rotation from pose 1 to pose 2.
+
+    The rotation is its axis times its angle (n, 3) [rad], or with `rot_error_type="quat"` a quaternion (n, 4).
+    """
     turn = multiply(q02, quat_conjugate(q01) / q01.square().sum(dim=-1, keepdim=True))
     return t02 - t01, turn if rot_error_type == "quat" else axis_angle_from_quat(turn)
 
 
 def apply_delta_pose(source_pos: Tensor, source_rot: Tensor, delta_pose: Tensor, eps: float = 1.0e-6) -> Any:
-    """Return a pose moved by a position [m] and a rotation vector [rad]. delta_pose (n, 6)"""
+    """Return a pose that is moved by `delta_pose`: a translation [m] and a rotation vector [rad]. (n, 6)"""
     turn = quat_from_angle_axis(delta_pose[:, 3:6].norm(p=2, dim=-1), delta_pose[:, 3:6])
     return source_pos + delta_pose[:, :3], multiply(turn, source_rot)
 
 
 def transform_points(points: Tensor, pos: Tensor | None = None, quat: Tensor | None = None) -> Tensor:
-    """Rotate, then move points. (n, p, 3) or (p, 3), one pose or n poses -> (n, p, 3), for one pose also (p, 3)"""
+    """Rotate points, then translate them.
+
+    Args:
+        points: (n, p, 3), or (p, 3) for one set of points.
+        pos: translations (n, 3) or one (3,) [m]; None: none.
+        quat: rotations (n, 4) or one (4,); None: none.
+    """
     moved = points if points.dim() == 3 else points.unsqueeze(0)
     if quat is not None:
         moved = moved @ matrix_from_quat(quat.reshape(-1, 4)).transpose(1, 2)
@@ -223,7 +241,7 @@ def transform_points(points: Tensor, pos: Tensor | None = None, quat: Tensor | N
 
 
 def skew_symmetric_matrix(vec: Tensor) -> Tensor:
-    """Return the matrix of the cross product with a vector. (..., 3) -> (..., 3, 3)"""
+    """Return the matrix S for which S w is the cross product of `vec` and w. (..., 3) -> (..., 3, 3)"""
     x, y, z = vec.unbind(-1)
     zero = torch.zeros_like(x)
     first, second = torch.stack([zero, -z, y], dim=-1), torch.stack([z, zero, -x], dim=-1)
@@ -242,7 +260,10 @@ def random_yaw_orientation(num: int, device: str) -> Tensor:
 
 
 def sample_triangle(lower: float, upper: float, size: Any, device: Any) -> Tensor:
-    """Sample the ends of a range more often than its middle, as Isaac Lab does: the density is |x| in [-1, 1]."""
+    """Sample from [lower, upper] with a density that is 0 in the middle and grows linearly to both ends.
+
+    Despite the name, this is what Isaac Lab's function does.
+    """
     uniform = sample_uniform(-1.0, 1.0, size, device)
     return (uniform.abs().sqrt().copysign(uniform) + 1.0) * 0.5 * (upper - lower) + lower
 

@@ -11,7 +11,10 @@ scale, clip, bias = "scale", "clip", "bias"
 
 @configclass
 class ModifierCfg:
-    """A function with parameters: `scale` (multiplier), `clip` (bounds) or `bias` (value)."""
+    """Settings of a modifier without a state: the function `scale`, `clip` or `bias`, and its parameters.
+
+    The parameters are `multiplier` for `scale`, `bounds` for `clip`, and `value` for `bias`.
+    """
 
     func: Any = MISSING
     params: dict[str, Any] = {}  # noqa: RUF012  (configclass copies it for each object)
@@ -19,7 +22,7 @@ class ModifierCfg:
 
 @configclass
 class DigitalFilterCfg(ModifierCfg):
-    """A linear filter with weights A of past outputs and B of inputs."""
+    """Settings of a linear filter: weights `A` of past outputs, weights `B` of the inputs."""
 
     func: Any = "DigitalFilter"
     A: Any = MISSING
@@ -28,7 +31,7 @@ class DigitalFilterCfg(ModifierCfg):
 
 @configclass
 class IntegratorCfg(ModifierCfg):
-    """Integral of the observation over the episode."""
+    """Settings of a modifier that integrates the observation over the episode, with the time step `dt` [s]."""
 
     func: Any = "Integrator"
     dt: float = MISSING

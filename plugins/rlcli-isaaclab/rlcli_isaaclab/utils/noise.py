@@ -9,7 +9,7 @@ from rlcli_isaaclab.config_class import MISSING, configclass
 
 @configclass
 class NoiseCfg:
-    """Settings of all noise; `operation` is add, scale or abs."""
+    """Settings that every kind of noise has; `operation` is `add`, `scale` or `abs` (replace the value)."""
 
     func: Any = "noise"
     operation: str = "add"
@@ -17,7 +17,7 @@ class NoiseCfg:
 
 @configclass
 class ConstantNoiseCfg(NoiseCfg):
-    """Constant noise: the same value in every step."""
+    """Settings of a constant offset: the same value in every step."""
 
     func: Any = "constant_noise"
     bias: Any = 0.0
@@ -25,7 +25,7 @@ class ConstantNoiseCfg(NoiseCfg):
 
 @configclass
 class UniformNoiseCfg(NoiseCfg):
-    """Uniform noise in [n_min, n_max)."""
+    """Settings of uniform noise in [n_min, n_max)."""
 
     func: Any = "uniform_noise"
     n_min: Any = -1.0
@@ -34,7 +34,7 @@ class UniformNoiseCfg(NoiseCfg):
 
 @configclass
 class GaussianNoiseCfg(NoiseCfg):
-    """Normally distributed noise."""
+    """Settings of normally distributed noise."""
 
     func: Any = "gaussian_noise"
     mean: Any = 0.0
@@ -43,7 +43,7 @@ class GaussianNoiseCfg(NoiseCfg):
 
 @configclass
 class NoiseModelCfg:
-    """Noise that is sampled in every step."""
+    """Settings of a noise model: noise that is sampled in every step."""
 
     class_type: Any = "NoiseModel"
     func: Any = None
@@ -52,7 +52,7 @@ class NoiseModelCfg:
 
 @configclass
 class NoiseModelWithAdditiveBiasCfg(NoiseModelCfg):
-    """Noise in every step, plus a bias that is sampled at the start of an episode."""
+    """Settings of a noise model: noise in every step, plus a bias that is sampled at the start of an episode."""
 
     class_type: Any = "NoiseModelWithAdditiveBias"
     bias_noise_cfg: Any = MISSING

@@ -1,4 +1,4 @@
-"""Poses as matrices, and interpolation. Names as in `isaaclab.utils.math`."""
+"""Poses as 4 x 4 matrices, Euler angles and interpolation of rotations. Names as in `isaaclab.utils.math`."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ from rlcli.sim.rotations import cross, rotate_inverse
 
 
 def matrix_from_euler(euler_angles: Tensor, convention: str) -> Tensor:
-    """Return rotation matrices of intrinsic Euler angles; `convention` names the axes, such as "XYZ". (..., 3, 3)"""
+    """Return the rotation matrices of intrinsic Euler angles. (..., 3) [rad] -> (..., 3, 3)
+
+    `convention` has the three axes in order, such as "XYZ".
+    """
     if len(convention) != 3 or set(convention) - set("XYZ") or convention[1] in (convention[0], convention[2]):
-        raise ValueError(f"unknown convention '{convention}'; use three of X, Y, Z, neighbours unequal")
+        raise ValueError(f"unknown convention '{convention}'; use three of X, Y and Z, such as XYZ or ZXZ")
     matrices = [_turn(axis, angle) for axis, angle in zip(convention, euler_angles.unbind(-1), strict=True)]
     return matrices[0] @ matrices[1] @ matrices[2]
 
 
 def _turn(axis: str, angle: Tensor) -> Tensor:
-    """Return the rotation matrix about a coordinate axis."""
+    """Return the matrices of rotations by `angle` [rad] about the axis "X", "Y" or "Z". (...) -> (..., 3, 3)"""
     first, second = {"X": (1, 2), "Y": (2, 0), "Z": (0, 1)}[axis]
     matrix = torch.eye(3, dtype=angle.dtype, device=angle.device).repeat(*angle.shape, 1, 1)
     matrix[..., first, first] = matrix[..., second, second] = angle.cos()
@@ -40,14 +43,14 @@ def unmake_pose(pose: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def pose_inv(pose: Tensor) -> Tensor:
-    """Return the inverse matrices of poses."""
+    """Return the inverse of pose matrices. (..., 4, 4)"""
     position, rotation = unmake_pose(pose)
     back = rotation.mT
     return make_pose(-(back @ position[..., None])[..., 0], back)
 
 
 def pose_in_A_to_pose_in_B(pose_in_A: Tensor, pose_A_in_B: Tensor) -> Tensor:  # noqa: N802, N803
-    """Return poses in the frame B that are given in the frame A."""
+    """Return poses relative to the frame B, from poses relative to the frame A. (..., 4, 4) matrices each"""
     return pose_A_in_B @ pose_in_A
 
 
@@ -59,7 +62,7 @@ def is_identity_pose(pos: Tensor, rot: Tensor) -> bool:
 
 
 def quat_slerp(q1: Tensor, q2: Tensor, tau: float) -> Tensor:
-    """Return the quaternion at a fraction of the shortest turn between two quaternions. (4,)"""
+    """Return the rotation at the fraction `tau` (0 to 1) of the shortest way from q1 to q2. (4,) each"""
     if tau in (0.0, 1.0):
         return q2 if tau else q1
     cosine = torch.dot(q1, q2)

@@ -1,4 +1,4 @@
-"""Functions for names and regexes of names. They are named as in `isaaclab.utils.string`."""
+"""Functions that convert names, and that select names by regexes. Names as in `isaaclab.utils.string`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ def to_snake_case(camel_str: str) -> str:
 def resolve_matching_names(
     keys: str | Sequence[str], list_of_strings: Sequence[str], preserve_order: bool = False
 ) -> tuple[list[int], list[str]]:
-    """Return indices and names of the strings that names or regexes match."""
+    """Return (indices, names) of the strings in `list_of_strings` that match `keys`, names or regexes.
+
+    The order is that of `list_of_strings`, or with `preserve_order` that of `keys`.
+    """
     names = list(list_of_strings)
     found = match([keys] if isinstance(keys, str) else list(keys), names, "name")
     indices = list(found) if preserve_order else sorted(found)
@@ -33,7 +36,9 @@ def resolve_matching_names(
 def resolve_matching_names_values(
     data: Mapping[str, Any], list_of_strings: Sequence[str], preserve_order: bool = False
 ) -> tuple[list[int], list[str], list[Any]]:
-    """Return indices, names and values of the strings that the keys of a mapping match.
+    """Return (indices, names, values) of the strings in `list_of_strings` that match a key of `data`.
+
+    The keys are names or regexes; the value of a string is the value of the key that matches.
 
     Raises:
         ValueError: if two keys match one string, or a key matches none.
@@ -55,12 +60,12 @@ def resolve_matching_names_values(
 
 
 def string_to_callable(name: str) -> Any:
-    """Return the function of `module:name`."""
+    """Import the function of a reference `module:name`."""
     from rlcli.registry.task_imports import load_object
 
     return load_object(name)
 
 
 def callable_to_string(value: Any) -> str:
-    """Return `module:name` of a function."""
+    """Return the reference `module:name` of a function."""
     return f"{value.__module__}:{value.__qualname__}"

@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass
 class ArticulationActions:
-    """Position and velocity targets and efforts of joints. (num_envs, joints) each"""
+    """Targets that an action sets for joints: positions, velocities and efforts. (num_envs, joints) each"""
 
     joint_positions: Tensor | None = None
     joint_velocities: Tensor | None = None

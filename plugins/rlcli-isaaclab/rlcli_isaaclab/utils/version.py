@@ -6,11 +6,14 @@ import re
 from typing import Any
 
 _ISAAC_SIM = ("5.1.0", "", "5", "1", "0", "", "", "")
-"""Version of Isaac Sim for which Isaac Lab 2.3.2 was written: text, build, major, minor, patch and three more texts."""
+"""Version of Isaac Sim for which Isaac Lab 2.3.2 was written, in the form that `get_version` returns."""
 
 
 def get_version() -> tuple[str, ...]:
-    """Return the version of Isaac Sim as `isaacsim.core.version.get_version` does."""
+    """Return the version of Isaac Sim in eight strings, as `isaacsim.core.version.get_version` does.
+
+    They are the version, the pre-release, major, minor and patch number, and three about the build.
+    """
     return _ISAAC_SIM
 
 
