@@ -35,6 +35,8 @@ from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registration
 _log = logging.getLogger(__name__)
 _OWN = "rlcli.mdp."
 _AGENTS = "agents/*.py"
+_FOREIGN_METHODS = ("__rlcli_task__", "__rlcli_agent__")
+"""Methods of the configurations and agents of other frameworks."""
 
 
 @dataclass(slots=True)
@@ -51,8 +53,8 @@ class PythonTask:
     """Model of `params` in `data`, the settings of the code of a task of another framework; None: it has none."""
     format: Format | None = None
     """The other framework's format to whose classes the configuration belongs; None: rlcli's own."""
-    place: str = ""
-    """File and line of the configuration's class; empty if unknown."""
+    places: dict[Path, str] = field(default_factory=dict)
+    """Path in `data` -> file and line of the class or file that sets its value; `()`: of the configuration's class."""
     filled: list[Path] = field(default_factory=list)
     """Paths of required settings that have no value in the file and got one from the command line."""
 
@@ -92,16 +94,14 @@ def load(
         report_failures()
         place = _place_of(value)
         task = to_task(value, source.label, source.root, models, values)
-        task.place = place
+        task.places = {(): place} if place else {}
         _add_agents(task, agents)
     except ValidationError as error:
         items = error.errors(include_url=False)
         problems = [Problem(source.label, ".".join(map(str, item["loc"])), item["msg"]) for item in items]
         raise ConfigError(problems) from None
     except ConfigError as error:
-        label = place or source.label
-        problems = [replace(p, where=label) if p.where == "configuration" else p for p in error.problems]
-        raise ConfigError(problems) from None
+        raise _placed(error, place or source.label) from None
     except RlcliError:
         raise
     except Exception as error:
@@ -170,17 +170,26 @@ def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
     return plain
 
 
+def _placed(error: ConfigError, place: str) -> ConfigError:
+    """Return an error whose problems without a file are at `place`."""
+    return ConfigError([replace(p, where=place) if p.where == "configuration" else p for p in error.problems])
+
+
 def _place_of(value: object) -> str:
-    """Return `file:line` of the class of a configuration of another framework; empty for rlcli's own configurations."""
+    """Return `file:line` of the class of a configuration or an agent of another framework; empty for other objects."""
     kind = value if isinstance(value, type) else type(value)
-    if not hasattr(kind, "__rlcli_task__") or is_framework(kind.__module__):
+    if not any(hasattr(kind, name) for name in _FOREIGN_METHODS) or is_framework(kind.__module__):
         return ""
     try:
         file, line = inspect.getsourcefile(kind), inspect.getsourcelines(kind)[1]
     except (OSError, TypeError):
         return ""
-    path = FilePath(str(file))
-    return f"{path.relative_to(FilePath.cwd()) if path.is_relative_to(FilePath.cwd()) else path}:{line}"
+    return f"{_short(FilePath(str(file)))}:{line}"
+
+
+def _short(path: FilePath) -> FilePath:
+    """Return a path relative to the current folder if it is below it, else unchanged."""
+    return path.relative_to(FilePath.cwd()) if path.is_relative_to(FilePath.cwd()) else path
 
 
 class _PlainData:
@@ -408,8 +417,9 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
         try:
             data = _read_agent(task, name, agent)
         except ConfigError as error:
+            error = _placed(error, _place_of(agent) or "configuration")
             if len(agents) == 1:
-                raise
+                raise error from None
             task.notes.append(Note("", f"agents.{name}", "ignored", "; ".join(map(str, error.problems))))
             continue
         if isinstance(agent, ModuleNotFoundError):
@@ -419,6 +429,8 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
             task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}; write a mapping"))
         else:
             found[name] = data
+            place = str(_short(agent)) if isinstance(agent, FilePath) else _place_of(agent)
+            task.places |= {("agents", name): place} if place else {}
     ranked = [name for name in order if name in found]
     default = next(iter(ranked or (found if len(found) == 1 or not order else ())), None)
     if found:

@@ -10,6 +10,7 @@ import builtins
 import contextlib
 import functools
 import importlib
+import importlib.util
 import os
 import re
 import sys
@@ -238,17 +239,17 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
     if in_tree:
         return importlib.import_module(f"{own}.{rest}" if rest else own), sys.modules[own]
     if first not in sys.modules:
-        _import_folder_above(first, rest, Path(file))
+        _import_package(first, rest, Path(file))
     return None, None
 
 
-def _import_folder_above(name: str, inner: str, file: Path) -> None:
+def _import_package(name: str, inner: str, file: Path) -> None:
     """Import the folder of a task's repository that an import statement `import name.inner` means, as a package.
 
-    The folder is one of the folders above the importing file, or `name` or `name/name` in one of these. It is imported
-    only if no installed package has the name. So files can import modules by their path in the repository
-    (`source.robot.mdp`), from a distribution of the repository that is not installed
-    (`source/robot_assets/robot_assets`), and from a package beside their own.
+    The folder is one of the folders above the importing file, or `name` or `name/name` in one of these. So files can
+    import modules by their path in the repository (`source.robot.mdp`), from a distribution of the repository that is
+    not installed (`source/robot_assets/robot_assets`), and from a package beside their own. An installed package of
+    the name is imported instead, as a package of the task if its files import the framework of an installed format.
 
     Args:
         name: first part of the imported module's name.
@@ -260,16 +261,25 @@ def _import_folder_above(name: str, inner: str, file: Path) -> None:
         beside = (folder for parent in file.parents for folder in (parent / name / name, parent / name))
         module = f"{inner.replace('.', '/')}.py" if inner else "__init__.py"
         found = [folder for folder in beside if any((folder / part).is_file() for part in ("__init__.py", module))]
-    folder = found[0] if found else None
-    spec = PathFinder.find_spec(name)
-    if folder is None or (spec is not None and str(folder) not in (spec.submodule_search_locations or ())):
+    spec = importlib.util.find_spec(name)
+    installed = [Path(place) for place in (spec.submodule_search_locations or ())] if spec is not None else []
+    usable = [place for place in found if spec is None or place in installed]
+    usable = usable[:1] or [place for place in installed if _is_for_a_framework(place)]
+    if not usable:
         return
+    folder = usable[0]
     register_package(name, folder, name)
     sys.path.append(str(folder.parent))
     try:
         importlib.import_module(name)
     finally:
         sys.path.remove(str(folder.parent))
+
+
+def _is_for_a_framework(folder: Path) -> bool:
+    """Return whether files of a package import the framework of an installed format."""
+    names = tuple(n for form in aliasing_formats() for n in form.spec.aliases if n not in form.spec.libraries)
+    return any(_imports(str(path), names) for path in sorted(folder.rglob("*.py"))[:_MOST_FILES])
 
 
 def _above_alias(form: Format, name: str, file: str) -> Any:

@@ -199,6 +199,26 @@ def merge_joint_settings(
     return joints
 
 
+def passive_joints(settings: JointSettings, model: Mapping[str, Any], driven: Mapping[str, str]) -> list[str]:
+    """Return the joints whose position an action commands without effect, because their drive has no stiffness.
+
+    Args:
+        settings: settings of the joints, from `read_actuators`.
+        model: names and values of the entity's MJCF, from `SceneReader`.
+        driven: joint -> what an action commands: effort, velocity or position.
+    """
+    found = []
+    for joint, command in driven.items():
+        values = settings_of(joint, settings)
+        if (
+            command == "position"
+            and joint not in model["driven"]
+            and 0.0 in (values.get("stiffness"), values.get("effort_limit"))
+        ):
+            found.append(joint)
+    return found
+
+
 def _joint_config(
     values: dict[str, Any], command: str, has_actuator: bool, key: tuple[str, ...], report: Report
 ) -> dict[str, Any]:

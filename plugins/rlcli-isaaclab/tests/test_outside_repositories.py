@@ -411,7 +411,7 @@ def test_actor_reads_another_group_only(tmp_path):
 
 def test_observation_group_that_does_not_exist(tmp_path):
     task = runner_of_groups(tmp_path / "rover", '{"policy": ["policy", "scan"]}')
-    with pytest.raises(ConfigError, match=r"rover_env.py:\d+: obs_groups.policy: no observation group 'scan'"):
+    with pytest.raises(ConfigError, match=r"rsl_rl_cfg.py:5: obs_groups.policy: no observation group 'scan'"):
         resolve(task)
 
 
@@ -494,3 +494,18 @@ def test_default_without_names_of_bodies_must_be_given(tmp_path):
     assert result.reward.tolist() == pytest.approx([0.02] * 4)
     with pytest.raises(ConfigError, match=r"rover_env.py:\d+: rewards.low: missing key 'asset_cfg'"):
         rover(tmp_path / "b", LOW, rewards={"low": "RewardTermCfg(func=low, weight=1.0)"})
+
+
+def test_mistake_of_an_agent_is_at_its_class_and_a_training_may_have_no_end(tmp_path):
+    rover(tmp_path / "rover", "", [("policy: Policy = Policy()", "actor: Policy = Policy()")])
+    agents = tmp_path / "rover" / "agents"
+    agents.mkdir()
+    file = agents / "rsl_rl_cfg.py"
+    source = find_task(f"{tmp_path / 'rover' / 'rover_env.py'}:RoverEnvCfg")
+    file.write_text(RUNNER.replace("= 8, 1, 1,", "= 8, 15000000000, 15000000000,"))
+    assert resolve(source).agent.max_iterations == 15_000_000_000
+    for name in [name for name, module in sys.modules.items() if getattr(module, "__file__", None) == str(file)]:
+        del sys.modules[name]
+    file.write_text(RUNNER.replace("= 8, 1, 1,", "= 8, -10, 1,"))
+    with pytest.raises(ConfigError, match=r"agents/rsl_rl_cfg\.py:5: agents\.rsl-rl\.max_iterations: "):
+        resolve(source)
