@@ -12,16 +12,16 @@ name.
 
 import copy
 import functools
-import inspect
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path as FilePath
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from rlcli.config.code_place import at_place, place_of, short_path
 from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.strict_yaml import Path
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
@@ -35,8 +35,6 @@ from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registration
 _log = logging.getLogger(__name__)
 _OWN = "rlcli.mdp."
 _AGENTS = "agents/*.py"
-_FOREIGN_METHODS = ("__rlcli_task__", "__rlcli_agent__")
-"""Methods of the configurations and agents of other frameworks."""
 
 
 @dataclass(slots=True)
@@ -92,7 +90,7 @@ def load(
     try:
         value, agents = _import_configuration(source)
         report_failures()
-        place = _place_of(value)
+        place = place_of(value)
         task = to_task(value, source.label, source.root, models, values)
         task.places = {(): place} if place else {}
         _add_agents(task, agents)
@@ -101,7 +99,7 @@ def load(
         problems = [Problem(source.label, ".".join(map(str, item["loc"])), item["msg"]) for item in items]
         raise ConfigError(problems) from None
     except ConfigError as error:
-        raise _placed(error, place or source.label) from None
+        raise at_place(error, place or source.label) from None
     except RlcliError:
         raise
     except Exception as error:
@@ -168,28 +166,6 @@ def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
     if not isinstance(plain, dict):
         raise TypeError(f"the agent is of type {type(value).__name__}; write a mapping")
     return plain
-
-
-def _placed(error: ConfigError, place: str) -> ConfigError:
-    """Return an error whose problems without a file are at `place`."""
-    return ConfigError([replace(p, where=place) if p.where == "configuration" else p for p in error.problems])
-
-
-def _place_of(value: object) -> str:
-    """Return `file:line` of the class of a configuration or an agent of another framework; empty for other objects."""
-    kind = value if isinstance(value, type) else type(value)
-    if not any(hasattr(kind, name) for name in _FOREIGN_METHODS) or is_framework(kind.__module__):
-        return ""
-    try:
-        file, line = inspect.getsourcefile(kind), inspect.getsourcelines(kind)[1]
-    except (OSError, TypeError):
-        return ""
-    return f"{_short(FilePath(str(file)))}:{line}"
-
-
-def _short(path: FilePath) -> FilePath:
-    """Return a path relative to the current folder if it is below it, else unchanged."""
-    return path.relative_to(FilePath.cwd()) if path.is_relative_to(FilePath.cwd()) else path
 
 
 class _PlainData:
@@ -417,7 +393,7 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
         try:
             data = _read_agent(task, name, agent)
         except ConfigError as error:
-            error = _placed(error, _place_of(agent) or "configuration")
+            error = at_place(error, place_of(agent) or "configuration")
             if len(agents) == 1:
                 raise error from None
             task.notes.append(Note("", f"agents.{name}", "ignored", "; ".join(map(str, error.problems))))
@@ -429,7 +405,7 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
             task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}; write a mapping"))
         else:
             found[name] = data
-            place = str(_short(agent)) if isinstance(agent, FilePath) else _place_of(agent)
+            place = str(short_path(agent)) if isinstance(agent, FilePath) else place_of(agent)
             task.places |= {("agents", name): place} if place else {}
     ranked = [name for name in order if name in found]
     default = next(iter(ranked or (found if len(found) == 1 or not order else ())), None)

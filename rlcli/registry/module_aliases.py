@@ -47,11 +47,24 @@ class TaskFileLoader(SourceFileLoader):
         if outermost:
             _known_paths.append(frozenset(sys.path))
         try:
-            super().exec_module(module)
+            with _without_gpu(self.path):
+                super().exec_module(module)
         finally:
             if outermost:
                 _add_own_paths()
                 _known_paths.clear()
+
+
+def _without_gpu(file: str) -> contextlib.AbstractContextManager[Any]:
+    """Return the context in which a file is executed: if it names `cuda` and there is no GPU, with the CPU for it."""
+    if b"cuda" in Path(file).read_bytes():
+        import torch
+
+        from rlcli.machine.device_names import CudaAsCpu
+
+        if not torch.cuda.is_available():
+            return CudaAsCpu()
+    return contextlib.nullcontext()
 
 
 class _KnownFileLoader(Loader):

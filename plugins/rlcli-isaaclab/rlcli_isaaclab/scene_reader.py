@@ -9,13 +9,7 @@ from typing import Any
 
 from rlcli.errors import ConfigError, TaskError, did_you_mean, listing
 from rlcli_isaaclab.absent import AbsentValue, reason_of
-from rlcli_isaaclab.actuator_reader import (
-    JointSettings,
-    merge_joint_settings,
-    passive_joints,
-    read_actuators,
-    settings_of,
-)
+from rlcli_isaaclab.actuator_reader import JointSettings, add_joint_settings, read_actuators, settings_of
 from rlcli_isaaclab.collection import entity_name
 from rlcli_isaaclab.model_lookup import given_models, mjcf_of, model_hint
 from rlcli_isaaclab.sensor_reader import camera_kinds, filter_name, image_name, read_filters, read_sensor
@@ -139,12 +133,7 @@ class SceneReader:
         for name, entity in self.entities.items():
             model = self._models.get(name) or {"joint": []}
             settings = self._joint_settings.get(name, [])
-            joints = merge_joint_settings(settings, model, driven.get(name, {}), name, self.report)
-            if joints:
-                entity["joints"] = joints
-            if passive := passive_joints(settings, model, driven.get(name, {})):
-                no_effort = {"joints": passive, "kind": "pd", "stiffness": 0.0, "damping": 0.0}
-                entity.setdefault("actuators", {})["passive_joints"] = no_effort
+            add_joint_settings(entity, settings, model, driven.get(name, {}), name, self.report)
 
     def integrator(self) -> dict[str, str]:
         """Return the setting `integrator` that a model with drives needs; empty without drives.

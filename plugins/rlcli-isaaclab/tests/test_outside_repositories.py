@@ -509,3 +509,9 @@ def test_mistake_of_an_agent_is_at_its_class_and_a_training_may_have_no_end(tmp_
     file.write_text(RUNNER.replace("= 8, 1, 1,", "= 8, -10, 1,"))
     with pytest.raises(ConfigError, match=r"agents/rsl_rl_cfg\.py:5: agents\.rsl-rl\.max_iterations: "):
         resolve(source)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the tensor is on the GPU")
+def test_tensor_on_cuda_while_a_file_is_imported(tmp_path):
+    code = "LIMITS = torch.tensor([1.0], device='cuda:0')\nassert LIMITS.cuda().device.type == 'cpu'\n"
+    stepped(rover(tmp_path / "rover", code))

@@ -1,0 +1,33 @@
+"""Place, `file:line`, of the Python code of a configuration or an agent of another framework."""
+
+import inspect
+from dataclasses import replace
+from pathlib import Path
+
+from rlcli.errors import ConfigError
+from rlcli.registry import is_framework
+
+_METHODS = ("__rlcli_task__", "__rlcli_agent__")
+"""Methods of the configurations and agents of other frameworks."""
+
+
+def place_of(value: object) -> str:
+    """Return `file:line` of the class of a configuration or an agent of another framework; empty for other objects."""
+    kind = value if isinstance(value, type) else type(value)
+    if not any(hasattr(kind, name) for name in _METHODS) or is_framework(kind.__module__):
+        return ""
+    try:
+        file, line = inspect.getsourcefile(kind), inspect.getsourcelines(kind)[1]
+    except (OSError, TypeError):
+        return ""
+    return f"{short_path(Path(str(file)))}:{line}"
+
+
+def short_path(path: Path) -> Path:
+    """Return a path relative to the current folder if it is below it, else unchanged."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def at_place(error: ConfigError, place: str) -> ConfigError:
+    """Return an error whose problems without a file are at `place`."""
+    return ConfigError([replace(p, where=place) if p.where == "configuration" else p for p in error.problems])
