@@ -30,6 +30,7 @@ from rlcli.formats import Note
 from rlcli.registry import TaskSource, import_file, is_framework, load_module, load_object
 from rlcli.registry.failed_imports import FailedImport, error_location, report_failures, take_failures
 from rlcli.registry.formats import Format, first_result, format_of_module, require_module
+from rlcli.registry.module_aliases import with_own_names
 from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registrations
 
 _log = logging.getLogger(__name__)
@@ -104,7 +105,7 @@ def load(
         raise
     except Exception as error:
         require_module(error)
-        message = f"{source.python}: {short_error(error)}{error_location(error)}"
+        message = f"{source.python}: {with_own_names(short_error(error))}{error_location(error)}"
         raise TaskError(message, hint=_hint(error)) from error
     return task
 

@@ -23,6 +23,8 @@ from typing import Any
 
 from rlcli.registry.formats import Format, aliasing_formats
 
+IMPORTED_NAME = "rlcli_folder_"
+"""Start of the module names under which folders and files are imported whose own name is taken."""
 _MOST_FILES = 200
 """Largest number of files of a task in which imports of formats are counted."""
 _python_import = builtins.__import__
@@ -107,6 +109,18 @@ def files_below(folder: Path) -> Iterator[None]:
     finally:
         if added:
             _roots.remove(folder)
+
+
+def with_own_names(text: str) -> str:
+    """Return a text in which modules of tasks have the names that their files use, not those in `sys.modules`."""
+    for module, own in _trees.items():
+        text = text.replace(module, own) if module.startswith(IMPORTED_NAME) else text
+    return re.sub(rf"{IMPORTED_NAME}task_[0-9a-f]{{16}}_(\w+)", r"\1", text)
+
+
+def is_task_package(name: str) -> bool:
+    """Return whether a top-level package is executed as files of a task."""
+    return name in _trees
 
 
 def is_alias(name: str) -> bool:
@@ -252,11 +266,11 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
     if in_tree:
         return importlib.import_module(f"{own}.{rest}" if rest else own), sys.modules[own]
     if first not in sys.modules:
-        _import_package(first, rest, Path(file))
+        import_package(first, rest, Path(file))
     return None, None
 
 
-def _import_package(name: str, inner: str, file: Path) -> None:
+def import_package(name: str, inner: str, file: Path) -> None:
     """Import the folder of a task's repository that an import statement `import name.inner` means, as a package.
 
     The folder is one of the folders above the importing file, or `name` or `name/name` in one of these. So files can
