@@ -30,7 +30,7 @@ from rlcli.formats import Note
 from rlcli.registry import TaskSource, import_file, is_framework, load_module, load_object
 from rlcli.registry.failed_imports import FailedImport, error_location, report_failures, take_failures
 from rlcli.registry.formats import Format, first_result, format_of_module, require_module
-from rlcli.registry.module_aliases import with_own_names
+from rlcli.registry.module_names import with_own_names
 from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registrations
 
 _log = logging.getLogger(__name__)

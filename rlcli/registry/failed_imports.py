@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.registry.formats import is_framework
-from rlcli.registry.module_aliases import with_own_names
+from rlcli.registry.module_names import with_own_names
 
 _log = logging.getLogger(__name__)
 _failures: dict[str, Exception] = {}

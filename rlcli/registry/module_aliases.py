@@ -22,14 +22,11 @@ from types import ModuleType
 from typing import Any
 
 from rlcli.registry.formats import Format, aliasing_formats
+from rlcli.registry.module_names import OWN_NAMES
 
-IMPORTED_NAME = "rlcli_folder_"
-"""Start of the module names under which folders and files are imported whose own name is taken."""
 _MOST_FILES = 200
 """Largest number of files of a task in which imports of formats are counted."""
 _python_import = builtins.__import__
-_trees: dict[str, str] = {}
-"""Module name of an imported package or folder -> name under which its own files import it."""
 _roots: list[Path] = []
 """Folders whose modules are executed as files of a task."""
 _by_file: dict[str, ModuleType] = {}
@@ -92,7 +89,7 @@ def register_package(module: str, folder: Path, own_name: str) -> None:
         folder: the folder.
         own_name: name of the package in the import statements of its files.
     """
-    _trees[module] = own_name
+    OWN_NAMES[module] = own_name
     if folder not in _roots:
         _roots.append(folder)
     if _FINDER not in sys.meta_path:
@@ -111,16 +108,9 @@ def files_below(folder: Path) -> Iterator[None]:
             _roots.remove(folder)
 
 
-def with_own_names(text: str) -> str:
-    """Return a text in which modules of tasks have the names that their files use, not those in `sys.modules`."""
-    for module, own in _trees.items():
-        text = text.replace(module, own) if module.startswith(IMPORTED_NAME) else text
-    return re.sub(rf"{IMPORTED_NAME}task_[0-9a-f]{{16}}_(\w+)", r"\1", text)
-
-
 def is_task_package(name: str) -> bool:
     """Return whether a top-level package is executed as files of a task."""
-    return name in _trees
+    return name in OWN_NAMES
 
 
 def is_alias(name: str) -> bool:
@@ -133,7 +123,7 @@ def import_by_name(name: str) -> Any:
 
     The folders of task files that are imported already are searched first.
     """
-    tree = next((module for module, own in _trees.items() if own == name.partition(".")[0] != module), "")
+    tree = next((module for module, own in OWN_NAMES.items() if own == name.partition(".")[0] != module), "")
     module, _ = _resolve(name, {"__name__": tree})
     return importlib.import_module(name) if module is None else module
 
@@ -145,7 +135,7 @@ class _TaskFinder(MetaPathFinder):
         """Return the `ModuleSpec` of a file in a registered folder, with a loader for task files; None for others."""
         if path is None:
             _add_own_paths()
-        if path is not None and name.partition(".")[0] not in _trees:
+        if path is not None and name.partition(".")[0] not in OWN_NAMES:
             return None
         spec = PathFinder.find_spec(name, path)
         if spec is None or not isinstance(spec.loader, SourceFileLoader) or spec.origin is None:
@@ -153,7 +143,7 @@ class _TaskFinder(MetaPathFinder):
         if not any(Path(spec.origin).is_relative_to(root) for root in (*_roots, *_folders_above())):
             return None
         if path is None:
-            _trees.setdefault(name, name)  # its modules are files of the task, too
+            OWN_NAMES.setdefault(name, name)  # its modules are files of the task, too
         known = _by_file.get(spec.origin)
         if known is not None and sys.modules.get(known.__name__) is known:
             spec.loader = _KnownFileLoader(known)
@@ -200,7 +190,8 @@ def _import(
 
         scope = module_globals or {}
         package, file = str(scope.get("__package__")), Path(str(scope.get("__file__", "")))
-        own = level > 0 or name.partition(".")[0] in (package.partition(".")[0], _trees.get(package.partition(".")[0]))
+        top = package.partition(".")[0]
+        own = level > 0 or name.partition(".")[0] in (top, OWN_NAMES.get(top))
         if level and not name and fromlist and len(fromlist) > 1:
             members = {part: getattr(_import(name, scope, {}, (part,), level), part) for part in fromlist}
             return _with_members(sys.modules[package], members)
@@ -257,7 +248,7 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
     """
     first, _, rest = name.partition(".")
     own = str(scope.get("__name__", "")).partition(".")[0]
-    in_tree = _trees.get(own) == first and own != first
+    in_tree = OWN_NAMES.get(own) == first and own != first
     file = str(scope.get("__file__", ""))
     for form in _formats_for(first, file):
         module = _alias_module(form, name, file, below_top=in_tree)

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.registry.module_aliases import (
-    IMPORTED_NAME,
     TaskFileLoader,
     files_below,
     import_by_name,
     is_alias,
     register_package,
 )
+from rlcli.registry.module_names import IMPORTED_NAME
 from rlcli.registry.plugin_imports import contain_side_effects
 
 CONFIGURATION = "env_cfg_entry_point"

@@ -9,7 +9,7 @@ from test_isaaclab_user_code import rover
 
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError, TaskError, pip_install
-from rlcli.registry import module_aliases
+from rlcli.registry.module_names import OWN_NAMES
 from rlcli_isaaclab import direct_convert, namespace
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.convert import agent
@@ -446,5 +446,5 @@ def test_installed_package_that_imports_isaac_lab(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(site))
     code = "from installed_robots_of_test import STIFFNESS\nimport installed_numbers_of_test\n"
     stepped(rover(tmp_path / "tasks", code))
-    own = [name for name in ("installed_robots_of_test", "installed_numbers_of_test") if name in module_aliases._trees]
+    own = [name for name in ("installed_robots_of_test", "installed_numbers_of_test") if name in OWN_NAMES]
     assert own == ["installed_robots_of_test"]
