@@ -160,6 +160,10 @@ class AbsentModule(ModuleType):
             from rlcli_isaaclab.usd_geometry import UsdGeom
 
             return UsdGeom
+        if self.__name__ == "isaacsim.core.utils.prims" and name == "create_prim":
+            from rlcli_isaaclab.setup_scene import create_prim
+
+            return create_prim
         if name[:1].isupper():
             return absent_class(f"{self.__name__}.{name}")
         if self.__name__ in ("carb", "omni.log") and name.startswith(("log", "info", "warn", "error", "verbose")):

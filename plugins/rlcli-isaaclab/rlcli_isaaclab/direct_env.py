@@ -312,6 +312,7 @@ class _Shell:
 
     def __init__(self, cfg: Any) -> None:
         self.device, self.num_envs = "cpu", cfg.scene.num_envs
+        self.entities: dict[str, Any] = {}
         self.physics_dt, self.step_dt = cfg.sim.dt, cfg.sim.dt * cfg.decimation
         self.sim = SimpleNamespace(device="cpu", cfg=cfg.sim, has_gui=lambda: False)
         self.scene = SimpleNamespace(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -116,7 +117,7 @@ class DirectRunner:
         observations of the restored state. Afterwards the state of the task and of torch's generator is restored.
         """
         if self.phase == "build":
-            return torch.zeros(self.managed.num_envs, *_channels_first(shape), device=self.managed.device)
+            return torch.zeros(self.managed.num_envs, *_layout_of(shape), device=self.managed.device)
         if group == "policy":
             manager = self.managed.termination_manager
             is_last = self.phase == "done" and bool((manager.terminated | manager.time_outs).any())
@@ -132,7 +133,7 @@ class DirectRunner:
         if self.cfg.state_space and "critic" not in found:
             found["critic"] = self.lab._get_states()
         found["policy"] = self.observation_noise(found["policy"])
-        return {name: _image_first(value).float().clone() for name, value in found.items() if isinstance(value, Tensor)}
+        return {name: _in_layout(value).float().clone() for name, value in found.items() if isinstance(value, Tensor)}
 
     def _without_effects(self, function: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
         attributes = dict(vars(self.lab))
@@ -148,13 +149,16 @@ class DirectRunner:
         return found
 
 
-def _channels_first(shape: tuple[int, ...]) -> tuple[int, ...]:
-    return (shape[2], shape[0], shape[1]) if len(shape) == 3 else shape
+def _layout_of(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the shape that rlcli gives an observation: an image has its channels first, all others are vectors."""
+    return (shape[2], shape[0], shape[1]) if len(shape) == 3 else (math.prod(shape),)
 
 
-def _image_first(value: Tensor) -> Tensor:
-    """Return images with the channels first, and other tensors unchanged."""
-    return value.movedim(-1, 1).contiguous() if value.dim() == 4 else value
+def _in_layout(value: Tensor) -> Tensor:
+    """Return images (num_envs, h, w, c) with the channels first, and other tensors flattened."""
+    if value.dim() == 4:
+        return value.movedim(-1, 1).contiguous()
+    return value.flatten(1) if value.dim() > 2 else value
 
 
 def runner_of(managed: Any, term: HookTerm) -> DirectRunner:

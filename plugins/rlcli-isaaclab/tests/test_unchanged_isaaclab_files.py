@@ -153,6 +153,29 @@ def direct(tmp_path):
     return folder / "pole_env.py"
 
 
+def test_direct_task_groups_prims_and_observes_arrays_of_two_dimensions(direct):
+    text = DIRECT.replace("observation_space = 3", "observation_space = [2, 3]")
+    text = text.replace('{"policy": torch', '{"policy": self.twice(torch').replace("dim=1)}", "dim=1))}")
+    group = 'import isaacsim.core.utils.prims as prim_utils\n        prim_utils.create_prim("/World/envs/env_0/Plants")'
+    text = text.replace("    def _setup_scene(self):\n", f"    def _setup_scene(self):\n        {group}\n")
+    twice = "    def twice(self, value):\n        return torch.stack([value, 2.0 * value], dim=1)\n"
+    direct.write_text(text.replace("    def _pre_physics_step", f"{twice}\n    def _pre_physics_step"))
+    env = make_env(resolve(find_task(f"{direct}:PoleEnvCfg")), seed=0)
+    env.reset()
+    obs = env.step(torch.ones(4, 1)).obs["policy"]
+    assert obs.shape == (4, 6)
+    assert torch.equal(obs[:, 3:], 2.0 * obs[:, :3])
+
+
+def test_direct_task_cannot_read_meshes_of_the_stage_while_its_scene_is_set_up(direct):
+    stage = "from isaacsim.core.utils.stage import get_current_stage\n"
+    read = '        get_current_stage().GetPrimAtPath("/World/terrain").IsValid()\n'
+    text = DIRECT.replace("    def _setup_scene(self):\n", f"    def _setup_scene(self):\n{read}")
+    direct.write_text(stage + text)
+    with pytest.raises(TaskError, match=r"pole_env\.py:\d+: pxr\.Usd\.Prim\.IsValid cannot be used"):
+        resolve(find_task(f"{direct}:PoleEnvCfg"))
+
+
 def test_direct_task_steps_and_observes_once_per_step(direct):
     env = make_env(resolve(find_task(f"{direct}:PoleEnvCfg")), seed=0)
     obs = env.reset()["policy"]
