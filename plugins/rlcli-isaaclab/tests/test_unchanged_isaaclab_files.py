@@ -124,10 +124,12 @@ class PoleEnv(DirectRLEnv):
 
     def _apply_action(self):
         self.applied += 1
+        self.scene.write_data_to_sim()
         self.robot.set_joint_effort_target(self.cfg.force * self.actions, joint_ids=self.cart)
 
     def _get_observations(self):
         self.observed += 1
+        self.scene.update(self.step_dt)
         velocity = self.robot.data.joint_vel
         return {"policy": torch.cat([velocity, self.observed[:, None]], dim=1)}
 
@@ -226,7 +228,7 @@ def test_direct_task_saves_and_restores_its_tensors(direct):
     [
         ("        self.cart = self.robot.body_names.index('finger')", "ValueError: 'finger' is not in list"),
         ("        self.robot.find_joints('finger')", "finger"),
-        ("        self.scene.write_data_to_sim()", "a task cannot step the simulation itself"),
+        ("        self.sim.step(render=False)", "a task cannot step the simulation itself"),
         (
             "        sim_utils.retrieve_file_path('omniverse://a/grasps.json', download_dir='.')",
             "'omniverse://a/grasps.json' is a file of NVIDIA's server, and rlcli downloads nothing",
@@ -407,7 +409,7 @@ params:
 models:
   policy: {class: GaussianMixin, initial_log_std: 0.0, network: [{name: net, layers: [16, 8], activations: elu}]}
   value: {class: DeterministicMixin, network: [{name: net, layers: [32], activations: elu}]}
-agent: {class: PPO, rollouts: 24, learning_epochs: 3, mini_batches: 2, discount_factor: 0.98, lambda: 0.9,
+agent: {class: PPO, experiment: {checkpoint_interval: 50}, rollouts: 24, learning_epochs: 3, mini_batches: 2, discount_factor: 0.98, lambda: 0.9,
         learning_rate: 1.0e-04, ratio_clip: 0.1, time_limit_bootstrap: False, rewards_shaper_scale: 0.5}
 trainer: {timesteps: 168}
 """,
@@ -447,6 +449,7 @@ def test_agent_file_of_each_library_is_read(direct, library):
         assert agent.max_iterations == 7
         assert agent.learning_rate == 1e-4
         assert agent.reward_scale == 0.5
+    assert agent.save_interval == (3 if library == "skrl" else None)
     if library == "rl_games":
         assert any("surprise" in note.key for note in resolved.notes if note.status == "ignored")
 
