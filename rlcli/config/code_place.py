@@ -1,9 +1,11 @@
 """Place, `file:line`, of the Python code of a configuration or an agent of another framework."""
 
 import inspect
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from rlcli.config.layers import Origin
 from rlcli.errors import ConfigError
 from rlcli.registry import is_framework
 
@@ -21,6 +23,17 @@ def place_of(value: object) -> str:
     except (OSError, TypeError):
         return ""
     return f"{short_path(Path(str(file)))}:{line}"
+
+
+def code_origin(places: Mapping[tuple[str | int, ...], str], path: tuple[str | int, ...]) -> Origin | None:
+    """Return the place of the code that sets the value at a path; None if it is not known.
+
+    Args:
+        places: path -> place of the code that sets the value there, as in `PythonTask.places`.
+        path: keys of the value.
+    """
+    ends = (path[:count] for count in range(len(path), -1, -1))
+    return next((Origin("task", places[end]) for end in ends if end in places), None)
 
 
 def short_path(path: Path) -> Path:

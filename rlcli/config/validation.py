@@ -9,6 +9,7 @@ from typing import Any, Self
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, python_task
+from rlcli.config.code_place import code_origin
 from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read, without
 from rlcli.config.model_option import MODELS, given_settings, model_path
 from rlcli.config.older_success import upgraded
@@ -130,12 +131,7 @@ class TaskCheck:
         """Merge the content of the task's file, which may be in another framework's format."""
         if not self._read_other_format(document):
             origin = document_origins(document, self.source.label, "task")
-            self.layers.merge(document.data, lambda path: self._code_origin(path) or origin(path))
-
-    def _code_origin(self, path: Path) -> Origin | None:
-        """Return the file and line of the code that sets the value at a path; None if it is not known."""
-        ends = (path[:count] for count in range(len(path), -1, -1))
-        return next((Origin("task", self.places[end]) for end in ends if end in self.places), None)
+            self.layers.merge(document.data, lambda path: code_origin(self.places, path) or origin(path))
 
     def _read_other_format(self, document: Document) -> bool:
         """Merge a document in another framework's format. Return False for a document in rlcli's own format.

@@ -209,7 +209,9 @@ class _Reward(_Hook):
     def __call__(self) -> Tensor:
         if self._runner.phase == "build":
             return torch.zeros(self._runner.managed.num_envs, device=self._runner.managed.device)
-        return self._runner.lab._get_rewards().float()
+        reward = self._runner.lab._get_rewards().float()
+        is_column = reward.shape == (self._runner.managed.num_envs, 1)  # as Isaac Lab's libraries of agents accept it
+        return reward[:, 0] if is_column else reward
 
 
 class _Reset(_Hook):

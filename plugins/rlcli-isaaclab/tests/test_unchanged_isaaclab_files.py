@@ -158,6 +158,7 @@ def direct(tmp_path):
 def test_direct_task_groups_prims_and_observes_arrays_of_two_dimensions(direct):
     text = DIRECT.replace("observation_space = 3", "observation_space = [2, 3]")
     text = text.replace('{"policy": torch', '{"policy": self.twice(torch').replace("dim=1)}", "dim=1))}")
+    text = text.replace("return torch.ones(self.num_envs,", "return torch.ones(self.num_envs, 1,")
     group = 'import isaacsim.core.utils.prims as prim_utils\n        prim_utils.create_prim("/World/envs/env_0/Plants")'
     text = text.replace("    def _setup_scene(self):\n", f"    def _setup_scene(self):\n        {group}\n")
     twice = "    def twice(self, value):\n        return torch.stack([value, 2.0 * value], dim=1)\n"
