@@ -12,16 +12,16 @@ name.
 
 import copy
 import functools
-import inspect
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path as FilePath
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from rlcli.config.code_place import at_place, place_of, short_path
 from rlcli.config.schema import AgentConfig, TaskConfig
 from rlcli.config.strict_yaml import Path
 from rlcli.config.term_signatures import SECTIONS, Signature, SignatureError, builtin_terms, signature_of, snake_case
@@ -30,6 +30,7 @@ from rlcli.formats import Note
 from rlcli.registry import TaskSource, import_file, is_framework, load_module, load_object
 from rlcli.registry.failed_imports import FailedImport, error_location, report_failures, take_failures
 from rlcli.registry.formats import Format, first_result, format_of_module, require_module
+from rlcli.registry.module_names import with_own_names
 from rlcli.registry.task_imports import CONFIGURATION, ENVIRONMENT, registrations
 
 _log = logging.getLogger(__name__)
@@ -51,8 +52,8 @@ class PythonTask:
     """Model of `params` in `data`, the settings of the code of a task of another framework; None: it has none."""
     format: Format | None = None
     """The other framework's format to whose classes the configuration belongs; None: rlcli's own."""
-    place: str = ""
-    """File and line of the configuration's class; empty if unknown."""
+    places: dict[Path, str] = field(default_factory=dict)
+    """Path in `data` -> file and line of the class or file that sets its value; `()`: of the configuration's class."""
     filled: list[Path] = field(default_factory=list)
     """Paths of required settings that have no value in the file and got one from the command line."""
 
@@ -90,23 +91,21 @@ def load(
     try:
         value, agents = _import_configuration(source)
         report_failures()
-        place = _place_of(value)
+        place = place_of(value)
         task = to_task(value, source.label, source.root, models, values)
-        task.place = place
+        task.places = {(): place} if place else {}
         _add_agents(task, agents)
     except ValidationError as error:
         items = error.errors(include_url=False)
         problems = [Problem(source.label, ".".join(map(str, item["loc"])), item["msg"]) for item in items]
         raise ConfigError(problems) from None
     except ConfigError as error:
-        label = place or source.label
-        problems = [replace(p, where=label) if p.where == "configuration" else p for p in error.problems]
-        raise ConfigError(problems) from None
+        raise at_place(error, place or source.label) from None
     except RlcliError:
         raise
     except Exception as error:
         require_module(error)
-        message = f"{source.python}: {short_error(error)}{error_location(error)}"
+        message = f"{source.python}: {with_own_names(short_error(error))}{error_location(error)}"
         raise TaskError(message, hint=_hint(error)) from error
     return task
 
@@ -168,19 +167,6 @@ def agent_data(value: object, notes: list[Note]) -> dict[str, Any]:
     if not isinstance(plain, dict):
         raise TypeError(f"the agent is of type {type(value).__name__}; write a mapping")
     return plain
-
-
-def _place_of(value: object) -> str:
-    """Return `file:line` of the class of a configuration of another framework; empty for rlcli's own configurations."""
-    kind = value if isinstance(value, type) else type(value)
-    if not hasattr(kind, "__rlcli_task__") or is_framework(kind.__module__):
-        return ""
-    try:
-        file, line = inspect.getsourcefile(kind), inspect.getsourcelines(kind)[1]
-    except (OSError, TypeError):
-        return ""
-    path = FilePath(str(file))
-    return f"{path.relative_to(FilePath.cwd()) if path.is_relative_to(FilePath.cwd()) else path}:{line}"
 
 
 class _PlainData:
@@ -408,8 +394,9 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
         try:
             data = _read_agent(task, name, agent)
         except ConfigError as error:
+            error = at_place(error, place_of(agent) or "configuration")
             if len(agents) == 1:
-                raise
+                raise error from None
             task.notes.append(Note("", f"agents.{name}", "ignored", "; ".join(map(str, error.problems))))
             continue
         if isinstance(agent, ModuleNotFoundError):
@@ -419,6 +406,8 @@ def _add_agents(task: PythonTask, agents: Mapping[str, Any]) -> None:
             task.notes.append(Note("", f"agents.{name}", "ignored", f"rlcli cannot read {what}; write a mapping"))
         else:
             found[name] = data
+            place = str(short_path(agent)) if isinstance(agent, FilePath) else place_of(agent)
+            task.places |= {("agents", name): place} if place else {}
     ranked = [name for name in order if name in found]
     default = next(iter(ranked or (found if len(found) == 1 or not order else ())), None)
     if found:

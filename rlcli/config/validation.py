@@ -9,6 +9,7 @@ from typing import Any, Self
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from rlcli.config import messages, python_task
+from rlcli.config.code_place import code_origin
 from rlcli.config.layers import Layers, Origin, document_origins, override_place, parse_override, read, without
 from rlcli.config.model_option import MODELS, given_settings, model_path
 from rlcli.config.older_success import upgraded
@@ -83,7 +84,7 @@ class TaskCheck:
     filled: list[Path] = field(default_factory=list)  # paths of the changes that the configuration has received
     format: formats.Format | None = None
     params: type[BaseModel] | None = None  # model of the parameters of a task of another framework
-    place: str = ""  # file and line of a configuration's class in another framework's form; empty for others
+    places: dict[Path, str] = field(default_factory=dict)  # `PythonTask.places`
 
     def document(self, changes: Iterable[Change] = ()) -> Document:
         """Return the content of the task's file.
@@ -98,8 +99,9 @@ class TaskCheck:
             return recorded
         known = recorded.data if recorded is not None else {}
         task = python_task.load(self.source, *given_settings(known, {path: value for path, value, _ in changes}))
-        self.functions, self.notes, self.format, self.place = task.terms, task.notes, task.format, task.place
-        self.filled, self.params = task.filled if recorded is None else [], task.params
+        self.functions, self.notes, self.format, self.params = task.terms, task.notes, task.format, task.params
+        if recorded is None:
+            self.filled, self.places = task.filled, task.places
         return recorded or Document(task.data)
 
     def add(self, *problems: Problem) -> None:
@@ -128,8 +130,8 @@ class TaskCheck:
     def read_task(self, document: Document) -> None:
         """Merge the content of the task's file, which may be in another framework's format."""
         if not self._read_other_format(document):
-            label = self.place or self.source.label
-            self.layers.merge(document.data, document_origins(document, label, "task"))
+            origin = document_origins(document, self.source.label, "task")
+            self.layers.merge(document.data, lambda path: code_origin(self.places, path) or origin(path))
 
     def _read_other_format(self, document: Document) -> bool:
         """Merge a document in another framework's format. Return False for a document in rlcli's own format.

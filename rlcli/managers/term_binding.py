@@ -145,8 +145,9 @@ class Binder:
             self.add_problem(path, str(problem), getattr(problem, "hint", None))
             return None
         except AttributeError:
-            self.raise_problems()  # a manager is absent because of a problem of its terms
-            raise
+            if not self.problems:
+                raise
+            return None  # a manager is absent because of a problem of its terms, which is reported with all others
         name = str(path[-1])
         own = signature.is_class and not hasattr(call, "state_dict") and not is_framework(type(call).__module__)
         memory = AttributeState(call) if own else None

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rlcli.registry.formats import is_framework
+from rlcli.registry.module_names import with_own_names
 
 _log = logging.getLogger(__name__)
 _failures: dict[str, Exception] = {}
@@ -47,7 +48,10 @@ def failed_import(name: str, error: Exception) -> FailedImport:
 
 def take_failures() -> list[str]:
     """Return a text for each import that failed since the last call: the module, the error, and its file and line."""
-    found = [f"{name} is left out: {error}{error_location(error)}" for name, error in _failures.items()]
+    texts = [f"{name} is left out: {error}" for name, error in _failures.items()]
+    found = [
+        with_own_names(text) + error_location(error) for text, error in zip(texts, _failures.values(), strict=True)
+    ]
     _failures.clear()
     return found
 

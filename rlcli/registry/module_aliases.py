@@ -10,6 +10,7 @@ import builtins
 import contextlib
 import functools
 import importlib
+import importlib.util
 import os
 import re
 import sys
@@ -21,12 +22,11 @@ from types import ModuleType
 from typing import Any
 
 from rlcli.registry.formats import Format, aliasing_formats
+from rlcli.registry.module_names import OWN_NAMES
 
 _MOST_FILES = 200
 """Largest number of files of a task in which imports of formats are counted."""
 _python_import = builtins.__import__
-_trees: dict[str, str] = {}
-"""Module name of an imported package or folder -> name under which its own files import it."""
 _roots: list[Path] = []
 """Folders whose modules are executed as files of a task."""
 _by_file: dict[str, ModuleType] = {}
@@ -46,11 +46,24 @@ class TaskFileLoader(SourceFileLoader):
         if outermost:
             _known_paths.append(frozenset(sys.path))
         try:
-            super().exec_module(module)
+            with _without_gpu(self.path):
+                super().exec_module(module)
         finally:
             if outermost:
                 _add_own_paths()
                 _known_paths.clear()
+
+
+def _without_gpu(file: str) -> contextlib.AbstractContextManager[Any]:
+    """Return the context in which a file is executed: if it names `cuda` and there is no GPU, with the CPU for it."""
+    if b"cuda" in Path(file).read_bytes():
+        import torch
+
+        from rlcli.machine.device_names import CudaAsCpu
+
+        if not torch.cuda.is_available():
+            return CudaAsCpu()
+    return contextlib.nullcontext()
 
 
 class _KnownFileLoader(Loader):
@@ -76,7 +89,7 @@ def register_package(module: str, folder: Path, own_name: str) -> None:
         folder: the folder.
         own_name: name of the package in the import statements of its files.
     """
-    _trees[module] = own_name
+    OWN_NAMES[module] = own_name
     if folder not in _roots:
         _roots.append(folder)
     if _FINDER not in sys.meta_path:
@@ -95,6 +108,11 @@ def files_below(folder: Path) -> Iterator[None]:
             _roots.remove(folder)
 
 
+def is_task_package(name: str) -> bool:
+    """Return whether a top-level package is executed as files of a task."""
+    return name in OWN_NAMES
+
+
 def is_alias(name: str) -> bool:
     """Return whether an installed format replaces modules of the package with this top-level name."""
     return bool(_formats_for(name, ""))
@@ -105,7 +123,7 @@ def import_by_name(name: str) -> Any:
 
     The folders of task files that are imported already are searched first.
     """
-    tree = next((module for module, own in _trees.items() if own == name.partition(".")[0] != module), "")
+    tree = next((module for module, own in OWN_NAMES.items() if own == name.partition(".")[0] != module), "")
     module, _ = _resolve(name, {"__name__": tree})
     return importlib.import_module(name) if module is None else module
 
@@ -117,7 +135,7 @@ class _TaskFinder(MetaPathFinder):
         """Return the `ModuleSpec` of a file in a registered folder, with a loader for task files; None for others."""
         if path is None:
             _add_own_paths()
-        if path is not None and name.partition(".")[0] not in _trees:
+        if path is not None and name.partition(".")[0] not in OWN_NAMES:
             return None
         spec = PathFinder.find_spec(name, path)
         if spec is None or not isinstance(spec.loader, SourceFileLoader) or spec.origin is None:
@@ -125,7 +143,7 @@ class _TaskFinder(MetaPathFinder):
         if not any(Path(spec.origin).is_relative_to(root) for root in (*_roots, *_folders_above())):
             return None
         if path is None:
-            _trees.setdefault(name, name)  # its modules are files of the task, too
+            OWN_NAMES.setdefault(name, name)  # its modules are files of the task, too
         known = _by_file.get(spec.origin)
         if known is not None and sys.modules.get(known.__name__) is known:
             spec.loader = _KnownFileLoader(known)
@@ -172,7 +190,8 @@ def _import(
 
         scope = module_globals or {}
         package, file = str(scope.get("__package__")), Path(str(scope.get("__file__", "")))
-        own = level > 0 or name.partition(".")[0] in (package.partition(".")[0], _trees.get(package.partition(".")[0]))
+        top = package.partition(".")[0]
+        own = level > 0 or name.partition(".")[0] in (top, OWN_NAMES.get(top))
         if level and not name and fromlist and len(fromlist) > 1:
             members = {part: getattr(_import(name, scope, {}, (part,), level), part) for part in fromlist}
             return _with_members(sys.modules[package], members)
@@ -229,7 +248,7 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
     """
     first, _, rest = name.partition(".")
     own = str(scope.get("__name__", "")).partition(".")[0]
-    in_tree = _trees.get(own) == first and own != first
+    in_tree = OWN_NAMES.get(own) == first and own != first
     file = str(scope.get("__file__", ""))
     for form in _formats_for(first, file):
         module = _alias_module(form, name, file, below_top=in_tree)
@@ -238,17 +257,17 @@ def _resolve(name: str, scope: Mapping[str, Any]) -> tuple[Any, Any]:
     if in_tree:
         return importlib.import_module(f"{own}.{rest}" if rest else own), sys.modules[own]
     if first not in sys.modules:
-        _import_folder_above(first, rest, Path(file))
+        import_package(first, rest, Path(file))
     return None, None
 
 
-def _import_folder_above(name: str, inner: str, file: Path) -> None:
+def import_package(name: str, inner: str, file: Path) -> None:
     """Import the folder of a task's repository that an import statement `import name.inner` means, as a package.
 
-    The folder is one of the folders above the importing file, or `name` or `name/name` in one of these. It is imported
-    only if no installed package has the name. So files can import modules by their path in the repository
-    (`source.robot.mdp`), from a distribution of the repository that is not installed
-    (`source/robot_assets/robot_assets`), and from a package beside their own.
+    The folder is one of the folders above the importing file, or `name` or `name/name` in one of these. So files can
+    import modules by their path in the repository (`source.robot.mdp`), from a distribution of the repository that is
+    not installed (`source/robot_assets/robot_assets`), and from a package beside their own. An installed package of
+    the name is imported instead, as a package of the task if its files import the framework of an installed format.
 
     Args:
         name: first part of the imported module's name.
@@ -260,16 +279,25 @@ def _import_folder_above(name: str, inner: str, file: Path) -> None:
         beside = (folder for parent in file.parents for folder in (parent / name / name, parent / name))
         module = f"{inner.replace('.', '/')}.py" if inner else "__init__.py"
         found = [folder for folder in beside if any((folder / part).is_file() for part in ("__init__.py", module))]
-    folder = found[0] if found else None
-    spec = PathFinder.find_spec(name)
-    if folder is None or (spec is not None and str(folder) not in (spec.submodule_search_locations or ())):
+    spec = importlib.util.find_spec(name)
+    installed = [Path(place) for place in (spec.submodule_search_locations or ())] if spec is not None else []
+    usable = [place for place in found if spec is None or place in installed]
+    usable = usable[:1] or [place for place in installed if _is_for_a_framework(place)]
+    if not usable:
         return
+    folder = usable[0]
     register_package(name, folder, name)
     sys.path.append(str(folder.parent))
     try:
         importlib.import_module(name)
     finally:
         sys.path.remove(str(folder.parent))
+
+
+def _is_for_a_framework(folder: Path) -> bool:
+    """Return whether files of a package import the framework of an installed format."""
+    names = tuple(n for form in aliasing_formats() for n in form.spec.aliases if n not in form.spec.libraries)
+    return any(_imports(str(path), names) for path in sorted(folder.rglob("*.py"))[:_MOST_FILES])
 
 
 def _above_alias(form: Format, name: str, file: str) -> Any:

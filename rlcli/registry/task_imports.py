@@ -11,7 +11,14 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
-from rlcli.registry.module_aliases import TaskFileLoader, files_below, import_by_name, is_alias, register_package
+from rlcli.registry.module_aliases import (
+    TaskFileLoader,
+    files_below,
+    import_by_name,
+    is_alias,
+    register_package,
+)
+from rlcli.registry.module_names import IMPORTED_NAME
 from rlcli.registry.plugin_imports import contain_side_effects
 
 CONFIGURATION = "env_cfg_entry_point"
@@ -43,7 +50,7 @@ def load_module(name: str) -> Any:
             return import_by_name(name)
         file = Path(name)
         digest = hashlib.blake2b(str(file.resolve()).encode(), digest_size=8).hexdigest()
-        alias = f"rlcli_folder_task_{digest}_{file.stem}"
+        alias = f"{IMPORTED_NAME}task_{digest}_{file.stem}"
         if alias not in sys.modules:
             spec = importlib.util.spec_from_file_location(alias, file, loader=TaskFileLoader(alias, str(file)))
             assert spec is not None
@@ -119,7 +126,7 @@ def _sibling_modules(folder: Path) -> Iterator[None]:
         sys.path.remove(str(folder))
         for name in set(sys.modules) - before:
             file = getattr(sys.modules[name], "__file__", None)
-            if file and Path(file).is_relative_to(folder) and not name.startswith("rlcli_folder_task_"):
+            if file and Path(file).is_relative_to(folder) and not name.startswith(f"{IMPORTED_NAME}task_"):
                 del sys.modules[name]
 
 
@@ -129,7 +136,7 @@ def _package(folder: Path, run_start: bool = True) -> str:
     With `run_start` false, the folder's `__init__.py` is not executed.
     """
     digest = hashlib.blake2b(str(folder).encode(), digest_size=8).hexdigest()
-    name = f"rlcli_folder_{digest}"
+    name = f"{IMPORTED_NAME}{digest}"
     if folder.name.isidentifier() and not is_alias(folder.name):
         existing = sys.modules.get(folder.name)
         is_folder = existing is not None and str(folder) in list(getattr(existing, "__path__", ()))

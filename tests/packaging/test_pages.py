@@ -134,7 +134,7 @@ def test_isaac_lab_examples_train(tmp_path):
     found = blocks(page_path("isaac-lab.md"))
     write_files(found, tmp_path)
     output = run_commands(found, tmp_path)
-    assert "swing_env_cfg.py: valid (files and model)" in output
+    assert "swing_env_cfg.py:SwingEnvCfg: valid (files and model)" in output
     assert "episodes" in output
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 import sys
 import traceback
 from types import ModuleType
@@ -10,7 +11,7 @@ from typing import Any
 
 from rlcli.errors import TaskError, pip_install
 from rlcli.registry.module_aliases import TaskFileLoader
-from rlcli_isaaclab.format import LIBRARIES
+from rlcli_isaaclab.format import LIBRARIES, TRAINERS
 
 _REASONS = {
     "pink": ("Pink inverse kinematics needs Pinocchio", "use DifferentialInverseKinematicsActionCfg"),
@@ -49,6 +50,9 @@ def reason_of(name: str) -> tuple[str, str]:
     library = "trimesh" if top == "trimesh" else LIBRARIES.get(top)
     if library is not None:
         return "the library is not installed", pip_install(library)
+    if top in TRAINERS:
+        what = f"the installed {top} does not have it" if importlib.util.find_spec(top) else f"{top} is not installed"
+        return what, f"install the version of {top} that the task needs, or train with another agent"
     words = name.lower()
     return next(
         (texts for part, texts in _REASONS.items() if part in words),
@@ -162,6 +166,10 @@ class AbsentModule(ModuleType):
             from rlcli_isaaclab.usd_geometry import UsdGeom
 
             return UsdGeom
+        if self.__name__ == "isaacsim.core.utils.prims" and name == "create_prim":
+            from rlcli_isaaclab.setup_scene import create_prim
+
+            return create_prim
         if name[:1].isupper():
             return absent_class(f"{self.__name__}.{name}")
         if self.__name__ in ("carb", "omni.log") and name.startswith(("log", "info", "warn", "error", "verbose")):

@@ -170,7 +170,25 @@ def settings_of(joint: str, settings: JointSettings) -> dict[str, Any]:
     return found
 
 
-def merge_joint_settings(
+def add_joint_settings(
+    entity: dict[str, Any],
+    settings: JointSettings,
+    model: Mapping[str, Any],
+    driven: Mapping[str, str],
+    name: str,
+    report: Report,
+) -> None:
+    """Add the keys `joints` and `actuators` of one entity in rlcli's scene; see `_merge` for the arguments."""
+    joints = _merge(settings, model, driven, name, report)
+    if joints:
+        entity["joints"] = joints
+    passive = _passive_joints(settings, model, driven)
+    if passive:
+        no_effort = {"joints": passive, "kind": "pd", "stiffness": 0.0, "damping": 0.0}
+        entity.setdefault("actuators", {})["passive_joints"] = no_effort
+
+
+def _merge(
     settings: JointSettings, model: Mapping[str, Any], driven: Mapping[str, str], name: str, report: Report
 ) -> dict[str, Any]:
     """Return the content of the key `joints` of an entity in rlcli's scene, without values that its MJCF already has.
@@ -207,6 +225,20 @@ def merge_joint_settings(
             for joint in matched:
                 del by_joint[joint]
     return joints
+
+
+def _passive_joints(settings: JointSettings, model: Mapping[str, Any], driven: Mapping[str, str]) -> list[str]:
+    """Return the joints whose position an action commands without effect, because their drive has no stiffness."""
+    found = []
+    for joint, command in driven.items():
+        values = settings_of(joint, settings)
+        if (
+            command == "position"
+            and joint not in model["driven"]
+            and 0.0 in (values.get("stiffness"), values.get("effort_limit"))
+        ):
+            found.append(joint)
+    return found
 
 
 def _joint_config(

@@ -168,6 +168,9 @@ def _read_skrl(top: Node) -> dict[str, Any]:
         "critic": critic,
         "init_std": math.exp(policy.get("initial_log_std", 0.0)),
     }
+    interval = agent.node("experiment").get("checkpoint_interval")  # in steps; "auto": ten in a training
+    if isinstance(interval, int) and interval > 0:
+        found["save_interval"] = math.ceil(interval / rollouts)
     if agent.get("value_clip"):
         found["clip_value_range"] = agent.get("value_clip")
     if cnn:

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from rlcli.errors import ConfigError, Problem, TaskError
+from rlcli_isaaclab.absent import user_place
 from rlcli_isaaclab.config_class import MISSING, configclass, fill_missing
 from rlcli_isaaclab.own_fields import set_valid_fields
 from rlcli_isaaclab.setup_scene import Setup, running
@@ -59,7 +60,7 @@ class DirectRLEnv(gymnasium.Env):
         self.cfg, self.managed, self.render_mode = cfg, managed, render_mode
         self.sim = SimpleNamespace(
             device=str(managed.device), cfg=cfg.sim, has_gui=lambda: False, has_rtx_sensors=lambda: False,
-            set_camera_view=lambda **view: None, get_physics_dt=lambda: managed.physics_dt,
+            set_camera_view=lambda **view: None, get_physics_dt=lambda: managed.physics_dt, step=_refuse_step,
         )  # fmt: skip
         self.scene = Scene(managed)
         self.extras: dict[str, Any] = {}
@@ -196,6 +197,12 @@ class DirectRLEnv(gymnasium.Env):
         """Do nothing: rlcli does not draw the markers of direct tasks."""
 
 
+def _refuse_step(*args: Any, **options: Any) -> None:
+    """Raise TaskError: a task steps the simulation itself, for example in a reset."""
+    what = f"{user_place()}env.sim.step cannot be used: a task cannot step the simulation itself"
+    raise TaskError(what, hint="rlcli steps all environments at once; set joint positions in a reset instead")
+
+
 class DirectMARLEnv(gymnasium.Env):
     """A multi-agent task, which rlcli does not support."""
 
@@ -315,6 +322,7 @@ class _Shell:
 
     def __init__(self, cfg: Any) -> None:
         self.device, self.num_envs = "cpu", cfg.scene.num_envs
+        self.entities: dict[str, Any] = {}
         self.physics_dt, self.step_dt = cfg.sim.dt, cfg.sim.dt * cfg.decimation
         self.sim = SimpleNamespace(device="cpu", cfg=cfg.sim, has_gui=lambda: False)
         self.scene = SimpleNamespace(

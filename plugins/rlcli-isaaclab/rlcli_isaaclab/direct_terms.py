@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -121,7 +122,7 @@ class DirectRunner:
             shape: shape of the group's observations.
         """
         if self.phase == "build":
-            return torch.zeros(self.managed.num_envs, *_channels_first(shape), device=self.managed.device)
+            return torch.zeros(self.managed.num_envs, *_layout_of(shape), device=self.managed.device)
         if group == "policy":
             manager = self.managed.termination_manager
             is_last = self.phase == "done" and bool((manager.terminated | manager.time_outs).any())
@@ -137,7 +138,7 @@ class DirectRunner:
         if self.cfg.state_space and "critic" not in found:
             found["critic"] = self.lab._get_states()
         found["policy"] = self.observation_noise(found["policy"])
-        return {name: _image_first(value).float().clone() for name, value in found.items() if isinstance(value, Tensor)}
+        return {name: _in_layout(value).float().clone() for name, value in found.items() if isinstance(value, Tensor)}
 
     def _without_effects(self, function: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
         attributes = dict(vars(self.lab))
@@ -153,13 +154,16 @@ class DirectRunner:
         return found
 
 
-def _channels_first(shape: tuple[int, ...]) -> tuple[int, ...]:
-    return (shape[2], shape[0], shape[1]) if len(shape) == 3 else shape
+def _layout_of(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the shape that rlcli gives an observation: an image has its channels first, all others are vectors."""
+    return (shape[2], shape[0], shape[1]) if len(shape) == 3 else (math.prod(shape),)
 
 
-def _image_first(value: Tensor) -> Tensor:
-    """Return images with the channels first, and other tensors unchanged."""
-    return value.movedim(-1, 1).contiguous() if value.dim() == 4 else value
+def _in_layout(value: Tensor) -> Tensor:
+    """Return images (num_envs, h, w, c) with the channels first, and other tensors flattened."""
+    if value.dim() == 4:
+        return value.movedim(-1, 1).contiguous()
+    return value.flatten(1) if value.dim() > 2 else value
 
 
 def runner_of(managed: Any, term: HookTerm) -> DirectRunner:
@@ -210,7 +214,9 @@ class _Reward(_Hook):
     def __call__(self) -> Tensor:
         if self._runner.phase == "build":
             return torch.zeros(self._runner.managed.num_envs, device=self._runner.managed.device)
-        return self._runner.lab._get_rewards().float()
+        reward = self._runner.lab._get_rewards().float()
+        is_column = reward.shape == (self._runner.managed.num_envs, 1)  # as Isaac Lab's libraries of agents accept it
+        return reward[:, 0] if is_column else reward
 
 
 class _Reset(_Hook):

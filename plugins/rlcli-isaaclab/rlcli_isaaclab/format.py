@@ -23,7 +23,10 @@ _FRAMEWORK = (
     *("isaaclab", "isaaclab_tasks", "isaaclab_assets", "isaaclab_rl", "isaaclab_contrib", "isaaclab_mimic"),
     *("isaacsim", "omni", "pxr", "carb", "usdrt"),
 )
-_LIBRARIES = ("toml", "pink", "pinocchio", "trimesh", *LIBRARIES)
+TRAINERS = ("rsl_rl",)
+"""Libraries of agents, of which repositories often need an own version. A name that the installed one lacks, or every
+name without the library, raises an error when it is used."""
+_LIBRARIES = ("toml", "pink", "pinocchio", "trimesh", *TRAINERS, *LIBRARIES)
 FOREIGN = (*_FRAMEWORK, *_LIBRARIES)
 """Packages whose modules `namespace.py` replaces in task files."""
 

@@ -106,18 +106,23 @@ def mjcf_of(usd: str, root: Path, given: Mapping[str, str], entity: str) -> str:
     """
     path = usd.replace("\\", "/")
     for end, mjcf in [(entity, given[entity])] if entity in given else given.items():
-        if end == entity or path.endswith(end):
+        if end == entity or is_end_of(end, path):
             return mjcf
     if path.endswith(".xml"):
         return usd
     for end, mjcf in USD_TO_MJCF.items():
-        if path.endswith(end):
+        if is_end_of(end, path):
             return mjcf
     file = f"{Path(path).stem}.xml"
     for folder, prefix in _folders(root):
         if (folder / file).is_file():
             return f"{prefix}{file}"
     raise TaskError(f"no MJCF model is known for '{path.rsplit('/', 1)[-1]}'", hint=model_hint(entity))
+
+
+def is_end_of(end: str, path: str) -> bool:
+    """Return whether a path ends with these folders and file, `folder/robot.usd`."""
+    return f"/{path}".replace("\\", "/").endswith(f"/{end.lstrip('/')}")
 
 
 def _folders(root: Path) -> Iterator[tuple[Path, str]]:

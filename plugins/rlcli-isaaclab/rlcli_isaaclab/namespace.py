@@ -12,12 +12,14 @@ import importlib
 import importlib.util
 import json
 import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from rlcli.errors import did_you_mean
+from rlcli.registry.module_aliases import import_package, is_task_package
 from rlcli.registry.task_imports import import_from
 from rlcli_isaaclab.absent import (
     AbsentValue,
@@ -28,7 +30,7 @@ from rlcli_isaaclab.absent import (
     user_place,
 )
 from rlcli_isaaclab.config_class import configclass
-from rlcli_isaaclab.format import LIBRARIES
+from rlcli_isaaclab.format import LIBRARIES, TRAINERS
 
 _OWN = "rlcli_isaaclab"
 _EXTRA = {
@@ -116,6 +118,8 @@ def module_of(name: str, file: str) -> ModuleType | None:
         folder = _source_folder(top, Path(file).parent)
         if folder is not None:
             return _of_source(name, folder, inner)
+    if top in TRAINERS:
+        return _trainer_module(name, file)
     if top in ("toml", "trimesh", *LIBRARIES) and importlib.util.find_spec(top) is not None:
         return None
     if top in ("toml", "trimesh"):
@@ -134,6 +138,30 @@ def module_of(name: str, file: str) -> ModuleType | None:
         what = f"Isaac Lab 2.3.2 has no module '{name}'"
         raise ModuleNotFoundError(f"{what}; {near}" if near else what, name=name)
     return _lab_module(name)
+
+
+def _trainer_module(name: str, file: str) -> ModuleType | None:
+    """Return a module of a library of agents: the repository's own one (None), the installed one, or a stand-in."""
+    top, _, inner = name.partition(".")
+    if top not in sys.modules:
+        import_package(top, inner, Path(file))
+    if top in sys.modules and is_task_package(top):
+        return None
+    try:
+        return _extended_module(name)
+    except ModuleNotFoundError as error:
+        if str(error.name).partition(".")[0] != top:
+            raise
+        return absent_module(name)
+
+
+@functools.cache
+def _extended_module(name: str) -> ModuleType:
+    """Return an installed module that also has the names of other versions of its library, as stand-ins."""
+    installed = importlib.import_module(name)
+    module = absent_module(name)
+    vars(module).update({key: value for key, value in vars(installed).items() if key != "__getattr__"})
+    return module
 
 
 def _of_source(name: str, folder: Path, inner: str) -> ModuleType:

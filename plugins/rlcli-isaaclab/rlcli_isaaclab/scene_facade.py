@@ -14,7 +14,7 @@ from rlcli.errors import TaskError, did_you_mean, listing
 from rlcli.scene.entity import Entity
 from rlcli.scene.names import NameProblem
 from rlcli.sim.rotations import conjugate, multiply, rotate, rotate_inverse
-from rlcli_isaaclab.absent import NoEffect, absence, user_place
+from rlcli_isaaclab.absent import NoEffect, absence
 from rlcli_isaaclab.asset_commands import BodyWrench, JointDrive, PhysxView
 from rlcli_isaaclab.asset_data import Data
 from rlcli_isaaclab.sensor_facade import FrameTransformer, TerrainImporter, bound, camera_or_sensor, find_elements
@@ -295,13 +295,15 @@ class Scene(Mapping[str, Any]):
         return found
 
     def write_data_to_sim(self) -> None:
-        """Raise an error: a task calls this to step the simulation itself, for example in a reset.
+        """Do nothing: targets are written when they are set."""
 
-        Raises:
-            TaskError: always.
-        """
-        what = f"{user_place()}env.scene.write_data_to_sim cannot be used: a task cannot step the simulation itself"
-        raise TaskError(what, hint="rlcli steps all environments at once; set joint positions in a reset instead")
+    def update(self, dt: float) -> None:
+        """Do nothing: data are computed when they are read."""
+
+    def reset(self, env_ids: Any = None) -> None:
+        """Remove forces on bodies."""
+        for asset in self.articulations.values():
+            asset.reset(env_ids)
 
     def clone_environments(self, *args: Any, **options: Any) -> None:
         """Do nothing: every environment has its own simulation."""

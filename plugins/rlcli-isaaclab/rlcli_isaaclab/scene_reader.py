@@ -9,9 +9,9 @@ from typing import Any
 
 from rlcli.errors import ConfigError, TaskError, did_you_mean, listing
 from rlcli_isaaclab.absent import AbsentValue, reason_of
-from rlcli_isaaclab.actuator_reader import JointSettings, merge_joint_settings, read_actuators, settings_of
+from rlcli_isaaclab.actuator_reader import JointSettings, add_joint_settings, read_actuators, settings_of
 from rlcli_isaaclab.collection import entity_name
-from rlcli_isaaclab.model_lookup import given_models, mjcf_of, model_hint
+from rlcli_isaaclab.model_lookup import given_models, is_end_of, mjcf_of, model_hint
 from rlcli_isaaclab.sensor_reader import camera_kinds, filter_name, image_name, read_filters, read_sensor
 from rlcli_isaaclab.settings import Key, Node, Report, as_float, kind_of
 from rlcli_isaaclab.terrain_reader import read_friction, read_ground, read_terrain
@@ -25,6 +25,8 @@ class SceneReader:
         self._asked = dict(models or {})
         self._given = given_models(root, self._asked)
         self._given_models = self._given.files
+        self._paths: dict[str, str] = {}
+        """Entity -> the path of its model in the task's files."""
         self.entities: dict[str, dict[str, Any]] = {}
         self.prims: dict[str, str] = {}
         """Entity -> the last part of its prim path."""
@@ -99,6 +101,8 @@ class SceneReader:
             )
         config["entities"] = self.entities
         for name in self._asked.keys() - self.entities.keys() if not self.report.problems else ():
+            if any(is_end_of(name, path) for path in self._paths.values()):
+                continue
             near = did_you_mean(name, self.entities) or f"robots and objects: {listing(self.entities)}"
             self.report.problem(node.key, f"--model {name}: the scene has no '{name}'", near)
         if self.sensors:
@@ -134,9 +138,7 @@ class SceneReader:
         for name, entity in self.entities.items():
             model = self._models.get(name) or {"joint": []}
             settings = self._joint_settings.get(name, [])
-            joints = merge_joint_settings(settings, model, driven.get(name, {}), name, self.report)
-            if joints:
-                entity["joints"] = joints
+            add_joint_settings(entity, settings, model, driven.get(name, {}), name, self.report)
 
     def integrator(self) -> dict[str, str]:
         """Return {"integrator": "implicitfast"} if a joint has a damping gain `kv`, otherwise {}.
@@ -275,6 +277,8 @@ class SceneReader:
         prim = str(item.data.get("prim_path") or "")
         self.prims[name] = prim.rstrip("/").rsplit("/", 1)[-1]
         path = spawn.get("usd_path", spawn.get("asset_path")) if spawn else None
+        if isinstance(path, str):
+            self._paths[name] = path
         path = self._given_models.get(name, path)
         shape = _SHAPES.get(kind_of(spawn.data.get("func"))) if spawn and path is None else None  # a model overrides
         if spawn and shape:

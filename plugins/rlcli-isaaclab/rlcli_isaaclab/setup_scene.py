@@ -12,6 +12,7 @@ from contextvars import ContextVar
 from typing import Any
 
 from rlcli.errors import TaskError
+from rlcli_isaaclab.absent import absence
 
 
 class Setup:
@@ -79,6 +80,26 @@ class Spawn:
         """Record the prim in the running `Setup`; the arguments are those of Isaac Lab's function."""
         pose = {"pos": translation or (0.0, 0.0, 0.0), "rot": orientation or (1.0, 0.0, 0.0, 0.0)}
         current_setup().spawned.append((prim_path, cfg, pose))
+
+
+def create_prim(
+    prim_path: str,
+    prim_type: str = "Xform",
+    position: Any = None,
+    translation: Any = None,
+    orientation: Any = None,
+    scale: Any = None,
+    usd_path: str | None = None,
+    **other: Any,
+) -> None:
+    """Store the USD file that is spawned. A prim that only groups others has no counterpart: then do nothing."""
+    if usd_path is not None:
+        from rlcli_isaaclab.sim import UsdFileCfg
+
+        pose = translation if position is None else position
+        spawn_from_usd(prim_path, UsdFileCfg(usd_path=usd_path, scale=scale), pose, orientation)
+    elif prim_type not in ("Xform", "Scope"):
+        raise absence(f"create_prim of the type {prim_type}")
 
 
 def clone(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -31,6 +31,35 @@ class Trimesh:
         areas: NDArray[np.float64] = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
         return areas
 
+    @property
+    def area(self) -> float:
+        """Area of all faces [m^2]."""
+        return float(self.area_faces.sum())
+
+    @property
+    def volume(self) -> float:
+        """Enclosed volume [m^3], positive if the corners of each face run anticlockwise, seen from outside."""
+        a, b, c = self.triangles.transpose(1, 0, 2)
+        return float((a * np.cross(b, c)).sum() / 6.0)
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Smallest and largest coordinates. (2, 3) [m]"""
+        limits: NDArray[np.float64] = np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        return limits
+
+    @property
+    def extents(self) -> NDArray[np.float64]:
+        """Size along each axis. (3,) [m]"""
+        low, high = self.bounds
+        size: NDArray[np.float64] = high - low
+        return size
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise absence(f"trimesh.Trimesh.{name}", hint=pip_install("trimesh"))
+
 
 def sample_surface(mesh: Any, count: int, face_weight: Any = None, seed: Any = None) -> tuple[Any, Any]:
     """Return random points on the surface of a mesh (count, 3) [m], and the index of each point's face (count,).

@@ -11,8 +11,8 @@ from typing import Any
 
 import mujoco
 
+from rlcli.machine.device_names import on_cpu
 from rlcli.registry import is_framework
-from rlcli.sim.device_names import on_cpu
 
 
 def code_of(function: Any) -> Any:

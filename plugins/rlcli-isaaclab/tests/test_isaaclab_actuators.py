@@ -3,6 +3,7 @@
 import pytest
 import torch
 from support.worlds import CRITTER
+from test_isaaclab_user_code import rover
 
 from rlcli.config.load import resolve
 from rlcli.config.python_task import source_of
@@ -173,3 +174,16 @@ def test_soft_limits_are_narrowed_about_the_middle(tmp_path):
     _, entity = robot(task(tmp_path, legs=implicit([".*"])))
     half = torch.tensor([-0.5, 0.5]) * torch.pi / 3
     torch.testing.assert_close(entity.data.soft_joint_pos_limits, half.expand(4, 2))
+
+
+def test_commands_of_a_passive_joint_have_no_effect(tmp_path):
+    action = 'wheel = mdp.JointVelocityActionCfg(asset_name="robot", joint_names=["wheel"])'
+    resolved = rover(tmp_path / "rover", "", [(action, action.replace("Velocity", "Position"))])
+    robot = resolved.task.scene.entities["robot"]
+    assert robot.actuators["passive_joints"].joints == ["wheel"]
+    assert robot.joints["wheel"].damping == 2.0
+    env = make_env(resolved, seed=0)
+    env.reset()
+    for _ in range(5):
+        env.step(torch.tensor([0.0, 1.0]).expand(4, 2).clone())
+    assert float(env.entities["robot"].data.joint_vel[:, 1].abs().max()) == pytest.approx(0.0, abs=1e-6)

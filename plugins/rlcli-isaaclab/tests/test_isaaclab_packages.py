@@ -9,6 +9,7 @@ from test_isaaclab_user_code import rover
 
 from rlcli.envs.make import make_env
 from rlcli.errors import ConfigError, TaskError, pip_install
+from rlcli.registry.module_names import OWN_NAMES
 from rlcli_isaaclab import direct_convert, namespace
 from rlcli_isaaclab.config_class import is_missing
 from rlcli_isaaclab.convert import agent
@@ -431,3 +432,19 @@ class _Local(threading.local):
 
 def test_source_of_a_direct_task_leaves_out_bases_without_source():
     assert "marker = 1" in direct_convert._source_of(_Local)
+
+
+def test_installed_package_that_imports_isaac_lab(tmp_path, monkeypatch):
+    site = tmp_path / "site"
+    robots = site / "installed_robots_of_test"
+    (robots / "arm").mkdir(parents=True)
+    (robots / "__init__.py").write_text("from .arm import STIFFNESS\n")
+    (robots / "arm" / "__init__.py").write_text("from isaaclab_tasks.utils import import_packages\n\nSTIFFNESS = 3.0\n")
+    plain = site / "installed_numbers_of_test"
+    plain.mkdir()
+    (plain / "__init__.py").write_text("")
+    monkeypatch.syspath_prepend(str(site))
+    code = "from installed_robots_of_test import STIFFNESS\nimport installed_numbers_of_test\n"
+    stepped(rover(tmp_path / "tasks", code))
+    own = [name for name in ("installed_robots_of_test", "installed_numbers_of_test") if name in OWN_NAMES]
+    assert own == ["installed_robots_of_test"]

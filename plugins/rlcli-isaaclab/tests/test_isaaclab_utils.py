@@ -6,6 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from rlcli.errors import TaskError
+from rlcli_isaaclab import triangle_mesh
 from rlcli_isaaclab.namespace import module_of
 from rlcli_isaaclab.sim import SimulationCfg
 from rlcli_isaaclab.utils.math import matrix_from_quat, quat_from_euler_xyz, random_orientation
@@ -88,3 +90,14 @@ def test_actuator_setting_with_two_values_for_a_joint_is_named():
     cfg = SimpleNamespace(stiffness={"a.*": 1.0, ".*m": 2.0})
     with pytest.raises(ValueError, match=r"setting 'stiffness' of an actuator: the keys 'a\.\*' and '\.\*m' both"):
         lab("isaaclab.actuators").IdealPDActuator(cfg, ["arm"], [0], 1, "cpu")
+
+
+def test_mesh_without_the_library_trimesh():
+    corners = [[x, y, z] for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)]
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    box = triangle_mesh.Trimesh(corners, [face for a, b, c, d in sides for face in ((a, b, c), (a, c, d))])
+    assert (box.volume, box.area, box.extents.tolist()) == (pytest.approx(6.0), pytest.approx(22.0), [1.0, 2.0, 3.0])
+    with pytest.raises(
+        TaskError, match=r"trimesh\.Trimesh\.is_watertight cannot be used: the library is not installed"
+    ):
+        _ = box.is_watertight

@@ -411,7 +411,7 @@ def test_actor_reads_another_group_only(tmp_path):
 
 def test_observation_group_that_does_not_exist(tmp_path):
     task = runner_of_groups(tmp_path / "rover", '{"policy": ["policy", "scan"]}')
-    with pytest.raises(ConfigError, match=r"rover_env.py:\d+: obs_groups.policy: no observation group 'scan'"):
+    with pytest.raises(ConfigError, match=r"rsl_rl_cfg.py:5: obs_groups.policy: no observation group 'scan'"):
         resolve(task)
 
 
@@ -494,3 +494,96 @@ def test_default_without_names_of_bodies_must_be_given(tmp_path):
     assert result.reward.tolist() == pytest.approx([0.02] * 4)
     with pytest.raises(ConfigError, match=r"rover_env.py:\d+: rewards.low: missing key 'asset_cfg'"):
         rover(tmp_path / "b", LOW, rewards={"low": "RewardTermCfg(func=low, weight=1.0)"})
+
+
+def test_mistake_of_an_agent_is_at_its_class_and_a_training_may_have_no_end(tmp_path):
+    rover(tmp_path / "rover", "", [("policy: Policy = Policy()", "actor: Policy = Policy()")])
+    agents = tmp_path / "rover" / "agents"
+    agents.mkdir()
+    file = agents / "rsl_rl_cfg.py"
+    source = find_task(f"{tmp_path / 'rover' / 'rover_env.py'}:RoverEnvCfg")
+    file.write_text(RUNNER.replace("= 8, 1, 1,", "= 8, 15000000000, 15000000000,"))
+    assert resolve(source).agent.max_iterations == 15_000_000_000
+    for name in [name for name, module in sys.modules.items() if getattr(module, "__file__", None) == str(file)]:
+        del sys.modules[name]
+    file.write_text(RUNNER.replace("= 8, 1, 1,", "= 8, -10, 1,"))
+    with pytest.raises(ConfigError, match=r"agents/rsl_rl_cfg\.py:5: agents\.rsl-rl\.max_iterations: "):
+        resolve(source)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="the tensor is on the GPU")
+def test_tensor_on_cuda_while_a_file_is_imported(tmp_path):
+    code = "LIMITS = torch.tensor([1.0], device='cuda:0')\nassert LIMITS.cuda().device.type == 'cpu'\n"
+    stepped(rover(tmp_path / "rover", code))
+
+
+@pytest.mark.parametrize("name", ["rover.usd", "somewhere/rover.usd", "omniverse://somewhere/rover.usd"])
+def test_model_option_names_the_end_of_a_path(tmp_path, name):
+    rover(tmp_path / "rover")
+    (tmp_path / "rover" / "models.yaml").unlink()
+    own = (tmp_path / "rover" / "rover.xml").rename(tmp_path / "own.xml")
+    source = find_task(f"{tmp_path / 'rover' / 'rover_env.py'}:RoverEnvCfg")
+    override = f'models."{name}"="{own}"'
+    assert resolve(source, overrides=[override]).task.scene.entities["robot"].model == f"file:{own}"
+    with pytest.raises(ConfigError, match=r"--model over\.usd: the scene has no 'over\.usd'"):
+        resolve(source, overrides=[override, f'models."over.usd"="{own}"'])
+
+
+def test_all_wrong_names_are_found_although_a_manager_is_absent(tmp_path):
+    code = BUILT.replace("def change(env, env_ids):", "def change(env, env_ids, asset_cfg):") + (
+        "\ndef still(env, asset_cfg):\n    return torch.zeros(env.num_envs)\n"
+    )
+    entity = "params={'asset_cfg': SceneEntityCfg('robot', body_names='%s')}"
+    sections = {
+        "commands": {"goal": GOAL},
+        "events": {"change": f"EventTermCfg(func=change, mode='reset', {entity % 'fin'})"},
+        "rewards": {
+            "turns": "RewardTermCfg(func=Turns, weight=1.0)",
+            "still": f"RewardTermCfg(func=still, weight=1.0, {entity % 'wing'})",
+        },
+    }
+    resolved = rover(tmp_path / "rover", code, **sections)
+    with pytest.raises(ConfigError) as caught:
+        make_env(resolved, seed=0)
+    assert [problem.path for problem in caught.value.problems] == ["events.change", "rewards.still"]
+
+
+OWN_RSL_RL = """
+from rsl_rl.algorithms import PPO, AmpOfTest
+from rsl_rl.networks.of_test import Discriminator
+from rsl_rl.utils import names_of_test
+
+class OwnAlgorithm(AmpOfTest):
+    pass
+
+def loss(env):
+    return Discriminator(env.num_envs).loss()
+"""
+
+
+def test_name_that_the_installed_rsl_rl_lacks_raises_when_it_is_used(tmp_path):
+    stepped(rover(tmp_path / "a", OWN_RSL_RL))
+    resolved = rover(tmp_path / "b", OWN_RSL_RL, rewards={"loss": "RewardTermCfg(func=loss, weight=1.0)"})
+    expected = r"rover_env.py:\d+: rsl_rl.networks.of_test.Discriminator.loss cannot be used: the installed rsl_rl does"
+    with pytest.raises(TaskError, match=expected):
+        stepped(resolved)
+
+
+def test_own_rsl_rl_of_a_repository_is_imported(tmp_path, monkeypatch):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "rsl_rl"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if not entry.endswith("site-packages")])
+    own = tmp_path / "rsl_rl" / "rsl_rl"
+    own.mkdir(parents=True)
+    (own / "__init__.py").write_text("")
+    (own / "of_test.py").write_text("from isaaclab.utils import configclass\n\nNUMBER = 3\n")
+    rover(tmp_path / "tasks", "from rsl_rl.of_test import NUMBER\nassert NUMBER == 3\n")
+
+
+def test_message_has_the_name_that_a_package_has_in_its_files(tmp_path):
+    package = write(tmp_path / "json")  # a package of this name is imported already
+    (package / "parts.py").write_text("")
+    start = package / "__init__.py"
+    start.write_text(f"from json.parts import missing\n{start.read_text()}")
+    with pytest.raises(TaskError, match=r"cannot import name 'missing' from 'json\.parts'"):
+        resolve(find_task(f"{package}:Template-Cartpole-v0"))

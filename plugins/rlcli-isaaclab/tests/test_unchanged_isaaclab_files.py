@@ -124,10 +124,12 @@ class PoleEnv(DirectRLEnv):
 
     def _apply_action(self):
         self.applied += 1
+        self.scene.write_data_to_sim()
         self.robot.set_joint_effort_target(self.cfg.force * self.actions, joint_ids=self.cart)
 
     def _get_observations(self):
         self.observed += 1
+        self.scene.update(self.step_dt)
         velocity = self.robot.data.joint_vel
         return {"policy": torch.cat([velocity, self.observed[:, None]], dim=1)}
 
@@ -151,6 +153,30 @@ def direct(tmp_path):
     (folder / "pole_env.py").write_text(DIRECT)
     (folder / "models.yaml").write_text("pole.usd: cartpole:cartpole.xml\n")
     return folder / "pole_env.py"
+
+
+def test_direct_task_groups_prims_and_observes_arrays_of_two_dimensions(direct):
+    text = DIRECT.replace("observation_space = 3", "observation_space = [2, 3]")
+    text = text.replace('{"policy": torch', '{"policy": self.twice(torch').replace("dim=1)}", "dim=1))}")
+    text = text.replace("return torch.ones(self.num_envs,", "return torch.ones(self.num_envs, 1,")
+    group = 'import isaacsim.core.utils.prims as prim_utils\n        prim_utils.create_prim("/World/envs/env_0/Plants")'
+    text = text.replace("    def _setup_scene(self):\n", f"    def _setup_scene(self):\n        {group}\n")
+    twice = "    def twice(self, value):\n        return torch.stack([value, 2.0 * value], dim=1)\n"
+    direct.write_text(text.replace("    def _pre_physics_step", f"{twice}\n    def _pre_physics_step"))
+    env = make_env(resolve(find_task(f"{direct}:PoleEnvCfg")), seed=0)
+    env.reset()
+    obs = env.step(torch.ones(4, 1)).obs["policy"]
+    assert obs.shape == (4, 6)
+    assert torch.equal(obs[:, 3:], 2.0 * obs[:, :3])
+
+
+def test_direct_task_cannot_read_meshes_of_the_stage_while_its_scene_is_set_up(direct):
+    stage = "from isaacsim.core.utils.stage import get_current_stage\n"
+    read = '        get_current_stage().GetPrimAtPath("/World/terrain").IsValid()\n'
+    text = DIRECT.replace("    def _setup_scene(self):\n", f"    def _setup_scene(self):\n{read}")
+    direct.write_text(stage + text)
+    with pytest.raises(TaskError, match=r"pole_env\.py:\d+: pxr\.Usd\.Prim\.IsValid cannot be used"):
+        resolve(find_task(f"{direct}:PoleEnvCfg"))
 
 
 def test_direct_task_steps_and_observes_once_per_step(direct):
@@ -203,7 +229,7 @@ def test_direct_task_saves_and_restores_its_tensors(direct):
     [
         ("        self.cart = self.robot.body_names.index('finger')", "ValueError: 'finger' is not in list"),
         ("        self.robot.find_joints('finger')", "finger"),
-        ("        self.scene.write_data_to_sim()", "a task cannot step the simulation itself"),
+        ("        self.sim.step(render=False)", "a task cannot step the simulation itself"),
         (
             "        sim_utils.retrieve_file_path('omniverse://a/grasps.json', download_dir='.')",
             "'omniverse://a/grasps.json' is a file of NVIDIA's server, and rlcli downloads nothing",
@@ -384,7 +410,7 @@ params:
 models:
   policy: {class: GaussianMixin, initial_log_std: 0.0, network: [{name: net, layers: [16, 8], activations: elu}]}
   value: {class: DeterministicMixin, network: [{name: net, layers: [32], activations: elu}]}
-agent: {class: PPO, rollouts: 24, learning_epochs: 3, mini_batches: 2, discount_factor: 0.98, lambda: 0.9,
+agent: {class: PPO, experiment: {checkpoint_interval: 50}, rollouts: 24, learning_epochs: 3, mini_batches: 2, discount_factor: 0.98, lambda: 0.9,
         learning_rate: 1.0e-04, ratio_clip: 0.1, time_limit_bootstrap: False, rewards_shaper_scale: 0.5}
 trainer: {timesteps: 168}
 """,
@@ -424,6 +450,7 @@ def test_agent_file_of_each_library_is_read(direct, library):
         assert agent.max_iterations == 7
         assert agent.learning_rate == 1e-4
         assert agent.reward_scale == 0.5
+    assert agent.save_interval == (3 if library == "skrl" else None)
     if library == "rl_games":
         assert any("surprise" in note.key for note in resolved.notes if note.status == "ignored")
 

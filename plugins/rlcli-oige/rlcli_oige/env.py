@@ -19,9 +19,9 @@ from rlcli.envs.build import grid
 from rlcli.envs.direct import DirectEnv
 from rlcli.envs.layout import Layout
 from rlcli.errors import DependencyError, TaskError, pip_install
+from rlcli.machine.device_names import on_cpu
 from rlcli.registry import import_file, is_framework
 from rlcli.scene.scene import Scene
-from rlcli.sim.device_names import on_cpu
 from rlcli.sim.env_selection import Selection
 from rlcli_oige.articulation_view import ArticulationView
 from rlcli_oige.cameras import Replicator

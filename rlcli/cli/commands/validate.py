@@ -46,7 +46,8 @@ def command(
         make_env(small).reset(seed=0)
         checked = "files and model"
     log_notes(resolved.notes)
-    console.data(f"{source.label}: valid ({checked})")
+    shown = target if source.python is not None and source.distribution is None else source.label
+    console.data(f"{shown}: valid ({checked})")
     for sentence in missing:
         console.warn(f"model of {sentence}")
     if unchecked:

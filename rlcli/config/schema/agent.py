@@ -5,7 +5,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from rlcli.config.schema.base import Count, Positive, StrictModel, Threads, _FractionString, _Limits
+from rlcli.config.schema.base import Count, Length, Positive, StrictModel, Threads, _FractionString
 from rlcli.safe_text import float_or_nan
 
 
@@ -50,11 +50,11 @@ class AgentConfig(StrictModel):
     """Name of an algorithm of the trainer."""
     task: dict[str, Any] = {}
     """Changes of the task for this agent: keys of the task with other values."""
-    max_iterations: Count | None = None
+    max_iterations: Length | None = None
     """Number of training iterations; null: no limit, then `max_steps` is needed."""
-    max_steps: Annotated[int, Field(ge=1), _Limits(1, 2**62)] | None = None
+    max_steps: Length | None = None
     """Number of environment steps of the training, summed over all environments; null: no limit."""
-    save_interval: Count | None = None
+    save_interval: Length | None = None
     """Iterations between two checkpoints; null: a checkpoint every 60 s and one at the end."""
     keep_last: Count | None = None
     """Number of newest checkpoints to keep, besides the first and the best; null: 10, or all if `save_interval` is

@@ -50,6 +50,11 @@ def _nonzero(message: str) -> AfterValidator:
     return AfterValidator(check)
 
 
+def _text(number: float) -> str:
+    """Return a number as text: all digits of a whole number, unless they are more than 20."""
+    return str(number) if isinstance(number, int) and abs(number) < 10**20 else f"{number:g}"
+
+
 @dataclass(frozen=True)
 class _Limits:
     """Annotation that refuses numbers outside of a range, because they would overflow in later computations.
@@ -66,7 +71,8 @@ class _Limits:
 
     def _check(self, value: float) -> float:
         if not self.smallest <= value <= self.largest:
-            raise ValueError(f"{value:g} is out of range; allowed: {self.smallest:g} to {self.largest:g}")
+            allowed = f"{_text(self.smallest)} to {_text(self.largest)}"
+            raise ValueError(f"{_text(value)} is out of range; allowed: {allowed}")
         return value
 
 
@@ -80,6 +86,8 @@ Seconds = Annotated[float, Field(gt=0), _FractionString(), _Limits(0.0, 1e9)]
 """Duration above 0 [s], at most 1e9, so that its number of environment steps fits 64 bits for every `sim.dt`."""
 Count = Annotated[int, Field(ge=1), _Limits(1, 2**31 - 1)]
 """Whole number of at least 1."""
+Length = Annotated[int, Field(ge=1), _Limits(1, 2**62)]
+"""Number of steps or iterations of a training: a very large one means that the training does not end by itself."""
 Width = Annotated[int, Field(ge=1, le=2**24)]
 """Number of units of a layer of a network."""
 Widths = Annotated[tuple[Width, ...], Field(min_length=1, max_length=100)]

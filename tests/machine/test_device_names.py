@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from rlcli.sim.device_names import on_cpu
+from rlcli.machine.device_names import on_cpu
 
 CALLS = {
     "factory": lambda x: torch.zeros(3, device="cuda"),

@@ -1,0 +1,46 @@
+"""Place, `file:line`, of the Python code of a configuration or an agent of another framework."""
+
+import inspect
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from rlcli.config.layers import Origin
+from rlcli.errors import ConfigError
+from rlcli.registry import is_framework
+
+_METHODS = ("__rlcli_task__", "__rlcli_agent__")
+"""Methods of the configurations and agents of other frameworks."""
+
+
+def place_of(value: object) -> str:
+    """Return `file:line` of the class of a configuration or an agent of another framework; empty for other objects."""
+    kind = value if isinstance(value, type) else type(value)
+    if not any(hasattr(kind, name) for name in _METHODS) or is_framework(kind.__module__):
+        return ""
+    try:
+        file, line = inspect.getsourcefile(kind), inspect.getsourcelines(kind)[1]
+    except (OSError, TypeError):
+        return ""
+    return f"{short_path(Path(str(file)))}:{line}"
+
+
+def code_origin(places: Mapping[tuple[str | int, ...], str], path: tuple[str | int, ...]) -> Origin | None:
+    """Return the place of the code that sets the value at a path; None if it is not known.
+
+    Args:
+        places: path -> place of the code that sets the value there, as in `PythonTask.places`.
+        path: keys of the value.
+    """
+    ends = (path[:count] for count in range(len(path), -1, -1))
+    return next((Origin("task", places[end]) for end in ends if end in places), None)
+
+
+def short_path(path: Path) -> Path:
+    """Return a path relative to the current folder if it is below it, else unchanged."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def at_place(error: ConfigError, place: str) -> ConfigError:
+    """Return an error whose problems without a file are at `place`."""
+    return ConfigError([replace(p, where=place) if p.where == "configuration" else p for p in error.problems])
