@@ -10,8 +10,11 @@ from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from rlcli.errors import listing
+from rlcli.scene.joint_units import LARGEST_LIMIT, doubtful_limits
+from rlcli.scene.reachable_positions import reachable_positions
 
 _CONTROL_DT = 0.02
 """Control period of the new task [s]."""
@@ -61,10 +64,19 @@ class Robot:
         self.joints = [j for j in range(model.njnt) if model.jnt_type[j] in SCALAR]
         joint_actuator = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
         self.actuator = {int(model.actuator_trnid[a, 0]): a for a in range(model.nu) if joint_actuator[a]}
+        names = [self.name(j) for j in self.joints]
+        self.doubts = [(message, hint) for message, hint, _ in doubtful_limits(model, self.joints, names)]
+        """Message and hint for each property of the file that is probably an error."""
         self.data = mujoco.MjData(model)
         for joint in self.joints:
             if home is not None and len(home) == model.nq:
                 self.data.qpos[model.jnt_qposadr[joint]] = home[original.joint(self.name(joint)).qposadr[0]]
+            if (
+                model.jnt_type[joint] == SCALAR[0]
+                and abs(value := self.data.qpos[model.jnt_qposadr[joint]]) > LARGEST_LIMIT
+            ):
+                found = f"the default pose has joint '{self.name(joint)}' at {value:.4g} rad"
+                self.doubts.append((found, "keyframes are in radians, in every file"))
             if model.jnt_limited[joint]:
                 address = model.jnt_qposadr[joint]
                 self.data.qpos[address] = np.clip(self.data.qpos[address], *model.jnt_range[joint])
@@ -79,17 +91,44 @@ class Robot:
         """Height of a floating robot's centre of mass above the ground in the default pose [m]."""
         self.inertia = self._inertia()
 
-    def kind(self) -> str:
-        """Return the kind of task that fits the robot: velocity, reach or balance.
+    def fitting_kind(self) -> tuple[str, str]:
+        """Return the kind of task that fits the robot, velocity, reach or balance, and the reason.
 
         They mean: follow velocity commands, move the last body to a goal, keep the default pose.
         """
-        legged = self.free and self.gravity > 0.0 and self.feet()
-        if legged and len(self.driven) >= max(4, len(self.passive) + 1):
-            return "velocity"
-        if self.free or self.passive or len(self.driven) < 2:
-            return "balance"
-        return "reach" if np.ptp(self.workspace(), axis=1).max() > 0.01 else "balance"
+        driven, undriven = len(self.driven), [self.name(j) for j in self.passive]
+        without = f"{len(undriven)} of its joints have no actuator of their own ({listing(undriven, 3)})"
+        if self.free:
+            if obstacle := self.obstacle_to("velocity"):
+                return "balance", obstacle
+            if driven < 4:
+                return "balance", f"its base floats and it has feet, but only {driven} driven joints; walking needs 4"
+            if driven <= len(undriven):
+                return "balance", f"its base floats and it has feet, but {without}, and only {driven} do"
+            return "velocity", f"its base floats, it has {len(self.feet())} feet and {driven} driven joints"
+        if undriven:
+            return "balance", f"its base is fixed, but {without}"
+        if driven < 2:
+            return "balance", "its base is fixed, and it has only one driven joint; reaching needs 2"
+        if obstacle := self.obstacle_to("reach"):
+            return "balance", obstacle
+        return "reach", f"its base is fixed, and all of its {driven} joints are driven"
+
+    def obstacle_to(self, kind: str) -> str:
+        """Return why a kind of task is impossible for the robot; empty if it is possible."""
+        if kind == "velocity":
+            if not self.free:
+                return "its base is fixed"
+            if not self.gravity:
+                return "there is no gravity, so it cannot walk"
+            return "" if self.feet() else "no body besides the root touches the ground, so it has no feet"
+        if kind == "reach":
+            if self.free:
+                return "its base floats"
+            hand = self.body_name(self.last_body())
+            moves = np.ptp(self.workspace(), axis=0).max() > 0.01
+            return "" if moves else f"its joints do not move its last body '{hand}' by more than 1 cm"
+        return ""
 
     def name(self, joint: int) -> str:
         """Return the name of the joint with this id."""
@@ -161,21 +200,21 @@ class Robot:
         gravity = [float(value) for value in self.model.opt.gravity]
         return settings if gravity == [0.0, 0.0, -9.81] else settings | {"gravity": gravity}
 
-    def scene_settings(self) -> dict[str, Any]:
-        """Return the key `scene` of the task for this robot, as data for its YAML."""
+    def scene_settings(self, kind: str) -> dict[str, Any]:
+        """Return the key `scene` of a task of this kind for the robot, as data for its YAML."""
         robot: dict[str, Any] = {"model": "model.xml"}
         if self.free:
             robot["pos"] = [0.0, 0.0, round(self.height + 0.005, 4)]
-        if self.kind() != "balance" and (settings := self.joint_settings()):
+        if kind != "balance" and (settings := self.joint_settings()):
             robot["joints"] = settings
         pose = {self.name(j): round(float(self.data.qpos[self.model.jnt_qposadr[j]]), 4) for j in self.joints}
         if pose := {name: value for name, value in pose.items() if value}:
             robot["init"] = {"joint_pos": pose}
-        envs = 256 if self.kind() == "velocity" else 512
+        envs = 256 if kind == "velocity" else 512
         return {"num_envs": envs, "env_spacing": 2.5, "entities": {"robot": robot}}
 
-    def viewer_settings(self) -> dict[str, Any]:
-        """Return the camera of the task: it looks at the robot in its default pose and sees it as a whole."""
+    def viewer_settings(self, kind: str) -> dict[str, Any]:
+        """Return the camera of a task of this kind, which sees the whole robot in its default pose."""
         model, data = self.model, self.data
         solid = [g for g in range(model.ngeom) if model.geom_bodyid[g]]
         points, radii = np.vstack([data.xpos[1:], data.geom_xpos[solid]]), np.zeros((model.nbody - 1 + len(solid), 1))
@@ -184,7 +223,7 @@ class Robot:
         lookat = 0.5 * (low + high)
         eye = lookat + 1.5 * max(float(np.linalg.norm(high - low)), 0.1) * _VIEW / np.linalg.norm(_VIEW)
         place = {name: [round(float(x), 3) + 0.0 for x in point] for name, point in (("eye", eye), ("lookat", lookat))}
-        return place | ({"follow": "robot"} if self.kind() == "velocity" else {})
+        return place | ({"follow": "robot"} if kind == "velocity" else {})
 
     def feet(self) -> list[str]:
         """Return the names of the bodies, without the root, that touch the ground in the default pose within 1 cm."""
@@ -224,26 +263,30 @@ class Robot:
         mujoco.mj_fullM(self.model, self.data, matrix)
         return {j: float(matrix[self.model.jnt_dofadr[j], self.model.jnt_dofadr[j]]) for j in self.joints}
 
-    def workspace(self) -> list[list[float]]:
-        """Return a box of positions that the last body can reach: [low, high] along x, y and z [m].
-
-        300 random poses near the default one are tried; the box goes from 20 % to 80 % of the positions along each
-        axis. Positions are in the frame of the fixed root, as the goals of commands.
-        """
-        generator, model, data = np.random.default_rng(0), self.model, mujoco.MjData(self.model)
-        body, turn = self.last_body(), np.zeros(9)
+    def workspace(self) -> NDArray[np.float64]:
+        """Return positions that the last body reaches, in the frame of the fixed root. (n, 3) [m]"""
+        model, turn = self.model, np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.body_quat[_ROOT])
-        places = []
-        for _ in range(300):
-            data.qpos[:] = self.data.qpos
-            for joint in self.driven:
-                address, spread = model.jnt_qposadr[joint], 0.6 if model.jnt_type[joint] == SCALAR[0] else 0.1
-                value = data.qpos[address] + generator.uniform(-spread, spread)
-                limits = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.inf, np.inf)
-                data.qpos[address] = np.clip(value, *limits)
-            mujoco.mj_kinematics(model, data)
-            places.append((data.xpos[body] - model.body_pos[_ROOT]) @ turn.reshape(3, 3))
-        return [[round(float(x), 3) for x in ends] for ends in np.percentile(places, [20, 80], axis=0).T]
+        found = reachable_positions(model, self.data.qpos, self.driven, self.last_body(), self.offsets())
+        places: NDArray[np.float64] = (found - model.body_pos[_ROOT]) @ turn.reshape(3, 3)
+        return places
+
+    def offsets(self) -> tuple[float, float]:
+        """Return the range of joint positions about the default pose in which goals are drawn [m or rad].
+
+        It includes a full turn of hinges; limits of the joints count in addition. Slides without limits move 0.5 m.
+        """
+        endless = any(self.model.jnt_type[j] != SCALAR[0] and not self.model.jnt_limited[j] for j in self.driven)
+        largest = 0.5 if endless else round3(math.pi)
+        return -largest, largest
+
+    def action_scales(self) -> dict[str, float]:
+        """Return joint name -> a quarter of the range of positions in which goals are drawn, at most 0.5 [m or rad]."""
+        scales = {}
+        for joint in self.driven:
+            low, high = self.model.jnt_range[joint] if self.model.jnt_limited[joint] else self.offsets()
+            scales[self.name(joint)] = round3(min(0.5, 0.25 * float(high - low)))
+        return scales
 
     def last_body(self) -> int:
         """Return the id of the body at the end of the longest chain of driven joints, such as a gripper."""
