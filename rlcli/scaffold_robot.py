@@ -18,7 +18,8 @@ import numpy as np
 
 from rlcli.config.strict_yaml import load
 from rlcli.errors import TaskError, UsageError, listing, require_known
-from rlcli.scaffold_mjcf import SCALAR, Robot, round3
+from rlcli.scaffold_mjcf import Robot, round3
+from rlcli.scaffold_mjcf_copy import SCALAR
 from rlcli.scene.mjcf_scan import BadModel
 from rlcli.scene.untrusted_mjcf import read_mjcf
 
@@ -91,6 +92,8 @@ def read_robot(file: Path, name: str, kind: str | None = None) -> RobotTask:
         reason = f"--kind says so; without it {fitting}, because {reason}"
         if obstacle := robot.obstacle_to(kind):
             raise UsageError(f"--kind {kind} is impossible for {file}: {obstacle}", hint=f"try --kind {fitting}")
+    if kind == "reach":
+        robot.prepare_for_reaching()
     parts = {"velocity": _velocity, "reach": _reach, "balance": _balance}[kind](robot)
     sensors = parts.pop("_sensors", {})
     task = {

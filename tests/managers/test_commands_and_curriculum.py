@@ -305,6 +305,23 @@ def test_reachable_positions_are_within_reach_above_the_ground(tmp_path):
     assert torch.allclose(seen, position + rotate(quat, goals), atol=1e-6)
 
 
+def test_reachable_positions_have_a_free_way_from_the_default_pose(tmp_path, monkeypatch):
+    wall = '<body name="wall" pos="0.5 0 0.8"><geom type="box" size="0.1 0.25 0.4"/></body></worldbody>'
+    monkeypatch.setitem(globals(), "ARM", ARM.replace("</worldbody>", wall))
+    _, goals = reacher(tmp_path)
+    assert goals[:, 2].max() > 0.3
+    assert goals[:, 0].min() > -0.1  # the arm would have to pass through the wall to reach the other side
+
+
+def test_joint_that_an_equality_couples_follows_in_reachable_positions(tmp_path, monkeypatch):
+    tie = '<equality><joint joint1="b" joint2="a" polycoef="0 -1 0 0 0"/></equality></mujoco>'
+    monkeypatch.setitem(globals(), "ARM", ARM.replace("</mujoco>", tie))
+    _, goals = reacher(tmp_path, joints=["a"], position=[-1.0, 0.0])
+    angle = torch.atan2(goals[:, 2], goals[:, 0] - 0.3)  # the forearm stays level
+    assert (0.4 * torch.sin(angle)).allclose(goals[:, 2], atol=0.15)
+    assert float((goals[:, 0] - 0.3).square().add(goals[:, 2].square()).sub(0.16).abs().max()) < 1e-4
+
+
 def test_reachable_positions_follow_joints_and_offsets(tmp_path):
     _, goals = reacher(tmp_path, joints=["b"], position=[-0.5, 0.0])
     angle = torch.atan2(goals[:, 2], goals[:, 0] - 0.4)

@@ -66,7 +66,7 @@ def _print_design(design: "RobotTask") -> None:
         console.warn(f"{message}; {hint}")
     if not design.has_pose:
         console.warn(
-            "no keyframe: the default pose is zero joint angles, or the limit nearest to zero; to change it, set"
-            " scene.entities.robot.init.joint_pos in task.yaml, and the height in scene.entities.robot.pos"
+            "no keyframe: the default pose is zero joint angles, except where a limit is near or beyond zero; to change"
+            " it, set scene.entities.robot.init.joint_pos in task.yaml, and the height in scene.entities.robot.pos"
         )
     console.info(f"task: {design.kind}, because {design.reason}")

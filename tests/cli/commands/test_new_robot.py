@@ -1,13 +1,17 @@
 """`rlcli new --robot`: what a task for the robot of an MJCF contains, and refused files."""
 
+import re
 import shutil
 import struct
 
 import mujoco
 import numpy as np
 import pytest
+import torch
 import yaml
 from PIL import Image
+
+from rlcli.api import make
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 
@@ -105,7 +109,7 @@ def test_fixed_base_reaches_with_its_last_body(cli, tmp_path):
     _, task = written(cli, tmp_path, ARM)
     goal = task["commands"]["goal"]
     assert (goal["func"], goal["bodies"], goal["joints"]) == ("reachable_position", "hand", ["a", "b", "c"])
-    assert task["actions"]["joint_position"]["scale"] == {"a": 0.5, "b": 0.5, "c": 0.5}
+    assert task["actions"]["joint_position"]["scale"] == {"a": 0.785, "b": 0.785, "c": 0.785}
     assert task["success"]["position"]["at_most"] == pytest.approx(0.025 * 1.2, rel=0.2)  # goals are within 1.2 m
     # gains of the motors follow from their efforts; the position actuator keeps its own
     joints = task["scene"]["entities"]["robot"]["joints"]
@@ -121,6 +125,64 @@ def test_untrained_policies_seldom_reach_the_goals(cli, tmp_path, text):
         )
         assert result.code == 0, result.err
         assert result.json["success"]["rate"] <= 0.02
+
+
+@pytest.mark.parametrize("size", [1.0, 0.2])
+def test_an_arm_reaches_its_goals_if_its_joints_are_at_their_targets(cli, tmp_path, size):
+    """Gravity displaces the hand by less than the tolerance of the success, for arms of any size."""
+    text = ARM[: ARM.index("<actuator>")] + "</mujoco>"
+    for length in ("0.4", "0.3", "0.02", "0.03"):
+        text = re.sub(rf"\b{length}\b", f"{float(length) * size:g}", text)
+    _, task = written(cli, tmp_path, text)
+    env, generator = make("my-robot/my_robot", num_envs=64), np.random.default_rng(0)
+    model = mujoco.MjModel.from_xml_path("my-robot/my_robot/model.xml")
+    plan, hands, targets = mujoco.MjData(model), [], generator.uniform(-1.0, 1.0, (64, 3))
+    for angles in targets:
+        plan.qpos[:] = angles
+        mujoco.mj_kinematics(model, plan)
+        hands.append(plan.body("hand").xpos.copy())
+    env.reset()
+    scales = [task["actions"]["joint_position"]["scale"][name] for name in "abc"]
+    for _ in range(100):
+        env.step(torch.tensor(targets / scales, dtype=torch.float32))
+    goal = env.command_manager.get_term("goal")
+    goal.command.copy_(torch.tensor(np.array(hands)))
+    env.step(torch.tensor(targets / scales, dtype=torch.float32))
+    assert float(goal.metrics()["position_error"].quantile(0.9)) < task["success"]["position"]["at_most"]
+
+
+def test_an_arm_without_a_keyframe_starts_away_from_its_limits(cli, tmp_path):
+    text = ARM.replace('axis="1 0 0" range="-90 90"', 'axis="1 0 0" range="0 150"')
+    _, task = written(cli, tmp_path, text)
+    assert task["scene"]["entities"]["robot"]["init"] == {"joint_pos": {"b": 1.31}}
+    shutil.rmtree(tmp_path / "my-robot")
+    _, task = written(cli, tmp_path, text.replace("</mujoco>", '<keyframe><key qpos="0 0.1 0"/></keyframe></mujoco>'))
+    assert task["scene"]["entities"]["robot"]["init"] == {"joint_pos": {"b": 0.1}}
+
+
+def test_a_finger_that_follows_another_one_is_not_driven(cli, tmp_path):
+    finger = (
+        '<body pos="0 {y} 0"><joint name="{name}" type="slide" axis="0 1 0" range="-0.04 0"/><geom size="0.01"/></body>'
+    )
+    fingers = finger.format(y=0.05, name="left") + finger.format(y=-0.05, name="right")
+    text = ARM[: ARM.index("<actuator>")].replace("</body>\n</body></body>", fingers + "</body>\n</body></body>")
+    tie = '<equality><joint joint1="right" joint2="left" polycoef="0 -1 0 0 0"/></equality></mujoco>'
+    result, task = written(cli, tmp_path, text + tie)
+    assert result.json["flavour"] == "reach"
+    assert task["actions"]["joint_position"]["joints"] == ["a", "b", "c", "left"]
+    assert task["scene"]["entities"]["robot"]["init"]["joint_pos"] == {"left": -0.02, "right": 0.02}
+
+
+def test_only_reaching_changes_the_usual_time_step(cli, tmp_path):
+    for text, expected in (
+        (ARM, (0.005, 4)),
+        (ARM.replace("<worldbody>", '<option timestep="0.001"/><worldbody>'), (0.001, 20)),
+        (ARM.replace('kp="20"', 'kp="90000"'), (0.002, 10)),  # a servo that is too fast for a longer step
+        (DOG, (0.002, 10)),
+    ):
+        _, task = written(cli, tmp_path, text)
+        assert (task["sim"]["dt"], task["decimation"]) == expected
+        shutil.rmtree(tmp_path / "my-robot")
 
 
 def test_the_reason_for_the_kind_is_printed(cli, tmp_path):
